@@ -102,13 +102,13 @@ def _diagnosis(arguments: argparse.Namespace, out: Path) -> Answer:
 
 def _identifiability(arguments: argparse.Namespace, out: Path) -> Answer:
     from pipeline.gap.report.identifiability_report import in_words, write_identifiability
-    from pipeline.gap.survey.identifiability import identifiability, table
-    from pipeline.gap.survey.surveys import surveys
+    from pipeline.gap.survey.identifiability import format_table, identifiability
+    from pipeline.gap.survey.load_surveys import load_surveys
 
     if len(arguments.measurement) > 1:
         raise InputError(f"got {len(arguments.measurement)} names", where="--identifiability", allowed="one")
-    wanted = surveys(arguments.measurement[0], arguments.overrides, arguments.sensor)
+    wanted = load_surveys(arguments.measurement[0], arguments.overrides, arguments.sensor)
     found = [identifiability(survey, arguments.reference_error) for survey in wanted]
     report = write_identifiability(out, found)
-    told = "\n\n".join(f"{in_words(each)}\n{table(each)}" for each in found)
+    told = "\n\n".join(f"{in_words(each)}\n{format_table(each)}" for each in found)
     return Answer(f"{told}\nreport: {report}", recorded(report, "identifiability.json"))

@@ -14,8 +14,8 @@ from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.naming.verification import Showing
 from pipeline.gap.naming.verify import Gap
-from pipeline.gap.residuals.cells import Cells, held_out_blocks
-from pipeline.gap.residuals.registration import settled
+from pipeline.gap.residuals.alignment import align
+from pipeline.gap.residuals.wall_blocks import WallCells, in_validation_blocks
 from scene.common.keyed_random import KeyedRandom
 
 
@@ -27,14 +27,14 @@ def _biased(coefficient_m: float) -> Callable[[Scan], Array]:
 def _showing(folder: Path, ranges: Callable[[Scan], Array]) -> Showing:
     """What a gap is measured with, of a scan with some ranges."""
     write_scan(folder, 8, ranges=ranges, step_rad=0.007)
-    there, residuals, _ = settled(read_measurement(folder))
-    held_out = held_out_blocks(residuals.at, Cells.over(residuals.at).side_m)
+    there, residuals, _ = align(read_measurement(folder))
+    held_out = in_validation_blocks(residuals.wall_xy, WallCells.over(residuals.wall_xy).side_m)
     return Showing(
         measurement=there,
         residuals=residuals,
-        chosen=np.flatnonzero(residuals.smooth & ~held_out),
-        tested=residuals.smooth & held_out,
-        learned=residuals.smooth & ~held_out,
+        chosen=np.flatnonzero(residuals.usable & ~held_out),
+        tested=residuals.usable & held_out,
+        learned=residuals.usable & ~held_out,
         losses=None,
         reference_sigma=0.0004,
         largest=20.0,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.gap.mean.selection import Chosen
+from pipeline.gap.mean.selection import SelectedEffect
 from pipeline.gap.naming import naming
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.naming.naming import with_doubtful
@@ -88,7 +88,7 @@ def test_such_an_effect_stands_where_it_leaves_no_more_than_chance(
 def test_an_effect_that_is_not_believed_stays_in_the_class_of_what_looks_like_it() -> None:
     """A camera turned by 23 times the usual looks as a tangential distortion does: whichever it is, it is not named alone."""
     turn: Any = SimpleNamespace(name="camera_omega", empirical=False)
-    chosen = Chosen(turn, ("tangential_distortion",), 0.002, 70.0, 67.0, ())
+    chosen = SelectedEffect(turn, ("tangential_distortion",), 0.002, 70.0, 67.0, ())
     named = [
         Named(f"stereo.{name}", "physical", {"name": name}, {}, (), 0.002, 70.0)
         for name in ("smoothing", "tangential_distortion")
@@ -102,7 +102,7 @@ def test_an_effect_that_is_not_believed_stays_in_the_class_of_what_looks_like_it
 def test_what_is_named_in_the_place_of_an_effect_that_is_not_believed_shares_its_class() -> None:
     """A drift of the tilt that was not there beside a vertical index is what that leaves; an offset that was there is not."""
     index: Any = SimpleNamespace(name="vertical_index", empirical=False)
-    chosen = Chosen(index, (), 0.002, 70.0, 67.0, ())
+    chosen = SelectedEffect(index, (), 0.002, 70.0, 67.0, ())
     named = [Named(f"tls.{name}", "physical", {"name": name}, {}, (), 0.002, 70.0) for name in ("tilt_drift", "range_offset")]
     found = with_doubtful(named, [chosen], frozenset({"vertical_index", "range_offset"}), frozenset({("vertical_index", False)}))
     assert [item.alike for item in found] == [("tls.vertical_index",), ()]

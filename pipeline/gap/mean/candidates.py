@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scene.geometry.mesh import FloatArray
 
 Rows = NDArray[np.int64]
-Explanation = tuple[str, bool]
+ExplanationKey = tuple[str, bool]
 """An effect, or all free forms of a covariate: its name, and whether it is empirical."""
 _KNOTS = 5
 _STEPS = 13
@@ -21,12 +21,12 @@ MOST_CYCLES = 12.0
 MOST_CYCLES_OF_A_SENSOR = 40.0
 """In a field of view: a divided circle, or columns read out in blocks, repeat tens of times; what lies along a wall does not."""
 _CHUNK = 32
-PLACE = "place along"
-HARMONICS, FOLDED, SURFACE = "harmonics", "folded", "surface"
-REPEATED = "every"
+SPATIAL_NULL = "place along"
+HARMONICS, HARMONIC_SERIES, POLYNOMIAL = "harmonics", "folded", "surface"
+LINE_PATTERN = "every"
 """Of forms that repeat after `fixed["lines"]` scan lines, columns or rows."""
 _DEGREE = 4
-OVERTONES = 5, 11
+HARMONIC_ORDERS = 5, 11
 """Up to which there may be some beside a sine: what a smooth error has, and what an error that jumps has."""
 _REPEATED = range(2, 9)
 _SCALE_UNKNOWN = 0.03
@@ -54,7 +54,7 @@ class Wave:
         angle = 2 * np.pi / period * self.x
         return self.factor[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=1)
 
-    def refined(self, period: float, change: float) -> float:
+    def stepped_period(self, period: float, change: float) -> float:
         """A period whose frequency is changed: by a third of what the reach of x tells apart at a time.
 
         It stays at the lowest that is tried, below which a sine is not told from a slope.
@@ -62,7 +62,7 @@ class Wave:
         step = 0.3 / float(np.ptp(self.x))
         return 1 / max(1 / period + float(np.clip(change, -step, step)), self.least)
 
-    def with_slope(self, period: float, coefficients: FloatArray) -> FloatArray:
+    def with_frequency_derivative(self, period: float, coefficients: FloatArray) -> FloatArray:
         """(n, 3) the two columns, and the change of their sum, weighted by `coefficients` (2,), by the frequency 1 / period."""
         sine, cosine = self.columns(period).T
         slope = 2 * np.pi * self.x * (coefficients[0] * cosine - coefficients[1] * sine)
@@ -92,7 +92,7 @@ class Candidate:
     form: str = ""
     wave: Wave | None = None
     period: float = 0.0
-    precision: FloatArray | None = None
+    prior_precision: FloatArray | None = None
     angle: str = ""
 
     @cached_property
@@ -135,9 +135,9 @@ class SineGrid:
 
     def candidate(self, index: int) -> Candidate:
         """The variant at one of the frequencies."""
-        return self.at(1 / float(self.frequencies[index]))
+        return self.at_period(1 / float(self.frequencies[index]))
 
-    def at(self, period: float) -> Candidate:
+    def at_period(self, period: float) -> Candidate:
         """The variant of any period: its coefficients are those of sine and cosine, and where given a change of the frequency."""
         amplitude, key = self.amplitude, self.wave.key
 
@@ -176,7 +176,7 @@ class SineGrid:
         return replace(self, wave=self.wave.part(rows))
 
 
-def variants(families: list[Candidate | SineGrid]) -> list[Candidate]:
+def expand_grids(families: list[Candidate | SineGrid]) -> list[Candidate]:
     """Every candidate, the searched ones at each of their frequencies."""
     return [
         candidate
@@ -192,17 +192,17 @@ def amplitude_and_phase(values: FloatArray, amplitude: str) -> dict[str, float]:
     return {amplitude: float(np.hypot(*values)), "phase_rad": float(np.arctan2(values[1], values[0]))}
 
 
-def frequencies(low: float, high: float, step: float, most: int = 200) -> FloatArray:
+def frequency_grid(low: float, high: float, step: float, most: int = 200) -> FloatArray:
     """Evenly from low to high by about `step`, at most some hundreds."""
     return np.linspace(low, high, int(np.clip(np.ceil((high - low) / step), 2, most)))
 
 
-def along_disparity(cycles: float, reach: float) -> FloatArray:
+def disparity_frequencies(cycles: float, reach: float) -> FloatArray:
     """Frequencies to try of a sine of so many cycles per pixel of the disparity, of unsure scale; reach: of the disparity, px."""
-    return frequencies(cycles * (1 - _SCALE_UNKNOWN), cycles * (1 + _SCALE_UNKNOWN), 0.3 / max(reach, 1.0), _MOST_SCALES)
+    return frequency_grid(cycles * (1 - _SCALE_UNKNOWN), cycles * (1 + _SCALE_UNKNOWN), 0.3 / max(reach, 1.0), _MOST_SCALES)
 
 
-def free_forms(
+def nonparametric_terms(
     covariate: str, values: FloatArray, highest: float = np.inf, most_cycles: float = MOST_CYCLES
 ) -> list[Candidate | SineGrid]:
     """Forms of one covariate that stand for no effect: a line, a parabola, a smooth curve, a step, a wave.
@@ -222,7 +222,7 @@ def free_forms(
     ]
 
 
-def angle_forms(angle: str, covariate: str, values: FloatArray, lever: FloatArray) -> list[Candidate | SineGrid]:
+def angle_error_terms(angle: str, covariate: str, values: FloatArray, lever: FloatArray) -> list[Candidate | SineGrid]:
     """Forms of an error of a recorded angle along a covariate; lever: (n,) what the observable changes by per radian of it.
 
     A circle that is divided unevenly may have many cycles in a field of view. Waves of the zenith along the azimuth are left out:
@@ -247,17 +247,17 @@ def _smooth(x: FloatArray) -> FloatArray:
     return np.stack([column / max(float(column.std()), 1e-12) for column in columns], axis=1)
 
 
-def reach_of(x: FloatArray) -> float:
+def robust_extent(x: FloatArray) -> float:
     """What all values but a few cover, which a wave's cycles are counted over."""
     return float(np.ptp(np.quantile(x, [0.005, 0.995])))
 
 
 def _waves(x: FloatArray, most_cycles: float, highest: float = np.inf) -> list[FloatArray]:
     """Frequencies to try, as one list; none where there are fewer than two."""
-    reach = reach_of(x)
+    reach = robust_extent(x)
     if reach <= 0:
         return []
-    tried = frequencies(0.8 / reach, most_cycles / reach, 0.5 / reach)
+    tried = frequency_grid(0.8 / reach, most_cycles / reach, 0.5 / reach)
     tried = tried[tried < highest]
     return [tried] if len(tried) > 1 else []
 
@@ -266,15 +266,17 @@ def _wave(factor: FloatArray, x: FloatArray, tried: FloatArray) -> Wave:
     return Wave("period", factor, x, float(tried[0]))
 
 
-def moved_to(candidate: Candidate, period: float) -> Candidate:
+def with_period(candidate: Candidate, period: float) -> Candidate:
     """The same sine with another period."""
     sine, fixed = candidate.sine, candidate.fixed
-    return SineGrid(candidate.name, candidate.names[0], sine, np.empty(0), fixed, candidate.empirical, candidate.angle).at(period)
+    return SineGrid(candidate.name, candidate.names[0], sine, np.empty(0), fixed, candidate.empirical, candidate.angle).at_period(
+        period
+    )
 
 
-def precision_of(candidate: Candidate, width: int) -> FloatArray:
+def prior_precision(candidate: Candidate, width: int) -> FloatArray:
     """(width,) of its coefficients; 0 where nothing is known of them."""
-    return np.zeros(width) if candidate.precision is None else candidate.precision
+    return np.zeros(width) if candidate.prior_precision is None else candidate.prior_precision
 
 
 def harmonics(covariate: str, sine: Candidate, last: int) -> Candidate:
@@ -283,7 +285,7 @@ def harmonics(covariate: str, sine: Candidate, last: int) -> Candidate:
     return replace(_free(covariate, HARMONICS, columns), period=sine.period, angle=sine.angle)
 
 
-def repeated(covariate: str, number: FloatArray, step: float) -> list[Candidate]:
+def line_pattern_terms(covariate: str, number: FloatArray, step: float) -> list[Candidate]:
     """Values free within a few scan lines, columns or rows, and again in the next few: facets of a mirror, blocks of a read-out.
 
     number: (n,) of the line; step: of the covariate from one line to the next.
@@ -293,37 +295,37 @@ def repeated(covariate: str, number: FloatArray, step: float) -> list[Candidate]
         place = np.mod(np.rint(number), lines)
         columns = (place[:, None] == np.arange(1, lines)) - 1 / lines
         if all(np.ptp(column) > 0 for column in columns.T):
-            form = _free(covariate, f"{REPEATED} {lines}", columns)
+            form = _free(covariate, f"{LINE_PATTERN} {lines}", columns)
             found.append(replace(form, fixed={"lines": lines}, period=lines * abs(step)))
     return found
 
 
-def twice_a_pixel(covariate: str, disparity: FloatArray) -> list[SineGrid]:
+def half_pixel_sine(covariate: str, disparity: FloatArray) -> list[SineGrid]:
     """A sine of two cycles per pixel of the disparity (n,), px: an interpolation between pixels is off the same way at each half.
 
     One cycle per pixel is an effect of the catalogue.
     """
-    x, reach, unit = _standardised(disparity), reach_of(disparity), float(disparity.std())
-    tried = unit * along_disparity(2.0, reach)
+    x, reach, unit = _standardised(disparity), robust_extent(disparity), float(disparity.std())
+    tried = unit * disparity_frequencies(2.0, reach)
     return [SineGrid(covariate, "amplitude", _wave(np.ones_like(x), x, tried), tried, {}, True)] if unit else []
 
 
-def surface_form(first: str, second: str, x: FloatArray, y: FloatArray) -> Candidate:
+def polynomial_term(first: str, second: str, x: FloatArray, y: FloatArray) -> Candidate:
     """A polynomial of two covariates (n,) together, which stands for no effect."""
     s, t = _standardised(x), _standardised(y)
     powers = [(a, degree - a) for degree in range(1, _DEGREE + 1) for a in range(degree + 1)]
     columns = np.stack([s**a * t**b for a, b in powers], axis=1)
-    return _free(f"{first} and {second}", SURFACE, columns / columns.std(axis=0))
+    return _free(f"{first} and {second}", POLYNOMIAL, columns / columns.std(axis=0))
 
 
-def places(at: FloatArray) -> list[Candidate | SineGrid]:
+def spatial_null_candidates(at: FloatArray) -> list[Candidate | SineGrid]:
     """Free forms of places (n, 2) on the wall in slanting directions, which no sensor knows of.
 
     What they gain is the reference's doing, in all likelihood, and so may as much be that a covariate gains which changes along
     the wall too.
     """
     turned = [(angle, at @ np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])) for angle in _DIRECTIONS]
-    return [form for angle, x in turned for form in free_forms(f"{PLACE} {angle}", x)]
+    return [form for angle, x in turned for form in nonparametric_terms(f"{SPATIAL_NULL} {angle}", x)]
 
 
 def _free(covariate: str, form: str, matrix: FloatArray) -> Candidate:

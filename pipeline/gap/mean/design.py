@@ -10,34 +10,34 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.gap.mean.candidates import Candidate, SineGrid, moved_to, precision_of
-from pipeline.gap.mean.mean_model import Covariance, MeanFit, MeanModel, Projected, column_blocks, fitted
-from pipeline.gap.mean.normal_equations import Equations, NoiseDraws, Waves, assembled, extended, wave_products
-from pipeline.gap.residuals.cells import Cells
+from pipeline.gap.mean.candidates import Candidate, SineGrid, prior_precision, with_period
+from pipeline.gap.mean.mean_model import CellCovariance, MeanFit, MeanModel, ProjectedColumns, column_chunks, fit_reml
+from pipeline.gap.mean.normal_equations import NoiseDraws, NormalEquations, SineProducts, assemble, extend, sine_products
 from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.wall_blocks import WallCells
 from scene.common.keyed_random import KeyedRandom
 from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 
-DRAWS = 499
+NULL_DRAWS = 499
 _NULL_ROWS = 8_000
 
 
 @dataclass(frozen=True, eq=False)
-class Families:
+class CandidateFamilies:
     """Explanations with fixed columns, and sines of which a grid of periods is searched."""
 
     plain: list[Candidate]
     grids: list[SineGrid]
 
     @classmethod
-    def of(cls, families: list[Candidate | SineGrid]) -> Families:
+    def of(cls, families: list[Candidate | SineGrid]) -> CandidateFamilies:
         """Of either kind, in any order; effects of the catalogue come first."""
         plain = sorted((family for family in families if isinstance(family, Candidate)), key=lambda each: each.empirical)
         return cls(plain, [family for family in families if isinstance(family, SineGrid)])
 
     @cached_property
-    def members(self) -> dict[str, tuple[list[int], list[int]]]:
+    def by_name(self) -> dict[str, tuple[list[int], list[int]]]:
         """Of each family the numbers of its plain candidates and of its sines."""
         families: dict[str, tuple[list[int], list[int]]] = {}
         for row, candidate in enumerate(self.plain):
@@ -70,20 +70,20 @@ class Design:
     """
 
     residuals: Residuals
-    families: Families
-    cells: Cells
+    families: CandidateFamilies
+    cells: WallCells
     model: MeanModel
-    pose: FloatArray
-    turn: FloatArray
+    pose_basis: FloatArray
+    pose_transform: FloatArray
     pose_precision: FloatArray
     grids: list[SineGrid]
-    value: Projected
-    fixed: Projected
-    sines: Projected | None
-    place: Mapping[Candidate, list[int]]
-    waves: Waves
-    drawn: FloatArray
-    equations: Equations
+    value: ProjectedColumns
+    fixed: ProjectedColumns
+    sine_columns: ProjectedColumns | None
+    column_numbers: Mapping[Candidate, list[int]]
+    sine_products: SineProducts
+    noise_products: FloatArray
+    equations: NormalEquations
 
     @classmethod
     def of(
@@ -94,111 +94,116 @@ class Design:
         pose_precision: FloatArray | None = None,
     ) -> Design:
         """pose_precision: 0 by default."""
-        chosen = Families.of(families)
-        cells = Cells.over(residuals.at)
-        model = MeanModel(cells, residuals.at, residuals.sigma, residuals.shared_noise)
-        rows, root = model.rows, model.root[:, None]
-        pose, turn = np.linalg.qr(residuals.pose[rows] * root)
+        chosen = CandidateFamilies.of(families)
+        cells = WallCells.over(residuals.wall_xy)
+        model = MeanModel(cells, residuals.wall_xy, residuals.sigma, residuals.correlated_noise)
+        rows, root = model.rows, model.inverse_sigma[:, None]
+        pose, turn = np.linalg.qr(residuals.pose_jacobian[rows] * root)
         count = pose.shape[1]
         precision = np.zeros(count) if pose_precision is None else pose_precision
         place = _places(chosen.plain, count)
         fixed = model.project(_columns(model, pose, chosen.plain, place))
         value = model.project(residuals.value[rows, None] * root)
-        model, covariances, bases = model.narrowed([fixed.some(list(range(count))), fixed], value)
-        fixed, value = fixed.kept(bases), value.kept(bases)
-        noise = NoiseDraws.of(model, DRAWS, _NULL_ROWS, random.child("within"))
+        model, covariances, bases = model.restrict([fixed.select(list(range(count))), fixed], value)
+        fixed, value = fixed.in_bases(bases), value.in_bases(bases)
+        noise = NoiseDraws.of(model, NULL_DRAWS, _NULL_ROWS, random.child("within"))
         grids = [grid.part(rows) for grid in chosen.grids]
         asked = count + sum(len(place[each]) for each in chosen.plain if not each.empirical)  # of free forms few are
-        waves = Waves.of(model, grids, fixed.weighed[:, :asked], value, noise)
-        known = [np.zeros(count), *(precision_of(each, each.columns.shape[1]) for each in chosen.plain)]
-        equations = assembled(model, covariances, fixed, value, waves).with_precision(np.concatenate(known))
-        drawn = noise.products(fixed.within[noise.rows], model.noise.on_nodes(fixed.within))
+        waves = SineProducts.of(model, grids, fixed.within_weighted[:, :asked], value, noise)
+        known = [np.zeros(count), *(prior_precision(each, each.columns.shape[1]) for each in chosen.plain)]
+        equations = assemble(model, covariances, fixed, value, waves).with_precision(np.concatenate(known))
+        drawn = noise.products(fixed.within[noise.rows], model.within_noise.to_nodes(fixed.within))
         found = cls(
             residuals, chosen, cells, model, pose, turn, precision, grids, value, fixed, None, place, waves, drawn, equations
         )  # fmt: skip
-        return found._crossed(found.base)
+        return found._crossed(found.pose_columns)
 
     @cached_property
-    def base(self) -> list[int]:
+    def pose_columns(self) -> list[int]:
         """Numbers of the pose's columns."""
-        return list(range(self.pose.shape[1]))
+        return list(range(self.pose_basis.shape[1]))
 
     @cached_property
-    def likely(self) -> list[int]:
+    def ranked_covariances(self) -> list[int]:
         """Numbers of the covariances, that under which the pose alone is most likely first."""
-        return [int(row) for row in np.argsort(-self.equations.log_likelihood(self.base)[:, 0], kind="stable")]
+        return [int(row) for row in np.argsort(-self.equations.log_likelihood(self.pose_columns)[:, 0], kind="stable")]
 
     @property
-    def null(self) -> Covariance:
+    def null_covariance(self) -> CellCovariance:
         """The covariance that is most likely where there is nothing but pose."""
-        return self.equations.at[self.likely[0]]
+        return self.equations.covariances[self.ranked_covariances[0]]
 
     @property
     def plain_columns(self) -> list[list[int]]:
         """Numbers of the columns of each plain candidate."""
-        return [self.place[candidate] for candidate in self.families.plain]
+        return [self.column_numbers[candidate] for candidate in self.families.plain]
 
-    def holding(self, candidate: Candidate) -> Design:
+    def conditioned_on(self, candidate: Candidate) -> Design:
         """With a candidate for others to stand beside; the columns of a sine are at its period refined."""
-        design = self if candidate in self.place else self._with_sine(candidate)
-        return design._crossed(design.place[candidate])
+        design = self if candidate in self.column_numbers else self._with_sine(candidate)
+        return design._crossed(design.column_numbers[candidate])
 
     def _crossed(self, columns: list[int]) -> Design:
         """With the products of the sines with some of the fixed columns."""
         held = self._some(columns)
-        if max(columns) < self.waves.fixed.shape[1]:
-            within = self.waves.fixed[:, columns]
+        if max(columns) < self.sine_products.fixed.shape[1]:
+            within = self.sine_products.fixed[:, columns]
         else:
-            within = wave_products(self.grids, held.weighed, self.model.root)
-        products = self.waves.at(self.equations.at, within, held.between)
-        return replace(self, equations=self.equations.holding(columns, products))
+            within = sine_products(self.grids, held.within_weighted, self.model.inverse_sigma)
+        products = self.sine_products.at(self.equations.covariances, within, held.between)
+        return replace(self, equations=self.equations.with_sine_products(columns, products))
 
-    def _some(self, columns: list[int]) -> Projected:
+    def _some(self, columns: list[int]) -> ProjectedColumns:
         """Some of the fixed columns, or of those of sines, which stand behind them."""
         behind = self.fixed.within.shape[1]
-        if self.sines is None or columns[0] < behind:
-            return self.fixed.some(columns)
-        return self.sines.some([column - behind for column in columns])
+        if self.sine_columns is None or columns[0] < behind:
+            return self.fixed.select(columns)
+        return self.sine_columns.select([column - behind for column in columns])
 
     def _with_sine(self, candidate: Candidate) -> Design:
-        (found,) = self.refined([candidate])[0]
-        added = self.model.project(_without(self.pose, self._matrix([found], None)))
-        had = [self.fixed] if self.sines is None else [self.fixed, self.sines]
-        equations = extended(self.equations, had, self.value, added)
+        (found,) = self.fit_refined([candidate])[0]
+        added = self.model.project(_without(self.pose_basis, self._matrix([found], None)))
+        had = [self.fixed] if self.sine_columns is None else [self.fixed, self.sine_columns]
+        equations = extend(self.equations, had, self.value, added)
         start = sum(each.within.shape[1] for each in had)
-        place = {**self.place, candidate: list(range(start, start + added.within.shape[1]))}
-        return replace(self, sines=Projected.of([*had[1:], added]), equations=equations, place=place)
+        place = {**self.column_numbers, candidate: list(range(start, start + added.within.shape[1]))}
+        return replace(
+            self, sine_columns=ProjectedColumns.concatenate([*had[1:], added]), equations=equations, column_numbers=place
+        )
 
     def columns(self, candidates: Sequence[Candidate]) -> list[int]:
         """Numbers of the pose's columns and of those of candidates that it holds."""
-        return [*self.base, *(column for each in candidates for column in self.place[each])]
+        return [*self.pose_columns, *(column for each in candidates for column in self.column_numbers[each])]
 
     def log_likelihood(self, value: FloatArray, candidate: Candidate) -> float:
         """Of other residuals (n,) of the same points, pose and a candidate fitted."""
-        columns = self._pose_columns.beside(self.model.project(_without(self.pose, self._matrix([candidate], None))))
-        projected = self.model.project(value[self.model.rows, None] * self.model.root[:, None])
-        return fitted(self.model.fine, columns, projected).log_likelihood
+        columns = self._pose_columns.append(self.model.project(_without(self.pose_basis, self._matrix([candidate], None))))
+        projected = self.model.project(value[self.model.rows, None] * self.model.inverse_sigma[:, None])
+        return fit_reml(self.model.covariances, columns, projected).log_likelihood
 
     def fit(self, candidates: list[Candidate], slopes: list[FloatArray | None] | None = None) -> MeanFit:
         """Pose (the columns of `Residuals.pose`) and some candidates, at their most likely covariance."""
-        turned = np.linalg.inv(self.turn)
+        turned = np.linalg.inv(self.pose_transform)
         if not candidates:
             known = np.asarray(turned.T @ (self.pose_precision[:, None] * turned), dtype=np.float64)
-            found = fitted(self.model.fine, self._pose_columns, self.value, known)
+            found = fit_reml(self.model.covariances, self._pose_columns, self.value, known)
             return replace(found, coefficients=turned @ found.coefficients, covariance=turned @ found.covariance @ turned.T)
         matrix = self._matrix(candidates, slopes)
-        columns = self._pose_columns.beside(self.model.project(_without(self.pose, matrix)))
+        columns = self._pose_columns.append(self.model.project(_without(self.pose_basis, matrix)))
         # the columns are fitted without what the pose explains of them, and the pose by orthonormal ones
         back = np.block(
-            [[turned, -turned @ (self.pose.T @ matrix)], [np.zeros((matrix.shape[1], len(turned))), np.eye(matrix.shape[1])]]
+            [
+                [turned, -turned @ (self.pose_basis.T @ matrix)],
+                [np.zeros((matrix.shape[1], len(turned))), np.eye(matrix.shape[1])],
+            ]
         )
         widths = [candidate.columns.shape[1] + (slope is not None) for candidate, slope in _with_slopes(candidates, slopes)]
-        typical = [precision_of(each, width) for each, width in zip(candidates, widths, strict=True)]
+        typical = [prior_precision(each, width) for each, width in zip(candidates, widths, strict=True)]
         precision = np.concatenate([self.pose_precision, *typical])
-        found = fitted(self.model.fine, columns, self.value, back.T @ (precision[:, None] * back))
+        found = fit_reml(self.model.covariances, columns, self.value, back.T @ (precision[:, None] * back))
         return replace(found, coefficients=back @ found.coefficients, covariance=back @ found.covariance @ back.T)
 
-    def refined(self, candidates: list[Candidate], rounds: int = 4) -> tuple[list[Candidate], MeanFit]:
+    def fit_refined(self, candidates: list[Candidate], rounds: int = 4) -> tuple[list[Candidate], MeanFit]:
         """Candidates with their periods at the top of the likelihood (Gauss-Newton), and the fit of pose and all of them.
 
         Each sine has three columns in that fit: sine, cosine and the change by its frequency.
@@ -208,55 +213,55 @@ class Design:
         if any(candidate.wave is not None for candidate in found):
             for number in range(rounds):
                 fit = self.fit(found, slopes)
-                start = len(self.base)
+                start = len(self.pose_columns)
                 for index, candidate in enumerate(found):
                     width = candidate.columns.shape[1] + (slopes[index] is not None)
                     values, start = fit.coefficients[start : start + width], start + width
                     if candidate.wave is None:
                         continue
                     if slopes[index] is not None and number:
-                        found[index] = moved_to(candidate, candidate.wave.refined(candidate.period, float(values[2])))
+                        found[index] = with_period(candidate, candidate.wave.stepped_period(candidate.period, float(values[2])))
                     slopes[index] = values[:2]
         return found, self.fit(found, slopes)
 
-    def split(self, values: NDArray[Any], candidates: list[Candidate]) -> list[NDArray[Any]]:
+    def split_coefficients(self, values: NDArray[Any], candidates: list[Candidate]) -> list[NDArray[Any]]:
         """The part of a fit's coefficients that belongs to each candidate after the pose, a sine's with that of its frequency."""
         widths = [candidate.columns.shape[1] + (candidate.wave is not None) for candidate in candidates]
-        return np.split(values[len(self.base) :], np.cumsum(widths)[:-1]) if candidates else []
+        return np.split(values[len(self.pose_columns) :], np.cumsum(widths)[:-1]) if candidates else []
 
     def reference_sigma(self, candidates: list[Candidate]) -> float:
         """Standard deviation of the reference's correlated error beside some candidates, in the observable's unit."""
-        return float(np.sqrt(self.fit(candidates).at.ratio)) * self.model.typical_sigma
+        return float(np.sqrt(self.fit(candidates).cell_covariance.variance_ratio)) * self.model.typical_sigma
 
-    def without(self, chosen: list[Candidate]) -> FloatArray:
+    def residuals_after(self, chosen: list[Candidate]) -> FloatArray:
         """(n,) residuals less pose and the chosen candidates at their most likely values."""
-        candidates, fit = self.refined(chosen)
-        value = self.residuals.value - self.residuals.pose @ fit.coefficients[: len(self.base)]
-        for candidate, coefficients in zip(candidates, self.split(fit.coefficients, candidates), strict=True):
+        candidates, fit = self.fit_refined(chosen)
+        value = self.residuals.value - self.residuals.pose_jacobian @ fit.coefficients[: len(self.pose_columns)]
+        for candidate, coefficients in zip(candidates, self.split_coefficients(fit.coefficients, candidates), strict=True):
             value = value - candidate.columns @ coefficients[: candidate.columns.shape[1]]
         return np.asarray(value)
 
     def identifiability(self) -> tuple[list[str], FloatArray, FloatArray]:
         """Names of the families, cosines of their signatures after the pose fit, and the share that survives the pose fit."""
-        row = self.likely[0]
+        row = self.ranked_covariances[0]
         names, matrices = [], []
-        for name, (plain, sines) in self.families.members.items():
+        for name, (plain, sines) in self.families.by_name.items():
             candidate = self.families.plain[plain[0]] if plain else self.families.sine(sines[len(sines) // 2])
             if not candidate.empirical:
                 names.append(name)
-                matrices.append(candidate.columns[self.model.rows, :1] * self.model.root[:, None])
+                matrices.append(candidate.columns[self.model.rows, :1] * self.model.inverse_sigma[:, None])
         whole = np.concatenate(matrices, axis=1)
-        weight = self.equations.at[row].weight[:, None]
+        weight = self.equations.covariances[row].weight[:, None]
         grams = []
-        for columns in (whole, left := _without(self.pose, whole)):
+        for columns in (whole, left := _without(self.pose_basis, whole)):
             projected = self.model.project(columns)
-            between = projected.between[self.null.length]
-            grams.append(projected.within.T @ projected.weighed + (between * weight).T @ between)
-        count = len(self.base)
+            between = projected.between[self.null_covariance.basis]
+            grams.append(projected.within.T @ projected.within_weighted + (between * weight).T @ between)
+        count = len(self.pose_columns)
         matrix, pose = grams[1], self.equations.fixed[row][:count, :count]
         found, base = self.model.project(left), self.fixed
-        cross = base.within[:, :count].T @ found.weighed
-        cross += base.between[self.null.length][:, :count].T @ (weight * found.between[self.null.length])
+        cross = base.within[:, :count].T @ found.within_weighted
+        cross += base.between[self.null_covariance.basis][:, :count].T @ (weight * found.between[self.null_covariance.basis])
         matrix = matrix - cross.T @ np.linalg.solve(pose, cross)
         size = np.sqrt(np.maximum(np.diag(matrix), 0))
         full = np.sqrt(np.maximum(np.diag(grams[0]), 1e-200))  # a signature may be 0
@@ -264,16 +269,18 @@ class Design:
         return names, np.clip(matrix / np.outer(scale, scale), -1, 1), size / full
 
     @cached_property
-    def _pose_columns(self) -> Projected:
-        return self.fixed.some(self.base)
+    def _pose_columns(self) -> ProjectedColumns:
+        return self.fixed.select(self.pose_columns)
 
     def _matrix(self, candidates: list[Candidate], slopes: list[FloatArray | None] | None) -> FloatArray:
         """Columns of some candidates over sigma; of a sine with its change by the frequency where `slopes` say so."""
-        rows, root = self.model.rows, self.model.root[:, None]
+        rows, root = self.model.rows, self.model.inverse_sigma[:, None]
         matrices = []
         for candidate, slope in _with_slopes(candidates, slopes):
             wave = candidate.wave
-            columns = candidate.columns if wave is None or slope is None else wave.with_slope(candidate.period, slope)
+            columns = (
+                candidate.columns if wave is None or slope is None else wave.with_frequency_derivative(candidate.period, slope)
+            )
             matrices.append(columns[rows] * root)
         return np.concatenate(matrices, axis=1)
 
@@ -286,7 +293,7 @@ def _columns(model: MeanModel, pose: FloatArray, plain: list[Candidate], place: 
 
     def fill(candidate: Candidate) -> None:
         columns = slice(place[candidate][0], place[candidate][-1] + 1)
-        np.multiply(candidate.columns[model.rows], model.root[:, None], out=found[:, columns])
+        np.multiply(candidate.columns[model.rows], model.inverse_sigma[:, None], out=found[:, columns])
 
     map_in_threads(fill, plain)
     _take_off(pose, found[:, count:])
@@ -306,7 +313,7 @@ def _take_off(pose: FloatArray, columns: FloatArray) -> None:
     def take(some: slice) -> None:
         columns[:, some] -= pose @ (pose.T @ columns[:, some])
 
-    map_in_threads(take, column_blocks(columns.shape[1]))
+    map_in_threads(take, column_chunks(columns.shape[1]))
 
 
 def _places(plain: list[Candidate], start: int) -> dict[Candidate, list[int]]:

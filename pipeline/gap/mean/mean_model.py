@@ -25,9 +25,9 @@ from scipy.linalg.lapack import dsysv
 from scipy.spatial.distance import pdist, squareform
 from scipy.special import j0
 
-from pipeline.gap.mean.within_noise import WithinNoise
-from pipeline.gap.residuals.cells import Cells
-from pipeline.gap.residuals.shared_noise import NOT_SHARED, SharedNoise
+from pipeline.gap.mean.within_cell_noise import WithinCellNoise
+from pipeline.gap.residuals.correlated_noise import NO_CORRELATED_NOISE, GridCorrelatedNoise
+from pipeline.gap.residuals.wall_blocks import WallCells
 from scene.common.keyed_random import KeyedRandom
 from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
@@ -51,12 +51,12 @@ _NOTHING = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
-class Covariance:
+class CellCovariance:
     """One covariance of the cell means. length: number of the basis; ratio: of the correlated part; weight: (m,) inverse
     eigenvalues."""
 
-    length: int
-    ratio: float
+    basis: int
+    variance_ratio: float
     weight: FloatArray
 
 
@@ -67,26 +67,28 @@ class MeanFit:
     coefficients: FloatArray
     covariance: FloatArray
     log_likelihood: float
-    at: Covariance
+    cell_covariance: CellCovariance
 
 
 class MeanModel:
     """The linear algebra of one set of points. Rows of whatever it takes are those of `rows`: points in cells, cell by cell."""
 
-    def __init__(self, cells: Cells, at: FloatArray, sigma: FloatArray, shared_noise: SharedNoise = NOT_SHARED) -> None:
+    def __init__(
+        self, cells: WallCells, at: FloatArray, sigma: FloatArray, shared_noise: GridCorrelatedNoise = NO_CORRELATED_NOISE
+    ) -> None:
         """at, sigma: (n, 2) m and (n,), of all points."""
         inside = np.flatnonzero(cells.cell >= 0)
         self.rows = inside[np.argsort(cells.cell[inside], kind="stable")]
         self._cell = cells.cell[self.rows]
         self._starts = np.flatnonzero(np.diff(self._cell, prepend=-1))
-        self.root = 1 / sigma[self.rows]
-        self._total = np.add.reduceat(self.root**2, self._starts)
-        field = shared_noise.part(self.rows).field(len(self.rows))
+        self.inverse_sigma = 1 / sigma[self.rows]
+        self._total = np.add.reduceat(self.inverse_sigma**2, self._starts)
+        field = shared_noise.part(self.rows).node_field(len(self.rows))
         offsets = (at[self.rows] - cells.centre[self._cell]).T / cells.side_m
         self._planes = self._orthonormal([] if field.weights.shape[1] else list(offsets))
         self._across = sparse.csr_array(self._planes.T)
-        self.noise = WithinNoise.of(field, self.root, self._planes[: len(cells)])
-        variance = self.noise.of_means()
+        self.within_noise = WithinCellNoise.of(field, self.inverse_sigma, self._planes[: len(cells)])
+        variance = self.within_noise.mean_covariance()
         self._root = cholesky(variance, lower=True)
         self.typical_sigma = typical = float(np.median(np.sqrt(np.diag(variance) / self._total)))
         scale = typical * np.sqrt(self._total)
@@ -100,7 +102,7 @@ class MeanModel:
             return np.maximum(values, 0.0), vectors
 
         self._bases: list[tuple[FloatArray, FloatArray]] = map_in_threads(basis, _CORRELATIONS)
-        self._white = Covariance(0, 0.0, np.ones(len(self._total)))
+        self._white = CellCovariance(0, 0.0, np.ones(len(self._total)))
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -110,19 +112,21 @@ class MeanModel:
         """Their number m."""
         return len(self._total)
 
-    def _at(self, length: int, ratio: float) -> Covariance:
-        return Covariance(length, ratio, 1 / (1 + ratio * self._bases[length][0])) if ratio else self._white
+    def _at(self, length: int, ratio: float) -> CellCovariance:
+        return CellCovariance(length, ratio, 1 / (1 + ratio * self._bases[length][0])) if ratio else self._white
 
-    def narrowed(self, designs: list[Projected], value: Projected) -> tuple[MeanModel, list[Covariance], list[int]]:
+    def restrict(
+        self, designs: list[ProjectedColumns], value: ProjectedColumns
+    ) -> tuple[MeanModel, list[CellCovariance], list[int]]:
         """Covariances under which the value is likely, whichever of the designs is fitted (the least and the most of them).
 
         Returns the model without the bases that none of them needs, those covariances, and which bases are kept, for
         `Projected.kept` of what there is already.
         """
         ratios = [0.0, *map(float, _RATIOS)]
-        normals = [_Normal.of(design, value) for design in designs]
+        normals = [_NormalEquations.of(design, value) for design in designs]
 
-        def highest(which: tuple[_Normal, int]) -> tuple[int, float]:
+        def highest(which: tuple[_NormalEquations, int]) -> tuple[int, float]:
             normal, basis = which
             return _highest([partial(normal.log_likelihood, self._at(basis, ratio)) for ratio in ratios])
 
@@ -132,7 +136,7 @@ class MeanModel:
         kept = [int(basis) for basis in np.flatnonzero((heights > heights.max(axis=1, keepdims=True) - _WORSE).any(axis=0))]
         narrower = copy(self)
         narrower._bases = [self._bases[basis] for basis in kept]
-        chosen: list[Covariance] = []
+        chosen: list[CellCovariance] = []
         for number, basis in enumerate(kept):
             low, high = max(tops[:, basis].min() - 1, 0), min(tops[:, basis].max() + 1, len(ratios) - 1)
             places = np.unique(np.rint(np.linspace(low, high, min(_MOST_RATIOS, high - low + 1))).astype(int))
@@ -140,7 +144,7 @@ class MeanModel:
         return narrower, [*dict.fromkeys(chosen)], kept
 
     @property
-    def fine(self) -> list[Covariance]:
+    def covariances(self) -> list[CellCovariance]:
         """Every covariance of the bases in use."""
         return [self._at(basis, float(ratio)) for basis in range(len(self._bases)) for ratio in (0.0, *_RATIOS)]
 
@@ -148,7 +152,7 @@ class MeanModel:
         """(3 m, n) a plane in each cell: rows of the cells' means, and of their slopes by each of the offsets (n,)."""
         found: list[FloatArray] = []
         for plain in (np.ones(len(self.rows)), *offsets):
-            row = plain * self.root
+            row = plain * self.inverse_sigma
             size = self._summed(row**2)
             for other in found:
                 row = row - other * self._summed(other * row)[self._cell]
@@ -162,56 +166,56 @@ class MeanModel:
     def _summed(self, column: FloatArray) -> FloatArray:
         return np.asarray(np.add.reduceat(column, self._starts))
 
-    def planes(self, weighted: FloatArray, rows: slice = slice(None)) -> FloatArray:
+    def plane_coefficients(self, weighted: FloatArray, rows: slice = slice(None)) -> FloatArray:
         """(3 m, k) the cells' means over their standard deviations, and their slopes likewise, of columns (n', k) on `rows` that
         are already over sigma; (m, k) means alone where neighbours share noise."""
         return np.asarray((self._planes if rows == slice(None) else self._planes[:, rows]) @ weighted)
 
-    def within(self, weighted: FloatArray, planes: FloatArray, rows: slice = slice(None)) -> FloatArray:
+    def deviations(self, weighted: FloatArray, planes: FloatArray, rows: slice = slice(None)) -> FloatArray:
         """Deviations from the cells' planes, or means, of `rows`; columns over sigma."""
         return np.asarray(weighted[rows] - self._across[rows] @ planes)
 
-    def between(self, means: FloatArray) -> list[FloatArray]:
+    def in_bases(self, means: FloatArray) -> list[FloatArray]:
         """Cell means (m, k) in each basis."""
         white = self._whitened(means)
         return [vectors.T @ white for _, vectors in self._bases]
 
     def _whitened(self, means: FloatArray) -> FloatArray:
         """Cell means (m, k) whose noise is independent and of variance 1."""
-        return means if self.noise.is_white else np.asarray(solve_triangular(self._root, means, lower=True))
+        return means if self.within_noise.is_white else np.asarray(solve_triangular(self._root, means, lower=True))
 
-    def project(self, weighted: FloatArray) -> Projected:
+    def project(self, weighted: FloatArray) -> ProjectedColumns:
         """Columns (n, k) over sigma as deviations within cells and as cell means in each basis."""
         within = np.empty(weighted.shape)
-        weighed = within if self.noise.is_white else np.empty(weighted.shape)
+        weighed = within if self.within_noise.is_white else np.empty(weighted.shape)
         between = [np.empty((self.cells, weighted.shape[1])) for _ in self._bases]
 
         def project(some: slice) -> None:
-            planes = self.planes(weighted[:, some])
-            within[:, some] = self.within(weighted[:, some], planes)
+            planes = self.plane_coefficients(weighted[:, some])
+            within[:, some] = self.deviations(weighted[:, some], planes)
             if weighed is not within:
                 weighed[:, some] = self._weighed(within[:, some])
-            for basis, means in zip(between, self.between(planes[: self.cells]), strict=True):
+            for basis, means in zip(between, self.in_bases(planes[: self.cells]), strict=True):
                 basis[:, some] = means
 
-        map_in_threads(project, column_blocks(weighted.shape[1]))
-        return Projected(within, weighed, between)
+        map_in_threads(project, column_chunks(weighted.shape[1]))
+        return ProjectedColumns(within, weighed, between)
 
     def _weighed(self, within: FloatArray) -> FloatArray:
         """Deviations within cells (n, k), multiplied with the inverse covariance of their noise."""
-        if self.noise.is_white:
+        if self.within_noise.is_white:
             return within
-        shared = self.noise.nodes @ self.noise.solved(self.noise.on_nodes(within))
-        return np.asarray((within - self.within(shared, self.planes(shared))) / self.noise.white)
+        shared = self.within_noise.nodes @ self.within_noise.solve(self.within_noise.to_nodes(within))
+        return np.asarray((within - self.deviations(shared, self.plane_coefficients(shared))) / self.within_noise.white)
 
-    def null_draws(self, at: Covariance, count: int, random: KeyedRandom) -> list[FloatArray]:
+    def null_draws(self, at: CellCovariance, count: int, random: KeyedRandom) -> list[FloatArray]:
         """Draws of the cell means under the covariance `at`, (m, count) in each basis."""
         draws = random.generator().standard_normal((len(self._total), count)) / np.sqrt(at.weight)[:, None]
-        vectors = self._bases[at.length][1]
-        return [draws if index == at.length else other.T @ (vectors @ draws) for index, (_, other) in enumerate(self._bases)]
+        vectors = self._bases[at.basis][1]
+        return [draws if index == at.basis else other.T @ (vectors @ draws) for index, (_, other) in enumerate(self._bases)]
 
 
-def column_blocks(count: int) -> list[slice]:
+def column_chunks(count: int) -> list[slice]:
     """Some of `count` columns at a time, for what is done to each of them."""
     return [slice(start, start + _AT_ONCE) for start in range(0, count, _AT_ONCE)]
 
@@ -239,82 +243,86 @@ _CORRELATIONS: list[Callable[[FloatArray], FloatArray]] = [
 
 
 @dataclass(frozen=True)
-class Projected:
+class ProjectedColumns:
     """Columns on both parts of the data. within: (n, k); weighed: (n, k) times the inverse covariance of the noise there, so that
     a.within.T @ b.weighed is a product of two; between: (m, k) per basis."""
 
     within: FloatArray
-    weighed: FloatArray
+    within_weighted: FloatArray
     between: list[FloatArray]
 
     @classmethod
-    def of(cls, parts: Sequence[Projected]) -> Projected:
+    def concatenate(cls, parts: Sequence[ProjectedColumns]) -> ProjectedColumns:
         """The columns of some, one after another."""
         if len(parts) == 1:
             return parts[0]
         within = np.concatenate([each.within for each in parts], axis=1)
-        white = all(each.weighed is each.within for each in parts)
-        weighed = within if white else np.concatenate([each.weighed for each in parts], axis=1)
+        white = all(each.within_weighted is each.within for each in parts)
+        weighed = within if white else np.concatenate([each.within_weighted for each in parts], axis=1)
         bases = zip(*(each.between for each in parts), strict=True)
         return cls(within, weighed, [np.concatenate(basis, axis=1) for basis in bases])
 
-    def some(self, columns: list[int]) -> Projected:
+    def select(self, columns: list[int]) -> ProjectedColumns:
         """Some of the columns."""
         within = self.within[:, columns]
-        weighed = within if self.weighed is self.within else self.weighed[:, columns]
-        return Projected(within, weighed, [part[:, columns] for part in self.between])
+        weighed = within if self.within_weighted is self.within else self.within_weighted[:, columns]
+        return ProjectedColumns(within, weighed, [part[:, columns] for part in self.between])
 
-    def kept(self, bases: list[int]) -> Projected:
+    def in_bases(self, bases: list[int]) -> ProjectedColumns:
         """In some of the bases."""
-        return Projected(self.within, self.weighed, [self.between[basis] for basis in bases])
+        return ProjectedColumns(self.within, self.within_weighted, [self.between[basis] for basis in bases])
 
-    def beside(self, other: Projected) -> Projected:
+    def append(self, other: ProjectedColumns) -> ProjectedColumns:
         """These columns and then those of another."""
-        return Projected.of([self, other])
+        return ProjectedColumns.concatenate([self, other])
 
 
 @dataclass(frozen=True)
-class _Normal:
+class _NormalEquations:
     """What the normal equations of one design hold at any covariance."""
 
-    columns: Projected
-    value: Projected
+    columns: ProjectedColumns
+    value: ProjectedColumns
     gram: FloatArray
     right: FloatArray
     square: float
 
     @classmethod
-    def of(cls, columns: Projected, value: Projected) -> _Normal:
-        y = value.weighed[:, 0]
-        return cls(columns, value, columns.within.T @ columns.weighed, columns.within.T @ y, float(value.within[:, 0] @ y))
+    def of(cls, columns: ProjectedColumns, value: ProjectedColumns) -> _NormalEquations:
+        y = value.within_weighted[:, 0]
+        return cls(
+            columns, value, columns.within.T @ columns.within_weighted, columns.within.T @ y, float(value.within[:, 0] @ y)
+        )
 
-    def log_likelihood(self, at: Covariance) -> float:
+    def log_likelihood(self, at: CellCovariance) -> float:
         """All columns fitted."""
         matrix, right, constant = self._equations(at)
         scale = _scale(matrix)
         found = dsysv(_ridged(matrix, scale), scale * right)[2]
         return constant + 0.5 * float(right @ (scale * found))
 
-    def at(self, at: Covariance, precision: FloatArray | None = None) -> MeanFit:
+    def at(self, at: CellCovariance, precision: FloatArray | None = None) -> MeanFit:
         """All columns fitted. precision: (k, k) inverse covariance of the coefficients, around 0, before there are data."""
         matrix, right, constant = self._equations(at)
         return _solve(matrix if precision is None else matrix + precision, right, constant, at)
 
-    def _equations(self, at: Covariance) -> tuple[FloatArray, FloatArray, float]:
+    def _equations(self, at: CellCovariance) -> tuple[FloatArray, FloatArray, float]:
         """Matrix (k, k), right side (k,), and the log-likelihood without the columns."""
         root = np.sqrt(at.weight)
-        basis, y = self.columns.between[at.length] * root[:, None], self.value.between[at.length][:, 0] * root
+        basis, y = self.columns.between[at.basis] * root[:, None], self.value.between[at.basis][:, 0] * root
         constant = 0.5 * (np.log(at.weight).sum() - y @ y - self.square)
         return self.gram + basis.T @ basis, self.right + basis.T @ y, float(constant)
 
 
-def fitted(covariances: list[Covariance], columns: Projected, value: Projected, precision: FloatArray | None = None) -> MeanFit:
+def fit_reml(
+    covariances: list[CellCovariance], columns: ProjectedColumns, value: ProjectedColumns, precision: FloatArray | None = None
+) -> MeanFit:
     """All columns fitted to one value, at the most likely of the covariances. precision: (k, k) as in `_Normal.at`.
 
     The likelihood is that of what the columns leave (REML, Patterson & Thompson 1971), and the coefficients' covariance is a mean
     over all covariances by it, with what they differ: which of them is true is not known.
     """
-    normal = _Normal.of(columns, value)
+    normal = _NormalEquations.of(columns, value)
     fits = [normal.at(each, precision) for each in covariances]
     likelihood = np.array([fit.log_likelihood + 0.5 * np.linalg.slogdet(fit.covariance)[1] for fit in fits])
     best = fits[int(np.argmax(likelihood))]
@@ -335,7 +343,7 @@ def _highest(heights: Sequence[Callable[[], float]]) -> tuple[int, float]:
     return top, found[top]
 
 
-def _solve(matrix: FloatArray, right: FloatArray, constant: float, at: Covariance) -> MeanFit:
+def _solve(matrix: FloatArray, right: FloatArray, constant: float, at: CellCovariance) -> MeanFit:
     scale = _scale(matrix)
     inverse = np.linalg.inv(_ridged(matrix, scale)) * np.outer(scale, scale)
     coefficients = inverse @ right

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.gap.mean.candidates import SineGrid
-from pipeline.gap.mean.mean_model import Covariance, MeanModel, Projected
+from pipeline.gap.mean.mean_model import CellCovariance, MeanModel, ProjectedColumns
 from scene.common.keyed_random import KeyedRandom
 from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
@@ -27,7 +27,7 @@ _AT_ONCE = 8
 
 
 @dataclass(frozen=True)
-class Waves:
+class SineProducts:
     """Products of w sines (2 w columns) on the deviations within cells, by the inverse covariance of their noise. fixed: (2 w, k)
     with the first k of the fixed columns; own: (w, 2, 2); right: (2 w, v) with the values; noise: (2 w, d) with draws of noise;
     between: (m, 2 w) the cells' means in each basis."""
@@ -39,28 +39,32 @@ class Waves:
     between: list[FloatArray]
 
     @classmethod
-    def of(cls, model: MeanModel, grids: list[SineGrid], fixed: FloatArray, value: Projected, noise: NoiseDraws) -> Waves:
+    def of(
+        cls, model: MeanModel, grids: list[SineGrid], fixed: FloatArray, value: ProjectedColumns, noise: NoiseDraws
+    ) -> SineProducts:
         """Of all sines of some grids. fixed: (n, k) columns, weighed."""
-        beside = np.concatenate([fixed, value.weighed], axis=1)
+        beside = np.concatenate([fixed, value.within_weighted], axis=1)
 
         def some(grid: SineGrid) -> tuple[FloatArray, ...]:
-            columns = grid.columns(model.root)
-            planes = model.planes(columns)
+            columns = grid.columns(model.inverse_sigma)
+            planes = model.plane_coefficients(columns)
             means = planes[: model.cells]
-            on_nodes = model.noise.on_nodes(columns, means)
-            own = (_squares(columns) - _squares(planes) - _squares(model.noise.halved(on_nodes))) / model.noise.white
-            drawn = noise.products(model.within(columns, planes, noise.rows), on_nodes)
+            on_nodes = model.within_noise.to_nodes(columns, means)
+            own = (
+                _squares(columns) - _squares(planes) - _squares(model.within_noise.whiten(on_nodes))
+            ) / model.within_noise.white
+            drawn = noise.products(model.deviations(columns, planes, noise.rows), on_nodes)
             return columns.T @ beside, own, drawn, means.T
 
         parts = map_in_threads(some, [part for grid in grids for part in grid.chunks])
         count = fixed.shape[1]
         if not parts:
             empty = np.zeros((0, count)), np.zeros((0, 2, 2)), np.zeros((0, value.within.shape[1]))
-            return cls(*empty, np.zeros((0, noise.white.shape[1])), model.between(np.zeros((model.cells, 0))))
+            return cls(*empty, np.zeros((0, noise.white.shape[1])), model.in_bases(np.zeros((model.cells, 0))))
         products, own, drawn, means = (np.concatenate([part[k] for part in parts]) for k in range(4))
-        return cls(products[:, :count], own, products[:, count:], drawn, model.between(means.T))
+        return cls(products[:, :count], own, products[:, count:], drawn, model.in_bases(means.T))
 
-    def at(self, covariances: list[Covariance], within: FloatArray, between: list[FloatArray]) -> FloatArray:
+    def at(self, covariances: list[CellCovariance], within: FloatArray, between: list[FloatArray]) -> FloatArray:
         """(C, 2 w, a) products with some columns at each covariance. within: (2 w, a); between: (m, a) in each basis."""
         found = np.empty((len(covariances), *within.shape))
         for basis, rows in _by_basis(covariances).items():
@@ -69,7 +73,7 @@ class Waves:
             found[rows] = within + products.reshape(len(within), len(rows), within.shape[1]).transpose(1, 0, 2)
         return found
 
-    def own_at(self, covariances: list[Covariance]) -> FloatArray:
+    def own_at(self, covariances: list[CellCovariance]) -> FloatArray:
         """(C, w, 2, 2) products of each sine with itself at each covariance."""
         found = np.empty((len(covariances), *self.own.shape))
         for basis, rows in _by_basis(covariances).items():
@@ -80,11 +84,11 @@ class Waves:
         return found
 
 
-def _by_basis(covariances: list[Covariance]) -> dict[int, list[int]]:
+def _by_basis(covariances: list[CellCovariance]) -> dict[int, list[int]]:
     """Of each basis in use the numbers of its covariances."""
     found: dict[int, list[int]] = {}
     for row, each in enumerate(covariances):
-        found.setdefault(each.length, []).append(row)
+        found.setdefault(each.basis, []).append(row)
     return found
 
 
@@ -101,10 +105,12 @@ class NoiseDraws:
     def of(cls, model: MeanModel, count: int, most_rows: int, random: KeyedRandom) -> NoiseDraws:
         """`count` draws; white noise on some of the rows stands for that on all."""
         rows = slice(None, None, max(len(model) // most_rows, 1))
-        few = len(model.root[rows])
+        few = len(model.inverse_sigma[rows])
         white = random.generator().standard_normal((few, count)) * np.sqrt(len(model) / few)
-        on_nodes = model.noise.drawn(white, rows, model.planes(white, rows)[: model.cells], random.child("nodes"))
-        return cls(rows, (white / np.sqrt(model.noise.white)).astype(np.float32), on_nodes)
+        on_nodes = model.within_noise.draw(
+            white, rows, model.plane_coefficients(white, rows)[: model.cells], random.child("nodes")
+        )
+        return cls(rows, (white / np.sqrt(model.within_noise.white)).astype(np.float32), on_nodes)
 
     def products(self, within: FloatArray, on_nodes: FloatArray) -> FloatArray:
         """(k, d) of columns with the draws, by the inverse covariance. within: (n', k); on_nodes: (q, k)."""
@@ -117,49 +123,51 @@ def _squares(columns: FloatArray) -> FloatArray:
     return np.asarray(pairs @ pairs.transpose(0, 2, 1))
 
 
-def wave_products(grids: list[SineGrid], weighed: FloatArray, root: FloatArray) -> FloatArray:
+def sine_products(grids: list[SineGrid], weighed: FloatArray, root: FloatArray) -> FloatArray:
     """(2 w, k) of all sines with further columns (n, k), which are within cells and weighed."""
     found = map_in_threads(lambda part: part.columns(root).T @ weighed, [part for grid in grids for part in grid.chunks])
     return np.concatenate(found) if found else np.zeros((0, weighed.shape[1]))
 
 
 @dataclass(frozen=True)
-class Equations:
+class NormalEquations:
     """For each of C covariances. fixed: (C, k, k); right: (C, k, v); constant: (C, v) log-likelihood without any column;
     wave_fixed: (C, 2 w, h) with the columns that are held; wave_own: (C, w, 2, 2); wave_right: (C, 2 w, v); at: the covariances;
     held: numbers of those h of the fixed columns."""
 
-    at: list[Covariance]
+    covariances: list[CellCovariance]
     fixed: FloatArray
     right: FloatArray
     constant: FloatArray
     wave_fixed: FloatArray
     wave_own: FloatArray
     wave_right: FloatArray
-    held: tuple[int, ...] = ()
+    held_columns: tuple[int, ...] = ()
 
-    def with_precision(self, precision: FloatArray) -> Equations:
+    def with_precision(self, precision: FloatArray) -> NormalEquations:
         """The same where the fixed columns' coefficients are known to lie about 0. precision: (k,) inverse variances."""
         return replace(self, fixed=self.fixed + np.diag(precision))
 
-    def of_values(self, right: FloatArray, constant: FloatArray, wave_right: FloatArray) -> Equations:
+    def with_values(self, right: FloatArray, constant: FloatArray, wave_right: FloatArray) -> NormalEquations:
         """The same columns with other values."""
         return replace(self, right=right, constant=constant, wave_right=wave_right)
 
-    def holding(self, columns: list[int], products: FloatArray) -> Equations:
+    def with_sine_products(self, columns: list[int], products: FloatArray) -> NormalEquations:
         """With the products (C, 2 w, a) of the sines with some more of the fixed columns."""
-        return replace(self, wave_fixed=np.concatenate([self.wave_fixed, products], axis=2), held=(*self.held, *columns))
+        return replace(
+            self, wave_fixed=np.concatenate([self.wave_fixed, products], axis=2), held_columns=(*self.held_columns, *columns)
+        )
 
-    def some(self, chosen: list[int]) -> Equations:
+    def at_covariances(self, chosen: list[int]) -> NormalEquations:
         """At some of the covariances."""
-        return self._of([self.at[index] for index in chosen], chosen)
+        return self._of([self.covariances[index] for index in chosen], chosen)
 
-    def _part(self, rows: slice) -> Equations:
-        return self._of(self.at[rows], rows)
+    def _part(self, rows: slice) -> NormalEquations:
+        return self._of(self.covariances[rows], rows)
 
-    def _of(self, at: list[Covariance], rows: Any) -> Equations:
+    def _of(self, at: list[CellCovariance], rows: Any) -> NormalEquations:
         names = ("fixed", "right", "constant", "wave_fixed", "wave_own", "wave_right")
-        return replace(self, at=at, **{name: getattr(self, name)[rows] for name in names})
+        return replace(self, covariances=at, **{name: getattr(self, name)[rows] for name in names})
 
     def log_likelihood(self, base: list[int]) -> FloatArray:
         """(C, v) with the fixed columns `base`."""
@@ -172,17 +180,17 @@ class Equations:
         regular = matrix * scale[:, :, None] * scale[:, None, :] + _RIDGE * np.eye(len(base))
         return np.asarray(np.linalg.solve(regular, right * scale[:, :, None]) * scale[:, :, None])
 
-    def profile(self, base: list[int], fixed: list[list[int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def profile_log_likelihood(self, base: list[int], fixed: list[list[int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Largest log-likelihoods over the covariances: (v,) of `base`, all of which are held, (f, v) with each list of columns
         added, (w, v) with each sine added."""
-        parts = [self._part(slice(start, start + _AT_ONCE)) for start in range(0, len(self.at), _AT_ONCE)]
-        found = map_in_threads(lambda part: part._profile(base, fixed), parts)
+        parts = [self._part(slice(start, start + _AT_ONCE)) for start in range(0, len(self.covariances), _AT_ONCE)]
+        found = map_in_threads(lambda part: part._profile_chunk(base, fixed), parts)
         plain, gains, waves = (np.max([each[kind] for each in found], axis=0) for kind in range(3))
         return plain, gains, waves
 
-    def _profile(self, base: list[int], fixed: list[list[int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _profile_chunk(self, base: list[int], fixed: list[list[int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
         count, whole = self.right.shape[2], self.fixed.shape[2]
-        waves = self.wave_fixed[:, :, [self.held.index(column) for column in base]]
+        waves = self.wave_fixed[:, :, [self.held_columns.index(column) for column in base]]
         beside = self.fixed[:, base]
         solved = self._solved(base, np.concatenate([self.right[:, base], beside, waves.transpose(0, 2, 1)], axis=2))
         value, others, sines = np.split(solved, [count, count + whole], axis=2)
@@ -199,7 +207,7 @@ class Equations:
 
     def _wave_profile(self, plain: FloatArray, right: FloatArray, solved: FloatArray, crossed: FloatArray) -> FloatArray:
         """Two columns at a time: the explained square by the inverse of a 2 x 2 matrix."""
-        shape = len(self.at), self.wave_own.shape[1], 2, crossed.shape[2]
+        shape = len(self.covariances), self.wave_own.shape[1], 2, crossed.shape[2]
         crossed, mine = crossed.reshape(shape), solved.transpose(0, 2, 1).reshape(shape)
         matrix = self.wave_own - crossed @ mine.transpose(0, 1, 3, 2)
         a, b, d = (matrix[:, :, i, j][..., None] for i, j in ((0, 0), (0, 1), (1, 1)))
@@ -221,30 +229,34 @@ def _gain(rest: FloatArray, own: FloatArray, left: FloatArray) -> FloatArray:
     return np.asarray(0.5 * np.einsum("cfk,cfkv->cfv", share, turned**2))
 
 
-def assembled(model: MeanModel, at: list[Covariance], fixed: Projected, value: Projected, waves: Waves) -> Equations:
+def assemble(
+    model: MeanModel, at: list[CellCovariance], fixed: ProjectedColumns, value: ProjectedColumns, waves: SineProducts
+) -> NormalEquations:
     """The equations at the covariances `at`, in which no column is held yet."""
-    gram, right = fixed.within.T @ fixed.weighed, fixed.within.T @ value.weighed
-    square = np.einsum("nv,nv->v", value.within, value.weighed)
+    gram, right = fixed.within.T @ fixed.within_weighted, fixed.within.T @ value.within_weighted
+    square = np.einsum("nv,nv->v", value.within, value.within_weighted)
 
-    def at_one(each: Covariance) -> tuple[FloatArray, ...]:
+    def at_one(each: CellCovariance) -> tuple[FloatArray, ...]:
         root = np.sqrt(each.weight)[:, None]
-        basis, y = fixed.between[each.length] * root, value.between[each.length] * root
+        basis, y = fixed.between[each.basis] * root, value.between[each.basis] * root
         constant = 0.5 * (np.log(each.weight).sum() - np.sum(y**2, axis=0) - square)
         return gram + basis.T @ basis, right + basis.T @ y, constant
 
     products, sides, constant = (np.stack(part) for part in zip(*map_in_threads(at_one, at), strict=True))
     nothing = np.empty((len(at), len(waves.right), 0))
-    return Equations(at, products, sides, constant, nothing, waves.own_at(at), waves.at(at, waves.right, value.between))
+    return NormalEquations(at, products, sides, constant, nothing, waves.own_at(at), waves.at(at, waves.right, value.between))
 
 
-def extended(equations: Equations, had: list[Projected], value: Projected, added: Projected) -> Equations:
+def extend(
+    equations: NormalEquations, had: list[ProjectedColumns], value: ProjectedColumns, added: ProjectedColumns
+) -> NormalEquations:
     """With further fixed columns. had: the fixed columns so far."""
-    cross, own = np.concatenate([each.within.T @ added.weighed for each in had]), added.within.T @ added.weighed
-    right = added.within.T @ value.weighed
+    cross, own = np.concatenate([each.within.T @ added.within_weighted for each in had]), added.within.T @ added.within_weighted
+    right = added.within.T @ value.within_weighted
     fixed, sides = [], []
-    for row, each in enumerate(equations.at):
-        weighted = added.between[each.length] * each.weight[:, None]
-        beside = cross + np.concatenate([part.between[each.length].T @ weighted for part in had])
-        fixed.append(np.block([[equations.fixed[row], beside], [beside.T, own + added.between[each.length].T @ weighted]]))
-        sides.append(np.concatenate([equations.right[row], right + weighted.T @ value.between[each.length]]))
+    for row, each in enumerate(equations.covariances):
+        weighted = added.between[each.basis] * each.weight[:, None]
+        beside = cross + np.concatenate([part.between[each.basis].T @ weighted for part in had])
+        fixed.append(np.block([[equations.fixed[row], beside], [beside.T, own + added.between[each.basis].T @ weighted]]))
+        sides.append(np.concatenate([equations.right[row], right + weighted.T @ value.between[each.basis]]))
     return replace(equations, fixed=np.stack(fixed), right=np.stack(sides))

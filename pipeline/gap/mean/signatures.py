@@ -16,13 +16,13 @@ from pipeline.gap.mean.candidates import (
     Candidate,
     SineGrid,
     Wave,
-    along_disparity,
     amplitude_and_phase,
-    frequencies,
-    variants,
+    disparity_frequencies,
+    expand_grids,
+    frequency_grid,
 )
-from pipeline.gap.residuals.disparity_raster import spacing, through
-from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, real_pair, seen_disparities
+from pipeline.gap.residuals.disparity_raster import apply_smoothing, raster_spacing_px
+from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, predict_disparities, real_pair
 from pipeline.gap.residuals.residuals import Geometry, Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from scene.geometry.mesh import FloatArray
@@ -39,12 +39,12 @@ _MOST_PERIODS = 2000
 _REDUCTIONS = (1.0, 2.0, 4.0, 8.0)
 
 
-def mean_candidates(residuals: Residuals, measurement: Measurement) -> list[Candidate]:
+def systematic_candidates(residuals: Residuals, measurement: Measurement) -> list[Candidate]:
     """Every effect of the catalogue on the mean that the recorded fields allow, cameras and searched parameters as variants."""
-    return variants(mean_families(residuals, measurement))
+    return expand_grids(systematic_families(residuals, measurement))
 
 
-def mean_families(residuals: Residuals, measurement: Measurement) -> list[Candidate | SineGrid]:
+def systematic_families(residuals: Residuals, measurement: Measurement) -> list[Candidate | SineGrid]:
     """The same with each searched sine as one grid."""
     geometry = residuals.geometry
     shown = [effect for effect in residuals.candidates if effect.shows_in == ShowsIn.MEAN and effect.known(geometry)]
@@ -97,7 +97,7 @@ def _searched(effect: type[Effect], search: Search, geometry: Geometry, fixed: d
     angle = 2 * np.pi * x / search.shortest
     columns = _sine_and_cosine(effect, geometry, {**fixed, search.period: search.shortest})
     factor = columns[:, 0] * np.sin(angle) + columns[:, 1] * np.cos(angle)
-    tried = frequencies(low, high, 0.3 / reach, _MOST_PERIODS)
+    tried = frequency_grid(low, high, 0.3 / reach, _MOST_PERIODS)
     yield SineGrid(effect.tag(), amplitude, Wave(search.period, factor, x, low), tried, fixed)
 
 
@@ -105,7 +105,7 @@ def _shortest(search: Search, geometry: Geometry) -> float:
     """Of the periods: pixels that lie farther apart than half of one would show it as a longer one."""
     if not isinstance(geometry, PixelGeometry):
         return search.shortest
-    step = spacing({"image_x": geometry.u, "image_y": geometry.v}[search.along])
+    step = raster_spacing_px({"image_x": geometry.u, "image_y": geometry.v}[search.along])
     return search.shortest if step is None else max(search.shortest, 2 * step)
 
 
@@ -122,9 +122,9 @@ def _of_cameras(
         for key in sorted({key for keys in sets[effect] for key in keys})
     ]
     changed = (real_pair(nominal, (effect(camera=side, **{key: step}),), measurement) for effect, side, key, step in varied)
-    base, *seen = seen_disparities(nominal, [nominal.pair, *changed], geometry)
+    base, *seen = predict_disparities(nominal, [nominal.pair, *changed], geometry)
     changes = np.stack([(each - base) / step for (*_, step), each in zip(varied, seen, strict=True)], axis=1)
-    passed = through(measurement.model.effects, geometry, changes)
+    passed = apply_smoothing(measurement.model.effects, geometry, changes)
     columns = {(effect, side, key): column for (effect, side, key, _), column in zip(varied, passed.T, strict=True)}
     return [
         Candidate(
@@ -154,5 +154,5 @@ def _locking(geometry: PixelGeometry) -> list[SineGrid]:
     one = np.ones_like(geometry.disparity)
     return [
         SineGrid(PixelLocking.tag(), "amplitude_px", Wave("period_px", one, geometry.disparity, float(tried[0])), tried)
-        for tried in (along_disparity(1 / reduction, reach) for reduction in _REDUCTIONS)
+        for tried in (disparity_frequencies(1 / reduction, reach) for reduction in _REDUCTIONS)
     ]

@@ -16,13 +16,13 @@ from pipeline.gap.naming.naming import Naming, name_effects
 from pipeline.gap.other.mixed_pixels import find_footprint
 from pipeline.gap.other.shapes import ShapeFound
 from pipeline.gap.other.stereo_shapes import find_shapes
-from pipeline.gap.residuals.cells import Cells
-from pipeline.gap.residuals.changes import SceneChange, find_changes, once_each
-from pipeline.gap.residuals.registration import registered, residuals_of, settled
+from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
-from pipeline.gap.residuals.sight import Sight
+from pipeline.gap.residuals.scene_changes import SceneChange, drop_duplicates, find_scene_changes
+from pipeline.gap.residuals.sensor_view import SensorView
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.residuals.wall_blocks import WallCells
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.beam_divergence import BeamDivergence
@@ -51,7 +51,7 @@ class State:
     changed: BoolArray
     rough: FloatArray
     scale: float
-    cells: Cells
+    cells: WallCells
     held_out: BoolArray
     chosen: NDArray[np.int64]
 
@@ -68,27 +68,27 @@ class State:
         touched = np.any([np.zeros(len(plain), dtype=bool), *(each.touched[plain.index] for each in shapes)], axis=0)
         trusted = plain.index[~(touched | held_points[plain.index])] if resettled else None
         shaped, residuals = _shaped(there, plain, shapes, touched, trusted)
-        rough, _, scale = registered(residuals)
-        sight = Sight.of(there, residuals)
-        changes, changed = find_changes(replace(residuals, value=rough), sight, residuals.even & ~touched)
+        rough, _, scale = fit_pose_robustly(residuals)
+        sight = SensorView.of(there, residuals)
+        changes, changed = find_scene_changes(replace(residuals, value=rough), sight, residuals.on_smooth_surface & ~touched)
         if isinstance(there, TlsMeasurement) and there.scans:
-            changes = once_each(changes)
-        rough, _, scale = registered(replace(residuals, smooth=residuals.smooth & ~changed))
-        cells = Cells.over(residuals.at)
+            changes = drop_duplicates(changes)
+        rough, _, scale = fit_pose_robustly(replace(residuals, usable=residuals.usable & ~changed))
+        cells = WallCells.over(residuals.wall_xy)
         held_out = held_points[residuals.index]
-        usable = residuals.smooth & ~changed & (np.abs(rough) < decided().points.outlier * scale * residuals.sigma)
+        usable = residuals.usable & ~changed & (np.abs(rough) < decided().points.outlier * scale * residuals.sigma)
         chosen = thinned_rows(np.flatnonzero(usable & ~held_out))
         return cls(shapes, shaped, residuals, touched, changes, changed, rough, scale, cells, held_out, chosen)
 
     @property
     def fit(self) -> BoolArray:
         """(n,) points on smooth surface that did not change."""
-        return np.asarray(self.residuals.smooth & ~self.changed)
+        return np.asarray(self.residuals.usable & ~self.changed)
 
     @property
     def shown(self) -> BoolArray:
         """(n,) points on which a gap may be measured: on smooth surface, or where an effect was found that shows elsewhere."""
-        return np.asarray((self.residuals.smooth | self.touched) & ~self.changed)
+        return np.asarray((self.residuals.usable | self.touched) & ~self.changed)
 
     @property
     def part(self) -> tuple[Measurement, Residuals]:
@@ -205,7 +205,7 @@ def _shapes(measurement: Measurement, residuals: Residuals, held_points: BoolArr
 
     held_points: of the measurement's points those that have no say.
     """
-    rough, _, scale = registered(residuals)
+    rough, _, scale = fit_pose_robustly(residuals)
     found: list[ShapeFound] = []
     held_out = held_points[residuals.index]
     match measurement, residuals:
@@ -234,18 +234,18 @@ def _shaped(
     entries = [from_shape(shape).entry for shape in shapes]
     shaped = measurement.changed(model=with_effects(measurement.model, entries))
     if trusted is None:
-        found = residuals_of(shaped)
+        found = compute_residuals(shaped)
     else:
-        shaped, found, _ = settled(shaped, trusted)
+        shaped, found, _ = align(shaped, trusted)
     place = np.full(len(measurement.cloud.points), -1)
     place[found.index] = np.arange(len(found))
     rows = place[residuals.index]
     known = rows >= 0
-    there = residuals.with_rows(known, found.part(rows[known]))
-    return shaped, replace(there, smooth=residuals.smooth & ~touched & known)
+    there = residuals.with_rows_from(known, found.part(rows[known]))
+    return shaped, replace(there, usable=residuals.usable & ~touched & known)
 
 
 def few(measurement: Measurement, residuals: Residuals, rows: NDArray[np.int64]) -> tuple[Measurement, Residuals]:
     """The measurement with the points of some rows of its residuals alone, and their residuals."""
     part = residuals.part(rows)
-    return measurement.part(part.index), replace(part, index=np.arange(len(rows)), missing=None)
+    return measurement.part(part.index), replace(part, index=np.arange(len(rows)), expected_pulses=None)

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.decisions import decided
-from pipeline.gap.mean.candidates import SURFACE, Candidate
-from pipeline.gap.mean.selection import Chosen
+from pipeline.gap.mean.candidates import POLYNOMIAL, Candidate
+from pipeline.gap.mean.selection import SelectedEffect
 from pipeline.gap.other.locking import Locking
 from pipeline.gap.other.missing import MissingFound
 from pipeline.gap.other.quantization import Comb
 from pipeline.gap.other.shapes import ShapeFound
 from pipeline.gap.other.spread import SpreadFound
-from pipeline.gap.residuals.registration import Settled, settled
+from pipeline.gap.residuals.alignment import Alignment, align
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.common.config import parse
@@ -97,13 +97,13 @@ def settled_with(
     effects: Iterable[Named],
     trusted: NDArray[np.int64] | None = None,
     noise: dict[str, float] | None = None,
-) -> Settled:
+) -> Alignment:
     """The measurement with further effects in its model, settled: its residuals are taken again and registered.
 
     trusted: rows of the measurement's points by which to register, all where None; noise: other values of the model's noise.
     """
     model = with_effects(measurement.model, [item.entry for item in effects], noise)
-    return settled(measurement.changed(model=model), trusted)
+    return align(measurement.changed(model=model), trusted)
 
 
 def within_bounds(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
@@ -171,7 +171,7 @@ def from_shape(found: ShapeFound) -> Named:
 
 def from_tails(part: Residuals, sigma: float, gain: float) -> Named:
     """Noise with heavy tails, which the catalogue does not have: its standard deviation as white noise, marked empirical."""
-    noise, key = part.noise
+    noise, key = part.white_noise
     return Named(f"{part.sensor}.{noise.tag()}", "empirical", {"name": noise.tag(), key: sigma}, {}, (), None, gain)
 
 
@@ -191,7 +191,7 @@ def from_missing(found: MissingFound, intensity: FloatArray | None) -> Named:
 class Estimate:
     """An explanation of the mean with the values of its coefficients (k,) and their covariance (k, k)."""
 
-    chosen: Chosen
+    chosen: SelectedEffect
     candidate: Candidate
     values: FloatArray
     covariance: FloatArray
@@ -204,11 +204,13 @@ def from_mean(found: Estimate, part: Residuals) -> Named:
     return _physical(found.candidate, found.values, found.covariance, found.chosen, part)
 
 
-def _physical(candidate: Candidate, values: FloatArray, covariance: FloatArray, item: Chosen, part: Residuals) -> Named:
+def _physical(candidate: Candidate, values: FloatArray, covariance: FloatArray, item: SelectedEffect, part: Residuals) -> Named:
     entry = {"name": candidate.name, **candidate.fixed, **candidate.parameters(values)}
     std = _uncertainty(candidate, values, covariance)
-    alike = tuple(f"{part.sensor}.{name}" for name in item.alike)
-    return Named(f"{part.sensor}.{candidate.name}", "physical", _plain(entry), std, alike, item.p_value, item.gain)
+    alike = tuple(f"{part.sensor}.{name}" for name in item.indistinguishable)
+    return Named(
+        f"{part.sensor}.{candidate.name}", "physical", _plain(entry), std, alike, item.p_value, item.log_likelihood_ratio
+    )
 
 
 def _uncertainty(candidate: Candidate, values: FloatArray, covariance: FloatArray) -> dict[str, float]:
@@ -225,19 +227,19 @@ def _uncertainty(candidate: Candidate, values: FloatArray, covariance: FloatArra
     return std
 
 
-def _empirical(candidate: Candidate, values: FloatArray, item: Chosen, part: Residuals) -> Named:
+def _empirical(candidate: Candidate, values: FloatArray, item: SelectedEffect, part: Residuals) -> Named:
     """A free form by values: over one cycle of a periodic one, else over all of its covariate that occurs."""
     error = candidate.columns @ values[: candidate.columns.shape[1]]
     if candidate.angle and isinstance(part, TlsResiduals):
         return _of_an_angle(candidate, error, item, part)
-    term, key = part.described_by
-    found = _surface(candidate, error, part) if candidate.form == SURFACE else _curve(candidate, error, part)
+    term, key = part.empirical_term
+    found = _surface(candidate, error, part) if candidate.form == POLYNOMIAL else _curve(candidate, error, part)
     rows = _rows(found.pop("values"))
     entry = {"name": term.tag(), **found, key: rows}
-    return Named(f"{part.sensor}.{term.tag()}", "empirical", entry, {}, (), item.p_value, item.gain)
+    return Named(f"{part.sensor}.{term.tag()}", "empirical", entry, {}, (), item.p_value, item.log_likelihood_ratio)
 
 
-def _of_an_angle(candidate: Candidate, error: FloatArray, item: Chosen, part: TlsResiduals) -> Named:
+def _of_an_angle(candidate: Candidate, error: FloatArray, item: SelectedEffect, part: TlsResiduals) -> Named:
     """Its curve is found back from the ranges where the surface slants more than at half of the points."""
     levers = {"azimuth": part.geometry.by_azimuth, "zenith": part.geometry.by_zenith}
     lever = -levers[candidate.angle]
@@ -245,7 +247,7 @@ def _of_an_angle(candidate: Candidate, error: FloatArray, item: Chosen, part: Tl
     found = _curve(candidate, np.divide(error, lever, out=np.zeros_like(error), where=steep), part, steep)
     rows = _rows(found.pop("values"))
     entry = {"name": AngleEmpirical.tag(), "angle": candidate.angle, **found, "values_rad": rows}
-    return Named(f"{part.sensor}.{AngleEmpirical.tag()}", "empirical", entry, {}, (), item.p_value, item.gain)
+    return Named(f"{part.sensor}.{AngleEmpirical.tag()}", "empirical", entry, {}, (), item.p_value, item.log_likelihood_ratio)
 
 
 def with_corrections(angles: list[Named], later: list[Named], part: Residuals) -> tuple[list[Named], list[Named]]:
@@ -286,7 +288,7 @@ def _curve(candidate: Candidate, error: FloatArray, part: Residuals, rows: Any =
 
 def _surface(candidate: Candidate, error: FloatArray, part: Residuals) -> dict[str, Any]:
     """The polynomial again, at the nodes of a grid: it is found back from its values at the points."""
-    first, second = part.planes
+    first, second = part.position_covariates
     x, y = part.covariates[first], part.covariates[second]
     axes = [np.linspace(values.min(), values.max(), _GRID) for values in (x, y)]
     nodes = np.meshgrid(*axes)

@@ -12,12 +12,12 @@ from scipy.sparse import csr_array
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.decisions import decided
-from pipeline.gap.mean.within_noise import inverse_of
+from pipeline.gap.mean.within_cell_noise import inverse_from_cholesky
 from pipeline.gap.naming.entries import Named, settled_with
-from pipeline.gap.residuals.cells import patches
-from pipeline.gap.residuals.registration import pose_of
+from pipeline.gap.residuals.alignment import fit_pose
+from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
-from pipeline.gap.residuals.shared_noise import SharedNoise
+from pipeline.gap.residuals.wall_blocks import wall_blocks_by_points
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import ShowsIn
 
@@ -47,14 +47,14 @@ def score_effects(
     if not scored or (~trained).sum() < 100:
         return Scored(named, [], [])
     whole = _value(measurement, named, residuals, trained)
-    shared = float(np.mean(residuals.averaged.sigma**2 - residuals.sigma**2)) / _POINTS_PER_PATCH
+    shared = float(np.mean(residuals.with_sigma_of_means.sigma**2 - residuals.sigma**2)) / _POINTS_PER_PATCH
     patch_sigma = float(np.sqrt(reference_sigma**2 + shared))
 
     def gains(out: list[Named]) -> tuple[float, float]:
         """Of some effects on the points that are scored, and what those that were trained let expect of them."""
         without = _value(measurement, [each for each in named if each not in out], residuals, trained)
         known = np.isfinite(whole.value) & np.isfinite(without.value)
-        tested, learned = (_gain(whole, without, known & rows, residuals.at, patch_sigma) for rows in (~trained, trained))
+        tested, learned = (_gain(whole, without, known & rows, residuals.wall_xy, patch_sigma) for rows in (~trained, trained))
         return tested, learned * float(np.sum(known & ~trained)) / max(float(np.sum(known & trained)), 1.0)
 
     found = {item.name: gains([item]) for item in scored}
@@ -104,7 +104,7 @@ class _Registered:
 
     value: FloatArray
     sigma: FloatArray
-    shared: SharedNoise
+    shared: GridCorrelatedNoise
 
     def log_score(self, rows: NDArray[np.int64], patch: NDArray[np.int64], reference_sigma: float) -> float:
         """Of some rows, in patches, in each of which the reference is off by one error of standard deviation `reference_sigma`.
@@ -112,7 +112,7 @@ class _Registered:
         By Woodbury's identity and the determinant lemma, first for the patches' errors and then for what neighbours share.
         """
         value, sigma = self.value[rows], self.sigma[rows]
-        field = self.shared.part(rows).field(len(rows))
+        field = self.shared.part(rows).node_field(len(rows))
         nodes, own = field.weights, np.maximum(sigma**2 - field.variance, _LEAST_OWN * sigma**2)
         total = np.bincount(patch, 1 / own)
         mean = np.bincount(patch, value / own) / total
@@ -127,7 +127,7 @@ class _Registered:
         if nodes.shape[1]:
             matrix = (nodes.T @ nodes.multiply(1 / own[:, None]) - node_sums.T @ node_sums.multiply(held[:, None])).toarray()
             prior = cholesky(field.covariance, lower=True)
-            root = cholesky(matrix + inverse_of(prior), lower=True)
+            root = cholesky(matrix + inverse_from_cholesky(prior), lower=True)
             right = nodes.T @ weighed - node_sums.T @ (held * sums)
             square -= np.sum(solve_triangular(root, right, lower=True) ** 2)
             size += 2 * np.sum(np.log(np.diag(root)) + np.log(np.diag(prior)))
@@ -140,7 +140,7 @@ def _gain(whole: _Registered, without: _Registered, rows: BoolArray, at: FloatAr
     at: (n, 2) places on the wall; sigma: of the reference's error. What is an outlier with the effect and without has no say.
     """
     chosen = np.flatnonzero(rows & (_usual(whole) | _usual(without)))
-    patch = patches(at[chosen], _POINTS_PER_PATCH)
+    patch = wall_blocks_by_points(at[chosen], _POINTS_PER_PATCH)
     return whole.log_score(chosen, patch, sigma) - without.log_score(chosen, patch, sigma)
 
 
@@ -164,10 +164,10 @@ def _value(measurement: Measurement, named: list[Named], residuals: Residuals, t
     found = settled_with(measurement, named, residuals.index[trained]).residuals
     count = len(measurement.cloud.points)
     place = np.full(count, -1)
-    place[found.index[found.smooth]] = np.flatnonzero(found.smooth)  # an edge where the beam goes by this model says nothing
+    place[found.index[found.usable]] = np.flatnonzero(found.usable)  # an edge where the beam goes by this model says nothing
     rows = place[residuals.index]
     known = rows >= 0
     value, sigma = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
-    pose = pose_of(found, rows[trained & known])
-    value[known], sigma[known] = (found.value - found.pose @ pose)[rows[known]], found.sigma[rows[known]]
-    return _Registered(value, sigma, found.shared_noise.part(rows))
+    pose = fit_pose(found, rows[trained & known])
+    value[known], sigma[known] = (found.value - found.pose_jacobian @ pose)[rows[known]], found.sigma[rows[known]]
+    return _Registered(value, sigma, found.correlated_noise.part(rows))

@@ -11,9 +11,9 @@ import numpy as np
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement
 from pipeline.gap.decisions import decided
-from pipeline.gap.mean.candidates import PLACE, REPEATED
+from pipeline.gap.mean.candidates import LINE_PATTERN, SPATIAL_NULL
 from pipeline.gap.mean.search import MeanSearch
-from pipeline.gap.mean.selection import Chosen, Tried
+from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
 from pipeline.gap.naming.entries import (
     Estimate,
     Named,
@@ -31,11 +31,11 @@ from pipeline.gap.other.locking import SpreadAllowed, find_locking
 from pipeline.gap.other.quantization import find_comb
 from pipeline.gap.other.spread import SpreadFound, SpreadTried, TimesPredicted, find_spread
 from pipeline.gap.other.stereo_noise import find_nodes, told_apart
-from pipeline.gap.residuals.cells import Cells
-from pipeline.gap.residuals.registration import registered
+from pipeline.gap.residuals.alignment import fit_pose_robustly
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.residuals.wall_blocks import WallCells
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.angle_empirical import AngleEmpirical
@@ -59,7 +59,7 @@ class Naming:
     residuals spread beside the effects on the mean.
     """
 
-    tried: tuple[Tried, ...]
+    tried: tuple[FamilyScore, ...]
     spread_tried: tuple[SpreadTried, ...]
     moving: frozenset[str]
     p_value: float | None
@@ -102,7 +102,7 @@ def name_effects(
         comb = find_comb(part.geometry.measured_m)
     if isinstance(part, StereoResiduals) and not believes(measurement, PixelLocking.tag()):
         at = part.geometry
-        allowed = SpreadAllowed(float(np.median(part.sigma)), nmad(registered(part)[0]))
+        allowed = SpreadAllowed(float(np.median(part.sigma)), nmad(fit_pose_robustly(part)[0]))
         locking = find_locking(at.found, at.disparity, at.tangent, at.infinity, allowed)
     if comb is not None:
         named.append(from_comb(comb, part))
@@ -116,14 +116,16 @@ def name_effects(
     out = left_out | found_apart
     possible = (each for each in families_of(measurement, part) if (each.name, each.empirical) not in out)
     families = [each for each in possible if not (each.empirical and FREE_FORMS in out)]
-    spread, spread_tried, words = _spread(measurement, part, Cells.over(part.at), registered(part)[0], random, left_out)
+    spread, spread_tried, words = _spread(
+        measurement, part, WallCells.over(part.wall_xy), fit_pose_robustly(part)[0], random, left_out
+    )
     if wrong := _too_wide(measurement, spread):
         return name_effects(measurement, whole, whole_scale, random, left_out | wrong)
     if not spread and nodes is not None:
         spread = [nodes]
 
     def spread_at(at: Residuals) -> list[SpreadFound]:
-        there = _spread(measurement, at, Cells.over(at.at), registered(at)[0], random, left_out)[0]
+        there = _spread(measurement, at, WallCells.over(at.wall_xy), fit_pose_robustly(at)[0], random, left_out)[0]
         if there or nodes is None:
             return there
         return [replace(nodes, variance=nodes.variance[np.isin(part.index, at.index)])]
@@ -138,7 +140,7 @@ def name_effects(
     if doubtful and not _explains_all(found):
         wrong |= doubtful
     design = found.search.design
-    left = design.without([each.candidate for each in found.beside])
+    left = design.residuals_after([each.candidate for each in found.beside])
     if found.chosen and not wrong:
         spread, spread_tried, words = _spread(measurement, found.at, design.cells, left, random, left_out)
     if spread in ([], [nodes]) and (_NODES, False) not in left_out:
@@ -147,7 +149,7 @@ def name_effects(
                 nodes_left, shared = find_nodes(found.at, left, model, random)
                 described = any(each.candidate.empirical for each in found.estimates)
                 if nodes_left is not None and nodes is None:
-                    nodes_in_all = find_nodes(part, registered(part)[0], model, random)[0] if described else None
+                    nodes_in_all = find_nodes(part, fit_pose_robustly(part)[0], model, random)[0] if described else None
                     found_nodes = nodes_in_all or nodes_left.everywhere(len(part))
                     return name_effects(measurement, whole, whole_scale, random, left_out, found_nodes)
                 kept = nodes_left or (None if described else nodes)
@@ -161,13 +163,13 @@ def name_effects(
     times = TimesPredicted(1.0, False) if spread else TimesPredicted.of(found.at, design.cells, left, random)
     said = (*_repeats(found.estimates), *_slanting(found), *_most_like(found, part))
     notes = (*part.notes, *_words(left_out), *filter(None, [words]), *said)
-    p_value = found.search.p_of_rest(found.tried)
-    alone = first.tried(()) if moving else ()
-    p_alone = first.p_of_rest(alone) if alone else p_value
+    p_value = found.search.goodness_of_fit_p_value(found.tried)
+    alone = first.score_families(()) if moving else ()
+    p_alone = first.goodness_of_fit_p_value(alone) if alone else p_value
     names_moving = frozenset(each.name for each in moving)
     table = {"names": [f"{part.sensor}.{name}" for name in names], "cosines": cosines.tolist(), "survival": survival.tolist()}
-    tried = found.chosen[0].tried if found.chosen else found.tried
-    shown = tuple(item for item in tried if not item.name.startswith(PLACE))
+    tried = found.chosen[0].family_scores if found.chosen else found.tried
+    shown = tuple(item for item in tried if not item.name.startswith(SPATIAL_NULL))
     sigma = design.reference_sigma([each.candidate for each in found.beside])
     spreads = nmad(left / found.at.sigma, 0.0)
     naming = Naming(shown, tuple(spread_tried), names_moving, p_value, p_alone, times, notes, table, sigma, spreads)
@@ -179,13 +181,13 @@ def name_effects(
 
 def _explains_all(found: Explained) -> bool:
     """Whether effects of the catalogue alone were found, and no more than chance is left beside them."""
-    p_value = found.search.p_of_rest(found.tried)
+    p_value = found.search.goodness_of_fit_p_value(found.tried)
     physical = not any(each.candidate.empirical for each in found.estimates)
     return physical and p_value is not None and p_value > decided().verdict.least_p
 
 
 def with_doubtful(
-    named: list[Named], chosen: list[Chosen], before: frozenset[str], left_out: frozenset[tuple[str, bool]]
+    named: list[Named], chosen: list[SelectedEffect], before: frozenset[str], left_out: frozenset[tuple[str, bool]]
 ) -> list[Named]:
     """An effect that was chosen first and is too large to be committed to stays in the class of those that would do as well: by
     slopes, or since they were not among those named with it (`before`) and stand in its place."""
@@ -194,7 +196,7 @@ def with_doubtful(
     for item in named:
         sensor, name = item.name.split(".", 1)
         instead = item.kind == "physical" and item.effect.shows_in == ShowsIn.MEAN and name not in before
-        alike = {f"{sensor}.{each.candidate.name}" for each in doubtful if instead or name in each.alike}
+        alike = {f"{sensor}.{each.candidate.name}" for each in doubtful if instead or name in each.indistinguishable}
         found.append(replace(item, alike=(*item.alike, *sorted(alike - {item.name, *item.alike}))))
     return found
 
@@ -213,7 +215,7 @@ def _with_angles(
     """
     there, found, _ = settled_with(measurement, angles, whole.index)
     at = at_points(found, whole)
-    named, naming = name_effects(there, at, registered(at)[2], random.child("angles"), left_out)
+    named, naming = name_effects(there, at, fit_pose_robustly(at)[2], random.child("angles"), left_out)
     joined, others = with_corrections(angles, [item for item in named if item.effect is AngleEmpirical], whole)
     rest = [item for item in named if item.effect is not AngleEmpirical]
     moving = naming.moving | {item.name for item in angles}
@@ -223,18 +225,18 @@ def _with_angles(
 
 def _repeats(estimates: list[Estimate]) -> list[str]:
     """Words for forms that repeat after a few lines."""
-    lines = [each.candidate.fixed["lines"] for each in estimates if each.candidate.form.startswith(REPEATED)]
+    lines = [each.candidate.fixed["lines"] for each in estimates if each.candidate.form.startswith(LINE_PATTERN)]
     return [f"what is described repeats every {each} lines exactly: facets of a mirror or a read-out in blocks" for each in lines]
 
 
 def _most_like(found: Explained, part: Residuals) -> list[str]:
     """Words for what remains where it is more than chance leaves, and nothing was found that says it."""
-    p_value = found.search.p_of_rest(found.tried)
+    p_value = found.search.goodness_of_fit_p_value(found.tried)
     if found.estimates or p_value is None or p_value > decided().verdict.least_p:
         return []
-    best = max((item for item in found.tried if not item.name.startswith(PLACE)), key=lambda item: item.score)
+    best = max((item for item in found.tried if not item.name.startswith(SPATIAL_NULL)), key=lambda item: item.score)
     what = f"a change with {best.name} ({best.candidate.form})" if best.empirical else best.name
-    size = 1e3 * found.search.size(best) * float(np.median(part.unit_m))
+    size = 1e3 * found.search.fitted_std(best) * float(np.median(part.unit_m))
     return [
         f"what remains is most like {what}, {size:.2g} mm (standard deviation): a reference that is wrong along whole lines or "
         "columns, as in strips, looks so too, and points from another station would tell"
@@ -243,7 +245,7 @@ def _most_like(found: Explained, part: Residuals) -> list[str]:
 
 def _slanting(found: Explained) -> list[str]:
     """Words for waves across the wall that are larger than chance leaves, though no sensor has an axis there."""
-    p_value = found.search.p_of_places(found.tried)
+    p_value = found.search.spatial_null_p_value(found.tried)
     if p_value is None or p_value > decided().verdict.least_p:
         return []
     return [
@@ -255,7 +257,7 @@ def _slanting(found: Explained) -> list[str]:
 def _spread(
     measurement: Measurement,
     part: Residuals,
-    cells: Cells,
+    cells: WallCells,
     value: FloatArray,
     random: KeyedRandom,
     left_out: frozenset[tuple[str, bool]],

@@ -9,13 +9,21 @@ import numpy as np
 
 from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.decisions import decided
-from pipeline.gap.mean.candidates import HARMONICS, OVERTONES, Candidate, Explanation, SineGrid, harmonics, precision_of
+from pipeline.gap.mean.candidates import (
+    HARMONIC_ORDERS,
+    HARMONICS,
+    Candidate,
+    ExplanationKey,
+    SineGrid,
+    harmonics,
+    prior_precision,
+)
 from pipeline.gap.mean.search import MeanSearch
-from pipeline.gap.mean.selection import Chosen, Tried, class_margin
+from pipeline.gap.mean.selection import FamilyScore, SelectedEffect, equivalence_margin
 from pipeline.gap.naming.entries import Estimate, from_mean, is_possible, settled_with, typical_sizes
 from pipeline.gap.naming.families import PERIODIC, effects_of, families_of
 from pipeline.gap.other.spread import SpreadFound
-from pipeline.gap.residuals.registration import Settled, registered
+from pipeline.gap.residuals.alignment import Alignment, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -50,12 +58,12 @@ class Explained:
     estimates: of both; search, at, tried: the last search, its residuals and what it tried; beside: what it chose.
     """
 
-    chosen: list[Chosen]
+    chosen: list[SelectedEffect]
     estimates: list[Estimate]
     search: MeanSearch
     at: Residuals
-    beside: list[Chosen]
-    tried: tuple[Tried, ...]
+    beside: list[SelectedEffect]
+    tried: tuple[FamilyScore, ...]
 
     @property
     def complexity(self) -> tuple[int, int]:
@@ -80,7 +88,7 @@ class _Alone:
     @property
     def score(self) -> float:
         """Of all points, less what the effect costs."""
-        return self.log_likelihood - (self.estimate.chosen.gain - self.estimate.chosen.score)
+        return self.log_likelihood - (self.estimate.chosen.log_likelihood_ratio - self.estimate.chosen.score)
 
     @classmethod
     def of(cls, points: SearchedPoints, first: MeanSearch, estimate: Estimate) -> _Alone | None:
@@ -89,19 +97,19 @@ class _Alone:
             return None
         there, found, _ = _with(points, [estimate])
         found = found.part(np.isin(found.index, points.part.index))
-        rough, _, scale = registered(found)
+        rough, _, scale = fit_pose_robustly(found)
         largest = decided().points.outlier * scale * found.sigma
         value, kept = np.zeros(len(points.part)), _kept(found, points.part)
         if kept.mean() < decided().points.kept:
             return None
-        value[kept] = np.where(found.smooth, np.clip(rough, -largest, largest), 0.0)
+        value[kept] = np.where(found.usable, np.clip(rough, -largest, largest), 0.0)
         return cls(estimate, at_points(found, points.part), there, first.design.log_likelihood(value, estimate.candidate))
 
     def better(self, points: SearchedPoints, first: MeanSearch) -> _Alone | None:
         """With its values moved by the slopes here."""
         candidate = _renewed(self.estimate.candidate, families_of(self.there, self.at))
         width = candidate.columns.shape[1]
-        step = _step(self.at, candidate.columns, precision_of(candidate, width), np.zeros(width))
+        step = _step(self.at, candidate.columns, prior_precision(candidate, width), np.zeros(width))
         return _Alone.of(points, first, replace(self.estimate, values=self.estimate.values + step))
 
 
@@ -164,7 +172,7 @@ def fitted_together(points: SearchedPoints, candidates: list[Candidate]) -> tupl
         if after > (1 - _FITTED) * before:
             break
         before = after
-        precision = np.concatenate([precision_of(each, width) for each, width in zip(candidates, widths, strict=True)])
+        precision = np.concatenate([prior_precision(each, width) for each, width in zip(candidates, widths, strict=True)])
         values = values + _step(at, _all_columns(candidates), precision, values)
         parts = np.split(values, np.cumsum(widths)[:-1])
         estimates = [_unchosen(each, part) for each, part in zip(candidates, parts, strict=True)]
@@ -192,26 +200,26 @@ def _all_columns(candidates: list[Candidate]) -> FloatArray:
 
 def _unchosen(candidate: Candidate, values: FloatArray) -> Estimate:
     """An effect of some size for which nothing speaks yet."""
-    nothing = Chosen(candidate, (), 1.0, 0.0, 0.0, ())
+    nothing = SelectedEffect(candidate, (), 1.0, 0.0, 0.0, ())
     return Estimate(nothing, candidate, values, np.zeros((len(values), len(values))))
 
 
 def _step(at: Residuals, columns: FloatArray, precision: FloatArray, values: FloatArray) -> FloatArray:
     """(k,) by how much values (k,) change: least squares by slopes (n, k), the pose free and each value known to be near 0."""
-    design = np.concatenate([at.pose, columns], axis=1) / at.sigma[:, None]
+    design = np.concatenate([at.pose_jacobian, columns], axis=1) / at.sigma[:, None]
     known, pull = np.zeros(design.shape[1]), np.zeros(design.shape[1])
-    start = at.pose.shape[1]
+    start = at.pose_jacobian.shape[1]
     known[start:], pull[start:] = precision, precision * values
     found = np.linalg.solve(design.T @ design + np.diag(known), design.T @ (at.value / at.sigma) - pull)
     return np.asarray(found[start:])
 
 
-def _largest_alone(points: SearchedPoints, first: MeanSearch, together: list[Chosen]) -> list[_Alone]:
+def _largest_alone(points: SearchedPoints, first: MeanSearch, together: list[SelectedEffect]) -> list[_Alone]:
     """The effects that explain most by themselves, of those that explain much, best first; none where slopes say all: where they
     are wrong by less than anything gains that was chosen."""
     found: list[_Alone] = []
-    serve = min([decided().mean.slopes_serve, *(_MADE_UP * each.gain for each in together)])
-    for candidate in first.leading():
+    serve = min([decided().mean.slopes_serve, *(_MADE_UP * each.log_likelihood_ratio for each in together)])
+    for candidate in first.leading_effects():
         alone = _taken_exactly(points, first, candidate)
         if alone is None:
             continue
@@ -222,7 +230,7 @@ def _largest_alone(points: SearchedPoints, first: MeanSearch, together: list[Cho
     if not found:
         return []
     likeliest = _likeliest(points, first, found)
-    return _with_others(points, first, likeliest, set(likeliest[0].estimate.chosen.alike))
+    return _with_others(points, first, likeliest, set(likeliest[0].estimate.chosen.indistinguishable))
 
 
 def _with_others(points: SearchedPoints, first: MeanSearch, alone: list[_Alone], names: set[str]) -> list[_Alone]:
@@ -230,7 +238,7 @@ def _with_others(points: SearchedPoints, first: MeanSearch, alone: list[_Alone],
 
     Of each the parameters that slopes ask for, in every camera.
     """
-    others = {item.name: item.candidate.names for item in first.tried(()) if not item.empirical and item.name in names}
+    others = {item.name: item.candidate.names for item in first.score_families(()) if not item.empirical and item.name in names}
     for each in alone:
         others.pop(each.name, None)
     plain = (each for each in first.design.families.plain if not each.empirical)
@@ -239,12 +247,12 @@ def _with_others(points: SearchedPoints, first: MeanSearch, alone: list[_Alone],
     if not more:
         return alone
     ranked = sorted([*alone, *_likeliest(points, first, more)], key=lambda each: -each.score)
-    return _with_others(points, first, ranked, set(ranked[0].estimate.chosen.alike))
+    return _with_others(points, first, ranked, set(ranked[0].estimate.chosen.indistinguishable))
 
 
 def _taken_exactly(points: SearchedPoints, first: MeanSearch, candidate: Candidate) -> _Alone | None:
     """One effect in the model, at the values that slopes give it."""
-    (estimate,) = _estimates(first, [first.alone(candidate)])
+    (estimate,) = _estimates(first, [first.selected_alone(candidate)])
     return _Alone.of(points, first, estimate)
 
 
@@ -270,10 +278,10 @@ def _with_class(converged: list[_Alone]) -> _Alone:
     """The best, with those that would do as well: slopes say so of effects that were not taken exactly only."""
     best, *others = converged
     chosen = best.estimate.chosen
-    least = best.score - class_margin(chosen.gain)
+    least = best.score - equivalence_margin(chosen.log_likelihood_ratio)
     near = {each.name for each in others if each.score > least}
-    slopes = set(chosen.alike) - {each.name for each in others}
-    return replace(best, estimate=replace(best.estimate, chosen=replace(chosen, alike=tuple(sorted(near | slopes)))))
+    slopes = set(chosen.indistinguishable) - {each.name for each in others}
+    return replace(best, estimate=replace(best.estimate, chosen=replace(chosen, indistinguishable=tuple(sorted(near | slopes)))))
 
 
 def _converged(points: SearchedPoints, first: MeanSearch, alone: _Alone) -> _Alone:
@@ -291,7 +299,7 @@ def _beside(points: SearchedPoints, chosen: Explained) -> Explained | None:
     physical = [each for each in chosen.estimates if not each.candidate.empirical]
     if not physical or beyond(points.measurement, chosen.estimates, chosen.at):
         return None
-    again = _again(points, physical, chosen.search.gains_alone)
+    again = _again(points, physical, chosen.search.single_effect_ratios)
     if again is None:
         return None
     search, at, estimates, beside, tried = again
@@ -318,18 +326,18 @@ def noisier(part: Residuals, variance: float) -> Residuals:
 
 def weighed(part: Residuals, spread: list[SpreadFound], scale: float) -> Residuals:
     """With the spread that the points really have, as it counts for means of neighbours."""
-    part = part.averaged
+    part = part.with_sigma_of_means
     if not spread:
         return replace(part, sigma=part.sigma * scale)
     made = (effect_of(each.effect)(**each.parameters) for each in spread if each.parameters)
     shared = [effect for effect in made if isinstance(effect, MatchingNoise)]
     sigma = np.sqrt(part.sigma**2 + sum(each.variance for each in spread))
-    return replace(part, sigma=sigma, shared_noise=part.shared_noise.beside(shared))
+    return replace(part, sigma=sigma, correlated_noise=part.correlated_noise.with_effects(shared))
 
 
-def _estimates(search: MeanSearch, chosen: list[Chosen]) -> list[Estimate]:
-    candidates, fit = search.design.refined([item.candidate for item in chosen])
-    places = search.design.split(np.arange(len(fit.coefficients)), candidates)
+def _estimates(search: MeanSearch, chosen: list[SelectedEffect]) -> list[Estimate]:
+    candidates, fit = search.design.fit_refined([item.candidate for item in chosen])
+    places = search.design.split_coefficients(np.arange(len(fit.coefficients)), candidates)
     return [
         Estimate(item, candidate, fit.coefficients[place], fit.covariance[np.ix_(place, place)])
         for item, candidate, place in zip(chosen, candidates, places, strict=True)
@@ -337,8 +345,8 @@ def _estimates(search: MeanSearch, chosen: list[Chosen]) -> list[Estimate]:
 
 
 def _again(
-    points: SearchedPoints, had: list[Estimate], alone: Mapping[Explanation, float]
-) -> tuple[MeanSearch, Residuals, list[Estimate], list[Chosen], tuple[Tried, ...]] | None:
+    points: SearchedPoints, had: list[Estimate], alone: Mapping[ExplanationKey, float]
+) -> tuple[MeanSearch, Residuals, list[Estimate], list[SelectedEffect], tuple[FamilyScore, ...]] | None:
     """The search beside effects that the model now has, whose values are free to move a little: they count as pose.
 
     alone: what each explanation gains by itself. Returns the search, its residuals, the effects with what was found beside them,
@@ -356,19 +364,19 @@ def _again(
     known = [replace(each, candidate=_renewed(each.candidate, renewed)) for each in had]
     columns = [_columns(each) for each in known]
     periodic = [(PERIODIC[name], each.candidate) for each in known if (name := each.candidate.name) in PERIODIC]
-    others += [harmonics(covariate, sine, last) for covariate, sine in periodic for last in OVERTONES]
+    others += [harmonics(covariate, sine, last) for covariate, sine in periodic for last in HARMONIC_ORDERS]
     heavier = _weighed_at(points, at)
-    precision = [precision_of(each.candidate, matrix.shape[1]) for each, matrix in zip(known, columns, strict=True)]
+    precision = [prior_precision(each.candidate, matrix.shape[1]) for each, matrix in zip(known, columns, strict=True)]
     search = MeanSearch(
-        replace(heavier, pose=np.concatenate([at.pose, *columns], axis=1)),
+        replace(heavier, pose_jacobian=np.concatenate([at.pose_jacobian, *columns], axis=1)),
         others,
         points.random.child("again"),
-        np.concatenate([np.zeros(at.pose.shape[1]), *precision]),
+        np.concatenate([np.zeros(at.pose_jacobian.shape[1]), *precision]),
         alone,
     )
     chosen, tried = search.select()
-    fit = search.design.refined([item.candidate for item in chosen])[1]
-    kept, start = [], at.pose.shape[1]
+    fit = search.design.fit_refined([item.candidate for item in chosen])[1]
+    kept, start = [], at.pose_jacobian.shape[1]
     for each, matrix in zip(known, columns, strict=True):
         place = slice(start, start := start + matrix.shape[1])
         kept.append(replace(each, values=each.values + fit.coefficients[place], covariance=fit.covariance[place, place]))
@@ -378,10 +386,10 @@ def _again(
 def _weighed_at(points: SearchedPoints, at: Residuals) -> Residuals:
     """Residuals with some effects on the mean in the model, with the spread that they have there: without those in the model what
     they do looks like noise, beside which nothing small would be seen."""
-    return weighed(at, points.spread_at(at), registered(at)[2])
+    return weighed(at, points.spread_at(at), fit_pose_robustly(at)[2])
 
 
-def _with(points: SearchedPoints, effects: list[Estimate]) -> Settled:
+def _with(points: SearchedPoints, effects: list[Estimate]) -> Alignment:
     """The measurement with some effects in its model, settled."""
     return settled_with(points.measurement, [from_mean(each, points.part) for each in effects], points.part.index)
 
@@ -401,8 +409,8 @@ def _without_sines(estimates: list[Estimate]) -> list[Estimate]:
 
 def at_points(found: Residuals, part: Residuals) -> Residuals:
     """What was found at the points of a part, where the surface is smooth there too and they are no outliers."""
-    rough, _, scale = registered(found)
-    good = found.smooth & (np.abs(rough) < decided().points.outlier * scale * found.sigma)
+    rough, _, scale = fit_pose_robustly(found)
+    good = found.usable & (np.abs(rough) < decided().points.outlier * scale * found.sigma)
     place = np.full(int(max(found.index.max(initial=-1), part.index.max())) + 1, -1)
     place[found.index[good]] = np.flatnonzero(good)
     rows = place[part.index]
@@ -421,7 +429,7 @@ def _renewed(candidate: Candidate, families: list[Candidate | SineGrid]) -> Cand
     for family in families:
         if family.name == candidate.name and not family.empirical and dict(family.fixed) == chosen:
             if isinstance(family, SineGrid):
-                return family.at(candidate.period)
+                return family.at_period(candidate.period)
             if family.names == candidate.names:
                 return family
     raise KeyError(candidate.name)
@@ -430,4 +438,4 @@ def _renewed(candidate: Candidate, families: list[Candidate | SineGrid]) -> Cand
 def _columns(found: Estimate) -> FloatArray:
     """(n, k) of its coefficients, a sine's with that of its frequency."""
     wave = found.candidate.wave
-    return found.candidate.columns if wave is None else wave.with_slope(found.candidate.period, found.values[:2])
+    return found.candidate.columns if wave is None else wave.with_frequency_derivative(found.candidate.period, found.values[:2])

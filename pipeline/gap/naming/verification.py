@@ -12,7 +12,7 @@ from pipeline.gap.decisions import decided
 from pipeline.gap.naming.entries import Named, settled_with, with_effects
 from pipeline.gap.naming.verify import LOSS_MEASURE, Gap, Version, measure_gap, measure_losses, thinned
 from pipeline.gap.other.missing import MissingFound
-from pipeline.gap.residuals.registration import pose_of
+from pipeline.gap.residuals.alignment import fit_pose
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -77,7 +77,7 @@ class Showing:
     @property
     def pose(self) -> FloatArray:
         """(6,) by which the model as it is is registered."""
-        return pose_of(self.residuals, self.chosen)
+        return fit_pose(self.residuals, self.chosen)
 
     def show(self, named: list[Named]) -> tuple[Shown, list[str]]:
         """The gap on points that no step has used, and words for effects that are taken out.
@@ -119,14 +119,14 @@ class Showing:
     def _registered(self, named: list[Named]) -> tuple[FloatArray, FloatArray]:
         """(n,) residuals of the same points with some effects, NaN where their rays miss the reference; the pose (6,)."""
         if not (named or self.lower):
-            return self.residuals.value - self.residuals.pose @ self.pose, self.pose
+            return self.residuals.value - self.residuals.pose_jacobian @ self.pose, self.pose
         trusted = self.residuals.index[self.chosen]
         _, found, there = settled_with(self.measurement, named, trusted, self.lower)
-        rest = pose_of(found, found.smooth & np.isin(found.index, trusted))
-        return found.of_points(found.value - found.pose @ rest, self.residuals.index), there + rest
+        rest = fit_pose(found, found.usable & np.isin(found.index, trusted))
+        return found.values_at(found.value - found.pose_jacobian @ rest, self.residuals.index), there + rest
 
     def _gap(self, named: list[Named], versions: tuple[Version, Version], rows: BoolArray) -> Gap | None:
-        missing = self.residuals.missing
+        missing = self.residuals.expected_pulses
         if self.losses is not None and missing is not None and named and named[0].name == f"tls.{self.losses[0].name}":
             found, held_out = self.losses
             share = np.full(len(held_out), float(missing.lost.mean()))

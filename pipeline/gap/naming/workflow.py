@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from pipeline.formats.measurements.checks import check_noise
 from pipeline.formats.measurements.measurement import FILE, Measurement, StereoMeasurement, TlsMeasurement
 from pipeline.gap.decisions import Decisions, decided, deciding
-from pipeline.gap.mean.selection import Tried
+from pipeline.gap.mean.selection import FamilyScore
 from pipeline.gap.naming.attempts import Starts, State, attempt, few, thinned_rows
 from pipeline.gap.naming.entries import (
     Named,
@@ -33,15 +33,15 @@ from pipeline.gap.naming.verification import Showing, Shown
 from pipeline.gap.naming.verify import Gap
 from pipeline.gap.other.missing import LOSSES, MissingFound, find_missing, isolated
 from pipeline.gap.other.spread import SpreadTried, Tails, find_tails
-from pipeline.gap.residuals.cells import Cells, block_numbers, held_out_blocks
-from pipeline.gap.residuals.changes import SceneChange, moved_share
-from pipeline.gap.residuals.registration import registered, residuals_of, settled
+from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
-from pipeline.gap.residuals.sight import Sight
+from pipeline.gap.residuals.scene_changes import SceneChange, moved_share
+from pipeline.gap.residuals.sensor_view import SensorView
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals, with_surroundings
+from pipeline.gap.residuals.subsampling import subsample
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
-from pipeline.gap.residuals.thinning import thinned
-from pipeline.gap.residuals.tls_residuals import TlsResiduals, missing_returns, with_order
+from pipeline.gap.residuals.tls_residuals import TlsResiduals, find_expected_pulses, with_scan_order
+from pipeline.gap.residuals.wall_blocks import WallCells, in_validation_blocks, wall_block_numbers
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.occlusion_fill import OcclusionFill
@@ -73,7 +73,7 @@ class GapDiagnosis:
     pose: FloatArray
     model_after: TlsModel | StereoModel
     gap: Gap | None
-    tried: tuple[Tried, ...]
+    tried: tuple[FamilyScore, ...]
     spread_tried: tuple[SpreadTried, ...]
     remaining: dict[str, Any]
     identifiability: dict[str, Any]
@@ -106,26 +106,26 @@ def diagnose(
     clock, random = _Clock(progress), KeyedRandom(seed, ("gap",))
     # the same sums on any number of threads, and none that wait for each other
     with deciding(decisions), threadpool_limits(1, "blas"):
-        ordered = with_order(measurement) if isinstance(measurement, TlsMeasurement) else measurement
-        part, rows = thinned(ordered, random.child("thinned"))
+        ordered = with_scan_order(measurement) if isinstance(measurement, TlsMeasurement) else measurement
+        part, rows = subsample(ordered, random.child("thinned"))
         found = _diagnose(part, clock, random)
     return replace(found, residuals=replace(found.residuals, index=rows[found.residuals.index]))
 
 
 def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> GapDiagnosis:
     measurement.check_near(FILE)
-    first = residuals_of(measurement)
+    first = compute_residuals(measurement)
     check_noise("surface" if isinstance(first, SurfaceResiduals) else first.sensor, first.sigma)
     held_points = np.zeros(len(measurement.cloud.points), dtype=bool)
-    held_points[first.index] = held_out_blocks(first.at, Cells.over(first.at).side_m)
+    held_points[first.index] = in_validation_blocks(first.wall_xy, WallCells.over(first.wall_xy).side_m)
     held_points |= _held_epoch(measurement.epochs)
-    there, plain, surveyed = settled(measurement, first.index[~held_points[first.index]], first)
+    there, plain, surveyed = align(measurement, first.index[~held_points[first.index]], first)
     if isinstance(there, StereoMeasurement) and isinstance(plain, StereoResiduals):
         there = with_surroundings(there, plain)
     if isinstance(there, TlsMeasurement) and isinstance(plain, TlsResiduals):
-        plain = replace(plain, missing=missing_returns(there, plain))
+        plain = replace(plain, expected_pulses=find_expected_pulses(there, plain))
     clock.lap("residuals")
-    if plain.smooth.sum() < decided().points.fewest:
+    if plain.usable.sum() < decided().points.fewest:
         return _insufficient(measurement, plain, clock)
     held = _held(Starts(there, plain, held_points), random)
     state, naming = held.state, held.naming
@@ -152,13 +152,13 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     if evidence.much_moved:
         shown, _ = replace(showing, lower={}).show([])
         notes = [*much_moved(evidence, bool(there.stable_areas)), *naming.notes]
-    value = plain.value - plain.pose @ showing.pose
+    value = plain.value - plain.pose_jacobian @ showing.pose
     clock.lap("verification")
     return GapDiagnosis(
         verdict=verdict_of(shown.named, evidence),
         effects=tuple(shown.named),
         changes=tuple(state.changes),
-        residuals=replace(plain, smooth=state.residuals.smooth),
+        residuals=replace(plain, usable=state.residuals.usable),
         held_out=state.held_out,
         before=value,
         after=np.where(np.isfinite(shown.value), shown.value, value),
@@ -194,11 +194,11 @@ def _with_moved(evidence: Evidence, there: Measurement, state: State, shown: Sho
     if not (noisy or unexplained_yet):
         return evidence
     after = replace(state.residuals, value=shown.value)
-    sight = Sight.of(there, after)
+    sight = SensorView.of(there, after)
     moved = moved_share(after, sight, state.fit)
     if noisy and not unexplained_yet and moved >= decided().changes.moved_share:
-        found = residuals_of(there.changed(model=shown.model))
-        sigma = found.of_points(found.sigma, after.index)
+        found = compute_residuals(there.changed(model=shown.model))
+        sigma = found.values_at(found.sigma, after.index)
         beside = moved_share(replace(after, sigma=np.where(np.isfinite(sigma), sigma, after.sigma)), sight, state.fit)
         moved = moved if beside >= decided().changes.moved_beside_noise else 0.0
     return replace(evidence, moved=moved)
@@ -270,7 +270,7 @@ def _with_tails(
     if any(item.effect is OcclusionFill or item.entry.get("early_share") for item in named):
         return named, None
     part, value, scale = _smooth_with(measurement, named)
-    tails = find_tails(value / part.sigma / scale, block_numbers(part.at, side_m))
+    tails = find_tails(value / part.sigma / scale, wall_block_numbers(part.wall_xy, side_m))
     if tails is None or not tails.even or not tails.sigma:
         return named, tails
     steady = [item for item in named if not item.spreads]
@@ -285,8 +285,8 @@ def _with_tails(
 def _smooth_with(measurement: Measurement, named: list[Named]) -> tuple[Residuals, FloatArray, float]:
     """Residuals on smooth rock against the model with some effects, registered ones (n,), and how many sigmas they spread."""
     found = settled_with(measurement, named).residuals
-    part = found.part(np.flatnonzero(found.smooth))
-    value, _, scale = registered(part)
+    part = found.part(np.flatnonzero(found.usable))
+    value, _, scale = fit_pose_robustly(part)
     return part, value, scale
 
 
@@ -328,10 +328,10 @@ def _found_first(notes: list[str], of_data: Sequence[str]) -> list[str]:
 
 
 def _insufficient(measurement: Measurement, residuals: Residuals, clock: _Clock) -> GapDiagnosis:
-    count, least = int(residuals.smooth.sum()), decided().points.fewest
+    count, least = int(residuals.usable.sum()), decided().points.fewest
     note = f"{count} points on smooth parts of the reference and stable ground, {least} are needed"
     empty = np.zeros(len(residuals))
-    pose = np.zeros(residuals.pose.shape[1] if isinstance(residuals, SurfaceResiduals) else 6)
+    pose = np.zeros(residuals.pose_jacobian.shape[1] if isinstance(residuals, SurfaceResiduals) else 6)
     return GapDiagnosis(
         "insufficient_data", (), (), residuals, empty > 1, residuals.value, residuals.value, pose, measurement.model,
         None, (), (), _remaining(Evidence(None, None), [note], {}), {"names": [], "cosines": [], "survival": []},
@@ -342,15 +342,15 @@ def _insufficient(measurement: Measurement, residuals: Residuals, clock: _Clock)
 def _missing(measurement: Measurement, state: State) -> tuple[MissingFound, BoolArray] | None:
     """The effect on the returns, and the pulses that it was not fitted to."""
     residuals = state.residuals
-    missing = residuals.missing
+    missing = residuals.expected_pulses
     if missing is None or any(believes(measurement, name) for name in LOSSES):
         return None
-    held_out = held_out_blocks(missing.at, state.cells.side_m)
+    held_out = in_validation_blocks(missing.wall_xy, state.cells.side_m)
     early = (
-        residuals.smooth
+        residuals.usable
         & ~state.changed
         & (state.rough < -np.maximum(decided().losses.early_sigmas * residuals.sigma, decided().losses.early))
     )
-    drops = isolated(residuals.at, early)
+    drops = isolated(residuals.wall_xy, early)
     found = find_missing(missing, ~held_out, drops, len(residuals), measurement.cloud.intensity)
     return None if found is None else (found, held_out)

@@ -11,8 +11,8 @@ from scipy.optimize import minimize
 from scipy.special import expit, logit, ndtr
 
 from pipeline.gap.decisions import decided
-from pipeline.gap.residuals.cells import patches
-from pipeline.gap.residuals.residuals import BoolArray, Missing
+from pipeline.gap.residuals.residuals import BoolArray, ExpectedPulses
+from pipeline.gap.residuals.wall_blocks import wall_blocks_by_points
 from scene.geometry.mesh import FloatArray
 from sensors.effects import catalogue
 from sensors.effects.base import ShowsIn
@@ -84,7 +84,9 @@ class _Best:
     cost: Callable[[FloatArray], float]
 
 
-def find_missing(missing: Missing, fit: BoolArray, early: int, points: int, intensity: FloatArray | None) -> MissingFound | None:
+def find_missing(
+    missing: ExpectedPulses, fit: BoolArray, early: int, points: int, intensity: FloatArray | None
+) -> MissingFound | None:
     """The effect that the losses ask for, if any. fit: (m,) pulses that may be looked at; early: returns far before the surface,
     of `points`; intensity: (n,) or None.
 
@@ -102,7 +104,7 @@ def find_missing(missing: Missing, fit: BoolArray, early: int, points: int, inte
     by = decided().losses
     if free.score > by.free_ratio * max(best.score, 0.0) + by.free_margin and _strips_agree(missing, best, free, fit):
         best = free
-    sureness = 1 / _clustering(lost[fit], best.chance[fit], missing.at[fit])
+    sureness = 1 / _clustering(lost[fit], best.chance[fit], missing.wall_xy[fit])
     best = replace(best, gain=best.gain * sureness, score=best.score * sureness)
     if best.score < decided().losses.least_gain:
         return None
@@ -116,7 +118,7 @@ def find_missing(missing: Missing, fit: BoolArray, early: int, points: int, inte
 def isolated(at: FloatArray, early: BoolArray) -> int:
     """How many returns come early from drops, which fall anywhere; what stands before the wall, or an edge of it, returns many
     pulses side by side, and then it is none."""
-    patch, count = patches(at, _PULSES_PER_PATCH), int(early.sum())
+    patch, count = wall_blocks_by_points(at, _PULSES_PER_PATCH), int(early.sum())
     number = int(patch.max()) + 1
     anywhere = number * (1 - (1 - 1 / number) ** count)
     return count if len(np.unique(patch[early])) >= decided().losses.scattered * anywhere else 0
@@ -124,13 +126,13 @@ def isolated(at: FloatArray, early: BoolArray) -> int:
 
 def _clustering(lost: BoolArray, chance: FloatArray, at: FloatArray) -> float:
     """Variance of the patches' losses over that of independent ones, at least 1."""
-    patch = patches(at, _PULSES_PER_PATCH)
+    patch = wall_blocks_by_points(at, _PULSES_PER_PATCH)
     left = np.bincount(patch, lost - chance)
     expected = np.bincount(patch, chance * (1 - chance))
     return float(max(np.sum(left**2) / np.sum(expected), 1.0))
 
 
-def _strips_agree(missing: Missing, known: MissingFound, free: MissingFound, fit: BoolArray) -> bool:
+def _strips_agree(missing: ExpectedPulses, known: MissingFound, free: MissingFound, fit: BoolArray) -> bool:
     """Whether losses by one angle are common to all strips of the other: a shrub before the wall takes the pulses of a few, as do
     lines that the scanner dropped. Each strip is asked what it gains by the losses of the others."""
     lost, across = missing.lost[fit], missing.covariates[_DIRECTIONS[free.covariate]][fit]

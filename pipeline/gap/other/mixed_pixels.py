@@ -12,7 +12,7 @@ from pipeline.formats.measurements.measurement import TlsMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.other.shapes import ShapeFound, WallBlocks, log_density, refined
 from pipeline.gap.residuals.residuals import BoolArray
-from pipeline.gap.residuals.scan_simulation import mean_model, simulate_modes, simulate_ranges
+from pipeline.gap.residuals.scan_simulation import simulate_ranges, simulate_ranges_by_mode, systematic_part
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -45,7 +45,7 @@ def find_footprint(
     some = some[np.abs(wide) > sigma[some]]
     if len(some) < decided().shapes.footprint_fewest:
         return []
-    blocks = WallBlocks(WallBlocks.over(residuals.at).number[some])
+    blocks = WallBlocks(WallBlocks.over(residuals.wall_xy).number[some])
     jittered = footprint.moved(some, ("mean",), _width_of_noise(measurement.model))["mean"]
     without = [log_density(rough[some], moved, sigma[some]) for moved in (np.zeros_like(jittered), jittered)]
     null = np.logaddexp(*without) - np.log(2)  # at a step the one, on a slope that bends the other
@@ -87,11 +87,11 @@ class _Footprint:
     @cached_property
     def _axis(self) -> FloatArray:
         """(n,) ranges along the beams' axes, m."""
-        return simulate_ranges(self.measurement, mean_model(self.measurement.model), self.residuals.geometry, _RANDOM)
+        return simulate_ranges(self.measurement, systematic_part(self.measurement.model), self.residuals.geometry, _RANDOM)
 
     def moved(self, rows: NDArray[np.int64], modes: tuple[Mode, ...], angle: float) -> dict[Mode, FloatArray]:
         """(m,) range of a beam of divergence `angle` less that of its axis, m, for each mode; 0 where either does not return."""
-        plain = mean_model(self.measurement.model)
+        plain = systematic_part(self.measurement.model)
         beam = plain.model_copy(update={"effects": (*plain.effects, BeamDivergence(divergence_rad=angle))})
-        whole = simulate_modes(self.measurement, beam, modes, self.residuals.geometry.part(rows), _RANDOM)
+        whole = simulate_ranges_by_mode(self.measurement, beam, modes, self.residuals.geometry.part(rows), _RANDOM)
         return {mode: np.asarray(np.nan_to_num(whole[mode] - self._axis[rows])) for mode in modes}

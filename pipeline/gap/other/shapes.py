@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.gap.decisions import decided
-from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.residuals import BoolArray
+from pipeline.gap.residuals.wall_blocks import wall_blocks_by_points
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect
 
@@ -45,7 +45,7 @@ class WallBlocks:
     @classmethod
     def over(cls, at: FloatArray) -> WallBlocks:
         """Of about a hundred points each; at: (n, 2)."""
-        return cls(patches(at, _POINTS_PER_BLOCK))
+        return cls(wall_blocks_by_points(at, _POINTS_PER_BLOCK))
 
     def sums(self, gains: FloatArray) -> FloatArray:
         """Gains (n,) by block."""

@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 
 from pipeline.change.robust import nmad
 from pipeline.gap.decisions import decided
-from pipeline.gap.residuals.cells import Cells, block_numbers
 from pipeline.gap.residuals.residuals import BoolArray, Geometry, Residuals
+from pipeline.gap.residuals.wall_blocks import WallCells, wall_block_numbers
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, ShowsIn
@@ -87,14 +87,14 @@ class SpreadTried:
     empirical: bool = False
 
 
-def standardised(residuals: Residuals, cells: Cells, value: FloatArray) -> FloatArray:
+def standardised(residuals: Residuals, cells: WallCells, value: FloatArray) -> FloatArray:
     """(n,) deviations from the cells' planes over the predicted spread, of unit variance if the model is right; NaN outside.
 
     A plane in each cell takes away what the reference's error, correlated over metres, does within it.
     """
     inside = cells.cell >= 0
     cell = cells.cell[inside]
-    offset = (residuals.at[inside] - cells.centre[cell]) / cells.side_m
+    offset = (residuals.wall_xy[inside] - cells.centre[cell]) / cells.side_m
     weight = 1 / residuals.sigma[inside]
     basis = np.stack([np.ones(len(cell)), offset[:, 0], offset[:, 1]], axis=1) * weight[:, None]
     y = value[inside] * weight
@@ -134,7 +134,7 @@ def _candidate(effect: type[Effect], geometry: Geometry, fixed: dict[str, float]
 
 
 def find_spread(
-    residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom, left_out: frozenset[str] = frozenset()
+    residuals: Residuals, cells: WallCells, value: FloatArray, random: KeyedRandom, left_out: frozenset[str] = frozenset()
 ) -> tuple[list[SpreadFound], list[SpreadTried], str]:
     """The effects that the spread asks for, at most two, all that were tried, best first, and words for a spread of no effect.
 
@@ -156,7 +156,7 @@ def find_spread(
             added = candidates[best.members[0]].variance @ best.theta[0]
             weighed = replace(residuals, sigma=np.sqrt(residuals.sigma**2 + added))
     excess = float(np.mean(best.added(forms)))
-    block = block_numbers(residuals.at[kept], cells.side_m)
+    block = wall_block_numbers(residuals.wall_xy[kept], cells.side_m)
     p_value = null_p_value(squared, [form.sum(axis=1) for form in forms], block, random)
     tried = [SpreadTried(c.name, fit.gain, fit.score) for c, fit in zip(candidates, singles, strict=True)]
     tried = sorted(_best_variants(tried), key=lambda item: -item.score)
@@ -228,8 +228,8 @@ def _between_neighbours(residuals: Residuals, value: FloatArray, kept: BoolArray
     """Share of an added variance, of the points `kept` and over the predicted one, that differences of neighbours show."""
     part = residuals.part(kept)
     value, predicted = value[kept], part.sigma**2
-    other = cKDTree(part.at).query(part.at, k=2)[1][:, 1]
-    variance = predicted + predicted[other] - 2 * part.shared_with(other)
+    other = cKDTree(part.wall_xy).query(part.wall_xy, k=2)[1][:, 1]
+    variance = predicted + predicted[other] - 2 * part.reference_covariance_with(other)
     more = (added * predicted + (added * predicted)[other]) / variance
     weight = more / (1 + more) ** 2
     return float(np.sum(weight * ((value - value[other]) ** 2 / variance - 1)) / np.sum(weight * more))
@@ -244,12 +244,14 @@ class TimesPredicted:
     below: bool
 
     @classmethod
-    def of(cls, residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom) -> TimesPredicted:
+    def of(cls, residuals: Residuals, cells: WallCells, value: FloatArray, random: KeyedRandom) -> TimesPredicted:
         """Of residuals (n,) without the effects on the mean; a few that are far off do not make it more."""
         z = standardised(residuals, cells, value)
         kept = np.isfinite(z)
         squared = np.minimum(z[kept] ** 2, _CUT**2) / _expected_square(residuals, cells, random)
-        means = np.bincount(np.unique(block_numbers(residuals.at[kept], cells.side_m), return_inverse=True)[1], squared - 1)
+        means = np.bincount(
+            np.unique(wall_block_numbers(residuals.wall_xy[kept], cells.side_m), return_inverse=True)[1], squared - 1
+        )
         below = float(means.sum()) < -decided().spread.block_sigmas * float(np.linalg.norm(means))
         return cls(float(np.sqrt(squared.mean())), below)
 
@@ -259,10 +261,10 @@ class TimesPredicted:
         return self.value if self.below and self.value < decided().spread.too_noisy else 1.0
 
 
-def _expected_square(residuals: Residuals, cells: Cells, random: KeyedRandom) -> float:
+def _expected_square(residuals: Residuals, cells: WallCells, random: KeyedRandom) -> float:
     """Mean square of standardised deviations from cells where the model is right: of noise that neighbours share, planes take
     away more than of white noise, by draws of it."""
-    field = residuals.shared_noise.field(len(residuals))
+    field = residuals.correlated_noise.node_field(len(residuals))
     if not field.weights.shape[1]:
         return 1.0
     own = np.sqrt(np.maximum(residuals.sigma**2 - field.variance, _LEAST_OWN * residuals.sigma**2))

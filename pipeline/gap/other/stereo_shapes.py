@@ -17,8 +17,8 @@ from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import StereoMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.other.shapes import ShapeFound, WallBlocks, log_density, refined
+from pipeline.gap.residuals.alignment import fit_pose_robustly
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
-from pipeline.gap.residuals.registration import registered
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from scene.common.threads import map_in_threads
@@ -69,14 +69,16 @@ class _Witnesses:
 
     def moved(self, effects: list[Effect]) -> FloatArray:
         """(n,) what effects beside the known ones add to the disparities, px."""
-        return self.raster.moved([*self.beside, *effects], self.disparity)
+        return self.raster.added_by([*self.beside, *effects], self.disparity)
 
     def gains(self, effect: Effect) -> FloatArray:
         """(n,) log-likelihood with an effect beside the known ones less that of these alone."""
         moved = self.moved([effect])
         counts = (moved != self.without) & ~self.held_out
         if isinstance(effect, EdgeFattening):
-            clear = np.maximum(decided().shapes.clear_sigmas * self.sigma, decided().shapes.clear_step * self.raster.jump_px)
+            clear = np.maximum(
+                decided().shapes.clear_sigmas * self.sigma, decided().shapes.clear_step * self.raster.depth_step_px
+            )
             counts &= np.abs(moved - self.without) > clear
         rows = np.flatnonzero(counts)
         gains = np.zeros(len(moved))
@@ -95,7 +97,7 @@ class _Witnesses:
     def registered_with(self, effect: Effect) -> _Witnesses:
         """With the registration and the spread that the residuals have where an effect beside the known ones is in the model."""
         moved = np.nan_to_num(self.moved([effect]))
-        value, _, scale = registered(replace(self.residuals, value=self.residuals.value - moved))
+        value, _, scale = fit_pose_robustly(replace(self.residuals, value=self.residuals.value - moved))
         return replace(self, rough=value + moved, sigma=scale * self.residuals.sigma)
 
     def likelier(self, found: list[ShapeFound]) -> ShapeFound:
@@ -122,11 +124,11 @@ def find_shapes(
     raster = DisparityRaster.of(measurement, residuals.geometry)
     if raster is None:
         return []
-    scale = nmad((rough / residuals.sigma)[residuals.smooth], 0.0)
+    scale = nmad((rough / residuals.sigma)[residuals.usable], 0.0)
     believed: list[Effect] = [effect for effect in measurement.model.effects if isinstance(effect, RasterEffect)]
     disparity = residuals.geometry.disparity
-    had = raster.moved(believed, disparity)
-    searched, points = raster.searched()
+    had = raster.added_by(believed, disparity)
+    searched, points = raster.search_part()
     part = residuals.part(points)
     witnesses = _Witnesses(
         replace(part, value=part.value + had[points]),
@@ -134,7 +136,7 @@ def find_shapes(
         part.geometry.disparity,
         (rough + had)[points],
         scale * part.sigma,
-        WallBlocks.over(part.at),
+        WallBlocks.over(part.wall_xy),
         held_out[points],
         believed,
     )
@@ -184,10 +186,12 @@ def _touched(effect: Effect, beside: list[Effect], raster: DisparityRaster, resi
     match effect:
         case EdgeFattening():
             wider = effect.model_copy(update={"radius_px": effect.radius_px + _NEAR_STEPS * raster.step})
-            return np.asarray(raster.moved([wider], at.disparity) != 0)
+            return np.asarray(raster.added_by([wider], at.disparity) != 0)
         case Smoothing():
-            return raster.beside_border(effect.sigma_px)
-    return raster.filled(beside) | raster.copies(at.found, _COPIED * float(np.median(residuals.sigma)))
+            return raster.near_border(effect.sigma_px)
+    return raster.in_filled_occlusions(beside) | raster.copied_from_neighbour(
+        at.found, _COPIED * float(np.median(residuals.sigma))
+    )
 
 
 def _fattening(witnesses: _Witnesses) -> ShapeFound | None:
@@ -224,7 +228,9 @@ def _fattening(witnesses: _Witnesses) -> ShapeFound | None:
 def _grown(radius: int, height: float, raster: DisparityRaster) -> EdgeFattening:
     """radius: cells; height: of a depth step, in the least that is one."""
     reach = (radius + 0.5) * raster.step
-    return EdgeFattening(radius_px=reach) if height == 1 else EdgeFattening(radius_px=reach, step_px=height * raster.jump_px)
+    return (
+        EdgeFattening(radius_px=reach) if height == 1 else EdgeFattening(radius_px=reach, step_px=height * raster.depth_step_px)
+    )
 
 
 def _smoothing(witnesses: _Witnesses) -> ShapeFound | None:
@@ -253,11 +259,11 @@ def _filling(witnesses: _Witnesses) -> ShapeFound | None:
     Without it hardly any of those cells holds a point (up to a fifth, by edges that are not quite where the reference has them).
     """
     raster = witnesses.raster
-    points = raster.filled(witnesses.beside)
+    points = raster.in_filled_occlusions(witnesses.beside)
     gain = float(witnesses.gains(OcclusionFill(reach_px=1e5))[points].sum())
     if points.sum() < decided().shapes.fewest_filled or gain < decided().shapes.least_filled_gain:
         return None
-    widths, held = _strips(raster.after(witnesses.beside), raster)
+    widths, held = _strips(raster.apply(witnesses.beside), raster)
     reach, std = _reach(widths, held, raster.step)
     narrow = held[widths <= reach / raster.step]
     if narrow.mean() < decided().shapes.least_held:

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.gap.naming.workflow import GapDiagnosis
-from pipeline.gap.residuals.cells import patches
-from pipeline.gap.residuals.residuals import Missing, Residuals
+from pipeline.gap.residuals.residuals import ExpectedPulses, Residuals
+from pipeline.gap.residuals.wall_blocks import wall_blocks_by_points
 from scene.geometry.mesh import FloatArray
 
 _BINS = 12
@@ -33,9 +33,11 @@ def where(found: GapDiagnosis) -> list[dict[str, Any]]:
     """
     residuals = found.residuals
     rows = [row for name, x, z in standardised(found) for row in _rows(name, x, z, residuals)]
-    if residuals.missing is not None and residuals.missing.lost.any():
-        patch = patches(residuals.missing.at, max(len(residuals.missing.lost) / _PATCHES, _LEAST_PULSES))
-        rows += [_lost(name, x, residuals.missing, patch) for name, x in residuals.missing.covariates.items()]
+    if residuals.expected_pulses is not None and residuals.expected_pulses.lost.any():
+        patch = wall_blocks_by_points(
+            residuals.expected_pulses.wall_xy, max(len(residuals.expected_pulses.lost) / _PATCHES, _LEAST_PULSES)
+        )
+        rows += [_lost(name, x, residuals.expected_pulses, patch) for name, x in residuals.expected_pulses.covariates.items()]
     return sorted(rows, key=lambda row: (row["p_value"], -abs(row["size_m"])))[:_MOST_ROWS]
 
 
@@ -50,10 +52,10 @@ def standardised(found: GapDiagnosis) -> list[tuple[str, FloatArray, FloatArray]
 def steady(found: GapDiagnosis) -> Any:
     """(n,) points on smooth parts of the surface, outside of scene changes, whose residual before is no outlier."""
     residuals = found.residuals
-    kept = residuals.smooth & (np.abs(found.before) < _INNER * residuals.sigma)
+    kept = residuals.usable & (np.abs(found.before) < _INNER * residuals.sigma)
     for change in found.changes:
         low, high = change.bounds[:, :2] + np.array([[-_MARGIN_M], [_MARGIN_M]])
-        kept = kept & ~((residuals.at >= low) & (residuals.at <= high)).all(axis=1)
+        kept = kept & ~((residuals.wall_xy >= low) & (residuals.wall_xy <= high)).all(axis=1)
     return kept
 
 
@@ -87,7 +89,7 @@ def _rows(name: str, x: FloatArray, z: FloatArray, residuals: Residuals) -> list
     return found
 
 
-def _lost(name: str, x: FloatArray, missing: Missing, patch: NDArray[np.int64]) -> dict[str, Any]:
+def _lost(name: str, x: FloatArray, missing: ExpectedPulses, patch: NDArray[np.int64]) -> dict[str, Any]:
     """Losses come many at a time, behind a shrub say. So a bin's deviate by as much as the patches within it do from their mean,
     and by as much as all patches do from the means of their bins, whichever is more."""
     edges, group = bins(x, _BINS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from pipeline.gap.mean.selection import Tried
+from pipeline.gap.mean.selection import FamilyScore
 from pipeline.gap.naming.entries import Named
 from pipeline.gap.naming.verdict import VERDICTS, closing, in_a_sentence, left_over
 from pipeline.gap.naming.workflow import GapDiagnosis
@@ -85,7 +85,7 @@ def sentence(found: GapDiagnosis) -> str:
 
 
 def _findings(found: GapDiagnosis, rows: list[dict[str, Any]]) -> list[str]:
-    parts = [f"{len(found.residuals):,} {found.residuals.called} were compared with what the model predicts."]
+    parts = [f"{len(found.residuals):,} {found.residuals.label} were compared with what the model predicts."]
     parts.append(sentence(found))
     scale = scale_of(found)
     parts += [] if scale is None else [scale.words]
@@ -132,7 +132,7 @@ def _shown_most(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
     return f"Before anything was named it showed most in the {statistic} against {listed(seen)}."
 
 
-def outcome(found: GapDiagnosis, tried: Sequence[Tried], item: Tried) -> str:
+def outcome(found: GapDiagnosis, tried: Sequence[FamilyScore], item: FamilyScore) -> str:
     """What became of one of the explanations `tried`, best first: named, in the class of a named one, or rejected."""
     if item.empirical:
         added = {effect.entry.get("covariate") for effect in found.effects if effect.kind == "empirical"}

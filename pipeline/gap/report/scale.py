@@ -44,7 +44,7 @@ def scale_of(found: GapDiagnosis) -> Scale | None:
     residuals = found.residuals
     if not isinstance(residuals, SurfaceResiduals) or not residuals.datum[6].any():
         return None
-    rows = residuals.smooth & ~found.held_out & (abs(found.after) < found.decisions.points.outlier * residuals.sigma)
+    rows = residuals.usable & ~found.held_out & (abs(found.after) < found.decisions.points.outlier * residuals.sigma)
     if rows.sum() < _FEWEST:
         return None
     stretch, variance = residuals.datum[6] @ found.pose, datum_covariance(residuals, found.after, rows)[6, 6]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import StereoMeasurement
-from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, is_hidden, project, rays, real_pair
+from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, is_hidden, pixel_rays, project, real_pair
 from pipeline.gap.residuals.residuals import BoolArray
 from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
@@ -46,8 +46,8 @@ class DisparityRaster:
     @classmethod
     def of(cls, measurement: StereoMeasurement, geometry: PixelGeometry) -> DisparityRaster | None:
         """None where the pixels are on no raster, or on one of more than 40 million cells."""
-        step = cell_px(geometry.u, geometry.v)
-        if step is None or cells_over(geometry.u, geometry.v, step) > MOST_CELLS:
+        step = raster_cell_px(geometry.u, geometry.v)
+        if step is None or raster_cell_count(geometry.u, geometry.v, step) > MOST_CELLS:
             return None
         nominal = NominalPair.of(measurement)
         real = real_pair(nominal, measurement.model.effects, measurement)
@@ -59,7 +59,7 @@ class DisparityRaster:
         only_left = np.zeros(disparity.shape, dtype=bool)
         for part in np.array_split(np.arange(len(rows)), -(-disparity.size // _AT_ONCE)):
             u, v = (x.ravel() for x in np.meshgrid(columns, rows[part]))
-            ray = rays(left, u, v)
+            ray = pixel_rays(left, u, v)
             point = left.position + measurement.scene.cast(left.position, ray)[0][:, None] * ray
             seen, hidden = np.isfinite(point).all(axis=1), is_hidden(measurement.scene, right.position, point)
             matched = seen & ~hidden & _pictured(right, point)
@@ -72,11 +72,11 @@ class DisparityRaster:
         return cls(step, disparity, only_left, row, column)
 
     @property
-    def jump_px(self) -> float:
+    def depth_step_px(self) -> float:
         """Difference of neighbouring cells beyond which they lie on both sides of a depth step."""
         return max(_STEEP * self.step, 1.0)
 
-    def searched(self) -> tuple[DisparityRaster, NDArray[np.int64]]:
+    def search_part(self) -> tuple[DisparityRaster, NDArray[np.int64]]:
         """The part among which a search looks, and the points in it: all, or of a large raster some bands of rows over all of it.
 
         Bands lie apart by as many empty rows as they reach beyond their points; `hidden` holds for the rows of points alone.
@@ -101,46 +101,46 @@ class DisparityRaster:
         """(n,) what a raster holds at the points."""
         return np.asarray(raster[self.row, self.column])
 
-    def beside_border(self, sigma_px: float) -> BoolArray:
+    def near_border(self, sigma_px: float) -> BoolArray:
         """(n,) points for which a low-pass sees beyond what both cameras see of the reference, by more than a hundredth."""
         from scipy.ndimage import gaussian_filter
 
         inside = (~np.isnan(self.disparity) | self.hidden).astype(np.float64)
         return self.at_points(gaussian_filter(inside, sigma_px / self.step, mode="constant") < 1 - _BEYOND)
 
-    def filled(self, effects: Iterable[Effect]) -> BoolArray:
+    def in_filled_occlusions(self, effects: Iterable[Effect]) -> BoolArray:
         """(n,) points in cells that the left camera alone sees, where no effect that looks at neighbours gives any."""
-        return np.asarray(np.isnan(self.at_points(self.after(effects))) & self.at_points(self.hidden))
+        return np.asarray(np.isnan(self.at_points(self.apply(effects))) & self.at_points(self.hidden))
 
-    def copies(self, found: FloatArray, tolerance: float) -> BoolArray:
+    def copied_from_neighbour(self, found: FloatArray, tolerance: float) -> BoolArray:
         """(n,) points whose measured disparity (n,), px, is that of the cell beside them in the row, as fillings leave it."""
         cells = np.full(self.disparity.shape, np.nan)
         cells[self.row, self.column] = found
         same = np.abs(np.diff(cells, axis=1)) < tolerance
         return self.at_points(np.pad(same, ((0, 0), (1, 0))) | np.pad(same, ((0, 0), (0, 1))))
 
-    def after(self, effects: Iterable[Effect]) -> FloatArray:
+    def apply(self, effects: Iterable[Effect]) -> FloatArray:
         """(rows, columns) disparities after those of the effects that look at neighbours, px, NaN where there is no match."""
         found = self.disparity
         filters = (effect for effect in effects if isinstance(effect, RasterEffect))
         for effect in sorted(filters, key=lambda effect: (effect.stage, effect.order)):
-            found = effect.filtered(found, self.step, self.jump_px)
+            found = effect.filtered(found, self.step, self.depth_step_px)
         return found
 
-    def moved(self, effects: Iterable[Effect], disparity: FloatArray) -> FloatArray:
+    def added_by(self, effects: Iterable[Effect], disparity: FloatArray) -> FloatArray:
         """(n,) what the effects add to the disparities (n,) that the reference has at the points, px; 0 where they say none."""
         plain = self.at_points(self.disparity)
-        return np.nan_to_num(self.at_points(self.after(effects)) - np.where(np.isnan(plain), disparity, plain))
+        return np.nan_to_num(self.at_points(self.apply(effects)) - np.where(np.isnan(plain), disparity, plain))
 
 
-def through(effects: Iterable[Effect], geometry: PixelGeometry, columns: FloatArray) -> FloatArray:
+def apply_smoothing(effects: Iterable[Effect], geometry: PixelGeometry, columns: FloatArray) -> FloatArray:
     """(n, k) what small changes of the disparities (n, k) at the points are after the low-passes among the effects.
 
     They take the rock's relief off them, by which a move of the cameras changes each disparity. What moves outlines leaves them.
     Of thinned points the low-pass is that over their own cells.
     """
-    filters, step = [effect for effect in effects if isinstance(effect, Smoothing)], cell_px(geometry.u, geometry.v)
-    if not filters or step is None or cells_over(geometry.u, geometry.v, step) > MOST_CELLS:
+    filters, step = [effect for effect in effects if isinstance(effect, Smoothing)], raster_cell_px(geometry.u, geometry.v)
+    if not filters or step is None or raster_cell_count(geometry.u, geometry.v, step) > MOST_CELLS:
         return columns
     row, column = _cell(geometry.v, step), _cell(geometry.u, step)
     matched = np.zeros((int(row.max()) + 1, int(column.max()) + 1), dtype=bool)
@@ -157,7 +157,7 @@ def through(effects: Iterable[Effect], geometry: PixelGeometry, columns: FloatAr
     return np.stack(map_in_threads(passed, columns.T), axis=1)
 
 
-def cells_over(u: FloatArray, v: FloatArray, step: float) -> int:
+def raster_cell_count(u: FloatArray, v: FloatArray, step: float) -> int:
     """Of a raster of `step` px, from the first to the last row and column of pixels (n,)."""
     return int(np.prod([np.rint(np.ptp(x) / step) + 1 for x in (u, v)]))
 
@@ -184,13 +184,13 @@ def _cell(x: FloatArray, step: float) -> NDArray[np.int64]:
     return np.rint((x - x.min()) / step).astype(np.int64)
 
 
-def cell_px(u: FloatArray, v: FloatArray) -> float | None:
+def raster_cell_px(u: FloatArray, v: FloatArray) -> float | None:
     """Side of the cells of a raster of pixels (n,), px: the less of the distances of neighbouring columns and rows."""
-    steps = [step for step in (spacing(u), spacing(v)) if step is not None]
+    steps = [step for step in (raster_spacing_px(u), raster_spacing_px(v)) if step is not None]
     return min(steps, default=None)
 
 
-def spacing(u: FloatArray) -> float | None:
+def raster_spacing_px(u: FloatArray) -> float | None:
     """Distance of neighbouring columns of a raster of pixels, px; also where a registration has moved them a little."""
     gaps = np.diff(np.unique(np.round(u, 3)))
     step = float(np.median(gaps)) if len(gaps) > 10 else 0.0

@@ -40,8 +40,8 @@ def simulate_disparities(
     height, width = pair.shape
     rows = np.clip((g.v / step).astype(int), 0, height - 1)
     columns = np.clip((g.u / step).astype(int), 0, width - 1)
-    middle = nominal.of_surface(measurement.scene, (columns + 0.5) * step, (rows + 0.5) * step)
-    beside = g.disparity + (middle - nominal.of_surface(measurement.scene, g.u, g.v))
+    middle = nominal.surface_disparity(measurement.scene, (columns + 0.5) * step, (rows + 0.5) * step)
+    beside = g.disparity + (middle - nominal.surface_disparity(measurement.scene, g.u, g.v))
     pair, shaped = _on_own_raster(pair, measurement, g, step)
     drawn = []
     for seen in _points(pair, measurement, rows * width + columns, randoms):
@@ -63,7 +63,7 @@ def _on_own_raster(
         return pair, np.zeros(len(geometry))
     others = tuple(effect for effect in pair.model.effects if effect not in shapes)
     without = replace(pair, model=pair.model.model_copy(update={"effects": others}))
-    return without, raster.moved(shapes, geometry.disparity)
+    return without, raster.added_by(shapes, geometry.disparity)
 
 
 def _points(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.formats.measurements.measurement import StereoMeasurement
-from pipeline.gap.residuals.residuals import BoolArray, Rows, part_of
+from pipeline.gap.residuals.residuals import BoolArray, Rows, select_rows
 from scene.common.backend import dr, mi
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -49,10 +49,10 @@ class PixelGeometry:
 
     def part(self, rows: Rows) -> PixelGeometry:
         """The same of some of the points."""
-        return part_of(self, rows)
+        return select_rows(self, rows)
 
     @property
-    def plane(self) -> FloatArray:
+    def sensor_coordinates(self) -> FloatArray:
         """(n, 2) column and row in the left image, px."""
         return np.stack([self.u, self.v], axis=1)
 
@@ -79,10 +79,10 @@ class NominalPair:
         first, second = ([on_device(mi.Float64, each) for each in pixel] for pixel in (left, right))
         return _on_host(self.left_column(*first) - self.right_column(*second))[0]
 
-    def of_surface(self, scene: RayCaster, u: FloatArray, v: FloatArray) -> FloatArray:
+    def surface_disparity(self, scene: RayCaster, u: FloatArray, v: FloatArray) -> FloatArray:
         """(n,) disparity of what pixels of the left image see, px; NaN where they see nothing."""
         left = self.pair.left
-        ray = rays(left, u, v)
+        ray = pixel_rays(left, u, v)
         point = left.position + scene.cast(left.position, ray)[0][:, None] * ray
         return self.disparity((u, v), project(self.pair.right, point))
 
@@ -118,7 +118,7 @@ def project(camera: Camera, points: FloatArray) -> tuple[FloatArray, FloatArray]
     return u, v
 
 
-def rays(camera: Camera, u: FloatArray, v: FloatArray) -> FloatArray:
+def pixel_rays(camera: Camera, u: FloatArray, v: FloatArray) -> FloatArray:
     """(n, 3) directions of pixels with unit component along the camera's axis."""
     return np.stack(_on_host(*_ray(camera, on_device(mi.Float64, u), on_device(mi.Float64, v))), axis=1)
 
@@ -153,7 +153,7 @@ def is_hidden(scene: RayCaster, position: FloatArray, points: FloatArray) -> Boo
     return np.asarray(scene.cast(position, back / length[:, None])[0] < length * (1 - _HIDDEN_SHARE))
 
 
-def seen_disparities(nominal: NominalPair, real: Iterable[CameraPair], geometry: PixelGeometry) -> list[FloatArray]:
+def predict_disparities(nominal: NominalPair, real: Iterable[CameraPair], geometry: PixelGeometry) -> list[FloatArray]:
     """(n,) of each real pair: the disparity that it gives on each point's tangent plane, in the nominal rectified pair."""
     u, v = on_device(mi.Float64, geometry.u), on_device(mi.Float64, geometry.v)
     point, normal = vectors_on_device(geometry.point), vectors_on_device(geometry.normal)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.gap.residuals.shared_noise import NOT_SHARED, SharedNoise
+from pipeline.gap.residuals.correlated_noise import NO_CORRELATED_NOISE, GridCorrelatedNoise
 from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 from sensors.effects import Effects, catalogue
@@ -34,7 +34,7 @@ class Geometry(Protocol):
         """The same of some of the points."""
 
     @property
-    def plane(self) -> FloatArray:
+    def sensor_coordinates(self) -> FloatArray:
         """(n, 2) direction as the sensor counts it: azimuth and zenith, rad, or column and row, px."""
 
     @property
@@ -46,7 +46,7 @@ def _order(values: FloatArray) -> NDArray[np.int32]:
     return np.argsort(values, kind="stable").astype(np.int32)
 
 
-def part_of(columns: _Columns, rows: Rows) -> _Columns:
+def select_rows(columns: _Columns, rows: Rows) -> _Columns:
     """Some rows of a dataclass of (n, ...) arrays, some of which may be None."""
     values: dict[str, Any] = {column.name: getattr(columns, column.name) for column in fields(columns)}
     return replace(columns, **{name: value[rows] for name, value in values.items() if value is not None})
@@ -70,24 +70,24 @@ class Residuals(ABC):
     """
 
     sensor: ClassVar[Sensor]
-    planes: ClassVar[tuple[str, str]]
-    described_by: ClassVar[tuple[type[Effect], str]]
-    noise: ClassVar[tuple[type[Effect], str]]
-    called: ClassVar[str]
+    position_covariates: ClassVar[tuple[str, str]]
+    empirical_term: ClassVar[tuple[type[Effect], str]]
+    white_noise: ClassVar[tuple[type[Effect], str]]
+    label: ClassVar[str]
     value: FloatArray
     sigma: FloatArray
     unit_m: FloatArray
-    smooth: BoolArray
-    even: BoolArray
-    pose: FloatArray
-    at: FloatArray
+    usable: BoolArray
+    on_smooth_surface: BoolArray
+    pose_jacobian: FloatArray
+    wall_xy: FloatArray
     covariates: dict[str, FloatArray]
     index: NDArray[np.int64]
     geometry: Geometry
-    away: FloatArray | None = None
+    epoch_offset: FloatArray | None = None
     notes: tuple[str, ...] = ()
-    missing: Missing | None = None
-    shared_noise: SharedNoise = NOT_SHARED
+    expected_pulses: ExpectedPulses | None = None
+    correlated_noise: GridCorrelatedNoise = NO_CORRELATED_NOISE
 
     def __len__(self) -> int:
         return len(self.value)
@@ -98,11 +98,11 @@ class Residuals(ABC):
         """(n,) metres by which the surface lies deeper per unit of the observable: positive where rock is missing."""
 
     @property
-    def averaged(self) -> Self:
+    def with_sigma_of_means(self) -> Self:
         """With the spread that counts for means of many neighbours: root n times that of a mean of n."""
         return self
 
-    def shared_with(self, other: NDArray[np.int64]) -> FloatArray:
+    def reference_covariance_with(self, other: NDArray[np.int64]) -> FloatArray:
         """(n,) covariance of each point's predicted noise with that of another, the row `other` (n,), by the reference's."""
         return np.zeros(len(other))
 
@@ -112,16 +112,16 @@ class Residuals(ABC):
         return catalogue(self.sensor)
 
     @property
-    def observed(self) -> FloatArray:
+    def total_departure(self) -> FloatArray:
         """(n,) measured minus geometric observable, without any effect of the model, as if all epochs had one place."""
-        return self.geometry.departure if self.away is None else self.geometry.departure - self.away
+        return self.geometry.departure if self.epoch_offset is None else self.geometry.departure - self.epoch_offset
 
     @cached_property
-    def orders(self) -> dict[str, NDArray[np.int32]]:
+    def sort_orders(self) -> dict[str, NDArray[np.int32]]:
         """(n,) rows by the value of each covariate, rising, and where that is the same as they are."""
         return dict(zip(self.covariates, map_in_threads(_order, self.covariates.values()), strict=True))
 
-    def of_points(self, values: FloatArray, index: NDArray[np.int64]) -> FloatArray:
+    def values_at(self, values: FloatArray, index: NDArray[np.int64]) -> FloatArray:
         """(m,) values (n,) of these residuals at the measurement's points `index` (m,); NaN where there is no residual."""
         found = np.full(int(max(self.index.max(initial=-1), index.max(initial=-1))) + 1, np.nan)
         found[self.index] = values
@@ -134,20 +134,20 @@ class Residuals(ABC):
             value=self.value[rows],
             sigma=self.sigma[rows],
             unit_m=self.unit_m[rows],
-            smooth=self.smooth[rows],
-            even=self.even[rows],
-            pose=self.pose[rows],
-            at=self.at[rows],
+            usable=self.usable[rows],
+            on_smooth_surface=self.on_smooth_surface[rows],
+            pose_jacobian=self.pose_jacobian[rows],
+            wall_xy=self.wall_xy[rows],
             covariates={name: values[rows] for name, values in self.covariates.items()},
             index=self.index[rows],
             geometry=self.geometry.part(rows),
-            away=None if self.away is None else self.away[rows],
-            shared_noise=self.shared_noise.part(rows),
+            epoch_offset=None if self.epoch_offset is None else self.epoch_offset[rows],
+            correlated_noise=self.correlated_noise.part(rows),
         )
 
-    def with_rows(self, known: BoolArray, other: Self) -> Self:
+    def with_rows_from(self, known: BoolArray, other: Self) -> Self:
         """With what `other` has of the points `known` (n,), in their order, but for which of them are smooth or even."""
-        names = ("value", "sigma", "unit_m", "pose", "at")
+        names = ("value", "sigma", "unit_m", "pose_jacobian", "wall_xy")
         columns: dict[str, Any] = {name: _merged(getattr(self, name), getattr(other, name), known) for name in names}
         columns["covariates"] = {name: _merged(values, other.covariates[name], known) for name, values in self.covariates.items()}
         mine, theirs = vars(self.geometry), vars(other.geometry)
@@ -164,15 +164,15 @@ def _merged(mine: NDArray[Any], theirs: NDArray[Any], known: BoolArray) -> NDArr
 
 
 @dataclass(frozen=True)
-class Missing:
+class ExpectedPulses:
     """Pulses of the pattern that should have met the wall. lost: (m,) whether no point stands in that direction."""
 
     lost: BoolArray
     covariates: dict[str, FloatArray] = field(default_factory=dict)
-    at: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    wall_xy: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
 
 
-def plane_slopes(normal: FloatArray, direction: FloatArray, moved: FloatArray, distance: FloatArray) -> FloatArray:
+def range_derivative(normal: FloatArray, direction: FloatArray, moved: FloatArray, distance: FloatArray) -> FloatArray:
     """(n,) change of the distance to a plane along a ray whose unit direction changes by `moved`, m per unit.
 
     From t = (p - o).n / (u.n): dt = -t (du.n) / (u.n).

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.formats.measurements.measurement import TlsMeasurement
-from pipeline.gap.residuals.rays import RayGeometry
+from pipeline.gap.residuals.ray_hits import RayGeometry
 from scene.common.backend import dr, mi
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -120,26 +120,26 @@ def simulate_ranges(measurement: TlsMeasurement, model: TlsModel, geometry: RayG
     return _scanner(measurement, model, geometry, geometry).ranges(measurement.scene, random)
 
 
-def simulate_modes(
+def simulate_ranges_by_mode(
     measurement: TlsMeasurement, model: TlsModel, modes: Sequence[Mode], geometry: RayGeometry, random: KeyedRandom
 ) -> dict[Mode, FloatArray]:
     """The same for a model whose beam has a footprint, for each of the modes in which its returns may be recorded."""
     return _scanner(measurement, model, geometry, geometry).ranges_by_mode(measurement.scene, random, modes)
 
 
-def mean_model(model: TlsModel) -> TlsModel:
+def systematic_part(model: TlsModel) -> TlsModel:
     """The model's effects on the mean alone, without noise."""
     kept = tuple(effect for effect in model.effects if effect.shows_in in (ShowsIn.MEAN, ShowsIn.EDGES))
     return model.model_copy(update={"noise": _NO_NOISE, "effects": kept})
 
 
-def aimed(measurement: TlsMeasurement, geometry: PulseGeometry) -> tuple[FloatArray, FloatArray]:
+def mean_beam_directions(measurement: TlsMeasurement, geometry: PulseGeometry) -> tuple[FloatArray, FloatArray]:
     """(n,) azimuth and zenith in which the pulses leave on average, by the measurement's model, scanner frame, rad."""
-    scanner = _scanner(measurement, mean_model(measurement.model), geometry)
+    scanner = _scanner(measurement, systematic_part(measurement.model), geometry)
     pulses = scanner.emitted(scanner.emit(), KeyedRandom(0, ("gap", "mean")))[0]
     return np.array(pulses.aim_azimuth), np.array(pulses.aim_zenith)
 
 
-def simulated_ranges(measurement: TlsMeasurement, geometry: RayGeometry) -> FloatArray:
+def predict_ranges(measurement: TlsMeasurement, geometry: RayGeometry) -> FloatArray:
     """(n,) mean range that the measurement's model predicts, m: the effects on the mean through the sensor's code, no noise."""
-    return simulate_ranges(measurement, mean_model(measurement.model), geometry, KeyedRandom(0, ("gap", "mean")))
+    return simulate_ranges(measurement, systematic_part(measurement.model), geometry, KeyedRandom(0, ("gap", "mean")))

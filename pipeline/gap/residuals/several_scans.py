@@ -16,22 +16,22 @@ from scene.geometry.mesh import FloatArray
 from sensors.models.sensor_model import TlsModel
 
 
-def scans_residuals(measurement: TlsMeasurement) -> TlsResiduals:
+def residuals_of_scans(measurement: TlsMeasurement) -> TlsResiduals:
     """Residuals of all scans, in the order of the measurement's points. pose: (n, 6 k), six columns for each of k set-ups."""
     count = 1 + max((scan.set_up for scan in measurement.scans), default=0)
     parts = []
     for scan, rows, one in measurement.each_scan():
         found = tls_residuals(one)
         pose = np.zeros((len(found), 6 * count))
-        pose[:, 6 * scan.set_up : 6 * scan.set_up + 6] = found.pose
-        parts.append(replace(found, pose=pose, index=rows[found.index]))
+        pose[:, 6 * scan.set_up : 6 * scan.set_up + 6] = found.pose_jacobian
+        parts.append(replace(found, pose_jacobian=pose, index=rows[found.index]))
     whole = _joined(parts)
     return whole.part(np.argsort(whole.index, kind="stable"))
 
 
 def _joined(parts: Sequence[TlsResiduals]) -> TlsResiduals:
     """One set of them, with the covariates that all have."""
-    arrays = ("value", "sigma", "unit_m", "smooth", "even", "pose", "at", "index")
+    arrays = ("value", "sigma", "unit_m", "usable", "on_smooth_surface", "pose_jacobian", "wall_xy", "index")
     columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}
     shared = [name for name in parts[0].covariates if all(name in part.covariates for part in parts)]
     columns["covariates"] = {name: np.concatenate([part.covariates[name] for part in parts]) for name in shared}
@@ -44,7 +44,9 @@ def _joined(parts: Sequence[TlsResiduals]) -> TlsResiduals:
     return replace(parts[0], **columns, geometry=replace(geometries[0], **pulses), notes=notes)
 
 
-def simulate_departures(measurement: TlsMeasurement, model: TlsModel, residuals: TlsResiduals, random: KeyedRandom) -> FloatArray:
+def simulate_range_errors(
+    measurement: TlsMeasurement, model: TlsModel, residuals: TlsResiduals, random: KeyedRandom
+) -> FloatArray:
     """(n,) simulated minus geometric range of the residuals' points, of one scan or several, NaN without a return."""
     rays = residuals.geometry
     if not measurement.scans:

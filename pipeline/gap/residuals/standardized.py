@@ -21,7 +21,7 @@ _ENOUGH = 5_000
 """Points of which a bin's NMAD is known to 1.6 %."""
 
 
-def standardized(residuals: Residuals, plane: FloatArray, quiet: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+def standardize(residuals: Residuals, plane: FloatArray, quiet: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
     """(n,) residuals less their surroundings' median, in the observable's unit and in units of their spread.
 
     plane: (n, 2) as the sensor sees the points; quiet: (n,) points of which surroundings and spread are learned. The spread is
@@ -30,18 +30,18 @@ def standardized(residuals: Residuals, plane: FloatArray, quiet: NDArray[np.bool
     """
     departure = residuals.value - _surroundings(plane, residuals.value, quiet)
     z = departure / residuals.sigma
-    return departure, z / np.maximum(spread(residuals, z, quiet), 1.0)
+    return departure, z / np.maximum(nmad_along_covariates(residuals, z, quiet), 1.0)
 
 
-def spread(residuals: Residuals, z: FloatArray, quiet: NDArray[np.bool_]) -> FloatArray:
+def nmad_along_covariates(residuals: Residuals, z: FloatArray, quiet: NDArray[np.bool_]) -> FloatArray:
     """(n,) largest NMAD that z has, of quiet points, among those of about the same value of one of the covariates."""
 
     def along(name: str) -> FloatArray:
-        order = residuals.orders[name]
+        order = residuals.sort_orders[name]
         return _spread_along(residuals.covariates[name], z, order[quiet[order]])
 
     whole = np.full(len(z), nmad(z[quiet], 0.0))
-    return reduce(np.maximum, map_in_threads(along, residuals.orders), whole)
+    return reduce(np.maximum, map_in_threads(along, residuals.sort_orders), whole)
 
 
 def _surroundings(plane: FloatArray, value: FloatArray, quiet: NDArray[np.bool_]) -> FloatArray:
@@ -51,7 +51,7 @@ def _surroundings(plane: FloatArray, value: FloatArray, quiet: NDArray[np.bool_]
     shape = tuple(int(extent / side) + 1 for extent in np.ptp(plane, axis=0))
     place = (plane - low) / side
     cell = np.ravel_multi_index(tuple(np.minimum(place[:, axis].astype(np.int64), shape[axis] - 1) for axis in (0, 1)), shape)
-    middle = medians(value[quiet], cell[quiet], int(np.prod(shape)), _FEWEST).reshape(shape)
+    middle = group_medians(value[quiet], cell[quiet], int(np.prod(shape)), _FEWEST).reshape(shape)
     padded = np.pad(middle, _WINDOW // 2, constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (_WINDOW, _WINDOW)).reshape(-1, _WINDOW**2)
     empty = np.isnan(windows).all(axis=1)
@@ -61,7 +61,7 @@ def _surroundings(plane: FloatArray, value: FloatArray, quiet: NDArray[np.bool_]
     return np.asarray(ndimage.map_coordinates(smooth, (place - 0.5).T, order=1, mode="nearest"))
 
 
-def medians(value: FloatArray, cell: NDArray[np.int64], count: int, fewest: int) -> FloatArray:
+def group_medians(value: FloatArray, cell: NDArray[np.int64], count: int, fewest: int) -> FloatArray:
     """(count,) median of the values of each cell, NaN where there are too few."""
     order = np.lexsort((value, cell))
     ordered = value[order]

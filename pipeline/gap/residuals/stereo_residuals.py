@@ -8,19 +8,25 @@ import numpy as np
 
 from pipeline.formats.measurements.measurement import StereoMeasurement
 from pipeline.formats.measurements.surroundings import Surroundings
-from pipeline.gap.residuals.disparity_raster import MOST_CELLS, DisparityRaster, cell_px, cells_over, through
+from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise
+from pipeline.gap.residuals.disparity_raster import (
+    MOST_CELLS,
+    DisparityRaster,
+    apply_smoothing,
+    raster_cell_count,
+    raster_cell_px,
+)
 from pipeline.gap.residuals.nominal_pair import (
     NominalPair,
     PixelGeometry,
     is_hidden,
     moved_pair,
+    pixel_rays,
+    predict_disparities,
     project,
-    rays,
     real_pair,
-    seen_disparities,
 )
 from pipeline.gap.residuals.residuals import Residuals
-from pipeline.gap.residuals.shared_noise import SharedNoise
 from pipeline.registration.rigid import RigidTransform
 from scene.geometry.mesh import FloatArray
 from scene.ray_casting.raycast import RayCaster
@@ -49,10 +55,10 @@ class StereoResiduals(Residuals):
     """Residuals of disparities, px."""
 
     sensor = "stereo"
-    planes = ("image_x", "image_y")
-    described_by = DisparityEmpirical, "values_px"
-    noise = ParallaxNoise, "sigma_px"
-    called = "disparities of a stereo pair"
+    position_covariates = ("image_x", "image_y")
+    empirical_term = DisparityEmpirical, "values_px"
+    white_noise = ParallaxNoise, "sigma_px"
+    label = "disparities of a stereo pair"
     geometry: PixelGeometry
 
     @property
@@ -61,7 +67,7 @@ class StereoResiduals(Residuals):
         return -self.unit_m
 
 
-def on_their_rays(left: Camera, points: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
+def move_onto_rays(left: Camera, points: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
     """Points (n, 3) moved as one rigid body so that they project into the pixels that they were matched at.
 
     A reconstruction lies on the rays of its pixels until it is registered; the registration, which the points show thus to some
@@ -105,14 +111,14 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
         value=measured - geometry.disparity - mean,
         sigma=np.full(len(u), np.sqrt(max(model.variance, _LEAST_VARIANCE))),
         unit_m=1 / slope,
-        smooth=even & measurement.stable,
-        even=even,
-        pose=through(model.effects, geometry, _pose(nominal, geometry)),
-        at=geometry.point[:, :2],
+        usable=even & measurement.stable,
+        on_smooth_surface=even,
+        pose_jacobian=apply_smoothing(model.effects, geometry, _pose(nominal, geometry)),
+        wall_xy=geometry.point[:, :2],
         covariates=covariates,
         index=np.arange(len(u)),
         geometry=geometry,
-        shared_noise=SharedNoise.of(model, np.stack([u, v], axis=1)),
+        correlated_noise=GridCorrelatedNoise.of(model, np.stack([u, v], axis=1)),
         notes=(*measurement.notes, *_notes(_recorded(measurement), u, v)),
     )
     return whole if hit.all() else whole.part(hit)
@@ -125,7 +131,7 @@ def with_surroundings(measurement: StereoMeasurement, found: StereoResiduals) ->
     points beside edges where it moves far.
     """
     edge = found.covariates["edge_step"]
-    about = Surroundings(found.geometry.point, edge, ~found.even & (edge < _EDGE_PX))
+    about = Surroundings(found.geometry.point, edge, ~found.on_smooth_surface & (edge < _EDGE_PX))
     everywhere = Surroundings.nowhere(len(measurement.cloud.points))
     return measurement.changed(surroundings=everywhere.changed(found.index, about))
 
@@ -141,13 +147,13 @@ def _pixels(nominal: NominalPair, measurement: StereoMeasurement) -> tuple[Float
     if not _recorded(measurement):
         return *project(left, points), points
     u, v = (np.asarray(measurement.cloud.extra[key], dtype=np.float64) for key in ("pixel_x", "pixel_y"))
-    return u, v, on_their_rays(left, points, u, v)
+    return u, v, move_onto_rays(left, points, u, v)
 
 
 def _notes(given: bool, u: FloatArray, v: FloatArray) -> tuple[str, ...]:
     """What cannot be looked into for want of a field. given: whether the pixels are recorded."""
-    step = cell_px(u, v)
-    large = step is not None and cells_over(u, v, step) > MOST_CELLS
+    step = raster_cell_px(u, v)
+    large = step is not None and raster_cell_count(u, v, step) > MOST_CELLS
     absent = {
         "no pixel_x, pixel_y: pixels were found by projecting the points": not given,
         "pixels on no raster: edge_fattening, smoothing and occlusion_fill were not tried": step is None,
@@ -163,7 +169,7 @@ def _reference(
     """What the pixels of the cameras as the model has them (`real`) see on the reference, its disparity in the nominal pair, and
     the depth (m)."""
     left, camera = real.left, real.right
-    ray = rays(left, u, v)
+    ray = pixel_rays(left, u, v)
     distance, face = scene.cast(left.position, ray)
     point = left.position + distance[:, None] * ray
     right = project(camera, point)
@@ -202,7 +208,7 @@ def _edge_px(nominal: NominalPair, left: Camera, scene: RayCaster, geometry: Pix
     """(n,) departure of the reference from its tangent planes beside what the pixels see, px of disparity."""
     edge = np.zeros(len(geometry))
     for du, dv in ((_PROBE_PX, 0.0), (-_PROBE_PX, 0.0), (0.0, _PROBE_PX), (0.0, -_PROBE_PX)):
-        beside = rays(left, geometry.u + du, geometry.v + dv)
+        beside = pixel_rays(left, geometry.u + du, geometry.v + dv)
         seen = scene.cast(left.position, beside)[0]
         flat = np.einsum("ni,ni->n", geometry.point - left.position, geometry.normal)
         flat /= np.einsum("ni,ni->n", beside, geometry.normal)
@@ -216,7 +222,7 @@ def _pose(nominal: NominalPair, geometry: PixelGeometry) -> FloatArray:
     centre, step = nominal.pair.left.position, 1e-4
     units = step * np.eye(3)
     moved = [moved_pair(nominal.pair, centre, unit, turned=turned) for turned in (False, True) for unit in units]
-    base, *columns = seen_disparities(nominal, [nominal.pair, *moved], geometry)
+    base, *columns = predict_disparities(nominal, [nominal.pair, *moved], geometry)
     return np.stack([(column - base) / step for column in columns], axis=1)
 
 
@@ -235,7 +241,7 @@ def _shaped_px(measurement: StereoMeasurement, geometry: PixelGeometry) -> Float
     if measurement.shaped_px is not None:
         return measurement.shaped_px
     raster = DisparityRaster.of(measurement, geometry)
-    return np.zeros(len(geometry)) if raster is None else raster.moved(shapes, geometry.disparity)
+    return np.zeros(len(geometry)) if raster is None else raster.added_by(shapes, geometry.disparity)
 
 
 def _empirical(model: StereoModel, covariates: dict[str, FloatArray]) -> FloatArray:

@@ -21,8 +21,8 @@ from scipy.spatial import cKDTree
 
 from pipeline.formats.measurements.measurement import SurfaceMeasurement
 from pipeline.gap.decisions import decided
-from pipeline.gap.residuals.registration import registered, settled
-from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, spacing_m
+from pipeline.gap.residuals.alignment import align, fit_pose_robustly
+from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, point_spacing_m
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 from sensors.models.sensor_model import StereoModel, StereoNoise
@@ -43,10 +43,10 @@ class SurfaceNoise:
     the points; share: of the variance that neighbours share."""
 
     sigma_m: float
-    shared_sigma_m: float
+    node_sigma_m: float
     step_m: float
     spacing_m: float
-    share: float
+    correlated_share: float
 
     @property
     def model(self) -> StereoModel:
@@ -56,29 +56,29 @@ class SurfaceNoise:
                 parallax_sigma_px=0.0,
                 regularization_sigma_px=0.0,
                 point_sigma_m=_rounded(self.sigma_m),
-                point_shared_sigma_m=_rounded(self.shared_sigma_m),
+                point_shared_sigma_m=_rounded(self.node_sigma_m),
                 point_shared_step_m=_rounded(self.step_m),
             )
         )
 
     @property
-    def words(self) -> str:
+    def summary(self) -> str:
         """Size and correlation, in a line."""
         how = "estimated from how the cloud's distances from the reference differ between neighbours"
         own = f"{how}: {1e3 * self.sigma_m:.3g} mm of each point"
-        if not self.shared_sigma_m:
+        if not self.node_sigma_m:
             return f"{own}, nothing that neighbours share ({1e3 * self.spacing_m:.3g} mm apart)"
         return (
-            f"{own} and {1e3 * self.shared_sigma_m * 2 / 3:.3g} mm that neighbours share over {1e3 * self.step_m:.3g} mm "
-            f"({1e3 * self.spacing_m:.3g} mm apart): {100 * self.share:.0f} % of the variance"
+            f"{own} and {1e3 * self.node_sigma_m * 2 / 3:.3g} mm that neighbours share over {1e3 * self.step_m:.3g} mm "
+            f"({1e3 * self.spacing_m:.3g} mm apart): {100 * self.correlated_share:.0f} % of the variance"
         )
 
 
-def estimated_noise(measurement: SurfaceMeasurement, where: str) -> SurfaceNoise:
+def estimate_surface_noise(measurement: SurfaceMeasurement, where: str) -> SurfaceNoise:
     """The noise of a cloud's points, registered first; whatever its model says. Raises InputError for too few points."""
-    found = settled(measurement).residuals
-    value = registered(found)[0]
-    rows = np.flatnonzero(found.smooth)
+    found = align(measurement).residuals
+    value = fit_pose_robustly(found)[0]
+    rows = np.flatnonzero(found.usable)
     if len(rows) < _FEWEST or not isinstance(found, SurfaceResiduals):
         raise InputError(
             f"{len(rows)} points on smooth parts of the reference", where=where, allowed=f"{_FEWEST} and more",
@@ -89,7 +89,7 @@ def estimated_noise(measurement: SurfaceMeasurement, where: str) -> SurfaceNoise
 
 def _fitted(points: FloatArray, value: FloatArray) -> SurfaceNoise:
     """Of distances (n,) at points (n, 3), m."""
-    spacing = spacing_m(points)
+    spacing = point_spacing_m(points)
     lag, gamma, weight = _semivariogram(points, value, spacing)
     root = np.sqrt(weight) / gamma  # the error of a variance is in proportion to it
     slow = (lag / lag.max()) ** 2

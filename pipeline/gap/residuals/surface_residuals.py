@@ -15,9 +15,9 @@ import numpy as np
 from pipeline.formats.measurements.measurement import SurfaceMeasurement
 from pipeline.formats.measurements.surface_datum import datum_columns
 from pipeline.formats.measurements.surface_fit import near_m
-from pipeline.gap.residuals.cells import block_numbers
+from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise
 from pipeline.gap.residuals.residuals import BoolArray, Residuals, Rows
-from pipeline.gap.residuals.shared_noise import SharedNoise
+from pipeline.gap.residuals.wall_blocks import wall_block_numbers
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects import Effects
@@ -51,7 +51,7 @@ class SurfaceGeometry(SurfacePlaces):
     departure: FloatArray
 
     @property
-    def plane(self) -> FloatArray:
+    def sensor_coordinates(self) -> FloatArray:
         """(n, 2) along the wall and up it, m."""
         return np.asarray(self.point[:, :2])
 
@@ -69,10 +69,10 @@ class SurfaceResiduals(Residuals):
     """
 
     sensor = "stereo"
-    planes = ("along", "up")
-    described_by = SurfaceEmpirical, "values_m"
-    noise = PointNoise, "sigma_m"
-    called = "points of a surface from photographs"
+    position_covariates = ("along", "up")
+    empirical_term = SurfaceEmpirical, "values_m"
+    white_noise = PointNoise, "sigma_m"
+    label = "points of a surface from photographs"
     geometry: SurfaceGeometry
     datum: FloatArray = field(default_factory=lambda: np.eye(7))
 
@@ -90,7 +90,7 @@ class SurfaceResiduals(Residuals):
 def surface_residuals(measurement: SurfaceMeasurement) -> SurfaceResiduals:
     """Distances with their predicted spread and covariates; points whose line misses the reference nearby are left out."""
     points, model = measurement.cloud.points, measurement.model
-    spacing = spacing_m(points)
+    spacing = point_spacing_m(points)
     geometry, triangle, across = _met(measurement, points)
     sigma = np.sqrt(sum((effect.variance(geometry) for effect in model.of_points()), np.zeros(len(points))))
     mean = sum((effect.mean(geometry) for effect in model.of_points()), np.zeros(len(points)))
@@ -102,15 +102,15 @@ def surface_residuals(measurement: SurfaceMeasurement) -> SurfaceResiduals:
         value=geometry.departure - mean,
         sigma=sigma,
         unit_m=np.ones(len(points)),
-        smooth=even & measurement.stable,
-        even=even,
-        pose=-datum_columns(geometry.point - measurement.centre, triangle) @ measurement.datum / across[:, None],
-        at=geometry.point[:, :2],
+        usable=even & measurement.stable,
+        on_smooth_surface=even,
+        pose_jacobian=-datum_columns(geometry.point - measurement.centre, triangle) @ measurement.datum / across[:, None],
+        wall_xy=geometry.point[:, :2],
         covariates=_varying(geometry, hit, measurement),
         index=np.arange(len(points)),
         geometry=geometry,
         datum=measurement.datum,
-        shared_noise=_shared(model, geometry.point[:, :2], spacing),
+        correlated_noise=_shared(model, geometry.point[:, :2], spacing),
         notes=(*measurement.notes, NO_CAMERAS, *(() if measurement.datum[6].any() else (NO_SCALE,))),
     )
     return whole.part(hit)
@@ -122,11 +122,11 @@ def _varying(geometry: SurfaceGeometry, hit: BoolArray, measurement: SurfaceMeas
     return {
         name: values
         for name, values in geometry.covariates.items()
-        if name in SurfaceResiduals.planes or (hit.any() and float(np.ptp(values[hit])) > _ROUNDING * extent)
+        if name in SurfaceResiduals.position_covariates or (hit.any() and float(np.ptp(values[hit])) > _ROUNDING * extent)
     }
 
 
-def spacing_m(points: FloatArray) -> float:
+def point_spacing_m(points: FloatArray) -> float:
     """Typical distance from a point (n, 3) to the next, m."""
     from scipy.spatial import cKDTree
 
@@ -193,20 +193,20 @@ def _rim_distance(measurement: SurfaceMeasurement, point: FloatArray) -> FloatAr
     return distance
 
 
-def _shared(model: StereoModel, at: FloatArray, spacing: float) -> SharedNoise:
+def _shared(model: StereoModel, at: FloatArray, spacing: float) -> GridCorrelatedNoise:
     """What neighbours share of the model's noise. Places are counted in spacings, as pixels are: values on nodes know no unit."""
     noise = [effect for effect in model.of_points() if isinstance(effect, PointNoise) and effect.shared_sigma_m > 0]
     nodes = tuple(RegularizationNoise(sigma_px=effect.shared_sigma_m, step_px=effect.shared_step_m / spacing) for effect in noise)
-    return SharedNoise(nodes, np.nan_to_num(at / spacing)) if nodes else SharedNoise()
+    return GridCorrelatedNoise(nodes, np.nan_to_num(at / spacing)) if nodes else GridCorrelatedNoise()
 
 
-def simulated_distances(model: StereoModel, residuals: SurfaceResiduals, random: KeyedRandom) -> FloatArray:
+def simulate_distances(model: StereoModel, residuals: SurfaceResiduals, random: KeyedRandom) -> FloatArray:
     """(n,) m above the reference that the model says of the residuals' points."""
     start = RecordedPoints(residuals.geometry, np.zeros(len(residuals)))
     return apply_stage(model.of_points(), Stage.POINT, start, random).above
 
 
-def sigma_of(model: StereoModel, residuals: SurfaceResiduals) -> FloatArray:
+def predicted_sigma(model: StereoModel, residuals: SurfaceResiduals) -> FloatArray:
     """(n,) spread that a model predicts, m."""
     return np.sqrt(sum((effect.variance(residuals.geometry) for effect in model.of_points()), np.zeros(len(residuals))))
 
@@ -218,11 +218,11 @@ def datum_covariance(residuals: SurfaceResiduals, value: FloatArray, rows: BoolA
     change by -(A - A_b)^-1 r_b, A and r being the normal equations' matrix and right side.
     """
     part, left = residuals.part(rows), value[rows]
-    extent = np.ptp(part.at, axis=0)
-    block = block_numbers(part.at, float(np.sqrt(np.prod(extent) / _JACKKNIFE_CELLS)) / 3)
+    extent = np.ptp(part.wall_xy, axis=0)
+    block = wall_block_numbers(part.wall_xy, float(np.sqrt(np.prod(extent) / _JACKKNIFE_CELLS)) / 3)
     _, number = np.unique(block, return_inverse=True)
-    scale = np.linalg.norm(part.pose / part.sigma[:, None], axis=0)
-    columns = part.pose / part.sigma[:, None] / scale
+    scale = np.linalg.norm(part.pose_jacobian / part.sigma[:, None], axis=0)
+    columns = part.pose_jacobian / part.sigma[:, None] / scale
     whole = columns.T @ columns
     changes = []
     for each in range(int(number.max()) + 1):

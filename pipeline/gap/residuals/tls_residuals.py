@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from pipeline.formats.measurements.config import ScanPattern
 from pipeline.formats.measurements.measurement import TlsMeasurement
 from pipeline.gap.decisions import decided
-from pipeline.gap.residuals.rays import RayGeometry, met, turned
-from pipeline.gap.residuals.residuals import BoolArray, Missing, Residuals, plane_slopes
-from pipeline.gap.residuals.scan_simulation import aimed, simulated_ranges
+from pipeline.gap.residuals.ray_hits import RayGeometry, cast_rays, redirect_hits
+from pipeline.gap.residuals.residuals import BoolArray, ExpectedPulses, Residuals, range_derivative
+from pipeline.gap.residuals.scan_simulation import mean_beam_directions, predict_ranges
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Stage
@@ -39,13 +39,13 @@ class TlsResiduals(Residuals):
     """
 
     sensor = "tls"
-    planes = ("azimuth", "zenith")
-    described_by = RangeEmpirical, "values_m"
-    noise = RangeNoise, "sigma_m"
-    called = "ranges of a laser scan"
+    position_covariates = ("azimuth", "zenith")
+    empirical_term = RangeEmpirical, "values_m"
+    white_noise = RangeNoise, "sigma_m"
+    label = "ranges of a laser scan"
     geometry: RayGeometry
     reference_error_m: float = 0.0
-    of_relief: bool = False
+    error_is_relief: bool = False
 
     @property
     def reference_variance(self) -> FloatArray:
@@ -53,28 +53,28 @@ class TlsResiduals(Residuals):
         return _reference_variance(self.reference_error_m, self.geometry)
 
     @property
-    def averaged(self) -> Self:
+    def with_sigma_of_means(self) -> Self:
         """Neighbours share the errors of the vertices between them."""
         corner, weight = self.geometry.corner, self.geometry.weight
-        if not self.reference_error_m or self.of_relief or corner is None or weight is None:
+        if not self.reference_error_m or self.error_is_relief or corner is None or weight is None:
             return self
         shared = np.sum(weight * np.bincount(corner.ravel(), weight.ravel())[corner], axis=1)
         variance = self.sigma**2 - self.reference_variance + self.reference_error_m**2 * shared
         return replace(self, sigma=np.sqrt(variance))
 
-    def shared_with(self, other: NDArray[np.int64]) -> FloatArray:
+    def reference_covariance_with(self, other: NDArray[np.int64]) -> FloatArray:
         corner, weight = self.geometry.corner, self.geometry.weight
         if not self.reference_error_m or corner is None or weight is None:
-            return super().shared_with(other)
+            return super().reference_covariance_with(other)
         same = corner[:, :, None] == corner[other][:, None]
         return np.asarray(self.reference_error_m**2 * np.einsum("nab,na,nb->n", same, weight, weight[other]))
 
-    def drawn_reference(self, random: KeyedRandom) -> FloatArray:
+    def draw_reference_error(self, random: KeyedRandom) -> FloatArray:
         """(n,) a draw of what the errors of the reference's vertices do to ranges that are measured on it, m."""
         corner, weight = self.geometry.corner, self.geometry.weight
         if not self.reference_error_m or corner is None or weight is None:
             return np.zeros(len(self))
-        if self.of_relief:
+        if self.error_is_relief:
             return np.asarray(np.sqrt(self.reference_variance) * random.generator().standard_normal(len(self)))
         errors = self.reference_error_m * random.generator().standard_normal(int(corner.max(initial=0)) + 1)
         return np.asarray(np.sum(weight * errors[corner], axis=1))
@@ -88,19 +88,19 @@ class TlsResiduals(Residuals):
 def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
     """Range residuals with their predicted spread and covariates; points whose ray misses the surface are left out."""
     (position, rotation), model = measurement.station, measurement.model
-    azimuth, zenith, measured = recorded(measurement)
+    azimuth, zenith, measured = recorded_polar(measurement)
     line, share = measurement.order or _order(measurement, azimuth)
     intensity = measurement.cloud.intensity
     real = azimuth, zenith
     if any(effect.stage == Stage.AIM for effect in model.effects):
-        real = aimed(measurement, PulseGeometry(azimuth, zenith, line=line, share=share, power=intensity))
+        real = mean_beam_directions(measurement, PulseGeometry(azimuth, zenith, line=line, share=share, power=intensity))
     axes = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(*real)]
     along_planes = measurement.planes is not None and measurement.planes.noise_dominates
     if along_planes:
         nominal = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(azimuth, zenith)]
-        seen = turned(met(measurement, nominal), nominal[0], axes[0])
+        seen = redirect_hits(cast_rays(measurement, nominal), nominal[0], axes[0])
     else:
-        seen = met(measurement, axes)
+        seen = cast_rays(measurement, axes)
     distance, normal = seen.distance, seen.normal
     geometry = RayGeometry(
         azimuth=azimuth,
@@ -111,14 +111,14 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
         corner=seen.corner,
         weight=seen.weight,
         plane_normal=normal @ rotation if along_planes else None,
-        by_azimuth=plane_slopes(normal, axes[0], axes[1], distance) * np.sin(zenith),
-        by_zenith=plane_slopes(normal, axes[0], axes[2], distance),
+        by_azimuth=range_derivative(normal, axes[0], axes[1], distance) * np.sin(zenith),
+        by_zenith=range_derivative(normal, axes[0], axes[2], distance),
         cos_incidence=seen.cos_incidence,
         line=line,
         share=share,
         power=None if intensity is None else np.maximum(intensity, _LEAST_POWER),
     )
-    predicted = simulated_ranges(measurement, geometry) if model.effects else distance
+    predicted = predict_ranges(measurement, geometry) if model.effects else distance
     sigma = np.sqrt(model.variance(geometry) + _reference_variance(measurement.reference_error_m, geometry))
     slope = np.hypot(geometry.by_azimuth / np.sin(zenith), geometry.by_zenith) / distance
     hit = np.isfinite(predicted) & np.isfinite(distance)
@@ -129,16 +129,16 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
         value=measured - predicted,
         sigma=sigma,
         unit_m=np.ones_like(measured),
-        smooth=hit & flat & measurement.stable,
-        even=hit & flat,
-        pose=_pose(axes[0], normal, distance),
-        at=(position + distance[:, None] * axes[0])[:, :2],
+        usable=hit & flat & measurement.stable,
+        on_smooth_surface=hit & flat,
+        pose_jacobian=_pose(axes[0], normal, distance),
+        wall_xy=(position + distance[:, None] * axes[0])[:, :2],
         covariates=_covariates(geometry, seen.curvature),
         index=np.arange(len(measured)),
         geometry=geometry,
         notes=_notes(measurement),
         reference_error_m=measurement.reference_error_m,
-        of_relief=measurement.planes is not None and not along_planes,
+        error_is_relief=measurement.planes is not None and not along_planes,
     )
     return whole.part(hit)
 
@@ -149,13 +149,13 @@ def _reference_variance(error_m: float, geometry: RayGeometry) -> FloatArray:
     return np.asarray(error_m**2 * np.sum(geometry.weight**2, axis=1))
 
 
-def with_order(measurement: TlsMeasurement) -> TlsMeasurement:
+def with_scan_order(measurement: TlsMeasurement) -> TlsMeasurement:
     """With scan lines and times of all points, so that a part of them keeps them."""
     if measurement.scans:
-        found = [(rows, with_order(one).order or (None, None)) for _, rows, one in measurement.each_scan() if len(rows)]
+        found = [(rows, with_scan_order(one).order or (None, None)) for _, rows, one in measurement.each_scan() if len(rows)]
         line, share = (_scattered([(rows, order[which]) for rows, order in found], len(measurement.scan_of)) for which in (0, 1))
         return measurement.changed(order=(line, share))
-    return measurement.changed(order=_order(measurement, recorded(measurement)[0]))
+    return measurement.changed(order=_order(measurement, recorded_polar(measurement)[0]))
 
 
 def _scattered(parts: list[tuple[NDArray[np.int64], FloatArray | None]], count: int) -> FloatArray | None:
@@ -174,7 +174,7 @@ def log_over_median(power: FloatArray) -> FloatArray:
     return np.asarray(np.log(positive / np.median(positive)), dtype=np.float64)
 
 
-def recorded(measurement: TlsMeasurement) -> tuple[FloatArray, FloatArray, FloatArray]:
+def recorded_polar(measurement: TlsMeasurement) -> tuple[FloatArray, FloatArray, FloatArray]:
     """(n,) azimuth, without jumps, and zenith (rad), as the face counts them, and range (m)."""
     position, rotation = measurement.station
     local = np.einsum("ji,nj->ni", rotation, measurement.cloud.points - position)
@@ -251,7 +251,7 @@ def _notes(measurement: TlsMeasurement) -> tuple[str, ...]:
     return (*measurement.notes, *(note for note, true in absent.items() if true))
 
 
-def missing_returns(measurement: TlsMeasurement, residuals: TlsResiduals) -> Missing | None:
+def find_expected_pulses(measurement: TlsMeasurement, residuals: TlsResiduals) -> ExpectedPulses | None:
     """Every pulse of the pattern that should meet the wall, and whether it came back, epoch after epoch; None without a pattern.
 
     residuals: of all points of the measurement.
@@ -261,10 +261,10 @@ def missing_returns(measurement: TlsMeasurement, residuals: TlsResiduals) -> Mis
         return None
     position, rotation = measurement.station
     sweeps = _sweeps(pattern)
-    sent = np.arange(pulses_of(pattern)) if measurement.pulses is None else np.flatnonzero(measurement.pulses)
+    sent = np.arange(pulse_count(pattern)) if measurement.pulses is None else np.flatnonzero(measurement.pulses)
     azimuth, zenith = (sweep[place] for sweep, place in zip(sweeps, np.divmod(sent, len(sweeps[1])), strict=True))
     axes = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(azimuth, zenith)]
-    seen_by = met(measurement, axes)
+    seen_by = cast_rays(measurement, axes)
     distance = seen_by.distance
     usable = np.isfinite(distance) & (seen_by.curvature < 0.3)
     covariates = {
@@ -278,15 +278,15 @@ def missing_returns(measurement: TlsMeasurement, residuals: TlsResiduals) -> Mis
     epochs = measurement.epochs[residuals.index]
     seen = [_seen(pattern, residuals.geometry.part(epochs == number))[sent[usable]] for number in np.unique(epochs)]
     chosen = {name: np.tile(values[usable], len(seen)) for name, values in covariates.items()}
-    return Missing(~np.concatenate(seen), chosen, np.tile(at[usable], (len(seen), 1)))
+    return ExpectedPulses(~np.concatenate(seen), chosen, np.tile(at[usable], (len(seen), 1)))
 
 
-def pulses_of(pattern: ScanPattern) -> int:
+def pulse_count(pattern: ScanPattern) -> int:
     """How many pulses a pattern has."""
     return int(np.prod([len(sweep) for sweep in _sweeps(pattern)]))
 
 
-def pulse_of(pattern: ScanPattern, azimuth: FloatArray, zenith: FloatArray) -> NDArray[np.int64]:
+def pulse_number(pattern: ScanPattern, azimuth: FloatArray, zenith: FloatArray) -> NDArray[np.int64]:
     """(n,) number of the pulse that has about a recorded direction, line after line."""
     sweeps = _sweeps(pattern)
     turn = 2 * np.pi * np.round((azimuth.mean() - sweeps[0].mean()) / (2 * np.pi))
@@ -300,8 +300,8 @@ def pulse_of(pattern: ScanPattern, azimuth: FloatArray, zenith: FloatArray) -> N
 
 def _seen(pattern: ScanPattern, geometry: RayGeometry) -> BoolArray:
     """(m,) pulses of a pattern in whose direction a point stands."""
-    seen = np.zeros(pulses_of(pattern), dtype=bool)
-    seen[pulse_of(pattern, geometry.azimuth, geometry.zenith)] = True
+    seen = np.zeros(pulse_count(pattern), dtype=bool)
+    seen[pulse_number(pattern, geometry.azimuth, geometry.zenith)] = True
     return seen
 
 

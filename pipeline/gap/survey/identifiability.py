@@ -23,20 +23,27 @@ import numpy as np
 
 from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.survey.known_points import KnownPoints, known_points
-from pipeline.gap.survey.planned import Survey, View
-from pipeline.gap.survey.spread_identifiability import OtherEffect, others
-from pipeline.gap.survey.survey_design import REFERENCE_LENGTH_M, SIGNAL_TO_NOISE, SurveyDesign, families_of, label, signatures
+from pipeline.gap.survey.noise_detectability import NoiseOrLossEffect, noise_and_loss_effects
+from pipeline.gap.survey.survey_design import (
+    DETECTION_SNR,
+    REFERENCE_LENGTH_M,
+    SurveyDesign,
+    group_by_effect,
+    parameter_label,
+    view_signatures,
+)
+from pipeline.gap.survey.survey_views import Survey, SurveyView
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 
-NAMED_AT = 8.0
-ALIKE = 0.9
+NAMING_SNR = 8.0
+SIMILAR_COSINE = 0.9
 """Signatures whose cosine is at least this count as alike."""
 REFERENCE_ERRORS_M = {"tls": 0.001, "stereo": 0.005}
 
 
 @dataclass(frozen=True)
-class Extension:
+class SurveyExtension:
     """A survey with one more measurement. cosines: (m, m) of the same effects as those of the survey as planned."""
 
     name: str
@@ -63,28 +70,28 @@ class Identifiability:
     seen_from: tuple[float, ...]
     seen_from_noise: tuple[float, ...]
     shown: tuple[str, ...]
-    extensions: tuple[Extension, ...]
+    extensions: tuple[SurveyExtension, ...]
     points: int
     reference_error_m: float
-    others: tuple[OtherEffect, ...] = ()
+    others: tuple[NoiseOrLossEffect, ...] = ()
 
     @property
     def named_from(self) -> tuple[float, ...]:
         """(m,) value of each effect's parameter from which it is told from all others."""
         return _named_from(self.cosines, self.seen_from)
 
-    def best_extension(self, row: int) -> Extension:
+    def best_extension(self, row: int) -> SurveyExtension:
         """The further measurement with which an effect is named from the smallest value on."""
         return min(self.extensions, key=lambda extension: extension.named_from[row])
 
     def alike(self, row: int) -> list[int]:
         """Effects whose signatures are alike that of `row`, the most alike first."""
         order = np.argsort(-self.cosines[row])
-        return [int(other) for other in order if other != row and self.cosines[row, other] >= ALIKE]
+        return [int(other) for other in order if other != row and self.cosines[row, other] >= SIMILAR_COSINE]
 
     def pairs(self) -> list[tuple[int, int]]:
         """Pairs that are alike as planned, the most alike first."""
-        found = [(a, b) for a in range(len(self.names)) for b in range(a) if self.cosines[a, b] >= ALIKE]
+        found = [(a, b) for a in range(len(self.names)) for b in range(a) if self.cosines[a, b] >= SIMILAR_COSINE]
         return sorted(found, key=lambda pair: -self.cosines[pair])
 
     def to_dict(self) -> dict[str, Any]:
@@ -102,7 +109,7 @@ class Identifiability:
                     "names": [self.names[a], self.names[b]],
                     "cosine": float(self.cosines[a, b]),
                     "with": {extension.name: float(extension.cosines[a, b]) for extension in self.extensions},
-                    "split_by": [e.name for e in self.extensions if e.cosines[a, b] < ALIKE],
+                    "split_by": [e.name for e in self.extensions if e.cosines[a, b] < SIMILAR_COSINE],
                 }
                 for a, b in self.pairs()
             ],
@@ -134,7 +141,7 @@ def _finite(value: float) -> float | None:
 def _named_from(cosines: FloatArray, seen_from: tuple[float, ...]) -> tuple[float, ...]:
     nearest = (cosines - np.eye(len(cosines))).max(axis=1)
     sine = np.sqrt(np.maximum(1 - nearest**2, 1e-300))
-    return tuple(NAMED_AT / SIGNAL_TO_NOISE * value / float(s) for value, s in zip(seen_from, sine, strict=True))
+    return tuple(NAMING_SNR / DETECTION_SNR * value / float(s) for value, s in zip(seen_from, sine, strict=True))
 
 
 def identifiability(survey: Survey, reference_error_m: float | None = None) -> Identifiability:
@@ -143,31 +150,31 @@ def identifiability(survey: Survey, reference_error_m: float | None = None) -> I
     reference_error_m: standard deviation of the reference's correlated error (none: 1 mm for a laser scanner, 5 mm for a pair).
     """
     error = REFERENCE_ERRORS_M[survey.sensor] if reference_error_m is None else reference_error_m
-    families = families_of(signatures(survey.views[0]))
+    families = group_by_effect(view_signatures(survey.views[0]))
     plain = SurveyDesign.of(survey.views, families)
     seen, noise = (plain.seen_from(sigma) for sigma in (error, 0.0))
     extensions = []
     for name, views, points in _extended(survey):
         design = SurveyDesign.of(views, families, points)
-        extensions.append(Extension(name, design.cosines(), design.seen_from(error)))
+        extensions.append(SurveyExtension(name, design.cosines(), design.seen_from(error)))
     shown = [variants[0] for variants in families.values()]
     return Identifiability(
         sensor=survey.sensor,
         names=tuple(f"{survey.sensor}.{name}" for name in families),
         survival=plain.survival(),
         cosines=plain.cosines(),
-        parameters=tuple(label(candidate) for candidate in shown),
+        parameters=tuple(parameter_label(candidate) for candidate in shown),
         seen_from=seen,
         seen_from_noise=noise,
         shown=tuple(_shown(candidate) for candidate in shown),
         extensions=tuple(extensions),
-        points=sum(view.whole for view in survey.views),
+        points=sum(view.point_count for view in survey.views),
         reference_error_m=error,
-        others=others(survey),
+        others=noise_and_loss_effects(survey),
     )
 
 
-def table(found: Identifiability) -> str:
+def format_table(found: Identifiability) -> str:
     """Name, share that survives the pose fit, value seen, and the signature that is most alike."""
     cosines = found.cosines - np.eye(len(found.names))
     lines = [f"{'effect':<32}{'survives pose':>14}  {'seen from (S/N 5)':<32}most alike (cosine)"]
@@ -178,16 +185,16 @@ def table(found: Identifiability) -> str:
     return "\n".join(lines)
 
 
-def _extended(survey: Survey) -> list[tuple[str, tuple[View, ...], KnownPoints | None]]:
+def _extended(survey: Survey) -> list[tuple[str, tuple[SurveyView, ...], KnownPoints | None]]:
     """The survey with one more measurement each: its name, all views, known points. What would see too little of the wall is no
     measurement to ask for."""
     number = max(view.station for view in survey.views) + 1
-    wanted: list[Callable[[], tuple[str, View]]] = [
+    wanted: list[Callable[[], tuple[str, SurveyView]]] = [
         lambda: (f"a second {survey.place} at half the range", survey.moved(0.5, 0.0, number)),
         lambda: (f"a second {survey.place} at the same range, 40 degrees aside", survey.moved(1.0, np.radians(40.0), number)),
         lambda: survey.repeated(number),
     ]
-    found: list[tuple[str, tuple[View, ...], KnownPoints | None]] = []
+    found: list[tuple[str, tuple[SurveyView, ...], KnownPoints | None]] = []
     for observed in wanted:
         with suppress(InputError):
             name, view = observed()

@@ -10,9 +10,9 @@ import numpy as np
 
 from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.residuals.nominal_pair import NominalPair, moved_pair, project, real_pair
-from pipeline.gap.residuals.rays import RayGeometry
+from pipeline.gap.residuals.ray_hits import RayGeometry
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from pipeline.gap.survey.planned import StereoView, TlsView
+from pipeline.gap.survey.survey_views import StereoView, TlsView
 from scene.geometry.mesh import FloatArray
 from sensors.cameras.camera import CameraPair
 from sensors.effects import effect_of
@@ -34,7 +34,7 @@ class KnownPoints:
     """Observations of known points. pose: (n, 6), of the first station; sigma: (n,); columns(wanted): (n, k) by candidates."""
 
     title: str
-    pose: FloatArray
+    pose_jacobian: FloatArray
     sigma: FloatArray
     columns: Callable[[list[Candidate]], FloatArray]
 
@@ -76,7 +76,7 @@ def _targets(view: TlsView) -> KnownPoints:
     )
     sigma = np.full(len(distance), _TARGET_SIGMA_M * np.sqrt(3.0))
     residuals = _only_geometry(view.residuals, geometry, sigma, pose)
-    there = replace(view, residuals=residuals, whole=len(sigma))
+    there = replace(view, residuals=residuals, point_count=len(sigma))
     title = f"{_TARGETS} targets around the station, known to {1e3 * _TARGET_SIGMA_M:.0f} mm"
     return KnownPoints(title, pose, sigma, lambda wanted: signature_columns(there, wanted))
 
@@ -89,9 +89,19 @@ def _ordered(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _only_geometry(like: TlsResiduals, geometry: RayGeometry, sigma: FloatArray, pose: FloatArray) -> TlsResiduals:
     zero = np.zeros(len(sigma))
     return replace(
-        like, value=zero, sigma=sigma, unit_m=zero + 1, smooth=zero < 1, even=zero < 1, pose=pose, at=np.zeros((len(sigma), 2)),
-        covariates={}, index=np.arange(len(sigma)), geometry=geometry, missing=None,
-    )  # fmt: skip
+        like,
+        value=zero,
+        sigma=sigma,
+        unit_m=zero + 1,
+        usable=zero < 1,
+        on_smooth_surface=zero < 1,
+        pose_jacobian=pose,
+        wall_xy=np.zeros((len(sigma), 2)),
+        covariates={},
+        index=np.arange(len(sigma)),
+        geometry=geometry,
+        expected_pulses=None,
+    )
 
 
 def _check_points(view: StereoView) -> KnownPoints:

@@ -10,23 +10,23 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.distance import cdist
 
 from pipeline.gap.mean.candidates import Candidate
-from pipeline.gap.mean.signatures import mean_candidates
-from pipeline.gap.residuals.cells import Cells
+from pipeline.gap.mean.signatures import systematic_candidates
+from pipeline.gap.residuals.wall_blocks import WallCells
 from pipeline.gap.survey.known_points import KnownPoints
-from pipeline.gap.survey.planned import View
+from pipeline.gap.survey.survey_views import SurveyView
 from scene.geometry.mesh import FloatArray
 
-SIGNAL_TO_NOISE = 5.0
+DETECTION_SNR = 5.0
 REFERENCE_LENGTH_M = 3.0
 _NULL = 1e-9
 
 
-def signatures(view: View) -> list[Candidate]:
+def view_signatures(view: SurveyView) -> list[Candidate]:
     """Every effect of the catalogue on the mean, with its variants."""
-    return mean_candidates(view.residuals, view.measurement)
+    return systematic_candidates(view.residuals, view.measurement)
 
 
-def families_of(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
+def group_by_effect(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
     """By effect: the variant that is shown first, then those that could take its place. Of searched waves the middle one."""
     groups: dict[str, list[Candidate]] = {}
     for candidate in candidates:
@@ -47,7 +47,7 @@ def families_of(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
     return families
 
 
-def label(candidate: Candidate) -> str:
+def parameter_label(candidate: Candidate) -> str:
     """The parameter that `seen_from` speaks of; of several of one kind all names."""
     hidden = {"phase_rad", "" if candidate.wave is None else candidate.wave.key}
     return ", ".join(name for name in candidate.names if name not in hidden)
@@ -57,7 +57,8 @@ def _scales(candidate: Candidate) -> tuple[float, ...]:
     """The parameter's value per unit of each coefficient."""
     units = np.eye(candidate.columns.shape[1])
     return tuple(
-        max(abs(v) for key, v in candidate.parameters(unit).items() if key in label(candidate).split(", ")) for unit in units
+        max(abs(v) for key, v in candidate.parameters(unit).items() if key in parameter_label(candidate).split(", "))
+        for unit in units
     )
 
 
@@ -66,29 +67,31 @@ class SurveyDesign:
     """Whitened columns of all views, without the pose. left, whole: (n, k) after and before the pose fit, white metric; spans:
     columns of each family's variants; cells of the wall and the weights there; the known points are the last rows."""
 
-    left: FloatArray
-    whole: FloatArray
-    pose: FloatArray
+    projected: FloatArray
+    signatures: FloatArray
+    pose_basis: FloatArray
     spans: list[list[slice]]
     scales: list[tuple[float, ...]]
-    cells: Cells
+    cells: WallCells
     sigma: FloatArray
     unit_m: float
     wall: int
 
     @classmethod
-    def of(cls, views: tuple[View, ...], families: dict[str, list[Candidate]], points: KnownPoints | None = None) -> SurveyDesign:
+    def of(
+        cls, views: tuple[SurveyView, ...], families: dict[str, list[Candidate]], points: KnownPoints | None = None
+    ) -> SurveyDesign:
         wanted = [variant for variants in families.values() for variant in variants]
         columns = np.concatenate([signature_columns(view, wanted) for view in views])
         sigma = np.concatenate([view.sigma for view in views])
         stations = sorted({view.station for view in views})
         pose = np.concatenate(
-            [np.kron(np.eye(len(stations))[stations.index(view.station)], view.residuals.pose) for view in views]
+            [np.kron(np.eye(len(stations))[stations.index(view.station)], view.residuals.pose_jacobian) for view in views]
         )
         wall = len(columns)
         if points is not None:
             more = np.zeros((len(points.sigma), pose.shape[1]))
-            more[:, :6] = points.pose
+            more[:, :6] = points.pose_jacobian
             columns, pose = np.concatenate([columns, points.columns(wanted)]), np.concatenate([pose, more])
             sigma = np.concatenate([sigma, points.sigma])
         whole, base = columns / sigma[:, None], np.linalg.qr(pose / sigma[:, None])[0]
@@ -101,14 +104,16 @@ class SurveyDesign:
                 stop = start + variant.columns.shape[1]
                 spans[-1].append(slice(start, stop))
                 start = stop
-        at = np.concatenate([view.residuals.at for view in views])
+        at = np.concatenate([view.residuals.wall_xy for view in views])
         unit = float(np.median(np.concatenate([view.residuals.unit_m for view in views])))
         scales = [_scales(variants[0]) for variants in families.values()]
-        return cls(left, whole, base, spans, scales, Cells.over(at), sigma, unit, wall)
+        return cls(left, whole, base, spans, scales, WallCells.over(at), sigma, unit, wall)
 
     def survival(self) -> FloatArray:
         """(m,) share of each first variant that survives the pose fit, root mean square over its columns."""
-        sizes = [(float(np.linalg.norm(self.left[:, v[0]])), float(np.linalg.norm(self.whole[:, v[0]]))) for v in self.spans]
+        sizes = [
+            (float(np.linalg.norm(self.projected[:, v[0]])), float(np.linalg.norm(self.signatures[:, v[0]]))) for v in self.spans
+        ]
         return np.array([left / max(whole, 1e-300) for left, whole in sizes])
 
     def cosines(self) -> FloatArray:
@@ -125,7 +130,7 @@ class SurveyDesign:
 
     def _basis(self, span: slice) -> FloatArray:
         """Orthonormal basis of what the pose fit leaves of some columns; no columns where it leaves nothing."""
-        columns, whole = self.left[:, span], np.linalg.norm(self.whole[:, span], axis=0)
+        columns, whole = self.projected[:, span], np.linalg.norm(self.signatures[:, span], axis=0)
         kept = columns[:, np.linalg.norm(columns, axis=0) > _NULL * whole]
         return np.asarray(np.linalg.qr(kept)[0]) if kept.shape[1] else np.zeros((len(columns), 1))
 
@@ -133,9 +138,9 @@ class SurveyDesign:
         """Parameter of each family's first variant at S/N 5; infinity where the pose fit leaves nothing."""
         first = [list(range(variants[0].start, variants[0].stop)) for variants in self.spans]
         chosen = [column for group in first for column in group]
-        design = np.concatenate([self.pose, self.left[:, chosen]], axis=1)
+        design = np.concatenate([self.pose_basis, self.projected[:, chosen]], axis=1)
         information = self._information(design, reference_error_m / self.unit_m)
-        count, places = self.pose.shape[1], {column: number for number, column in enumerate(chosen)}
+        count, places = self.pose_basis.shape[1], {column: number for number, column in enumerate(chosen)}
         nuisance = information[:count, :count]
         found = []
         for group, scales in zip(first, self.scales, strict=True):
@@ -143,8 +148,8 @@ class SurveyDesign:
             cross = information[np.ix_(range(count), rows)]
             own = information[np.ix_(rows, rows)] - cross.T @ np.linalg.solve(nuisance, cross)
             least = float(np.linalg.eigvalsh(own / np.outer(scales, scales))[0])
-            whole = float(np.max(np.sum((self.whole[:, group] / np.array(scales)) ** 2, axis=0)))
-            found.append(SIGNAL_TO_NOISE / np.sqrt(least) if least > _NULL**2 * whole else np.inf)
+            whole = float(np.max(np.sum((self.signatures[:, group] / np.array(scales)) ** 2, axis=0)))
+            found.append(DETECTION_SNR / np.sqrt(least) if least > _NULL**2 * whole else np.inf)
         return tuple(found)
 
     def _information(self, design: FloatArray, error: float) -> FloatArray:
@@ -165,9 +170,9 @@ class SurveyDesign:
         return np.asarray(total - taken + left)
 
 
-def signature_columns(view: View, wanted: list[Candidate]) -> FloatArray:
+def signature_columns(view: SurveyView, wanted: list[Candidate]) -> FloatArray:
     """(n, k) columns of the wanted variants in a view; searched periods are those of the variant, not of the view's own grid."""
-    own = {_key(each): each for each in signatures(view)}
+    own = {_key(each): each for each in view_signatures(view)}
     parts = []
     for variant in wanted:
         found = own[_key(variant)]

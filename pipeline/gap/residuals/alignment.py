@@ -12,7 +12,7 @@ from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement
 from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.residuals import BoolArray, Residuals, Rows
-from pipeline.gap.residuals.several_scans import scans_residuals
+from pipeline.gap.residuals.several_scans import residuals_of_scans
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, surface_residuals
 from pipeline.gap.residuals.tls_residuals import tls_residuals
@@ -30,33 +30,33 @@ _FAR_SIGMAS, _MOST_MOVES_OF_SURFACES = 0.1, 12
 """Of a cloud whose nearest places change as it moves: far in predicted sigmas, on average over its points."""
 
 
-def registered(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
+def fit_pose_robustly(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
     """(n,) residuals after a robust registration, the pose (6 k,) of k set-ups, and how many predicted sigmas their spread is (at
     least 1)."""
-    kept, scale = residuals.smooth.copy(), 1.0
-    value, pose, design = residuals.value, np.zeros(residuals.pose.shape[1]), _weighed(residuals)
+    kept, scale = residuals.usable.copy(), 1.0
+    value, pose, design = residuals.value, np.zeros(residuals.pose_jacobian.shape[1]), _weighed(residuals)
     for _ in range(_ROUNDS):
         before, pose = kept, _solved(design[kept])
-        value = residuals.value - residuals.pose @ pose
+        value = residuals.value - residuals.pose_jacobian @ pose
         z = np.abs(value / residuals.sigma)
-        scale = max(1.0, nmad(z[residuals.smooth], 0.0))
-        kept = residuals.smooth & (z < decided().points.unregistered * scale)
+        scale = max(1.0, nmad(z[residuals.usable], 0.0))
+        kept = residuals.usable & (z < decided().points.unregistered * scale)
         if kept.sum() < _FEWEST:
-            kept = residuals.smooth
+            kept = residuals.usable
         if np.array_equal(kept, before):  # the next rounds would be the same
             break
     return value, pose, scale
 
 
-def pose_of(residuals: Residuals, rows: BoolArray | NDArray[np.int64]) -> FloatArray:
+def fit_pose(residuals: Residuals, rows: BoolArray | NDArray[np.int64]) -> FloatArray:
     """(6,) shift (m) and turn (rad) by weighted least squares over some rows (a mask or indices)."""
     return _solved(_weighed(residuals, rows))
 
 
 def _weighed(residuals: Residuals, rows: Rows = slice(None)) -> FloatArray:
     """(m, 6 k + 1) pose of k set-ups and value of some rows, over sigma."""
-    design = np.empty((len(residuals.sigma[rows]), residuals.pose.shape[1] + 1))
-    design[:, :-1], design[:, -1] = residuals.pose[rows], residuals.value[rows]
+    design = np.empty((len(residuals.sigma[rows]), residuals.pose_jacobian.shape[1] + 1))
+    design[:, :-1], design[:, -1] = residuals.pose_jacobian[rows], residuals.value[rows]
     design /= residuals.sigma[rows, None]
     return design
 
@@ -82,29 +82,29 @@ def _factors(blocks: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.qr(blocks, mode="r")).reshape(-1, blocks.shape[2])
 
 
-def raw_residuals(measurement: Measurement) -> Residuals:
+def compute_raw_residuals(measurement: Measurement) -> Residuals:
     """The raw residuals of a laser scan, of a pair, or of a surface without cameras."""
     if isinstance(measurement, SurfaceMeasurement):
         return surface_residuals(measurement)
     if isinstance(measurement, StereoMeasurement):
         return stereo_residuals(measurement)
-    return scans_residuals(measurement) if measurement.scans else tls_residuals(measurement)
+    return residuals_of_scans(measurement) if measurement.scans else tls_residuals(measurement)
 
 
-def residuals_of(measurement: Measurement) -> Residuals:
+def compute_residuals(measurement: Measurement) -> Residuals:
     """The raw residuals of either sensor; those of several epochs as if all had been taken from one place."""
-    found = raw_residuals(measurement)
+    found = compute_raw_residuals(measurement)
     epochs = measurement.epochs[found.index]
     numbers = np.unique(epochs)
     if len(numbers) < 2:
         return found
-    poses = np.stack([registered(found.part(epochs == number))[1] for number in numbers])
+    poses = np.stack([fit_pose_robustly(found.part(epochs == number))[1] for number in numbers])
     apart = (poses - poses.mean(axis=0))[np.searchsorted(numbers, epochs)]
-    away = np.einsum("ni,ni->n", found.pose, apart)
-    return replace(found, value=found.value - away, away=away)
+    away = np.einsum("ni,ni->n", found.pose_jacobian, apart)
+    return replace(found, value=found.value - away, epoch_offset=away)
 
 
-class Settled(NamedTuple):
+class Alignment(NamedTuple):
     """A measurement with its sensor where its points say that it stood, its residuals there, and the pose (6,) that led there."""
 
     measurement: Measurement
@@ -112,37 +112,37 @@ class Settled(NamedTuple):
     pose: FloatArray
 
 
-def settled(measurement: Measurement, trusted: NDArray[np.int64] | None = None, found: Residuals | None = None) -> Settled:
+def align(measurement: Measurement, trusted: NDArray[np.int64] | None = None, found: Residuals | None = None) -> Alignment:
     """The measurement with its sensor where its points say that it stood.
 
     trusted: rows of the measurement's points by which to register, all where None; found: its residuals, if known. A pose that
     moves the rays by more than some millimetres on the wall is gone along with, a few times at the most, since slopes at the
     first place no longer serve.
     """
-    found = residuals_of(measurement) if found is None else found
-    total = np.zeros(found.pose.shape[1])
+    found = compute_residuals(measurement) if found is None else found
+    total = np.zeros(found.pose_jacobian.shape[1])
     most = _MOST_MOVES_OF_SURFACES if isinstance(measurement, SurfaceMeasurement) else _MOST_MOVES
     for _ in range(most if len(found) else 0):
-        pose = registered(_only(found, trusted))[1]
+        pose = fit_pose_robustly(_only(found, trusted))[1]
         if not _is_far(pose, found):
             break
         there = measurement.moved(pose)
-        beyond = residuals_of(there)
+        beyond = compute_residuals(there)
         if not len(beyond.value):  # the pose leads off the wall
             break
         measurement, total, found = there, total + pose, beyond
-    return Settled(measurement, found, total)
+    return Alignment(measurement, found, total)
 
 
 def _only(residuals: Residuals, trusted: NDArray[np.int64] | None) -> Residuals:
-    return residuals if trusted is None else replace(residuals, smooth=residuals.smooth & np.isin(residuals.index, trusted))
+    return residuals if trusted is None else replace(residuals, usable=residuals.usable & np.isin(residuals.index, trusted))
 
 
 def _is_far(pose: FloatArray, residuals: Residuals) -> bool:
     if isinstance(residuals, SurfaceResiduals):
-        return float(np.mean(np.abs(residuals.pose @ pose) / residuals.sigma)) > _FAR_SIGMAS
+        return float(np.mean(np.abs(residuals.pose_jacobian @ pose) / residuals.sigma)) > _FAR_SIGMAS
     for start in range(0, len(pose), 6):
-        own, columns = pose[start : start + 6], residuals.pose[:, start : start + 6]
+        own, columns = pose[start : start + 6], residuals.pose_jacobian[:, start : start + 6]
         turn, shift = (float(np.linalg.norm(columns[:, part], axis=1).mean()) for part in (slice(3, 6), slice(3)))
         if shift > 0 and np.linalg.norm(own[:3]) + turn / shift * np.linalg.norm(own[3:]) > _FAR_M:
             return True

@@ -33,7 +33,7 @@ _FROM_AFAR, _STEEPEST = 1000.0, 0.2
 
 
 @dataclass(frozen=True)
-class Sight:
+class SensorView:
     """How the sensor saw n points.
 
     plane: (n, 2) direction as the sensor counts it, rad (azimuth, zenith) or px (column, row), in any units; epoch: (n,); origin:
@@ -42,7 +42,7 @@ class Sight:
     ranges are measured; slant: (n,) range per metre of a residual, of a surface without cameras, which is seen from far away.
     """
 
-    plane: FloatArray
+    coordinates: FloatArray
     epoch: NDArray[np.int64]
     origin: FloatArray
     ray: FloatArray
@@ -51,7 +51,7 @@ class Sight:
     slant: FloatArray | None = None
 
     @classmethod
-    def of(cls, measurement: Measurement, residuals: Residuals) -> Sight:
+    def of(cls, measurement: Measurement, residuals: Residuals) -> SensorView:
         """Of the points of the residuals. A pair of cameras looks from the left one."""
         origin, reference, disparity, slant = measurement.viewpoint, None, None, None
         match measurement, residuals:
@@ -67,17 +67,17 @@ class Sight:
             case _:
                 raise TypeError("measurement and residuals are of different sensors")
         length = np.linalg.norm(towards, axis=1)
-        epoch, plane = measurement.epochs[residuals.index], residuals.geometry.plane
+        epoch, plane = measurement.epochs[residuals.index], residuals.geometry.sensor_coordinates
         if isinstance(measurement, TlsMeasurement) and measurement.scans:
             plane = _apart_by_scan(plane, measurement.scan_of[residuals.index])
         reference = length if reference is None else reference
         return cls(plane, epoch, origin, towards / length[:, None], reference, disparity, slant)
 
-    def part(self, rows: Rows) -> Sight:
+    def part(self, rows: Rows) -> SensorView:
         """Of some of the points."""
         return replace(
             self,
-            plane=self.plane[rows],
+            coordinates=self.coordinates[rows],
             epoch=self.epoch[rows],
             ray=self.ray[rows],
             origin=self.origin if self.origin.ndim == 1 else self.origin[rows],
@@ -86,7 +86,7 @@ class Sight:
             slant=None if self.slant is None else self.slant[rows],
         )
 
-    def range_with(self, rows: NDArray[np.int64], residual: FloatArray) -> FloatArray:
+    def range_at_residual(self, rows: NDArray[np.int64], residual: FloatArray) -> FloatArray:
         """(m,) range of some points that depart from the reference by residuals (m,), m of range or px: R d / (d + residual)."""
         if self.slant is not None:
             return np.asarray(self.reference_m[rows] + residual * self.slant[rows])
@@ -100,9 +100,9 @@ class Sight:
         return np.asarray(origin + range_m[:, None] * self.ray[rows])
 
     @cached_property
-    def even_plane(self) -> FloatArray:
+    def scaled_coordinates(self) -> FloatArray:
         """(n, 2) `plane` with neighbours as far off by the one axis as by the other, 1 from one to the next."""
-        plane = (self.plane - self.plane.min(axis=0)) / np.maximum(np.ptp(self.plane, axis=0), 1e-300)
+        plane = (self.coordinates - self.coordinates.min(axis=0)) / np.maximum(np.ptp(self.coordinates, axis=0), 1e-300)
         rows = np.flatnonzero(self.epoch == self.epoch.min())
         apart = _apart(plane[rows])
         for _ in range(_ROUNDS):
@@ -116,23 +116,23 @@ class Sight:
     def _trees(self) -> list[tuple[NDArray[np.int64], cKDTree]]:
         """Of each epoch: its points and where they lie."""
         groups = [np.flatnonzero(self.epoch == number) for number in np.unique(self.epoch)]
-        return [(rows, cKDTree(self.even_plane[rows])) for rows in groups]
+        return [(rows, cKDTree(self.scaled_coordinates[rows])) for rows in groups]
 
-    def around(self, rows: NDArray[np.int64], count: int = NEIGHBOURS) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def neighbour_pairs(self, rows: NDArray[np.int64], count: int = NEIGHBOURS) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Pairs (k,), (k,) of some points and their nearest of the same epoch; and of the next epoch the one at their place."""
         pairs = [np.empty((2, 0), dtype=np.int64)]
-        wanted = np.zeros(len(self.plane), dtype=bool)
+        wanted = np.zeros(len(self.coordinates), dtype=bool)
         wanted[rows] = True
         for number, (group, tree) in enumerate(self._trees):
             own = group[wanted[group]]
-            pairs.append(_found(own, group, *tree.query(self.even_plane[own], count + 1, distance_upper_bound=_FARTHEST)))
+            pairs.append(_found(own, group, *tree.query(self.scaled_coordinates[own], count + 1, distance_upper_bound=_FARTHEST)))
             if number + 1 < len(self._trees):
                 following, other = self._trees[number + 1]
-                pairs.append(_found(own, following, *other.query(self.even_plane[own], [1], distance_upper_bound=1.0)))
+                pairs.append(_found(own, following, *other.query(self.scaled_coordinates[own], [1], distance_upper_bound=1.0)))
         first, second = np.concatenate(pairs, axis=1)
         return first[first != second], second[first != second]
 
-    def median_around(self, z: FloatArray) -> FloatArray:
+    def neighbour_median(self, z: FloatArray) -> FloatArray:
         """(n,) median of each point and its ring of neighbours."""
         found = np.empty(len(z))
         for group, near in self._rings:
@@ -146,13 +146,15 @@ class Sight:
         """Of each epoch: its points, and for each of them itself and its ring of neighbours, by their place among those."""
         counts = [min(NEIGHBOURS + 1, len(group)) for group, _ in self._trees]
         return [
-            (group, tree.query(self.even_plane[group], count, workers=-1)[1].astype(np.int32))
+            (group, tree.query(self.scaled_coordinates[group], count, workers=-1)[1].astype(np.int32))
             for (group, tree), count in zip(self._trees, counts, strict=True)
         ]
 
-    def beside(self, rows: NDArray[np.int64], spacings: float) -> NDArray[np.bool_]:
+    def near(self, rows: NDArray[np.int64], spacings: float) -> NDArray[np.bool_]:
         """(n,) points within some spacings of any of `rows`, whatever their epoch."""
-        distance = cKDTree(self.even_plane[rows]).query(self.even_plane, distance_upper_bound=spacings, workers=-1)[0]
+        distance = cKDTree(self.scaled_coordinates[rows]).query(
+            self.scaled_coordinates, distance_upper_bound=spacings, workers=-1
+        )[0]
         return np.asarray(np.isfinite(distance))
 
     def solid_angles(self, rows: NDArray[np.int64]) -> FloatArray:
@@ -161,16 +163,16 @@ class Sight:
         Points of one epoch share what is between them, lost returns included; triangles over a gap of several points count as
         much as the largest usual one.
         """
-        total = np.zeros(len(self.plane))
-        wanted = np.zeros(len(self.plane), dtype=bool)
+        total = np.zeros(len(self.coordinates))
+        wanted = np.zeros(len(self.coordinates), dtype=bool)
         wanted[rows] = True
         for group, tree in self._trees:
             own = group[wanted[group]]
             if not len(own):
                 continue
-            near = np.unique(tree.query(self.even_plane[own], min(_AROUND, len(group)))[1])
+            near = np.unique(tree.query(self.scaled_coordinates[own], min(_AROUND, len(group)))[1])
             chosen = group[near.ravel()]
-            corners = chosen[Delaunay(self.even_plane[chosen], qhull_options="Qbb QJ").simplices]
+            corners = chosen[Delaunay(self.scaled_coordinates[chosen], qhull_options="Qbb QJ").simplices]
             area = 0.5 * np.linalg.norm(area_normals(self.ray[corners]), axis=1)
             touching = wanted[corners].any(axis=1)
             area = np.minimum(area, _LARGEST_CELL * np.median(area[touching]))

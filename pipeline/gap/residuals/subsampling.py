@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement
 from pipeline.gap.decisions import decided
-from pipeline.gap.residuals.tls_residuals import pulse_of, pulses_of, recorded
+from pipeline.gap.residuals.tls_residuals import pulse_count, pulse_number, recorded_polar
 from scene.common.keyed_random import KeyedRandom
 
 
-def thinned(measurement: Measurement, random: KeyedRandom) -> tuple[Measurement, NDArray[np.int64]]:
+def subsample(measurement: Measurement, random: KeyedRandom) -> tuple[Measurement, NDArray[np.int64]]:
     """At most about `points.most` of a scan's or a surface's points, with a note, and their rows; of a stereo pair all.
 
     Scan lines and times have to be known already (`with_order`): a part of the points does not tell them.
@@ -27,9 +27,9 @@ def thinned(measurement: Measurement, random: KeyedRandom) -> tuple[Measurement,
     if isinstance(measurement, SurfaceMeasurement) or measurement.pattern is None:
         drawn = generator.random(count, dtype=np.float32) < share
     else:
-        pulses = generator.random(pulses_of(measurement.pattern), dtype=np.float32) < share
-        azimuth, zenith, _ = recorded(measurement)
-        drawn = pulses[pulse_of(measurement.pattern, azimuth, zenith)]
+        pulses = generator.random(pulse_count(measurement.pattern), dtype=np.float32) < share
+        azimuth, zenith, _ = recorded_polar(measurement)
+        drawn = pulses[pulse_number(measurement.pattern, azimuth, zenith)]
     rows = np.flatnonzero(drawn)
     note = (
         f"{len(rows):,} of {count:,} points, drawn at random, were looked at: the smallest change of the scene that can be found "

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.formats.measurements.measurement import TlsMeasurement
-from pipeline.gap.residuals.residuals import Rows, part_of, plane_slopes
+from pipeline.gap.residuals.residuals import Rows, range_derivative, select_rows
 from scene.geometry.mesh import FloatArray, IntArray, barycentric
 from scene.geometry.point_planes import PointPlanes
 from sensors.signal_chain.pulses import PulseGeometry
@@ -34,10 +34,10 @@ class RayGeometry(PulseGeometry):
 
     def part(self, rows: Rows) -> RayGeometry:
         """The same of some of the points."""
-        return part_of(self, rows)
+        return select_rows(self, rows)
 
     @property
-    def plane(self) -> FloatArray:
+    def sensor_coordinates(self) -> FloatArray:
         """(n, 2) azimuth and zenith, rad."""
         return np.stack([self.azimuth, self.zenith], axis=1)
 
@@ -48,7 +48,7 @@ class RayGeometry(PulseGeometry):
 
 
 @dataclass(frozen=True)
-class Met:
+class RayHits:
     """What n rays meet. distance: (n,), m; normal: (n, 3) of the triangle, unit; cos_incidence: (n,); curvature: (n,) the largest
     departure from the triangle's plane within a beam's width, m.
 
@@ -68,7 +68,7 @@ class Met:
     weight: FloatArray | None = None
 
 
-def met(measurement: TlsMeasurement, axes: list[FloatArray]) -> Met:
+def cast_rays(measurement: TlsMeasurement, axes: list[FloatArray]) -> RayHits:
     """axes: the rays' directions (n, 3), unit, wall frame, and how they turn with azimuth and zenith."""
     ray, scene, position = axes[0], measurement.scene, measurement.station[0]
     distance, face = scene.cast(position, ray)
@@ -76,11 +76,11 @@ def met(measurement: TlsMeasurement, axes: list[FloatArray]) -> Met:
     normal = scene.mesh.normals[face]
     curvature = np.zeros(len(ray))
     for axis in axes[1:]:
-        flat = plane_slopes(normal, ray, axis, distance)
+        flat = range_derivative(normal, ray, axis, distance)
         for step in (_PROBE_RAD, -_PROBE_RAD):
             beside = scene.cast(position, ray + step * axis)[0]
             curvature = np.maximum(curvature, np.nan_to_num(np.abs(beside - distance - step * flat), nan=np.inf))
-    found = Met(distance, normal, np.abs(np.einsum("ni,ni->n", ray, normal)), curvature)
+    found = RayHits(distance, normal, np.abs(np.einsum("ni,ni->n", ray, normal)), curvature)
     if measurement.planes is None and not measurement.reference_error_m:
         return found
     corner = scene.mesh.faces[face]
@@ -91,7 +91,7 @@ def met(measurement: TlsMeasurement, axes: list[FloatArray]) -> Met:
     return _between_points(found, measurement.planes, ray, (corner, weight, scene.mesh.vertices[corner]))
 
 
-def turned(found: Met, nominal: FloatArray, real: FloatArray) -> Met:
+def redirect_hits(found: RayHits, nominal: FloatArray, real: FloatArray) -> RayHits:
     """What rays (n, 3) meet that left in other directions `real`, along the planes that the nominal ones met: where noise is most
     of a reference's scatter, a ray that turns would go along the noise of a triangle."""
     before, after = (np.einsum("ni,ni->n", found.normal, each) for each in (nominal, real))
@@ -103,7 +103,7 @@ _Triangles = tuple[IntArray, FloatArray, FloatArray]
 """Of those met: their corners (n, 3), the weights of these (n, 3), and where they are (n, 3 corners, 3)."""
 
 
-def _between_points(found: Met, planes: PointPlanes, ray: FloatArray, triangles: _Triangles) -> Met:
+def _between_points(found: RayHits, planes: PointPlanes, ray: FloatArray, triangles: _Triangles) -> RayHits:
     """With planes through the points; where those are noise, in place of triangles, and the surface bent over these."""
     corner = triangles[0]
     normal = planes.normal[corner]

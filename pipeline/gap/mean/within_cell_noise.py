@@ -14,7 +14,7 @@ from scipy import sparse
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.linalg.lapack import dpotri
 
-from pipeline.gap.residuals.shared_noise import NodeField
+from pipeline.gap.residuals.correlated_noise import NodeField
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 
@@ -23,7 +23,7 @@ _LEAST_WHITE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class WithinNoise:
+class WithinCellNoise:
     """white: w; nodes: (n, q) before the cells' means are taken off; means: (m, q) of the cells, over the standard deviation that
     white noise gives them; prior, root: (q, q) lower Cholesky factors of C and of K."""
 
@@ -34,7 +34,7 @@ class WithinNoise:
     root: FloatArray
 
     @classmethod
-    def of(cls, field: NodeField, inverse_sigma: FloatArray, gathered: sparse.csr_array) -> WithinNoise:
+    def of(cls, field: NodeField, inverse_sigma: FloatArray, gathered: sparse.csr_array) -> WithinCellNoise:
         """inverse_sigma: (n,) of the points; gathered: (m, n) from columns over sigma to the cells' means."""
         nodes = sparse.csr_array(field.weights.multiply(inverse_sigma[:, None]))
         means = (gathered @ nodes).toarray()
@@ -42,10 +42,10 @@ class WithinNoise:
             return cls(1.0, nodes, means, field.covariance, field.covariance)
         white = max(1 - field.variance * float(np.mean(inverse_sigma**2)), _LEAST_WHITE)
         prior = cholesky(field.covariance, lower=True)
-        matrix = (nodes.T @ nodes).toarray() - means.T @ means + white * inverse_of(prior)
+        matrix = (nodes.T @ nodes).toarray() - means.T @ means + white * inverse_from_cholesky(prior)
         return cls(white, nodes, means, prior, cholesky(matrix, lower=True))
 
-    def of_means(self) -> FloatArray:
+    def mean_covariance(self) -> FloatArray:
         """(m, m) covariance of the cells' means."""
         shared = self.means @ self.prior
         return np.asarray(self.white * np.eye(len(shared)) + shared @ shared.T)
@@ -55,20 +55,20 @@ class WithinNoise:
         """Whether neighbours share nothing."""
         return self.nodes.shape[1] == 0
 
-    def on_nodes(self, columns: FloatArray, means: FloatArray | None = None) -> FloatArray:
+    def to_nodes(self, columns: FloatArray, means: FloatArray | None = None) -> FloatArray:
         """(q, k) Z' of columns (n, k); means: (m, k) of their cells, None where they are deviations already."""
         found = np.asarray(self.nodes.T @ columns)
         return found if means is None else found - self.means.T @ means
 
-    def solved(self, on_nodes: FloatArray) -> FloatArray:
+    def solve(self, on_nodes: FloatArray) -> FloatArray:
         """(q, k) K^-1 of columns on the nodes."""
         return np.asarray(cho_solve((self.root, True), on_nodes)) if len(self.root) else on_nodes
 
-    def halved(self, on_nodes: FloatArray) -> FloatArray:
+    def whiten(self, on_nodes: FloatArray) -> FloatArray:
         """(q, k) columns whose products are those of `on_nodes` with K^-1 between them."""
         return np.asarray(solve_triangular(self.root, on_nodes, lower=True)) if len(self.root) else on_nodes
 
-    def drawn(self, white: FloatArray, rows: slice, spread: FloatArray, random: KeyedRandom) -> FloatArray:
+    def draw(self, white: FloatArray, rows: slice, spread: FloatArray, random: KeyedRandom) -> FloatArray:
         """(q, d) what draws of the noise add to the products of columns on the nodes, beside `white` / root w with themselves.
 
         white: (n', d) draws of white noise on some `rows`; spread: (m, d) their sums over cells, as `means`. For noise
@@ -78,10 +78,10 @@ class WithinNoise:
         if not self.is_white:
             own = solve_triangular(self.prior, own, lower=True, trans="T")
         shared = self.nodes[rows].T @ white - self.means.T @ spread
-        return self.solved(own - shared / np.sqrt(self.white))
+        return self.solve(own - shared / np.sqrt(self.white))
 
 
-def inverse_of(root: FloatArray) -> FloatArray:
+def inverse_from_cholesky(root: FloatArray) -> FloatArray:
     """(q, q) inverse of the matrix whose lower Cholesky factor is given."""
     half = np.tril(dpotri(root, lower=True)[0])
     return np.asarray(half + np.tril(half, -1).T)

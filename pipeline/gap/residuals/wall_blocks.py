@@ -16,7 +16,7 @@ BLOCK_CELLS = 3
 
 
 @dataclass(frozen=True)
-class Cells:
+class WallCells:
     """Square cells. side_m; cell: (n,) number of each point's cell, -1 in a cell of too few points; centre: (m, 2), m."""
 
     side_m: float
@@ -24,7 +24,7 @@ class Cells:
     centre: FloatArray
 
     @classmethod
-    def over(cls, at: FloatArray) -> Cells:
+    def over(cls, at: FloatArray) -> WallCells:
         """Cells over points at (n, 2), as many as a dense covariance can serve."""
         side = float(np.sqrt(np.prod(np.ptp(at, axis=0)) / _MOST_CELLS)) or 1.0
         column, row = (np.floor((at[:, axis] - at[:, axis].min()) / side).astype(np.int64) for axis in (0, 1))
@@ -41,20 +41,20 @@ class Cells:
         return len(self.centre)
 
 
-def block_numbers(at: FloatArray, side_m: float) -> NDArray[np.int64]:
+def wall_block_numbers(at: FloatArray, side_m: float) -> NDArray[np.int64]:
     """(n,) number of the block, BLOCK_CELLS cells of `side_m` wide, in which each point lies."""
     column, row = (np.floor((at[:, axis] - at[:, axis].min()) / (BLOCK_CELLS * side_m)).astype(np.int64) for axis in (0, 1))
     return column + 100_000 * row
 
 
-def patches(at: FloatArray, points: float) -> NDArray[np.int64]:
+def wall_blocks_by_points(at: FloatArray, points: float) -> NDArray[np.int64]:
     """(n,) number of the square patch, of about so many points, in which each point lies."""
     side = float(np.sqrt(np.prod(np.ptp(at, axis=0)) / max(len(at) / points, 1.0))) or 1.0
     column, row = (np.floor((at[:, axis] - at[:, axis].min()) / side).astype(np.int64) for axis in (0, 1))
     return np.asarray(np.unique(column + 100_000 * row, return_inverse=True)[1])
 
 
-def held_out_blocks(at: FloatArray, side_m: float) -> NDArray[np.bool_]:
+def in_validation_blocks(at: FloatArray, side_m: float) -> NDArray[np.bool_]:
     """(n,) points of every fifth block, in a knight's-move pattern, which no step before the last one may look at."""
-    block = block_numbers(at, side_m)
+    block = wall_block_numbers(at, side_m)
     return np.asarray((block % 100_000 + 2 * (block // 100_000)) % 5 == 0)

@@ -38,26 +38,26 @@ class NodeField:
 
 
 @dataclass(frozen=True)
-class SharedNoise:
+class GridCorrelatedNoise:
     """What of the predicted noise neighbours share. effects: what makes it; pixels: (n, 2) columns and rows of the points."""
 
     effects: tuple[NodeNoise, ...] = ()
     pixels: FloatArray | None = None
 
     @classmethod
-    def of(cls, model: StereoModel, pixels: FloatArray) -> SharedNoise:
+    def of(cls, model: StereoModel, pixels: FloatArray) -> GridCorrelatedNoise:
         """What a model predicts of it."""
         return cls(_shared(model.matching_noise), pixels)
 
-    def part(self, rows: Any) -> SharedNoise:
+    def part(self, rows: Any) -> GridCorrelatedNoise:
         """Of some of the points."""
         return self if self.pixels is None else replace(self, pixels=self.pixels[rows])
 
-    def beside(self, effects: Sequence[MatchingNoise]) -> SharedNoise:
+    def with_effects(self, effects: Sequence[MatchingNoise]) -> GridCorrelatedNoise:
         """With further noise."""
         return replace(self, effects=(*self.effects, *_shared(effects)))
 
-    def field(self, count: int) -> NodeField:
+    def node_field(self, count: int) -> NodeField:
         """As values on nodes; of `count` points.
 
         What is finer than the points' own spacing is as good as white, and left out.
@@ -69,7 +69,7 @@ class SharedNoise:
         return _on_nodes(coarse, self.pixels, area) if coarse else _none(count)
 
 
-NOT_SHARED = SharedNoise()
+NO_CORRELATED_NOISE = GridCorrelatedNoise()
 
 
 def _none(count: int) -> NodeField:

@@ -41,19 +41,19 @@ Pose = tuple[FloatArray, FloatArray]
 
 
 @dataclass(frozen=True)
-class View:
+class SurveyView:
     """What one station or one pair sees. residuals: of a thinned grid, values without meaning; whole: points of the real grid;
     station: number of its pose; measurement: with its pose or its cameras."""
 
     residuals: Residuals
-    whole: int
+    point_count: int
     station: int
     measurement: Measurement
 
     @classmethod
     def of(cls, found: Residuals, whole: int, number: int, measurement: Measurement) -> Self:
         """On smooth parts of the wall. Raises InputError where there are next to none."""
-        smooth = np.flatnonzero(found.smooth)
+        smooth = np.flatnonzero(found.usable)
         if len(smooth) < _FEWEST_POINTS:
             raise InputError(
                 f"{len(smooth)} of {len(found)} points lie on smooth parts of the wall, {_FEWEST_POINTS} are needed",
@@ -65,11 +65,11 @@ class View:
     @property
     def sigma(self) -> FloatArray:
         """(n,) predicted spread that gives the thinned points the weight of all."""
-        return self.residuals.sigma * np.sqrt(len(self.residuals) / max(self.whole, 1))
+        return self.residuals.sigma * np.sqrt(len(self.residuals) / max(self.point_count, 1))
 
 
 @dataclass(frozen=True)
-class TlsView(View):
+class TlsView(SurveyView):
     """What one station sees."""
 
     residuals: TlsResiduals
@@ -77,7 +77,7 @@ class TlsView(View):
 
 
 @dataclass(frozen=True)
-class StereoView(View):
+class StereoView(SurveyView):
     """What one pair sees."""
 
     residuals: StereoResiduals
@@ -165,7 +165,7 @@ def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Surve
     centre = measurement.reference.bounds.mean(axis=0)
     if isinstance(measurement, StereoMeasurement):
         seen = stereo_residuals(measurement)
-        pair = StereoView(seen.part(_thinned(seen, most)), int(seen.smooth.sum()), 0, measurement)
+        pair = StereoView(seen.part(_thinned(seen, most)), int(seen.usable.sum()), 0, measurement)
         return StereoSurvey((pair,), centre, _pair_observer("medium"))
     if isinstance(measurement, SurfaceMeasurement):
         raise InputError("has no cameras, so no effect that it could show", where="--identifiability", remedy="name `cameras`")
@@ -173,11 +173,11 @@ def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Surve
     several = [(scan.set_up, one) for scan, rows, one in measurement.each_scan() if len(rows)]
     found, *others = [(number, one, tls_residuals(one)) for number, one in several or [(0, measurement)]]
     views = tuple(
-        TlsView(each.part(_thinned(each, most)), int(each.smooth.sum()), number, one) for number, one, each in (found, *others)
+        TlsView(each.part(_thinned(each, most)), int(each.usable.sum()), number, one) for number, one, each in (found, *others)
     )
     _, measurement, residuals = found
     view = views[0]
-    step = float(np.sqrt(np.prod(np.ptp(measurement.cloud.points[:, :2], axis=0)) / max(view.whole, 1)))
+    step = float(np.sqrt(np.prod(np.ptp(measurement.cloud.points[:, :2], axis=0)) / max(view.point_count, 1)))
     reach = float(np.median(residuals.geometry.range_m))
     steps = {"azimuth_step_rad": step / reach, "zenith_step_rad": step / reach}  # coarser than a scan where the wall is near
     scanner = ScannerConfig(zenith_limits_rad=(0.05, 3.09)).model_copy(update=steps)
@@ -186,7 +186,7 @@ def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Surve
 
 def _thinned(found: Residuals, most: int) -> NDArray[np.int64]:
     """About so many of the rows on smooth parts."""
-    rows = np.flatnonzero(found.smooth)
+    rows = np.flatnonzero(found.usable)
     return rows[:: max(len(rows) // most, 1)]
 
 

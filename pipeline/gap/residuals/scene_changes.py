@@ -34,8 +34,8 @@ from scipy.special import ndtri
 from pipeline.change.robust import nmad
 from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
-from pipeline.gap.residuals.sight import NEIGHBOURS, Sight
-from pipeline.gap.residuals.standardized import medians, spread, standardized
+from pipeline.gap.residuals.sensor_view import NEIGHBOURS, SensorView
+from pipeline.gap.residuals.standardized import group_medians, nmad_along_covariates, standardize
 from scene.geometry.frame import WallFrame
 from scene.geometry.mesh import FloatArray
 
@@ -85,7 +85,7 @@ class SceneChange:
                 "volume_std_m3": self.volume_std_m3}  # fmt: skip
 
 
-def find_changes(residuals: Residuals, sight: Sight, eligible: BoolArray) -> tuple[list[SceneChange], BoolArray]:
+def find_scene_changes(residuals: Residuals, sight: SensorView, eligible: BoolArray) -> tuple[list[SceneChange], BoolArray]:
     """Regions that moved, and (n,) the points in or beside them.
 
     residuals: registered roughly; eligible: (n,) points away from depth edges, which alone bear witness. What is around a change,
@@ -99,23 +99,23 @@ def find_changes(residuals: Residuals, sight: Sight, eligible: BoolArray) -> tup
     for _ in range(_ROUNDS):
         before = beside
         quiet = eligible & ~beside
-        departure, z = standardized(residuals, sight.even_plane, quiet)
-        around = sight.median_around(np.where(eligible, z, 0.0))
-        scatter = spread(residuals, around, quiet)
+        departure, z = standardize(residuals, sight.scaled_coordinates, quiet)
+        around = sight.neighbour_median(np.where(eligible, z, 0.0))
+        scatter = nmad_along_covariates(residuals, around, quiet)
         shared = np.sqrt(np.maximum(scatter**2 - _BY_WHITE**2, 0.0))
         error = np.stack([np.abs(departure / np.where(z == 0, np.inf, z)), shared * residuals.sigma]) * residuals.unit_m
         faint = around / np.maximum(scatter, _LEAST_AROUND)
         faint[np.abs(around) * residuals.sigma * residuals.unit_m < decided().changes.smallest] = 0.0
         label, limit = _components(z, faint, sight, eligible)
         members = np.flatnonzero(label >= 0)
-        beside = sight.beside(members, decided().changes.margin) if len(members) else np.zeros(len(residuals), dtype=bool)
+        beside = sight.near(members, decided().changes.margin) if len(members) else np.zeros(len(residuals), dtype=bool)
         if not (beside & ~before).any():
             break
     limited = departure * np.minimum(1.0, limit / np.maximum(np.abs(z), 1e-12))
     return _measured(label, limited, error, sight), beside
 
 
-def once_each(changes: list[SceneChange]) -> list[SceneChange]:
+def drop_duplicates(changes: list[SceneChange]) -> list[SceneChange]:
     """Without those that another scan saw too: whose middle lies in a larger one's box."""
     kept: list[SceneChange] = []
     for change in changes:
@@ -125,7 +125,7 @@ def once_each(changes: list[SceneChange]) -> list[SceneChange]:
     return kept
 
 
-def moved_share(residuals: Residuals, sight: Sight, eligible: BoolArray) -> float:
+def moved_share(residuals: Residuals, sight: SensorView, eligible: BoolArray) -> float:
     """Share of the eligible points (n,) that lie off the reference together with their neighbours, wherever and however far.
 
     residuals: registered. White noise moves a median of nine by 0.4 sigma; a wrong pose, where much moved, counts too.
@@ -134,19 +134,19 @@ def moved_share(residuals: Residuals, sight: Sight, eligible: BoolArray) -> floa
     if len(known) < NEIGHBOURS:
         return 0.0
     part = residuals.part(known)
-    around = sight.part(known).median_around(part.value / part.sigma)
+    around = sight.part(known).neighbour_median(part.value / part.sigma)
     far = np.abs(around) * part.sigma * part.unit_m > decided().changes.smallest
     return float(np.mean(far & (np.abs(around) > decided().changes.moved_sigmas)))
 
 
-def _components(z: FloatArray, faint: FloatArray, sight: Sight, eligible: BoolArray) -> tuple[NDArray[np.int64], FloatArray]:
+def _components(z: FloatArray, faint: FloatArray, sight: SensorView, eligible: BoolArray) -> tuple[NDArray[np.int64], FloatArray]:
     """(n,) number of the change in which each point lies, -1 in none, and (n,) sigmas by which its neighbours bear it out.
 
     z: (n,) departures in sigmas; faint: (n,) the same of medians of neighbours.
     """
     spread_out = np.abs(faint) > decided().changes.faint
     side = np.where(spread_out, np.sign(faint), np.sign(z)) * (spread_out | (np.abs(z) > _LEVELS[0]))
-    first, second = sight.around(np.flatnonzero(side))
+    first, second = sight.neighbour_pairs(np.flatnonzero(side))
     together = side[first] * side[second] > 0
     pairs, size = (first[together], second[together]), np.abs(z)
     least = max(decided().changes.middle_sigmas, _correlated_sigmas(z, sight, eligible))
@@ -191,7 +191,7 @@ def _significant(z: FloatArray, level: float, ratio: float, pairs: Pairs, eligib
     label = _connected(eligible & (z > level), _agreeing(pairs, np.abs(z), ratio))
     inside = label >= 0
     count = np.bincount(label[inside])
-    middle = medians(z[inside], label[inside], len(count), 1)
+    middle = group_medians(z[inside], label[inside], len(count), 1)
     accepted = np.zeros(len(count), dtype=bool)
     for _ in range(len(count)):
         stray = np.sort(z[inside][~accepted[label[inside]]])
@@ -223,11 +223,11 @@ def _agreeing_share(ordered: FloatArray, ratio: float) -> float:
     return float(max(2 * above.sum(), 1) / (len(ordered) * (len(ordered) - 1)))
 
 
-def _correlated_sigmas(z: FloatArray, sight: Sight, eligible: BoolArray) -> float:
+def _correlated_sigmas(z: FloatArray, sight: SensorView, eligible: BoolArray) -> float:
     """Departure of a component, in sigmas, that noise hardly makes: little where it is white, as much as of single points where
     neighbours share it. From how much means over a point and its neighbours spread."""
     known = np.flatnonzero(eligible)
-    first, second = sight.around(known[:: max(len(known) // _SAMPLE, 1)])
+    first, second = sight.neighbour_pairs(known[:: max(len(known) // _SAMPLE, 1)])
     clipped = np.clip(z, -_ALMOST_ALL, _ALMOST_ALL)
     counts = np.bincount(first, minlength=len(z))
     total = clipped + np.bincount(first, clipped[second], len(z))
@@ -266,14 +266,14 @@ def _kept(pairs: Pairs, which: BoolArray) -> Pairs:
     return pairs[0][which], pairs[1][which]
 
 
-def _compact(label: NDArray[np.int64], sight: Sight, points: int) -> NDArray[np.int64]:
+def _compact(label: NDArray[np.int64], sight: SensorView, points: int) -> NDArray[np.int64]:
     """Labels (n,) without those of regions that are no compact change: a large part of the wall, or a stripe."""
     rows = np.flatnonzero(label >= 0)
     if not len(rows):
         return label
     order = rows[np.argsort(label[rows], kind="stable")]
     starts = np.flatnonzero(np.diff(label[order], prepend=-1))
-    place = sight.even_plane[order]
+    place = sight.scaled_coordinates[order]
     length = (np.maximum.reduceat(place, starts) - np.minimum.reduceat(place, starts)).max(axis=1)
     size = np.diff(np.append(starts, len(order))) / len(np.unique(sight.epoch))
     stripe = (length >= decided().changes.stripe) & (size <= 0.1 * length**2)
@@ -281,13 +281,13 @@ def _compact(label: NDArray[np.int64], sight: Sight, points: int) -> NDArray[np.
     return np.where(np.isin(label, label[order][starts][compact]), label, -1)
 
 
-def _measured(label: NDArray[np.int64], departure: FloatArray, error: FloatArray, sight: Sight) -> list[SceneChange]:
+def _measured(label: NDArray[np.int64], departure: FloatArray, error: FloatArray, sight: SensorView) -> list[SceneChange]:
     """The changes by their volume, the largest first. error: (2, n) of each ray's departure, and of all in common, m."""
     rows = np.flatnonzero(label >= 0)
     if not len(rows):
         return []
     solid = sight.solid_angles(rows)
-    near, far = sight.reference_m[rows], sight.range_with(rows, departure[rows])
+    near, far = sight.reference_m[rows], sight.range_at_residual(rows, departure[rows])
     volume = (far**3 - near**3) / 3 * solid
     area = near**2 * solid
     width = 0.5 * np.sqrt(area)

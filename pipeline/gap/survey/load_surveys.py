@@ -7,11 +7,11 @@ from pathlib import Path
 
 from pipeline.config.simulation import SensorName, load_config
 from pipeline.formats.measurements.measurement import FILE, read_measurement
-from pipeline.gap.survey.planned import Survey, measured_survey, planned_survey
+from pipeline.gap.survey.survey_views import Survey, measured_survey, planned_survey
 from scene.common.errors import InputError
 
 
-def surveys(path: Path, overrides: Sequence[str] = (), sensor: SensorName | None = None) -> list[Survey]:
+def load_surveys(path: Path, overrides: Sequence[str] = (), sensor: SensorName | None = None) -> list[Survey]:
     """A measurement's survey, or one for each sensor of a config (or for `sensor` alone).
 
     path: a folder with measurement.yaml, that file, or a config. Raises InputError for what cannot be read or does not fit.

@@ -9,8 +9,8 @@ import numpy as np
 
 from pipeline.gap.decisions import decided
 from pipeline.gap.other.spread import spread_candidates
-from pipeline.gap.survey.planned import Survey, TlsView, View
-from pipeline.gap.survey.survey_design import SIGNAL_TO_NOISE, signatures
+from pipeline.gap.survey.survey_design import DETECTION_SNR, view_signatures
+from pipeline.gap.survey.survey_views import Survey, SurveyView, TlsView
 from sensors.effects import catalogue
 from sensors.effects.base import Effect
 from sensors.effects.detection_limit import DetectionLimit
@@ -23,7 +23,7 @@ _NO_NUMBER = "no signature in closed form: the diagnosis tries it, this table ha
 
 
 @dataclass(frozen=True)
-class OtherEffect:
+class NoiseOrLossEffect:
     """An effect on the spread or on the returns. seen_from: the parameter's value at S/N 5, NaN where none is computed."""
 
     name: str
@@ -41,7 +41,7 @@ class OtherEffect:
         }
 
 
-def others(survey: Survey) -> tuple[OtherEffect, ...]:
+def noise_and_loss_effects(survey: Survey) -> tuple[NoiseOrLossEffect, ...]:
     """Every effect of the catalogue that has no signature in the mean, with the value that would be seen where it is known."""
     view = survey.views[0]
     found = {each.name: each for each in _spread(view)}
@@ -49,7 +49,7 @@ def others(survey: Survey) -> tuple[OtherEffect, ...]:
         found |= {each.name: each for each in (_steps(), _limit(view), _rain(view))}
     names = {f"{survey.sensor}.{effect.tag()}": effect for effect in catalogue(survey.sensor)}
     mean = _mean_names(view)
-    unknown = {name: OtherEffect(name, "", np.nan, _unknown(effect)) for name, effect in names.items()}
+    unknown = {name: NoiseOrLossEffect(name, "", np.nan, _unknown(effect)) for name, effect in names.items()}
     return tuple(found.get(name, unknown[name]) for name in names if name not in mean)
 
 
@@ -58,53 +58,53 @@ def _unknown(effect: type[Effect]) -> str:
     return f"needs {' and '.join(effect.needs)}: the diagnosis does not try it" if effect.needs else _NO_NUMBER
 
 
-def _mean_names(view: View) -> set[str]:
-    return {f"{view.residuals.sensor}.{candidate.name}" for candidate in signatures(view)}
+def _mean_names(view: SurveyView) -> set[str]:
+    return {f"{view.residuals.sensor}.{candidate.name}" for candidate in view_signatures(view)}
 
 
-def _spread(view: View) -> list[OtherEffect]:
+def _spread(view: SurveyView) -> list[NoiseOrLossEffect]:
     """sigma_i^2 = model + theta f_i: the information on theta is sum (f_i / sigma_i^2)^2 / 2."""
     residuals = view.residuals
     candidates = spread_candidates(residuals)
-    found: dict[str, OtherEffect] = {}
+    found: dict[str, NoiseOrLossEffect] = {}
     excess = decided().spread.least_excess
     for candidate in candidates:
         form = candidate.variance.sum(axis=1) / residuals.sigma**2
-        information = 0.5 * float(np.sum(form**2)) * view.whole / len(residuals)
-        theta = SIGNAL_TO_NOISE / np.sqrt(max(information, 1e-300))
+        information = 0.5 * float(np.sum(form**2)) * view.point_count / len(residuals)
+        theta = DETECTION_SNR / np.sqrt(max(information, 1e-300))
         least = excess / max(float(np.mean(form)), 1e-300)
         note = "" if theta > least else f"below that it adds less than {100 * excess:.0f} % to the variance, which is not named"
         value = candidate.parameters(np.full(len(candidate.names), max(theta, least)))[candidate.names[0]]
         name = f"{residuals.sensor}.{candidate.name}"
         if name not in found or value < found[name].seen_from:
-            found[name] = OtherEffect(name, candidate.names[0], float(value), note)
+            found[name] = NoiseOrLossEffect(name, candidate.names[0], float(value), note)
     return list(found.values())
 
 
-def _steps() -> OtherEffect:
+def _steps() -> NoiseOrLossEffect:
     note = "by its comb, where the file holds ranges more finely than the step"
-    return OtherEffect(f"tls.{RangeQuantization.tag()}", "step_m", 1e-4, note)
+    return NoiseOrLossEffect(f"tls.{RangeQuantization.tag()}", "step_m", 1e-4, note)
 
 
-def _limit(view: TlsView) -> OtherEffect:
+def _limit(view: TlsView) -> NoiseOrLossEffect:
     """Losing the k weakest echoes gains k ln(1 / losses) in likelihood; S/N 5 is a gain of 12.5."""
     power = view.residuals.geometry.power
     if power is None:
-        return OtherEffect(f"tls.{DetectionLimit.tag()}", "minimum_power", np.nan, "needs recorded powers")
-    share = 0.5 * SIGNAL_TO_NOISE**2 / np.log(1 / _LOSSES) / view.whole
+        return NoiseOrLossEffect(f"tls.{DetectionLimit.tag()}", "minimum_power", np.nan, "needs recorded powers")
+    share = 0.5 * DETECTION_SNR**2 / np.log(1 / _LOSSES) / view.point_count
     value = float(np.quantile(power, min(max(share, 1 / len(power)), 1.0)))
-    return OtherEffect(
+    return NoiseOrLossEffect(
         f"tls.{DetectionLimit.tag()}", "minimum_power", value, "as soon as it takes the weakest echoes; needs the pattern"
     )
 
 
-def _rain(view: TlsView) -> OtherEffect:
+def _rain(view: TlsView) -> NoiseOrLossEffect:
     """The share p = 1 - (1 - p0) exp(-2 beta R) of losses, p0 unknown: information on beta beside p0."""
     distance = view.residuals.geometry.range_m
     slopes = np.stack([2 * distance * (1 - _LOSSES), np.ones_like(distance)], axis=1)
-    weight = view.whole / len(distance) / (_LOSSES * (1 - _LOSSES))
+    weight = view.point_count / len(distance) / (_LOSSES * (1 - _LOSSES))
     information = weight * slopes.T @ slopes
-    rate = SIGNAL_TO_NOISE * float(np.sqrt(np.linalg.inv(information)[0, 0]))
-    return OtherEffect(
+    rate = DETECTION_SNR * float(np.sqrt(np.linalg.inv(information)[0, 0]))
+    return NoiseOrLossEffect(
         f"tls.{Precipitation.tag()}", "rate_per_m", rate, f"beside a loss of {100 * _LOSSES:.0f} % that is there anyway"
     )

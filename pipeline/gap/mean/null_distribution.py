@@ -1,0 +1,59 @@
+"""What every family of explanations gains where there is nothing to explain: the null distribution of the largest gain."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.gap.mean.design import NULL_DRAWS, Design
+from pipeline.gap.mean.mean_model import CellCovariance
+from scene.common.keyed_random import KeyedRandom
+from scene.common.threads import map_in_threads
+from scene.geometry.mesh import FloatArray
+
+_NEAR_NULL = 8
+"""Covariances, the most likely ones, at which the draws are fitted."""
+
+
+@dataclass(frozen=True)
+class NullDistribution:
+    """Gains of every family in draws of pose, the reference's correlated error and noise alone, (DRAWS,) each."""
+
+    log_likelihood_ratios: Mapping[str, FloatArray]
+
+    @classmethod
+    def of(cls, design: Design, random: KeyedRandom) -> NullDistribution:
+        """By the most likely covariances, each family at its best value."""
+        near = design.equations.at_covariances(design.ranked_covariances[:_NEAR_NULL])
+        draws = design.model.null_draws(design.null_covariance, NULL_DRAWS, random.child("between"))
+
+        def values(at: CellCovariance) -> tuple[FloatArray, FloatArray, FloatArray]:
+            weighted = draws[at.basis] * at.weight[:, None]
+            constant = 0.5 * (np.log(at.weight).sum() - np.sum(draws[at.basis] * weighted, axis=0))
+            right = design.noise_products + design.fixed.between[at.basis].T @ weighted
+            return right, constant, design.sine_products.noise + design.sine_products.between[at.basis].T @ weighted
+
+        right, constant, waves = (np.stack(part) for part in zip(*map_in_threads(values, near.covariances), strict=True))
+        drawn = near.with_values(right, constant, waves)
+        plain, fixed, searched = drawn.profile_log_likelihood(design.pose_columns, design.plain_columns)
+        return cls(
+            {
+                name: np.maximum(np.concatenate([fixed[rows], searched[numbers]]).max(axis=0) - plain, 0.0)
+                for name, (rows, numbers) in design.families.by_name.items()
+            }
+        )
+
+    def penalty(self, family: str) -> float:
+        """Twice what a family gains on average where there is nothing."""
+        return 2 * float(self.log_likelihood_ratios[family].mean())
+
+    def p_value(self, score: float, larger: Mapping[str, float] | None = None) -> float:
+        """Of the largest score over all families where there is nothing: (1 + b) / (1 + N).
+
+        larger: those families alone, which gain so many times as much.
+        """
+        times = dict.fromkeys(self.log_likelihood_ratios, 1.0) if larger is None else larger
+        scores = np.stack([each * self.log_likelihood_ratios[name] - self.penalty(name) for name, each in times.items()])
+        return float((1 + np.sum(scores.max(axis=0) >= score)) / (1 + NULL_DRAWS))
