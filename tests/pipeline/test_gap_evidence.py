@@ -124,7 +124,7 @@ class _Scripted:
     def __init__(self, scores: Callable[[set[str]], dict[tuple[str, str], float]]) -> None:
         self._scores = scores
 
-    def tried(self, members: EffectSet) -> tuple[FamilyScore, ...]:
+    def score_families(self, members: EffectSet) -> tuple[FamilyScore, ...]:
         known = {member.name for member in members}
         found = [
             FamilyScore(name, bool(form), score, score, Candidate(name, np.zeros((1, 1)), lambda _: {}, (), {}, bool(form), form))
@@ -136,16 +136,16 @@ class _Scripted:
     def p_value(self, score: float) -> float:
         return 0.001
 
-    def score(self, members: EffectSet) -> float:
+    def joint_score(self, members: EffectSet) -> float:
         return sum(member.score for member in members)
 
-    def kin(self, form: FamilyScore) -> set[str]:
+    def correlated_covariates(self, form: FamilyScore) -> set[str]:
         return {form.name}
 
-    def folded(self, members: Any, form: Any) -> Any:
+    def with_harmonics(self, members: Any, form: Any) -> Any:
         return form
 
-    def may_be_the_reference(self, members: EffectSet, form: FamilyScore) -> bool:
+    def may_be_reference_error(self, members: EffectSet, form: FamilyScore) -> bool:
         return False
 
 
@@ -164,7 +164,7 @@ class _Cameras(_Scripted):
     def __init__(self) -> None:
         super().__init__(lambda known: {})
 
-    def tried(self, members: EffectSet) -> tuple[FamilyScore, ...]:
+    def score_families(self, members: EffectSet) -> tuple[FamilyScore, ...]:
         found = []
         for key, score in self._SCORES.get(
             " ".join(" ".join([one.name, *one.candidate.fixed.values()]) for one in members), {}

@@ -81,7 +81,9 @@ def test_such_an_effect_stands_where_it_leaves_no_more_than_chance(
 ) -> None:
     """Whatever only looks like it leaves something: its signature is another one."""
     estimate = SimpleNamespace(candidate=SimpleNamespace(empirical=empirical))
-    found: Any = SimpleNamespace(search=SimpleNamespace(p_of_rest=lambda _: p_value), tried=(), estimates=[estimate])
+    found: Any = SimpleNamespace(
+        search=SimpleNamespace(goodness_of_fit_p_value=lambda _: p_value), tried=(), estimates=[estimate]
+    )
     assert naming._explains_all(found) is all_of_it
 
 

@@ -18,7 +18,7 @@ from pipeline.gap.other.missing import MissingFound
 from pipeline.gap.other.quantization import Comb
 from pipeline.gap.other.shapes import ShapeFound
 from pipeline.gap.other.spread import SpreadFound
-from pipeline.gap.residuals.alignment import Alignment, align
+from pipeline.gap.residuals.alignment import AlignedMeasurement, align
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from scene.common.config import parse
@@ -97,7 +97,7 @@ def settled_with(
     effects: Iterable[Named],
     trusted: NDArray[np.int64] | None = None,
     noise: dict[str, float] | None = None,
-) -> Alignment:
+) -> AlignedMeasurement:
     """The measurement with further effects in its model, settled: its residuals are taken again and registered.
 
     trusted: rows of the measurement's points by which to register, all where None; noise: other values of the model's noise.

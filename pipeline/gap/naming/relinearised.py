@@ -23,7 +23,7 @@ from pipeline.gap.mean.selection import FamilyScore, SelectedEffect, equivalence
 from pipeline.gap.naming.entries import Estimate, from_mean, is_possible, settled_with, typical_sizes
 from pipeline.gap.naming.families import PERIODIC, effects_of, families_of
 from pipeline.gap.other.spread import SpreadFound
-from pipeline.gap.residuals.alignment import Alignment, fit_pose_robustly
+from pipeline.gap.residuals.alignment import AlignedMeasurement, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -389,7 +389,7 @@ def _weighed_at(points: SearchedPoints, at: Residuals) -> Residuals:
     return weighed(at, points.spread_at(at), fit_pose_robustly(at)[2])
 
 
-def _with(points: SearchedPoints, effects: list[Estimate]) -> Alignment:
+def _with(points: SearchedPoints, effects: list[Estimate]) -> AlignedMeasurement:
     """The measurement with some effects in its model, settled."""
     return settled_with(points.measurement, [from_mean(each, points.part) for each in effects], points.part.index)
 

@@ -104,7 +104,7 @@ def compute_residuals(measurement: Measurement) -> Residuals:
     return replace(found, value=found.value - away, epoch_offset=away)
 
 
-class Alignment(NamedTuple):
+class AlignedMeasurement(NamedTuple):
     """A measurement with its sensor where its points say that it stood, its residuals there, and the pose (6,) that led there."""
 
     measurement: Measurement
@@ -112,7 +112,9 @@ class Alignment(NamedTuple):
     pose: FloatArray
 
 
-def align(measurement: Measurement, trusted: NDArray[np.int64] | None = None, found: Residuals | None = None) -> Alignment:
+def align(
+    measurement: Measurement, trusted: NDArray[np.int64] | None = None, found: Residuals | None = None
+) -> AlignedMeasurement:
     """The measurement with its sensor where its points say that it stood.
 
     trusted: rows of the measurement's points by which to register, all where None; found: its residuals, if known. A pose that
@@ -131,7 +133,7 @@ def align(measurement: Measurement, trusted: NDArray[np.int64] | None = None, fo
         if not len(beyond.value):  # the pose leads off the wall
             break
         measurement, total, found = there, total + pose, beyond
-    return Alignment(measurement, found, total)
+    return AlignedMeasurement(measurement, found, total)
 
 
 def _only(residuals: Residuals, trusted: NDArray[np.int64] | None) -> Residuals:
