@@ -1,4 +1,4 @@
-"""What the rays of a scan meet on the surface as known."""
+"""Trace the rays of a laser scan to the reference surface, and describe the surface where they hit it."""
 
 from __future__ import annotations
 
@@ -13,17 +13,26 @@ from scene.geometry.point_planes import PointPlanes
 from sensors.signal_chain.pulses import PulseGeometry
 
 _PROBE_RAD = 6e-4
-"""Angle to the neighbouring rays that tell edges: about the width of a beam."""
+"""Angle to the neighbouring rays that detect edges, rad: about the width of a beam."""
 _LEAST_COSINE = 0.05
+"""Smallest cosine of the incidence angle that is divided by."""
 
 
 @dataclass(frozen=True)
 class RayGeometry(PulseGeometry):
-    """Per point what the equations look at, where the beam goes on average by the model, and the measured range (m).
+    """Geometry of n laser rays as the equations of the effects use it, with what the residuals need beside it.
 
-    bulge_m: by how much nearer the surface lies than the triangle between its points, part of range_m; None: not at all. corner,
-    weight: (n, 3) vertices of the triangle met, and what each says of the place in it; None where the vertices have no errors.
-    plane_normal: (n, 3), scanner frame, of the plane along which a ray that turns goes; None: along the triangles.
+    The fields of `PulseGeometry` describe the average direction of the beam under the current model.
+
+    Attributes
+    ----------
+    measured_m : (n,) measured ranges, m.
+    bulge_m : (n,) how much nearer the curved surface lies than the triangle between its points, m; included in `range_m`. None if
+        the reference is used as it is.
+    corner : (n, 3) vertices of the triangle that was hit; None if the vertices have no errors of their own.
+    weight : (n, 3) barycentric weights of these vertices at the hit.
+    plane_normal : (n, 3) normals, scanner frame, of the planes along which a deflected ray is followed; None: along the
+        triangles.
     """
 
     measured_m: FloatArray = field(default_factory=lambda: np.zeros(0))
@@ -33,29 +42,37 @@ class RayGeometry(PulseGeometry):
     plane_normal: FloatArray | None = None
 
     def part(self, rows: Rows) -> RayGeometry:
-        """The same of some of the points."""
+        """Return the geometry of some of the rays."""
         return select_rows(self, rows)
 
     @property
     def sensor_coordinates(self) -> FloatArray:
-        """(n, 2) azimuth and zenith, rad."""
+        """(n, 2) azimuth and zenith angle, rad."""
         return np.stack([self.azimuth, self.zenith], axis=1)
 
     @property
     def departure(self) -> FloatArray:
-        """(n,) measured range less that of the reference, m."""
+        """(n,) measured range minus the range to the reference, m."""
         return np.asarray(self.measured_m - self.range_m)
 
 
 @dataclass(frozen=True)
 class RayHits:
-    """What n rays meet. distance: (n,), m; normal: (n, 3) of the triangle, unit; cos_incidence: (n,); curvature: (n,) the largest
-    departure from the triangle's plane within a beam's width, m.
+    """Where n rays hit the reference surface.
 
-    Of a reference made of points the incidence is that to planes through 24 of them, and so is the normal where noise is most of
-    their scatter: triangles lean by the noise of their corners, which is that of the distance too, so that whatever is
-    proportional to a slope would seem to be there. bulge: (n,) by how much nearer the surface then lies than the triangle, part
-    of the distance, m; scatter: (n,) of the points about planes, over the typical one. corner, weight: as in `RayGeometry`.
+    For a reference made of points, incidence angles refer to planes through 24 points, because triangles lean with the noise of
+    their corners. That noise is also in the range, so it would imitate every effect that depends on the incidence angle. Where
+    noise dominates the scatter of the points, the normals are those of the planes too.
+
+    Attributes
+    ----------
+    distance : (n,) range to the surface, m; infinite or NaN without a hit.
+    normal : (n, 3) unit normals, of the triangle or of the plane through the points.
+    cos_incidence : (n,) cosine of the incidence angle.
+    curvature : (n,) largest deviation of the surface from the triangle's plane within a beam's width, m.
+    bulge : (n,) how much nearer the curved surface lies than the triangle, m; included in `distance`.
+    scatter : (n,) scatter of the reference's points about the planes, relative to its median.
+    corner, weight : As in `RayGeometry`.
     """
 
     distance: FloatArray
@@ -69,7 +86,18 @@ class RayHits:
 
 
 def cast_rays(measurement: TlsMeasurement, axes: list[FloatArray]) -> RayHits:
-    """axes: the rays' directions (n, 3), unit, wall frame, and how they turn with azimuth and zenith."""
+    """Trace rays from the scanner to the reference surface.
+
+    Parameters
+    ----------
+    measurement : The scan, with its station and reference.
+    axes : Three (n, 3) arrays in the wall frame: unit directions of the rays, and their derivatives by azimuth and by zenith
+        angle.
+
+    Returns
+    -------
+    The hits, in the order of the rays.
+    """
     ray, scene, position = axes[0], measurement.scene, measurement.station[0]
     distance, face = scene.cast(position, ray)
     face = np.maximum(face, 0)
@@ -88,23 +116,35 @@ def cast_rays(measurement: TlsMeasurement, axes: list[FloatArray]) -> RayHits:
     found = replace(found, corner=corner, weight=weight)
     if measurement.planes is None:
         return found
-    return _between_points(found, measurement.planes, ray, (corner, weight, scene.mesh.vertices[corner]))
+    return _smoothed_hits(found, measurement.planes, ray, (corner, weight, scene.mesh.vertices[corner]))
 
 
 def redirect_hits(found: RayHits, nominal: FloatArray, real: FloatArray) -> RayHits:
-    """What rays (n, 3) meet that left in other directions `real`, along the planes that the nominal ones met: where noise is most
-    of a reference's scatter, a ray that turns would go along the noise of a triangle."""
+    """Compute the hits of deflected rays from those of the nominal rays, along the planes that the nominal rays hit.
+
+    This is for a reference whose scatter is mostly noise: there a deflected ray would follow the noise of a triangle.
+
+    Parameters
+    ----------
+    found : Hits of the nominal rays.
+    nominal : (n, 3) unit directions of the nominal rays.
+    real : (n, 3) unit directions of the deflected rays.
+
+    Returns
+    -------
+    The hits with the new distances and incidence angles.
+    """
     before, after = (np.einsum("ni,ni->n", found.normal, each) for each in (nominal, real))
     distance = found.distance * before / np.where(np.abs(after) > _LEAST_COSINE, after, np.nan)
     return replace(found, distance=distance, cos_incidence=np.abs(after))
 
 
 _Triangles = tuple[IntArray, FloatArray, FloatArray]
-"""Of those met: their corners (n, 3), the weights of these (n, 3), and where they are (n, 3 corners, 3)."""
+"""The triangles that were hit: vertex numbers (n, 3), barycentric weights (n, 3), and corner positions (n, 3 corners, 3)."""
 
 
-def _between_points(found: RayHits, planes: PointPlanes, ray: FloatArray, triangles: _Triangles) -> RayHits:
-    """With planes through the points; where those are noise, in place of triangles, and the surface bent over these."""
+def _smoothed_hits(found: RayHits, planes: PointPlanes, ray: FloatArray, triangles: _Triangles) -> RayHits:
+    """Take incidence angle and scatter from planes through the points; if noise dominates, also normal and a curved surface."""
     corner = triangles[0]
     normal = planes.normal[corner]
     normal = normal * np.where(np.einsum("nki,ni->nk", normal, found.normal) < 0, -1.0, 1.0)[..., None]
@@ -116,15 +156,15 @@ def _between_points(found: RayHits, planes: PointPlanes, ray: FloatArray, triang
     if not planes.noise_dominates:
         return found
     towards = np.where(np.einsum("ni,ni->n", ray, found.normal) > 0, -1.0, 1.0)
-    bulge = towards * _height(normal, triangles) / np.maximum(cosine, _LEAST_COSINE)
+    bulge = towards * _height_above_triangles(normal, triangles) / np.maximum(cosine, _LEAST_COSINE)
     return replace(found, distance=found.distance - bulge, normal=mean, bulge=bulge)
 
 
-def _height(normal: FloatArray, triangles: _Triangles) -> FloatArray:
-    """(n,) of a surface over its triangles whose normals at the corners are (n, 3 corners, 3).
+def _height_above_triangles(normal: FloatArray, triangles: _Triangles) -> FloatArray:
+    """(n,) height of a curved surface above its triangles, from normals (n, 3 corners, 3) at their corners.
 
-    With barycentric coordinates b the sum over the sides of 4 b_i b_j d_ij, where d_ij = (n_j - n_i) (p_j - p_i) / 8 is the
-    height of an arc over its chord.
+    With barycentric coordinates b it is the sum over the sides of 4 b_i b_j d_ij, where d_ij = (n_j − n_i)·(p_j − p_i) / 8 is the
+    height of an arc above its chord.
     """
     _, weight, at = triangles
     height = np.zeros(len(weight))

@@ -1,4 +1,4 @@
-"""Several scans with one instrument as one set of residuals: one set of effects, and a pose for each set-up."""
+"""Combine several scans with one instrument: all share one set of effects, and each set-up has its own pose."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ from sensors.models.sensor_model import TlsModel
 
 
 def residuals_of_scans(measurement: TlsMeasurement) -> TlsResiduals:
-    """Residuals of all scans, in the order of the measurement's points. pose: (n, 6 k), six columns for each of k set-ups."""
+    """Compute the residuals of all scans of a measurement, in the order of its points.
+
+    The pose Jacobian is (n, 6 k), with six columns for each of k set-ups.
+    """
     count = 1 + max((scan.set_up for scan in measurement.scans), default=0)
     parts = []
     for scan, rows, one in measurement.each_scan():
@@ -25,12 +28,12 @@ def residuals_of_scans(measurement: TlsMeasurement) -> TlsResiduals:
         pose = np.zeros((len(found), 6 * count))
         pose[:, 6 * scan.set_up : 6 * scan.set_up + 6] = found.pose_jacobian
         parts.append(replace(found, pose_jacobian=pose, index=rows[found.index]))
-    whole = _joined(parts)
+    whole = _concatenated(parts)
     return whole.part(np.argsort(whole.index, kind="stable"))
 
 
-def _joined(parts: Sequence[TlsResiduals]) -> TlsResiduals:
-    """One set of them, with the covariates that all have."""
+def _concatenated(parts: Sequence[TlsResiduals]) -> TlsResiduals:
+    """Concatenate residuals, with the covariates that all of them have."""
     arrays = ("value", "sigma", "unit_m", "usable", "on_smooth_surface", "pose_jacobian", "wall_xy", "index")
     columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}
     shared = [name for name in parts[0].covariates if all(name in part.covariates for part in parts)]
@@ -47,7 +50,19 @@ def _joined(parts: Sequence[TlsResiduals]) -> TlsResiduals:
 def simulate_range_errors(
     measurement: TlsMeasurement, model: TlsModel, residuals: TlsResiduals, random: KeyedRandom
 ) -> FloatArray:
-    """(n,) simulated minus geometric range of the residuals' points, of one scan or several, NaN without a return."""
+    """Simulate the range errors that a model gives at the residuals' points.
+
+    Parameters
+    ----------
+    measurement : One scan or several.
+    model : The sensor model.
+    residuals : Residuals with the rays to simulate.
+    random : Source of the random numbers.
+
+    Returns
+    -------
+    (n,) simulated minus geometric range, m; NaN without a return.
+    """
     rays = residuals.geometry
     if not measurement.scans:
         return simulate_ranges(measurement, model, rays, random) - np.asarray(rays.range_m)

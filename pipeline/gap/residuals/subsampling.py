@@ -1,7 +1,7 @@
-"""Scans of more points than memory holds residuals of: a part of the pulses, drawn at random all over the scan.
+"""Subsample scans whose residuals would not fit into memory, by drawing pulses at random over the whole scan.
 
-Points are drawn, not lines or areas: lines may repeat what an effect does to them, and areas would not cover the wall. Of a known
-pattern the pulses are drawn, so that a pulse that was lost is drawn as often as one that came back.
+Points are drawn, not lines or areas: an effect may repeat along lines, and areas would not cover the wall. If the scan
+pattern is known, its pulses are drawn, so that a lost pulse is as likely to be drawn as one that returned.
 """
 
 from __future__ import annotations
@@ -16,9 +16,18 @@ from scene.common.keyed_random import KeyedRandom
 
 
 def subsample(measurement: Measurement, random: KeyedRandom) -> tuple[Measurement, NDArray[np.int64]]:
-    """At most about `points.most` of a scan's or a surface's points, with a note, and their rows; of a stereo pair all.
+    """Draw at most about `points.most` points of a laser scan or a surface; keep all points of a stereo pair.
 
-    Scan lines and times have to be known already (`with_order`): a part of the points does not tell them.
+    Call it after `with_scan_order`, because scan lines and times cannot be recovered from a subsample.
+
+    Parameters
+    ----------
+    measurement : The measurement.
+    random : Source of the random numbers.
+
+    Returns
+    -------
+    The subsampled measurement, with a note if points were left out, and the (m,) rows of its points in the full one.
     """
     count, most = len(measurement.cloud.points), decided().points.most
     if isinstance(measurement, StereoMeasurement) or count <= most:
@@ -32,8 +41,8 @@ def subsample(measurement: Measurement, random: KeyedRandom) -> tuple[Measuremen
         drawn = pulses[pulse_number(measurement.pattern, azimuth, zenith)]
     rows = np.flatnonzero(drawn)
     note = (
-        f"{len(rows):,} of {count:,} points, drawn at random, were looked at: the smallest change of the scene that can be found "
-        f"is {1 / share:.1f} times as large; --set points.most=... takes more, with 1.5 kB of memory each"
+        f"a random subsample of {len(rows):,} of {count:,} points was used, so the smallest change of the scene that can be "
+        f"detected is {1 / share:.1f} times as large; use --set points.most=... for more points (1.5 kB of memory each)"
     )
     part = measurement.part(rows).changed(notes=(*measurement.notes, note))
     return part if isinstance(part, SurfaceMeasurement) else part.changed(pulses=pulses), rows
