@@ -172,7 +172,7 @@ def align(
         pose = fit_pose_robustly(_restricted_to(found, trusted))[1]
         if not _moves_rays_far(pose, found):
             break
-        there = measurement.moved(pose)
+        aligned = measurement.moved(pose)
         new_residuals = compute_residuals(aligned)
         if not len(new_residuals.value):  # no ray meets the wall from there
             break
