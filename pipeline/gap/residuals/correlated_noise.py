@@ -110,7 +110,7 @@ def _on_nodes(effects: list[NodeNoise], pixels: FloatArray, area: float) -> Node
 
 
 def _covariance_by_offset(effect: NodeNoise, step: float) -> FloatArray:
-    """(k, k) covariance of two nodes by their offset along both axes, up to (k − 1) / 2 grid steps either way."""
+    """(k, k) covariance of two nodes by their offset along both axes, up to (k - 1) / 2 grid steps either way."""
     reach = int(np.ceil(_REACH * effect.step_px / step))
     near = step * np.arange(-reach, reach + 1)
     around = np.stack(np.meshgrid(near, near, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -122,7 +122,7 @@ def _covariance_by_offset(effect: NodeNoise, step: float) -> FloatArray:
 def _covariance_of_nodes(place: NDArray[np.int64], table: FloatArray) -> FloatArray:
     """(q, q) covariance of nodes at `place` ((q, 2), in grid steps); nodes beyond the reach of `table` are uncorrelated.
 
-    `table`: (k, k) covariance by the offset along both axes, up to (k − 1) / 2 grid steps either way.
+    `table`: (k, k) covariance by the offset along both axes, up to (k - 1) / 2 grid steps either way.
     """
     corner, margin = place.min(axis=0), len(table) // 2
     number = np.full(np.ptp(place, axis=0) + 1 + 2 * margin, -1)

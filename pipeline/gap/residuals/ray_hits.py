@@ -163,7 +163,7 @@ def _smoothed_hits(found: RayHits, planes: PointPlanes, ray: FloatArray, triangl
 def _height_above_triangles(normal: FloatArray, triangles: _Triangles) -> FloatArray:
     """(n,) height of a curved surface above its triangles, from normals (n, 3 corners, 3) at their corners.
 
-    With barycentric coordinates b it is the sum over the sides of 4 b_i b_j d_ij, where d_ij = (n_j − n_i)·(p_j − p_i) / 8 is the
+    With barycentric coordinates b it is the sum over the sides of 4 b_i b_j d_ij, where d_ij = (n_j - n_i)·(p_j - p_i) / 8 is the
     height of an arc above its chord.
     """
     _, weight, at = triangles

@@ -35,7 +35,7 @@ class Geometry(Protocol):
 
     @property
     def sensor_coordinates(self) -> FloatArray:
-        """(n, 2) direction of each point in the sensor's own coordinates: azimuth and zenith, rad, or image column and row, px."""
+        """(n, 2) direction of each point in sensor coordinates: azimuth and zenith, rad, or image column and row, px."""
 
     @property
     def departure(self) -> FloatArray:
@@ -226,7 +226,7 @@ class ExpectedPulses:
 def range_derivative(normal: FloatArray, direction: FloatArray, moved: FloatArray, distance: FloatArray) -> FloatArray:
     """Return how the distance to a plane along a ray changes as the ray turns.
 
-    With t = (p − o)·n / (u·n), the derivative is dt = −t (du·n) / (u·n).
+    With t = (p - o)·n / (u·n), the derivative is dt = -t (du·n) / (u·n).
 
     Parameters
     ----------

@@ -3,7 +3,7 @@
 The semivariogram is half the mean squared difference of two distances whose points are h apart. It is estimated robustly, from
 the median absolute difference, and fitted by
 
-    g(h) = w + r² (4/9 − B(hx / s) B(hy / s)) + c h²
+    g(h) = w + r² (4/9 - B(hx / s) B(hy / s)) + c h²
 
 with w the variance of each point's own (white) noise, r and s the standard deviation and the node spacing of grid-correlated
 noise, B the cubic B-spline, and c h² slow variation over the wall: an error of the reference, or a wrong shape of the cloud. The

@@ -92,7 +92,7 @@ class SurfaceResiduals(Residuals):
 
     @property
     def depth_m(self) -> FloatArray:
-        """(n,) −1: a point above the surface lies less deep."""
+        """(n,) -1: a point above the surface lies less deep."""
         return -self.unit_m
 
     @property
@@ -243,7 +243,7 @@ def predicted_sigma(model: StereoModel, residuals: SurfaceResiduals) -> FloatArr
 def datum_covariance(residuals: SurfaceResiduals, value: FloatArray, rows: BoolArray) -> FloatArray:
     """Estimate the covariance of the datum by a jackknife over wall blocks, because errors are correlated within them.
 
-    Without block b the datum changes by −(A − A_b)⁻¹ r_b, with A and r the matrix and the right side of the normal equations.
+    Without block b the datum changes by -(A - A_b)⁻¹ r_b, with A and r the matrix and the right side of the normal equations.
 
     Parameters
     ----------

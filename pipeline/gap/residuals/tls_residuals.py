@@ -53,7 +53,7 @@ class TlsResiduals(Residuals):
 
     @property
     def reference_variance(self) -> FloatArray:
-        """(n,) variance of the ranges that the errors of the reference's vertices cause, m²: it follows from the squared weights."""
+        """(n,) variance of the ranges that errors of the reference's vertices cause, m²; it uses the squared weights."""
         return _reference_variance(self.reference_error_m, self.geometry)
 
     @property
@@ -69,7 +69,7 @@ class TlsResiduals(Residuals):
         return replace(self, sigma=np.sqrt(variance))
 
     def reference_covariance_with(self, other: NDArray[np.int64]) -> FloatArray:
-        """Return the covariance that two rays have by sharing vertices of the reference, m². `other`: (n,) row of the other ray."""
+        """Return the covariance of two rays that share vertices of the reference, m². `other`: (n,) row of the other ray."""
         corner, weight = self.geometry.corner, self.geometry.weight
         if not self.reference_error_m or corner is None or weight is None:
             return super().reference_covariance_with(other)
@@ -203,7 +203,7 @@ def recorded_polar(measurement: TlsMeasurement) -> tuple[FloatArray, FloatArray,
 def _pose_jacobian(ray: FloatArray, normal: FloatArray, distance: FloatArray) -> FloatArray:
     """(n, 6) pose Jacobian of measured minus predicted range: shift (m) and rotation (rad) of the scanner from the survey.
 
-    The true ray starts at o + t with direction u + w x u, so dR = −n·t / (n·u) − R n·(w x u) / (n·u).
+    The true ray starts at o + t with direction u + w x u, so dR = -n·t / (n·u) - R n·(w x u) / (n·u).
     """
     scale = -1 / np.einsum("ni,ni->n", ray, normal)[:, None]
     return np.concatenate([normal * scale, distance[:, None] * np.cross(ray, normal) * scale], axis=1)
