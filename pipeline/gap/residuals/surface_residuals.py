@@ -268,5 +268,5 @@ def datum_covariance(residuals: SurfaceResiduals, value: FloatArray, rows: BoolA
         matrix = whole - columns[own].T @ columns[own]
         changes.append(-np.linalg.lstsq(matrix, columns[own].T @ (left[own] / part.sigma[own]), rcond=None)[0] / scale)
     count = len(changes)
-    spread = (np.array(changes) - np.mean(changes, axis=0)) @ residuals.datum.T
-    return np.asarray((count - 1) / count * spread.T @ spread)
+    deviations = (np.array(changes) - np.mean(changes, axis=0)) @ residuals.datum.T
+    return np.asarray((count - 1) / count * deviations.T @ deviations)
