@@ -140,7 +140,7 @@ class DisparityRaster:
         return self.at_points(gaussian_filter(inside, sigma_px / self.step, mode="constant") < 1 - _BEYOND)
 
     def in_filled_occlusions(self, effects: Iterable[Effect]) -> BoolArray:
-        """Return (n,) whether a point lies where only the left camera sees the reference and no given effect makes a disparity."""
+        """Return (n,) whether a point lies where only the left camera sees the reference and no effect gives a disparity."""
         return np.asarray(np.isnan(self.at_points(self.apply(effects))) & self.at_points(self.hidden))
 
     def copied_from_neighbour(self, found: FloatArray, tolerance: float) -> BoolArray:
@@ -161,7 +161,7 @@ class DisparityRaster:
         return self.at_points(np.pad(same, ((0, 0), (1, 0))) | np.pad(same, ((0, 0), (0, 1))))
 
     def apply(self, effects: Iterable[Effect]) -> FloatArray:
-        """Apply those of the effects that use neighbouring pixels; return (rows, columns) disparities, px, NaN without a match."""
+        """Apply the effects that use neighbouring pixels; return (rows, columns) disparities, px, NaN without a match."""
         found = self.disparity
         filters = (effect for effect in effects if isinstance(effect, RasterEffect))
         for effect in sorted(filters, key=lambda effect: (effect.stage, effect.order)):

@@ -193,5 +193,5 @@ def mean_beam_directions(measurement: TlsMeasurement, geometry: PulseGeometry) -
 
 
 def predict_ranges(measurement: TlsMeasurement, geometry: RayGeometry) -> FloatArray:
-    """Predict the (n,) mean ranges, m, under the measurement's model: the scanner simulation without noise. `geometry`: the rays."""
+    """Predict the (n,) mean ranges along the rays, m, under the measurement's model: the simulation without noise."""
     return simulate_ranges(measurement, systematic_part(measurement.model), geometry, KeyedRandom(0, ("gap", "mean")))

@@ -1,4 +1,4 @@
-"""Compute the disparity residuals of a stereo pair: measured minus reference disparity of each pixel, in nominal rectification."""
+"""Compute the disparity residuals of a stereo pair: measured minus reference disparity, nominally rectified."""
 
 from __future__ import annotations
 
