@@ -1,4 +1,4 @@
-"""What every family of explanations gains where there is nothing to explain: the null distribution of the largest gain."""
+"""Simulate the null distribution: how large the log-likelihood ratio of every family gets without any effect."""
 
 from __future__ import annotations
 
@@ -14,18 +14,32 @@ from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 
 _NEAR_NULL = 8
-"""Covariances, the most likely ones, at which the draws are fitted."""
+"""Number of the most likely covariances at which the draws are fitted."""
 
 
 @dataclass(frozen=True)
 class NullDistribution:
-    """Gains of every family in draws of pose, the reference's correlated error and noise alone, (DRAWS,) each."""
+    """Log-likelihood ratios of every family in simulations of pose, correlated error of the reference and noise alone.
+
+    Attributes
+    ----------
+    log_likelihood_ratios : For each family its largest ratio in each draw, (NULL_DRAWS,).
+    """
 
     log_likelihood_ratios: Mapping[str, FloatArray]
 
     @classmethod
     def of(cls, design: Design, random: KeyedRandom) -> NullDistribution:
-        """By the most likely covariances, each family at its best value."""
+        """Simulate the null distribution of a design.
+
+        Draws are made under the most likely covariance and fitted at the eight most likely ones; each family takes its best
+        variant.
+
+        Parameters
+        ----------
+        design : The candidates on one set of points.
+        random : Source of the random numbers.
+        """
         near = design.equations.at_covariances(design.ranked_covariances[:_NEAR_NULL])
         draws = design.model.null_draws(design.null_covariance, NULL_DRAWS, random.child("between"))
 
@@ -46,13 +60,21 @@ class NullDistribution:
         )
 
     def penalty(self, family: str) -> float:
-        """Twice what a family gains on average where there is nothing."""
+        """Return the penalty of a family's score: twice its mean log-likelihood ratio under the null (k for k linear
+        coefficients).
+        """
         return 2 * float(self.log_likelihood_ratios[family].mean())
 
     def p_value(self, score: float, larger: Mapping[str, float] | None = None) -> float:
-        """Of the largest score over all families where there is nothing: (1 + b) / (1 + N).
+        """Return the p-value (1 + b) / (1 + N) of a score: b of N simulations have a largest score over all families that
+        reaches it.
 
-        larger: those families alone, which gain so many times as much.
+        It is corrected for multiple testing, because the maximum over all families is the test statistic.
+
+        Parameters
+        ----------
+        score : Penalised log-likelihood ratio.
+        larger : Restricts the maximum to these families, whose ratios are multiplied by the given factors.
         """
         times = dict.fromkeys(self.log_likelihood_ratios, 1.0) if larger is None else larger
         scores = np.stack([each * self.log_likelihood_ratios[name] - self.penalty(name) for name, each in times.items()])
