@@ -204,7 +204,7 @@ def test_an_unknown_without_a_name_says_what_remains_is_most_like() -> None:
     def item(name: str, score: float, form: str) -> Any:
         return SimpleNamespace(name=name, score=score, empirical=bool(form), candidate=SimpleNamespace(form=form))
 
-    tried = (item(f"{SPATIAL_NULL} 30", 9.0, "step"), item("azimuth", 8.0, "smooth"), item("row_jitter", 3.0, ""))
+    tried = (item(f"{SPATIAL_NULL} 30", 9.0, "step"), item("azimuth", 8.0, "spline"), item("row_jitter", 3.0, ""))
     part: Any = SimpleNamespace(unit_m=np.full(3, 0.1))
     for p_value, estimates, expected in ((0.004, [], 1), (0.02, [], 0), (None, [], 0), (0.004, ["effect"], 0)):
         search = SimpleNamespace(
@@ -213,7 +213,7 @@ def test_an_unknown_without_a_name_says_what_remains_is_most_like() -> None:
         found: Any = SimpleNamespace(search=search, tried=tried, estimates=estimates)
         said = _most_like(found, part)
         assert len(said) == expected
-        assert all("a change with azimuth (smooth), 8 mm" in words for words in said)
+        assert all("a change with azimuth (spline), 8 mm" in words for words in said)
 
 
 def test_what_shapes_do_is_found_once_for_a_search(tmp_path: Path) -> None:

@@ -30,12 +30,12 @@ a field of view; properties of a wall do not.
 """
 _CHUNK = 32
 """Frequencies whose columns are computed together."""
-SPATIAL_NULL = "place along"
+SPATIAL_NULL = "spatial null"
 """Start of the names of spatial null candidates."""
-HARMONICS, HARMONIC_SERIES, POLYNOMIAL = "harmonics", "folded", "surface"
+HARMONICS, HARMONIC_SERIES, POLYNOMIAL = "harmonics", "wave with overtones", "polynomial"
 """Forms of candidates: overtones beside a sine of the catalogue, a wave with its overtones, and a polynomial of two covariates.
 """
-LINE_PATTERN = "every"
+LINE_PATTERN = "repeating every"
 """Start of the form of patterns that repeat after `fixed["lines"]` scan lines, columns or rows."""
 _DEGREE = 4
 """Degree of the polynomial of two covariates."""
@@ -290,7 +290,7 @@ def nonparametric_terms(
     return [
         _nonparametric(covariate, "line", smooth[:, :1]),
         _nonparametric(covariate, "parabola", smooth[:, :2]),
-        _nonparametric(covariate, "smooth", smooth),
+        _nonparametric(covariate, "spline", smooth),
         *(_nonparametric(covariate, "step", (x > place).astype(np.float64)[:, None]) for place in steps),
         *(SineGrid(covariate, "amplitude", _wave(np.ones_like(x), x, tried), tried, {}, True) for tried in waves),
     ]
@@ -311,7 +311,7 @@ def angle_error_terms(angle: str, covariate: str, values: FloatArray, lever: Flo
     """
     x = _standardised(values)
     smooth = _spline_columns(x) * lever[:, None]
-    forms = [_nonparametric(covariate, "line", smooth[:, :1]), _nonparametric(covariate, "smooth", smooth)]
+    forms = [_nonparametric(covariate, "line", smooth[:, :1]), _nonparametric(covariate, "spline", smooth)]
     waves = _wave_frequencies(x, MOST_CYCLES_OF_A_SENSOR) if angle == covariate else []
     found = [SineGrid(covariate, "amplitude", _wave(lever, x, tried), tried, {}, True, angle) for tried in waves]
     return [*(replace(form, angle=angle) for form in forms), *found]
