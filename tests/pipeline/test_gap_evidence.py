@@ -13,7 +13,7 @@ import pytest
 from gap_cases import Array, Scan, smooth_noise, write_scan
 
 from pipeline.formats.measurements.measurement import read_measurement
-from pipeline.gap.mean.candidates import POLYNOMIAL, SPATIAL_NULL, Candidate
+from pipeline.gap.mean.candidates import SPATIAL_NULL, Candidate
 from pipeline.gap.mean.selection import EffectSet, FamilyScore, ForwardSelection
 from pipeline.gap.naming.attempts import few
 from pipeline.gap.naming.entries import Named
@@ -202,7 +202,7 @@ def test_an_effect_beside_a_free_form_says_more_than_a_form_of_two_covariates(su
 
     def scores(known: set[str]) -> dict[tuple[str, str], float]:
         form = 70.0 if "camera_shift" in known else 60.0
-        return {("camera_shift", ""): 20.0, ("radius", "spline"): form, ("image_x and image_y", POLYNOMIAL): surface}
+        return {("camera_shift", ""): 20.0, ("radius", "spline"): form, ("image_x and image_y", "polynomial"): surface}
 
     chosen, _ = ForwardSelection(_Scripted(scores)).select()
     assert {each.candidate.name for each in chosen} == named
