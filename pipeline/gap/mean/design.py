@@ -1,4 +1,6 @@
-"""The columns of every explanation of the mean over one set of points, and their normal equations; nothing of it changes."""
+"""Set up the columns of all candidates of the mean model on one set of points, with their normal equations. Designs are
+immutable.
+"""
 
 from __future__ import annotations
 
@@ -20,25 +22,33 @@ from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 
 NULL_DRAWS = 499
+"""Number of simulations of the null distribution."""
 _NULL_ROWS = 8_000
+"""Most points on which white noise is drawn."""
 
 
 @dataclass(frozen=True, eq=False)
 class CandidateFamilies:
-    """Explanations with fixed columns, and sines of which a grid of periods is searched."""
+    """Candidates with fixed columns, and sines whose period is searched on a grid.
+
+    Attributes
+    ----------
+    plain : Candidates with fixed columns; effects of the catalogue come first.
+    grids : Grids of sines.
+    """
 
     plain: list[Candidate]
     grids: list[SineGrid]
 
     @classmethod
     def of(cls, families: list[Candidate | SineGrid]) -> CandidateFamilies:
-        """Of either kind, in any order; effects of the catalogue come first."""
+        """Sort a list of both kinds."""
         plain = sorted((family for family in families if isinstance(family, Candidate)), key=lambda each: each.empirical)
         return cls(plain, [family for family in families if isinstance(family, SineGrid)])
 
     @cached_property
     def by_name(self) -> dict[str, tuple[list[int], list[int]]]:
-        """Of each family the numbers of its plain candidates and of its sines."""
+        """For each family the numbers of its plain candidates and of its sines."""
         families: dict[str, tuple[list[int], list[int]]] = {}
         for row, candidate in enumerate(self.plain):
             families.setdefault(candidate.family, ([], []))[0].append(row)
@@ -50,7 +60,7 @@ class CandidateFamilies:
         return families
 
     def sine(self, number: int) -> Candidate:
-        """One of all sines."""
+        """Return a sine by its number over all grids."""
         for grid in self.grids:
             if number < len(grid.frequencies):
                 return grid.candidate(number)
@@ -62,11 +72,23 @@ class CandidateFamilies:
 class Design:
     """All candidates on one set of points.
 
-    pose: (n, p) orthonormal columns of the pose over sigma, in the model's rows; turn: (p, p) from them to those of the
-    residuals; pose_precision: (p,) inverse variance of its coefficients before there are data; value, fixed: the residuals and
-    all fixed columns, pose first; place: columns of each candidate; waves: products of the searched sines; drawn: (k,
-    DRAWS) products of the fixed columns with draws of the noise within cells; equations: at every likely covariance; sines: the
-    columns of those that others stand beside, which are numbered on from the fixed ones, None where there are none.
+    Attributes
+    ----------
+    residuals : Residuals of the points.
+    families : The candidates.
+    cells : Cells of the wall.
+    model : The mean model.
+    pose_basis : (n, p) orthonormal columns of the pose over sigma, in the model's rows.
+    pose_transform : (p, p) matrix from these columns to those of the residuals.
+    pose_precision : (p,) prior inverse variances of the pose's coefficients.
+    grids : The sine grids in the model's rows.
+    value : The residuals over sigma, projected.
+    fixed : All fixed columns, projected, those of the pose first.
+    sine_columns : Columns of sines that became fixed; they are numbered after the others. None without any.
+    column_numbers : For each candidate the numbers of its columns.
+    sine_products : Products of the searched sines.
+    noise_products : (k, NULL_DRAWS) products of the fixed columns with draws of the noise within cells.
+    equations : Normal equations under every likely covariance.
     """
 
     residuals: Residuals
@@ -93,7 +115,15 @@ class Design:
         random: KeyedRandom,
         pose_precision: FloatArray | None = None,
     ) -> Design:
-        """pose_precision: 0 by default."""
+        """Set up a design.
+
+        Parameters
+        ----------
+        residuals : Residuals of the points.
+        families : Candidates and sine grids.
+        random : Source of the random numbers for the noise.
+        pose_precision : (p,) prior inverse variances of the coefficients of the pose Jacobian; 0 by default.
+        """
         chosen = CandidateFamilies.of(families)
         cells = WallCells.over(residuals.wall_xy)
         model = MeanModel(cells, residuals.wall_xy, residuals.sigma, residuals.correlated_noise)
@@ -101,22 +131,24 @@ class Design:
         pose, turn = np.linalg.qr(residuals.pose_jacobian[rows] * root)
         count = pose.shape[1]
         precision = np.zeros(count) if pose_precision is None else pose_precision
-        place = _places(chosen.plain, count)
+        place = _number_columns(chosen.plain, count)
         fixed = model.project(_columns(model, pose, chosen.plain, place))
         value = model.project(residuals.value[rows, None] * root)
         model, covariances, bases = model.restrict([fixed.select(list(range(count))), fixed], value)
         fixed, value = fixed.in_bases(bases), value.in_bases(bases)
         noise = NoiseDraws.of(model, NULL_DRAWS, _NULL_ROWS, random.child("within"))
         grids = [grid.part(rows) for grid in chosen.grids]
-        asked = count + sum(len(place[each]) for each in chosen.plain if not each.empirical)  # of free forms few are
-        waves = SineProducts.of(model, grids, fixed.within_weighted[:, :asked], value, noise)
+        held_count = count + sum(
+            len(place[each]) for each in chosen.plain if not each.empirical
+        )  # few non-parametric ones are held
+        waves = SineProducts.of(model, grids, fixed.within_weighted[:, :held_count], value, noise)
         known = [np.zeros(count), *(prior_precision(each, each.columns.shape[1]) for each in chosen.plain)]
         equations = assemble(model, covariances, fixed, value, waves).with_precision(np.concatenate(known))
         drawn = noise.products(fixed.within[noise.rows], model.within_noise.to_nodes(fixed.within))
         found = cls(
             residuals, chosen, cells, model, pose, turn, precision, grids, value, fixed, None, place, waves, drawn, equations
         )  # fmt: skip
-        return found._crossed(found.pose_columns)
+        return found._with_products(found.pose_columns)
 
     @cached_property
     def pose_columns(self) -> list[int]:
@@ -125,12 +157,12 @@ class Design:
 
     @cached_property
     def ranked_covariances(self) -> list[int]:
-        """Numbers of the covariances, that under which the pose alone is most likely first."""
+        """Numbers of the covariances, by the likelihood of the fit of the pose alone; the most likely first."""
         return [int(row) for row in np.argsort(-self.equations.log_likelihood(self.pose_columns)[:, 0], kind="stable")]
 
     @property
     def null_covariance(self) -> CellCovariance:
-        """The covariance that is most likely where there is nothing but pose."""
+        """The most likely covariance if there is no effect."""
         return self.equations.covariances[self.ranked_covariances[0]]
 
     @property
@@ -139,13 +171,13 @@ class Design:
         return [self.column_numbers[candidate] for candidate in self.families.plain]
 
     def conditioned_on(self, candidate: Candidate) -> Design:
-        """With a candidate for others to stand beside; the columns of a sine are at its period refined."""
+        """Return the design in which others can be fitted beside a candidate; a sine is held at its refined period."""
         design = self if candidate in self.column_numbers else self._with_sine(candidate)
-        return design._crossed(design.column_numbers[candidate])
+        return design._with_products(design.column_numbers[candidate])
 
-    def _crossed(self, columns: list[int]) -> Design:
-        """With the products of the sines with some of the fixed columns."""
-        held = self._some(columns)
+    def _with_products(self, columns: list[int]) -> Design:
+        """Add the products of the sines with some of the fixed columns."""
+        held = self._select(columns)
         if max(columns) < self.sine_products.fixed.shape[1]:
             within = self.sine_products.fixed[:, columns]
         else:
@@ -153,16 +185,17 @@ class Design:
         products = self.sine_products.at(self.equations.covariances, within, held.between)
         return replace(self, equations=self.equations.with_sine_products(columns, products))
 
-    def _some(self, columns: list[int]) -> ProjectedColumns:
-        """Some of the fixed columns, or of those of sines, which stand behind them."""
+    def _select(self, columns: list[int]) -> ProjectedColumns:
+        """Some of the fixed columns, including those of sines."""
         behind = self.fixed.within.shape[1]
         if self.sine_columns is None or columns[0] < behind:
             return self.fixed.select(columns)
         return self.sine_columns.select([column - behind for column in columns])
 
     def _with_sine(self, candidate: Candidate) -> Design:
+        """Make a sine, with its period refined, a fixed column."""
         (found,) = self.fit_refined([candidate])[0]
-        added = self.model.project(_without(self.pose_basis, self._matrix([found], None)))
+        added = self.model.project(_projected(self.pose_basis, self._matrix([found], None)))
         had = [self.fixed] if self.sine_columns is None else [self.fixed, self.sine_columns]
         equations = extend(self.equations, had, self.value, added)
         start = sum(each.within.shape[1] for each in had)
@@ -172,69 +205,94 @@ class Design:
         )
 
     def columns(self, candidates: Sequence[Candidate]) -> list[int]:
-        """Numbers of the pose's columns and of those of candidates that it holds."""
+        """Return the numbers of the columns of the pose and of held candidates."""
         return [*self.pose_columns, *(column for each in candidates for column in self.column_numbers[each])]
 
     def log_likelihood(self, value: FloatArray, candidate: Candidate) -> float:
-        """Of other residuals (n,) of the same points, pose and a candidate fitted."""
-        columns = self._pose_columns.append(self.model.project(_without(self.pose_basis, self._matrix([candidate], None))))
+        """Return the log-likelihood of other residuals (n,) of the same points with the pose and a candidate fitted."""
+        columns = self._pose_columns.append(self.model.project(_projected(self.pose_basis, self._matrix([candidate], None))))
         projected = self.model.project(value[self.model.rows, None] * self.model.inverse_sigma[:, None])
         return fit_reml(self.model.covariances, columns, projected).log_likelihood
 
-    def fit(self, candidates: list[Candidate], slopes: list[FloatArray | None] | None = None) -> MeanFit:
-        """Pose (the columns of `Residuals.pose`) and some candidates, at their most likely covariance."""
+    def fit(self, candidates: list[Candidate], wave_coefficients: list[FloatArray | None] | None = None) -> MeanFit:
+        """Fit the pose (coefficients of `Residuals.pose_jacobian`) and some candidates, under their most likely covariance.
+
+        Parameters
+        ----------
+        candidates : Candidates to fit.
+        wave_coefficients : For each sine its coefficients (2,), to also fit a change of its frequency; None for no such column.
+        """
         turned = np.linalg.inv(self.pose_transform)
         if not candidates:
             known = np.asarray(turned.T @ (self.pose_precision[:, None] * turned), dtype=np.float64)
             found = fit_reml(self.model.covariances, self._pose_columns, self.value, known)
             return replace(found, coefficients=turned @ found.coefficients, covariance=turned @ found.covariance @ turned.T)
-        matrix = self._matrix(candidates, slopes)
-        columns = self._pose_columns.append(self.model.project(_without(self.pose_basis, matrix)))
-        # the columns are fitted without what the pose explains of them, and the pose by orthonormal ones
+        matrix = self._matrix(candidates, wave_coefficients)
+        columns = self._pose_columns.append(self.model.project(_projected(self.pose_basis, matrix)))
+        # the fit uses orthonormal columns of the pose, projected out of the candidates; this matrix transforms back
         back = np.block(
             [
                 [turned, -turned @ (self.pose_basis.T @ matrix)],
                 [np.zeros((matrix.shape[1], len(turned))), np.eye(matrix.shape[1])],
             ]
         )
-        widths = [candidate.columns.shape[1] + (slope is not None) for candidate, slope in _with_slopes(candidates, slopes)]
+        widths = [
+            candidate.columns.shape[1] + (coefficients is not None)
+            for candidate, coefficients in _with_wave_coefficients(candidates, wave_coefficients)
+        ]
         typical = [prior_precision(each, width) for each, width in zip(candidates, widths, strict=True)]
         precision = np.concatenate([self.pose_precision, *typical])
         found = fit_reml(self.model.covariances, columns, self.value, back.T @ (precision[:, None] * back))
         return replace(found, coefficients=back @ found.coefficients, covariance=back @ found.covariance @ back.T)
 
     def fit_refined(self, candidates: list[Candidate], rounds: int = 4) -> tuple[list[Candidate], MeanFit]:
-        """Candidates with their periods at the top of the likelihood (Gauss-Newton), and the fit of pose and all of them.
+        """Fit candidates with their periods refined to the maximum of the likelihood, by Gauss-Newton.
 
-        Each sine has three columns in that fit: sine, cosine and the change by its frequency.
+        Parameters
+        ----------
+        candidates : Candidates to fit, with periods from the grid.
+        rounds : Most Gauss-Newton steps.
+
+        Returns
+        -------
+        The candidates with refined periods, and the joint fit with the pose. Each sine has three columns in that fit: sine,
+        cosine and change of the frequency.
         """
         found = list(candidates)
-        slopes: list[FloatArray | None] = [None] * len(found)
+        wave_coefficients: list[FloatArray | None] = [None] * len(found)
         if any(candidate.wave is not None for candidate in found):
             for number in range(rounds):
-                fit = self.fit(found, slopes)
+                fit = self.fit(found, wave_coefficients)
                 start = len(self.pose_columns)
                 for index, candidate in enumerate(found):
-                    width = candidate.columns.shape[1] + (slopes[index] is not None)
+                    width = candidate.columns.shape[1] + (wave_coefficients[index] is not None)
                     values, start = fit.coefficients[start : start + width], start + width
                     if candidate.wave is None:
                         continue
-                    if slopes[index] is not None and number:
+                    if wave_coefficients[index] is not None and number:
                         found[index] = with_period(candidate, candidate.wave.stepped_period(candidate.period, float(values[2])))
-                    slopes[index] = values[:2]
-        return found, self.fit(found, slopes)
+                    wave_coefficients[index] = values[:2]
+        return found, self.fit(found, wave_coefficients)
 
     def split_coefficients(self, values: NDArray[Any], candidates: list[Candidate]) -> list[NDArray[Any]]:
-        """The part of a fit's coefficients that belongs to each candidate after the pose, a sine's with that of its frequency."""
+        """Split the coefficients of a refined fit by candidate, without those of the pose.
+
+        Parameters
+        ----------
+        values : (k,) coefficients or numbers of `fit_refined`.
+        candidates : The fitted candidates.
+        """
         widths = [candidate.columns.shape[1] + (candidate.wave is not None) for candidate in candidates]
         return np.split(values[len(self.pose_columns) :], np.cumsum(widths)[:-1]) if candidates else []
 
     def reference_sigma(self, candidates: list[Candidate]) -> float:
-        """Standard deviation of the reference's correlated error beside some candidates, in the observable's unit."""
+        """Return the standard deviation of the reference's correlated error beside some candidates, in the unit of the
+        observable.
+        """
         return float(np.sqrt(self.fit(candidates).cell_covariance.variance_ratio)) * self.model.typical_sigma
 
     def residuals_after(self, chosen: list[Candidate]) -> FloatArray:
-        """(n,) residuals less pose and the chosen candidates at their most likely values."""
+        """Return the (n,) residuals after the fitted pose and candidates are subtracted."""
         candidates, fit = self.fit_refined(chosen)
         value = self.residuals.value - self.residuals.pose_jacobian @ fit.coefficients[: len(self.pose_columns)]
         for candidate, coefficients in zip(candidates, self.split_coefficients(fit.coefficients, candidates), strict=True):
@@ -242,7 +300,12 @@ class Design:
         return np.asarray(value)
 
     def identifiability(self) -> tuple[list[str], FloatArray, FloatArray]:
-        """Names of the families, cosines of their signatures after the pose fit, and the share that survives the pose fit."""
+        """Compare the signatures of the effects, after the pose is fitted.
+
+        Returns
+        -------
+        Names of the families; cosines (f, f) between their signatures; and the share (f,) of each signature that the pose leaves.
+        """
         row = self.ranked_covariances[0]
         names, matrices = [], []
         for name, (plain, sines) in self.families.by_name.items():
@@ -253,7 +316,7 @@ class Design:
         whole = np.concatenate(matrices, axis=1)
         weight = self.equations.covariances[row].weight[:, None]
         grams = []
-        for columns in (whole, left := _without(self.pose_basis, whole)):
+        for columns in (whole, left := _projected(self.pose_basis, whole)):
             projected = self.model.project(columns)
             between = projected.between[self.null_covariance.basis]
             grams.append(projected.within.T @ projected.within_weighted + (between * weight).T @ between)
@@ -264,7 +327,7 @@ class Design:
         cross += base.between[self.null_covariance.basis][:, :count].T @ (weight * found.between[self.null_covariance.basis])
         matrix = matrix - cross.T @ np.linalg.solve(pose, cross)
         size = np.sqrt(np.maximum(np.diag(matrix), 0))
-        full = np.sqrt(np.maximum(np.diag(grams[0]), 1e-200))  # a signature may be 0
+        full = np.sqrt(np.maximum(np.diag(grams[0]), 1e-200))  # avoids dividing by a signature of 0
         scale = np.maximum(size, 1e-12 * full)
         return names, np.clip(matrix / np.outer(scale, scale), -1, 1), size / full
 
@@ -272,21 +335,23 @@ class Design:
     def _pose_columns(self) -> ProjectedColumns:
         return self.fixed.select(self.pose_columns)
 
-    def _matrix(self, candidates: list[Candidate], slopes: list[FloatArray | None] | None) -> FloatArray:
-        """Columns of some candidates over sigma; of a sine with its change by the frequency where `slopes` say so."""
+    def _matrix(self, candidates: list[Candidate], wave_coefficients: list[FloatArray | None] | None) -> FloatArray:
+        """Columns of some candidates over sigma, with a sine's derivative by its frequency if its coefficients are given."""
         rows, root = self.model.rows, self.model.inverse_sigma[:, None]
         matrices = []
-        for candidate, slope in _with_slopes(candidates, slopes):
+        for candidate, coefficients in _with_wave_coefficients(candidates, wave_coefficients):
             wave = candidate.wave
             columns = (
-                candidate.columns if wave is None or slope is None else wave.with_frequency_derivative(candidate.period, slope)
+                candidate.columns
+                if wave is None or coefficients is None
+                else wave.with_frequency_derivative(candidate.period, coefficients)
             )
             matrices.append(columns[rows] * root)
         return np.concatenate(matrices, axis=1)
 
 
 def _columns(model: MeanModel, pose: FloatArray, plain: list[Candidate], place: Mapping[Candidate, list[int]]) -> FloatArray:
-    """(n, k) those of the pose, and of candidates without what the pose explains of them, over sigma, in the model's rows."""
+    """(n, k) columns over sigma, in the model's rows: the pose, and candidates with the pose projected out."""
     count = pose.shape[1]
     found = np.empty((len(pose), count + sum(len(each) for each in place.values())))
     found[:, :count] = pose
@@ -296,19 +361,22 @@ def _columns(model: MeanModel, pose: FloatArray, plain: list[Candidate], place: 
         np.multiply(candidate.columns[model.rows], model.inverse_sigma[:, None], out=found[:, columns])
 
     map_in_threads(fill, plain)
-    _take_off(pose, found[:, count:])
+    _project_out(pose, found[:, count:])
     return found
 
 
-def _without(pose: FloatArray, columns: FloatArray) -> FloatArray:
-    """A shift and a turn of a distant sensor are so much alike that the normal equations would lose what tells them apart."""
+def _projected(pose: FloatArray, columns: FloatArray) -> FloatArray:
+    """Columns with the pose projected out.
+
+    Shift and rotation of a distant sensor are so similar that the normal equations alone would lose their difference.
+    """
     found = columns.copy()
-    _take_off(pose, found)
+    _project_out(pose, found)
     return found
 
 
-def _take_off(pose: FloatArray, columns: FloatArray) -> None:
-    """What the pose explains, of columns (n, k), in their place."""
+def _project_out(pose: FloatArray, columns: FloatArray) -> None:
+    """Project the pose out of columns (n, k), in place."""
 
     def take(some: slice) -> None:
         columns[:, some] -= pose @ (pose.T @ columns[:, some])
@@ -316,14 +384,16 @@ def _take_off(pose: FloatArray, columns: FloatArray) -> None:
     map_in_threads(take, column_chunks(columns.shape[1]))
 
 
-def _places(plain: list[Candidate], start: int) -> dict[Candidate, list[int]]:
+def _number_columns(plain: list[Candidate], start: int) -> dict[Candidate, list[int]]:
+    """Numbers of the columns of each candidate, from `start`."""
     place: dict[Candidate, list[int]] = {}
     for candidate in plain:
         place[candidate] = list(range(start, start := start + candidate.columns.shape[1]))
     return place
 
 
-def _with_slopes(
-    candidates: list[Candidate], slopes: list[FloatArray | None] | None
+def _with_wave_coefficients(
+    candidates: list[Candidate], wave_coefficients: list[FloatArray | None] | None
 ) -> Iterator[tuple[Candidate, FloatArray | None]]:
-    return zip(candidates, slopes or [None] * len(candidates), strict=True)
+    """Pair candidates with the coefficients of their sines."""
+    return zip(candidates, wave_coefficients or [None] * len(candidates), strict=True)
