@@ -1,4 +1,4 @@
-"""The surveys that a path names: a measurement's, or those of a simulation config."""
+"""Load the surveys to analyse: that of a measurement, or those of a simulation config."""
 
 from __future__ import annotations
 
@@ -12,15 +12,24 @@ from scene.common.errors import InputError
 
 
 def load_surveys(path: Path, overrides: Sequence[str] = (), sensor: SensorName | None = None) -> list[Survey]:
-    """A measurement's survey, or one for each sensor of a config (or for `sensor` alone).
+    """Load the survey of a measurement, or one for each sensor of a config.
 
-    path: a folder with measurement.yaml, that file, or a config. Raises InputError for what cannot be read or does not fit.
+    Parameters
+    ----------
+    path : Folder with measurement.yaml, that file itself, or a config.
+    overrides : Settings of the config as `key=value`.
+    sensor : The sensor of the config to use; None for all.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or options of a config are given for a measurement.
     """
     if path.is_dir() or path.name == FILE:
         measurement = read_measurement(path)
         if overrides or sensor not in (None, measurement.sensor):
             raise InputError(
-                "--set and another --sensor belong to a config", where=str(path), remedy="leave them out for a measurement"
+                "--set and another --sensor need a config, and this is a measurement", where=str(path), remedy="omit them"
             )
         return [measured_survey(measurement)]
     config = load_config(path, overrides, sensor, None)

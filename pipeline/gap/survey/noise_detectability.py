@@ -1,4 +1,4 @@
-"""From which size on a survey would show effects on the spread and on the returns, before there are data."""
+"""Compute, before there are data, from which size effects on the noise and on missing returns can be detected."""
 
 from __future__ import annotations
 
@@ -18,13 +18,22 @@ from sensors.effects.precipitation import Precipitation
 from sensors.effects.range_quantization import RangeQuantization
 
 _LOSSES = 0.01
-"""Share of returns that are taken to be missing anyway."""
-_NO_NUMBER = "no signature in closed form: the diagnosis tries it, this table has no number for it"
+"""Share of returns that is assumed to be missing anyway."""
+_NO_NUMBER = "no closed-form signature: gap tests it, but its detectable size is not computed here"
+"""Note for effects whose detectable size is not computed."""
 
 
 @dataclass(frozen=True)
 class NoiseOrLossEffect:
-    """An effect on the spread or on the returns. seen_from: the parameter's value at S/N 5, NaN where none is computed."""
+    """An effect on the noise or on missing returns.
+
+    Attributes
+    ----------
+    name : Name of the effect, with the sensor as prefix.
+    parameter : Name of its main parameter.
+    seen_from : Detectable size: the parameter value at a signal-to-noise ratio of 5; NaN if it is not computed.
+    note : Condition or reason, in words.
+    """
 
     name: str
     parameter: str
@@ -32,7 +41,7 @@ class NoiseOrLossEffect:
     note: str
 
     def to_dict(self) -> dict[str, Any]:
-        """As identifiability.json holds it."""
+        """Return the entry of identifiability.json."""
         return {
             "name": self.name,
             "parameter": self.parameter,
@@ -42,28 +51,29 @@ class NoiseOrLossEffect:
 
 
 def noise_and_loss_effects(survey: Survey) -> tuple[NoiseOrLossEffect, ...]:
-    """Every effect of the catalogue that has no signature in the mean, with the value that would be seen where it is known."""
+    """List every effect of the catalogue that is not systematic, with its detectable size where that can be computed."""
     view = survey.views[0]
-    found = {each.name: each for each in _spread(view)}
+    found = {each.name: each for each in _variance_effects(view)}
     if isinstance(view, TlsView):
-        found |= {each.name: each for each in (_steps(), _limit(view), _rain(view))}
+        found |= {each.name: each for each in (_quantisation(), _detection_limit(view), _precipitation(view))}
     names = {f"{survey.sensor}.{effect.tag()}": effect for effect in catalogue(survey.sensor)}
-    mean = _mean_names(view)
+    mean = _systematic_names(view)
     unknown = {name: NoiseOrLossEffect(name, "", np.nan, _unknown(effect)) for name, effect in names.items()}
     return tuple(found.get(name, unknown[name]) for name in names if name not in mean)
 
 
 def _unknown(effect: type[Effect]) -> str:
-    """Why a table has no number for an effect."""
-    return f"needs {' and '.join(effect.needs)}: the diagnosis does not try it" if effect.needs else _NO_NUMBER
+    """Why an effect has no detectable size here."""
+    return f"needs {' and '.join(effect.needs)}: gap does not test it" if effect.needs else _NO_NUMBER
 
 
-def _mean_names(view: SurveyView) -> set[str]:
+def _systematic_names(view: SurveyView) -> set[str]:
+    """Names of the systematic effects."""
     return {f"{view.residuals.sensor}.{candidate.name}" for candidate in view_signatures(view)}
 
 
-def _spread(view: SurveyView) -> list[NoiseOrLossEffect]:
-    """sigma_i^2 = model + theta f_i: the information on theta is sum (f_i / sigma_i^2)^2 / 2."""
+def _variance_effects(view: SurveyView) -> list[NoiseOrLossEffect]:
+    """Effects on the variance: sigma_i² = model + theta f_i has the information sum (f_i / sigma_i²)² / 2 on theta."""
     residuals = view.residuals
     candidates = spread_candidates(residuals)
     found: dict[str, NoiseOrLossEffect] = {}
@@ -73,7 +83,7 @@ def _spread(view: SurveyView) -> list[NoiseOrLossEffect]:
         information = 0.5 * float(np.sum(form**2)) * view.point_count / len(residuals)
         theta = DETECTION_SNR / np.sqrt(max(information, 1e-300))
         least = excess / max(float(np.mean(form)), 1e-300)
-        note = "" if theta > least else f"below that it adds less than {100 * excess:.0f} % to the variance, which is not named"
+        note = "" if theta > least else f"smaller ones add less than {100 * excess:.0f} % to the variance and are not named"
         value = candidate.parameters(np.full(len(candidate.names), max(theta, least)))[candidate.names[0]]
         name = f"{residuals.sensor}.{candidate.name}"
         if name not in found or value < found[name].seen_from:
@@ -81,30 +91,29 @@ def _spread(view: SurveyView) -> list[NoiseOrLossEffect]:
     return list(found.values())
 
 
-def _steps() -> NoiseOrLossEffect:
-    note = "by its comb, where the file holds ranges more finely than the step"
+def _quantisation() -> NoiseOrLossEffect:
+    """Range quantisation, which shows as a comb in the distribution of the ranges."""
+    note = "from the comb of ranges, if the file stores them more finely than the step"
     return NoiseOrLossEffect(f"tls.{RangeQuantization.tag()}", "step_m", 1e-4, note)
 
 
-def _limit(view: TlsView) -> NoiseOrLossEffect:
-    """Losing the k weakest echoes gains k ln(1 / losses) in likelihood; S/N 5 is a gain of 12.5."""
+def _detection_limit(view: TlsView) -> NoiseOrLossEffect:
+    """The detection limit: losing the k weakest echoes has a log-likelihood ratio of k ln(1 / losses); SNR 5 is a ratio of 12.5."""
     power = view.residuals.geometry.power
     if power is None:
         return NoiseOrLossEffect(f"tls.{DetectionLimit.tag()}", "minimum_power", np.nan, "needs recorded powers")
     share = 0.5 * DETECTION_SNR**2 / np.log(1 / _LOSSES) / view.point_count
     value = float(np.quantile(power, min(max(share, 1 / len(power)), 1.0)))
     return NoiseOrLossEffect(
-        f"tls.{DetectionLimit.tag()}", "minimum_power", value, "as soon as it takes the weakest echoes; needs the pattern"
+        f"tls.{DetectionLimit.tag()}", "minimum_power", value, "as soon as the weakest echoes are lost; needs the pattern"
     )
 
 
-def _rain(view: TlsView) -> NoiseOrLossEffect:
-    """The share p = 1 - (1 - p0) exp(-2 beta R) of losses, p0 unknown: information on beta beside p0."""
+def _precipitation(view: TlsView) -> NoiseOrLossEffect:
+    """Precipitation: information on beta in the share of losses p = 1 - (1 - p0) exp(-2 beta R), with p0 unknown too."""
     distance = view.residuals.geometry.range_m
-    slopes = np.stack([2 * distance * (1 - _LOSSES), np.ones_like(distance)], axis=1)
+    jacobian = np.stack([2 * distance * (1 - _LOSSES), np.ones_like(distance)], axis=1)
     weight = view.point_count / len(distance) / (_LOSSES * (1 - _LOSSES))
-    information = weight * slopes.T @ slopes
+    information = weight * jacobian.T @ jacobian
     rate = DETECTION_SNR * float(np.sqrt(np.linalg.inv(information)[0, 0]))
-    return NoiseOrLossEffect(
-        f"tls.{Precipitation.tag()}", "rate_per_m", rate, f"beside a loss of {100 * _LOSSES:.0f} % that is there anyway"
-    )
+    return NoiseOrLossEffect(f"tls.{Precipitation.tag()}", "rate_per_m", rate, f"beside {100 * _LOSSES:.0f} % of other losses")
