@@ -54,7 +54,7 @@ class KnownPoints:
 
 
 def known_points(view: TlsView | StereoView) -> KnownPoints:
-    """Return the known points that a survey of this kind could add: targets around a scanner, or check points in front of a pair."""
+    """Return known points that a survey could add: targets around a scanner, or check points in front of a stereo pair."""
     return _targets(view) if isinstance(view, TlsView) else _check_points(view)
 
 

@@ -98,7 +98,7 @@ def _quantisation() -> NoiseOrLossEffect:
 
 
 def _detection_limit(view: TlsView) -> NoiseOrLossEffect:
-    """The detection limit: losing the k weakest echoes has a log-likelihood ratio of k ln(1 / losses); SNR 5 is a ratio of 12.5."""
+    """The detection limit: losing the k weakest echoes has the log-likelihood ratio k ln(1 / losses); SNR 5 means 12.5."""
     power = view.residuals.geometry.power
     if power is None:
         return NoiseOrLossEffect(f"tls.{DetectionLimit.tag()}", "minimum_power", np.nan, "needs recorded powers")
