@@ -101,8 +101,8 @@ class Wave:
         (n, 3) columns.
         """
         sine, cosine = self.columns(period).T
-        slope = 2 * np.pi * self.x * (coefficients[0] * cosine - coefficients[1] * sine)
-        return np.stack([sine, cosine, slope], axis=1)
+        derivative = 2 * np.pi * self.x * (coefficients[0] * cosine - coefficients[1] * sine)
+        return np.stack([sine, cosine, derivative], axis=1)
 
     def part(self, rows: Rows) -> Wave:
         """Return the wave on some of the points."""

@@ -268,8 +268,8 @@ class NormalEquations:
         """
         parts = [self._part(slice(start, start + _AT_ONCE)) for start in range(0, len(self.covariances), _AT_ONCE)]
         found = map_in_threads(lambda part: part._profile_chunk(base, fixed), parts)
-        plain, gains, waves = (np.max([each[kind] for each in found], axis=0) for kind in range(3))
-        return plain, gains, waves
+        plain, added, waves = (np.max([each[kind] for each in found], axis=0) for kind in range(3))
+        return plain, added, waves
 
     def _profile_chunk(self, base: list[int], fixed: list[list[int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
         """The same for a few covariances."""
@@ -280,14 +280,14 @@ class NormalEquations:
         value, others, sines = np.split(solved, [count, count + whole], axis=2)
         plain = self.constant + 0.5 * np.einsum("ckv,ckv->cv", self.right[:, base], value)
         left = self.right - beside.transpose(0, 2, 1) @ value
-        gains = np.zeros((len(fixed), count))
+        heights = np.zeros((len(fixed), count))
         for size in {len(columns) for columns in fixed}:
             rows = [row for row, columns in enumerate(fixed) if len(columns) == size]
             columns = np.array([fixed[row] for row in rows])
             own = self.fixed[:, columns[:, :, None], columns[:, None, :]]
             rest = own - beside[:, :, columns].transpose(0, 2, 3, 1) @ others[:, :, columns].transpose(0, 2, 1, 3)
-            gains[rows] = (plain[:, None] + _explained(rest, own, left[:, columns])).max(axis=0)
-        return plain.max(axis=0), gains, self._wave_profile(plain, self.wave_right - waves @ value, sines, waves)
+            heights[rows] = (plain[:, None] + _explained(rest, own, left[:, columns])).max(axis=0)
+        return plain.max(axis=0), heights, self._wave_profile(plain, self.wave_right - waves @ value, sines, waves)
 
     def _wave_profile(self, plain: FloatArray, right: FloatArray, solved: FloatArray, crossed: FloatArray) -> FloatArray:
         """The part for sines: the explained sum of squares of two columns follows from the inverse of a 2 x 2 matrix."""
@@ -299,8 +299,8 @@ class NormalEquations:
         determinant = a * d - b * b
         whole = (self.wave_own[:, :, 0, 0] * self.wave_own[:, :, 1, 1])[..., None]
         explained = np.where(determinant > _SMALLEST * whole, 0.5 * (r * r * d - 2 * r * s * b + s * s * a), 0.0)
-        gains = explained / np.where(determinant > _SMALLEST * whole, determinant, 1.0)
-        return np.asarray((plain[:, None] + np.maximum(gains, 0.0)).max(axis=0))
+        ratios = explained / np.where(determinant > _SMALLEST * whole, determinant, 1.0)
+        return np.asarray((plain[:, None] + np.maximum(ratios, 0.0)).max(axis=0))
 
 
 def _explained(rest: FloatArray, own: FloatArray, left: FloatArray) -> FloatArray:

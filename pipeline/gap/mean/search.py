@@ -88,13 +88,13 @@ class MeanSearch:
         plain, fixed, searched = self._profile(tuple(member.candidate for member in members))
         families, found = self.design.families, []
         for name, (rows, sines) in families.by_name.items():
-            gains = np.concatenate([fixed[rows, 0], searched[sines, 0]]) - plain[0]
-            best = int(np.argmax(gains))
+            ratios = np.concatenate([fixed[rows, 0], searched[sines, 0]]) - plain[0]
+            best = int(np.argmax(ratios))
             candidate = families.plain[rows[best]] if best < len(rows) else families.sine(sines[best - len(rows)])
-            gain = float(gains[best])
-            slight = gain < decided().mean.practical_share * alone.get((candidate.name, candidate.empirical), 0.0)
+            ratio = float(ratios[best])
+            negligible = ratio < decided().mean.practical_share * alone.get((candidate.name, candidate.empirical), 0.0)
             found.append(
-                FamilyScore(candidate.name, candidate.empirical, gain - self._null.penalty(name), gain, candidate, slight)
+                FamilyScore(candidate.name, candidate.empirical, ratio - self._null.penalty(name), ratio, candidate, negligible)
             )
         return tuple(sorted(found, key=lambda item: -item.score))
 
@@ -194,9 +194,9 @@ class MeanSearch:
             return form
         wave, others = waves[0], [member.candidate for member in members]
         (sine, *_), fit = self.design.fit_refined([wave.candidate, *others])
-        gain = wave.log_likelihood_ratio + fit.log_likelihood - self.design.fit([wave.candidate, *others]).log_likelihood
-        score = gain - (wave.log_likelihood_ratio - wave.score)
-        return replace(wave, candidate=sine, log_likelihood_ratio=gain, score=score) if score > form.score else form
+        ratio = wave.log_likelihood_ratio + fit.log_likelihood - self.design.fit([wave.candidate, *others]).log_likelihood
+        score = ratio - (wave.log_likelihood_ratio - wave.score)
+        return replace(wave, candidate=sine, log_likelihood_ratio=ratio, score=score) if score > form.score else form
 
     def _with_overtones(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
         """A wave with its overtones if these improve the score clearly; else the wave itself."""
@@ -209,9 +209,9 @@ class MeanSearch:
             if np.linalg.cond(columns.T @ columns) > _ALIKE:
                 return form
             both = replace(overtones, matrix=columns, form=HARMONIC_SERIES, period=unit * sine.period)
-            gain = self.design.fit([both, *others]).log_likelihood - fit.log_likelihood
-            score = gain - overtones.columns.shape[1]
-            return replace(form, candidate=both, log_likelihood_ratio=form.log_likelihood_ratio + gain, score=form.score + score)
+            ratio = self.design.fit([both, *others]).log_likelihood - fit.log_likelihood
+            score = ratio - overtones.columns.shape[1]
+            return replace(form, candidate=both, log_likelihood_ratio=form.log_likelihood_ratio + ratio, score=form.score + score)
 
         best = max(map(with_overtones, HARMONIC_ORDERS), key=lambda each: each.score)
         return best if best.score >= form.score + decided().mean.free_margin else form
@@ -244,11 +244,11 @@ class MeanSearch:
         without linearising.
         """
         plain, fixed, _ = self._profile(())
-        gains = fixed[:, 0] - plain[0]
-        found = [(gain, each) for gain, each in zip(gains, self.design.families.plain, strict=True) if not each.empirical]
+        ratios = fixed[:, 0] - plain[0]
+        found = [(ratio, each) for ratio, each in zip(ratios, self.design.families.plain, strict=True) if not each.empirical]
         ranked = sorted(found, key=lambda item: -item[0])
         least = max(decided().mean.leading_share * ranked[0][0], decided().mean.leading_gain) if ranked else 0.0
-        return [each for gain, each in ranked if gain >= least][:_MOST_LEADING]
+        return [each for ratio, each in ranked if ratio >= least][:_MOST_LEADING]
 
     def selected_alone(self, candidate: Candidate) -> SelectedEffect:
         """Return a candidate as if it had been selected alone, with its equivalence class."""

@@ -121,13 +121,13 @@ class _Set:
         return one_covariate
 
 
-def equivalence_margin(gain: float) -> float:
+def equivalence_margin(log_likelihood_ratio: float) -> float:
     """Return the difference of scores within which two effects are indistinguishable.
 
     It is at least `mean.class_margin` and grows with the log-likelihood ratio, because signatures are only exact to a share of
     it.
     """
-    return max(decided().mean.class_margin, decided().mean.class_share * gain)
+    return max(decided().mean.class_margin, decided().mean.class_share * log_likelihood_ratio)
 
 
 def _replacements(names: frozenset[str], name: str, margin: float, scores: SetScores) -> list[str]:

@@ -120,17 +120,17 @@ def _fit_noise(points: FloatArray, value: FloatArray) -> SurfaceNoise:
     root = np.sqrt(weight) / gamma  # the standard error of a variance is proportional to it
     slow = (lag / lag.max()) ** 2
     best = None
-    plain = _nonnegative_fit(np.stack([np.ones(len(lag)), slow], axis=1), gamma, root)
+    without_nodes = _nonnegative_fit(np.stack([np.ones(len(lag)), slow], axis=1), gamma, root)
     for step in _STEPS:
         form = np.stack([np.ones(len(lag)), _node_semivariogram(lag / step), slow], axis=1)
         found = _nonnegative_fit(form, gamma, root)
         if best is None or found[1] < best[1][1]:
             best = step, found
-    step, (values, square) = best if best is not None else (1.0, plain)
+    step, (values, square) = best if best is not None else (1.0, without_nodes)
     shared = 4 / 9 * values[1]
-    gains = plain[1] - square > decided().nodes.least_gain
-    if not gains or shared < decided().spread.least_excess * values[0]:
-        return SurfaceNoise(float(np.sqrt(plain[0][0])), 0.0, 0.1, spacing, 0.0)
+    improves = without_nodes[1] - square > decided().nodes.least_gain
+    if not improves or shared < decided().spread.least_excess * values[0]:
+        return SurfaceNoise(float(np.sqrt(without_nodes[0][0])), 0.0, 0.1, spacing, 0.0)
     own = max(values[0], 1e-4 * shared)
     return SurfaceNoise(float(np.sqrt(own)), float(np.sqrt(values[1])), step * spacing, spacing, float(shared / (own + shared)))
 

@@ -7,8 +7,8 @@ out in the metric of the predicted noise, W = diag(1 / sigma²):
     cosine      largest canonical correlation of two effects' S_perp, over the variants of one of them (such as the camera)
     seen_from   detectable size: the parameter value with a signal-to-noise ratio of 5, 5 sqrt(C), where C is the variance of its
                 estimate beside the pose
-    named_from  size from which it can be named: signal-to-noise ratio times the sine of the angle to the nearest other
-    signature is 8
+    named_from  size from which it can be named: the signal-to-noise ratio times the sine of the angle to the nearest other
+                signature is 8
 
 C counts all points of the survey, and a reference error that is correlated over metres (Matern 3/2), which many points do not
 average out. The amplitude of an effect with a phase is given for the phase that is hardest to detect.
