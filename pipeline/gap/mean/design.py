@@ -210,7 +210,7 @@ class Design:
 
     def log_likelihood(self, value: FloatArray, candidate: Candidate) -> float:
         """Return the log-likelihood of other residuals (n,) of the same points with the pose and a candidate fitted."""
-        columns = self._pose_columns.append(self.model.project(_projected(self.pose_basis, self._matrix([candidate], None))))
+        columns = self._projected_pose.append(self.model.project(_projected(self.pose_basis, self._matrix([candidate], None))))
         projected = self.model.project(value[self.model.rows, None] * self.model.inverse_sigma[:, None])
         return fit_reml(self.model.covariances, columns, projected).log_likelihood
 
@@ -225,10 +225,10 @@ class Design:
         turned = np.linalg.inv(self.pose_transform)
         if not candidates:
             known = np.asarray(turned.T @ (self.pose_precision[:, None] * turned), dtype=np.float64)
-            found = fit_reml(self.model.covariances, self._pose_columns, self.value, known)
+            found = fit_reml(self.model.covariances, self._projected_pose, self.value, known)
             return replace(found, coefficients=turned @ found.coefficients, covariance=turned @ found.covariance @ turned.T)
         matrix = self._matrix(candidates, wave_coefficients)
-        columns = self._pose_columns.append(self.model.project(_projected(self.pose_basis, matrix)))
+        columns = self._projected_pose.append(self.model.project(_projected(self.pose_basis, matrix)))
         # the fit uses orthonormal columns of the pose, projected out of the candidates; this matrix transforms back
         back = np.block(
             [
@@ -332,7 +332,8 @@ class Design:
         return names, np.clip(matrix / np.outer(scale, scale), -1, 1), size / full
 
     @cached_property
-    def _pose_columns(self) -> ProjectedColumns:
+    def _projected_pose(self) -> ProjectedColumns:
+        """Projected columns of the pose."""
         return self.fixed.select(self.pose_columns)
 
     def _matrix(self, candidates: list[Candidate], wave_coefficients: list[FloatArray | None] | None) -> FloatArray:

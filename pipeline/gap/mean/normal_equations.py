@@ -222,7 +222,14 @@ class NormalEquations:
         return replace(self, fixed=self.fixed + np.diag(precision))
 
     def with_values(self, right: FloatArray, constant: FloatArray, wave_right: FloatArray) -> NormalEquations:
-        """Replace the values, given their products with the columns and their log-likelihood without any."""
+        """Replace the values whose log-likelihoods are computed.
+
+        Parameters
+        ----------
+        right : (C, k, v) products of the new values with the fixed columns.
+        constant : (C, v) their log-likelihood without any column.
+        wave_right : (C, 2 w, v) their products with the sines.
+        """
         return replace(self, right=right, constant=constant, wave_right=wave_right)
 
     def with_sine_products(self, columns: list[int], products: FloatArray) -> NormalEquations:
@@ -236,9 +243,11 @@ class NormalEquations:
         return self._of([self.covariances[index] for index in chosen], chosen)
 
     def _part(self, rows: slice) -> NormalEquations:
+        """The equations of consecutive covariances."""
         return self._of(self.covariances[rows], rows)
 
     def _of(self, at: list[CellCovariance], rows: Any) -> NormalEquations:
+        """The equations of some rows, whose covariances are `at`."""
         names = ("fixed", "right", "constant", "wave_fixed", "wave_own", "wave_right")
         return replace(self, covariances=at, **{name: getattr(self, name)[rows] for name in names})
 

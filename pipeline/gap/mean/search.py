@@ -189,7 +189,7 @@ class MeanSearch:
 
     def _wave_instead(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
         """A wave of the same covariate, with its period refined, if it scores better than a spline; else the spline."""
-        waves = [each for each in self.score_families(members) if each.candidate.form == "wave" and _of_one_kind(each, form)]
+        waves = [each for each in self.score_families(members) if each.candidate.form == "wave" and _same_covariate(each, form)]
         if not waves:
             return form
         wave, others = waves[0], [member.candidate for member in members]
@@ -257,5 +257,6 @@ class MeanSearch:
         return ForwardSelection(self).with_equivalents((item,), item, {})
 
 
-def _of_one_kind(one: FamilyScore, other: FamilyScore) -> bool:
+def _same_covariate(one: FamilyScore, other: FamilyScore) -> bool:
+    """Whether two terms have the same covariate and the same angle."""
     return one.name == other.name and one.candidate.angle == other.candidate.angle

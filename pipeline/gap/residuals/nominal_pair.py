@@ -149,29 +149,44 @@ def project(camera: Camera, points: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 def pixel_rays(camera: Camera, u: FloatArray, v: FloatArray) -> FloatArray:
-    """Return the (n, 3) directions of pixels, with a component of 1 along the camera's axis. u, v: (n,) columns and rows, px."""
+    """Return the rays of pixels.
+
+    Parameters
+    ----------
+    camera : The camera.
+    u, v : (n,) columns and rows, px.
+
+    Returns
+    -------
+    (n, 3) directions in the frame in which the camera's pose is given, with a component of 1 along its axis.
+    """
     return np.stack(_on_host(*_ray(camera, on_device(mi.Float64, u), on_device(mi.Float64, v))), axis=1)
 
 
 def _pixel(camera: Camera, point: mi.Array3f64) -> tuple[mi.Float64, mi.Float64]:
+    """Column and row at which a camera sees points, on the device."""
     u, v = camera.on_device().pixel(*_seen_tangents(camera, point))
     return u, v
 
 
 def _seen_tangents(camera: Camera, point: mi.Array3f64) -> tuple[mi.Float64, mi.Float64]:
+    """Tangents x / z and y / z of points in a camera, on the device."""
     local = rotated(camera.rotation.T, point - vector(camera.position))
     return local.x / local.z, local.y / local.z
 
 
 def _interior(camera: Camera) -> tuple[float, ...]:
+    """Parameters of the interior orientation, to compare two cameras."""
     return tuple(float(getattr(camera, name)) for name in INTERIOR)
 
 
 def _ray(camera: Camera, u: mi.Float64, v: mi.Float64) -> mi.Array3f64:
+    """Directions of pixels, on the device."""
     return rotated(camera.rotation, mi.Array3f64(*camera.on_device().tangents(u, v), 1.0))
 
 
 def _on_host(*columns: mi.Float64) -> list[FloatArray]:
+    """Copy arrays from the device."""
     dr.eval(*columns)
     return [np.array(column) for column in columns]
 
