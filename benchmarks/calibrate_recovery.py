@@ -1,11 +1,11 @@
-"""Do calibrations find the noise that maps were simulated with, and do their intervals hold it as often as they say?
+"""Check whether calibrations recover the noise of simulated maps, and whether their intervals have the stated coverage.
 
     python benchmarks/calibrate_recovery.py [--sensor stereo|tls] [--trials 50] [--out DIR] [--write]
 
-Each trial has a wall and a seed of its own and draws its true noise at random; its maps are made by the whole simulation
-(`noise_map`: every cell, meshing, ICP of one noisy epoch to the other, rasters), not by the one that the calibration searches
-with. Finished trials are kept under --out, so an interrupted benchmark goes on where it was. --write puts the
-table into docs/validation/calibration.md.
+Each trial has its own wall and seed and draws its true noise at random. Its maps come from the whole simulation (`noise_map`:
+every cell, meshing, ICP between two noisy epochs, rasters), not from the fast one that the calibration searches with. Finished
+trials are kept under --out, so that an interrupted benchmark continues. --write puts the table into
+docs/validation/calibration.md.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pipeline.change.difference import raster_grid
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import load_config
 from pipeline.report.progress import Progress
-from pipeline.run.acquisition import look, reconstruct
+from pipeline.run.acquisition import acquire, reconstruct
 from pipeline.run.site import prepare_site
 from scene.common.backend import dr
 from scene.common.keyed_random import KeyedRandom
@@ -57,11 +57,11 @@ TRUTH = {
     "range_sigma_m": (0.0015, 0.01),
     "angle_sigma_rad": (3e-5, 3e-4),
 }
-"""Bounds between which the logarithm of the true value is uniform."""
+"""Bounds of the true value, whose logarithm is uniform."""
 
 
 def trial(sensor: Any, number: int) -> dict[str, Any]:
-    """One calibration: true values, estimates, intervals."""
+    """Run one calibration and return true values, estimates and intervals."""
     config = load_config(bundled_config("", "demo"), [*SETTINGS, f"wall.seed={100 + number}"], sensor, 1000 + number)
     random = KeyedRandom(50_000 + number)
     site = prepare_site(config, sensor, KeyedRandom(config.seed))
@@ -71,7 +71,7 @@ def trial(sensor: Any, number: int) -> dict[str, Any]:
     true = np.exp(random.child("truth").generator().uniform(low, high))
     real = replace(site, sensor=replace(instrument, model=fitted.model(true)))
     caster = RayCaster(site.mesh)
-    grid = raster_grid(reconstruct(config, look(config, real, caster, random.child("grid"))).bounds, config.difference)
+    grid = raster_grid(reconstruct(config, acquire(config, real, caster, random.child("grid"))).bounds, config.difference)
     maps = np.stack([noise_map(config, real, real, caster, random.child("map", epoch), grid) for epoch in range(EPOCHS)])
     names = tuple(f"epoch {epoch}" for epoch in range(EPOCHS))
     inputs = CalibrationInputs(names, grid, maps, ~np.isnan(maps).any(axis=0), False, site, False)
@@ -86,8 +86,9 @@ def trial(sensor: Any, number: int) -> dict[str, Any]:
 
 
 def table(found: list[dict[str, Any]]) -> list[str]:
-    """Per parameter: intervals that hold the truth, with the binomial bounds (Clopper and Pearson 1934) of 95 % of their share,
-    median width and RMS error of the logarithm."""
+    """Return, for each parameter, the coverage of the intervals with its 95 % binomial interval (Clopper and Pearson 1934), the
+    median width, and the RMS error of the logarithm.
+    """
     rows = [f"| {len(found)} trials | in the interval of 95 % (bounds of the share) | RMS error | median half width |"]
     rows.append("|" + "---|" * 4)
     for name in found[0]["parameters"]:

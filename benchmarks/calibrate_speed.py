@@ -1,8 +1,9 @@
-"""Observations per second of a Glendale calibration, against the bare casting of as many rays and against whole maps.
+"""Measure the observations per second of a Glendale calibration, compared with casting as many rays and with simulating whole
+maps.
 
     python benchmarks/calibrate_speed.py [--site glendale]
 
-Windows as a calibration lays them on a map of the whole wall; glendale_independent_high noise; medium depth maps.
+The windows are those of a calibration on a map of the whole wall; noise is glendale_independent_high, depth maps are medium.
 """
 
 from __future__ import annotations

@@ -1,13 +1,12 @@
-"""Tiles per minute, share of the stages, memory, and the time that the nine sets would take.
+"""Measure how fast data sets are made: tiles per minute, share of the steps, memory, and the projected time of the nine sets.
 
     python benchmarks/dataset.py                      workers: a small set by one and by two workers, in turns
     python benchmarks/dataset.py epochs [--epochs 6]  epochs of rockfall_9 in this process, projection of the whole plan
     python benchmarks/dataset.py memory [--epochs 100] [--sensor tls] [--small]    peak memory of one worker over many epochs
 
-Rates are of wall time and of processor time; on a machine that others use too only the latter tells of the program.
-The projection plays the plan through: a free worker takes the next run of epochs and pays for a stage (wall, frame, scene,
-reference) where it is not the one that it has. It is checked on the epochs that were just timed, and on the small set's two
-workers.
+Rates are given per wall time and per processor time; on a shared machine, only the latter is meaningful. The projection simulates
+the plan: a free worker takes the next run of epochs, and sets up a stage (wall, frame, scene, reference) if it is not its present
+one. It is checked on the epochs that were just timed, and on the small set's two workers.
 """
 
 from __future__ import annotations
@@ -37,7 +36,9 @@ SIZES = ("small", "medium", "large")
 
 
 def timed(config: DatasetConfig, workers: int) -> tuple[float, DatasetSummary]:
-    """Wall time of a whole set by some workers with a core each, s, the start of their processes and the card included."""
+    """Return the wall time of a whole set by some workers with one core each, s, including the start of processes and
+    the card.
+    """
     cores = os.sched_getaffinity(0)
     if workers:
         os.sched_setaffinity(0, sorted(cores)[:workers])
@@ -57,7 +58,9 @@ def stage_seconds(made: Sequence[dict[str, Any]]) -> dict[str, float]:
 
 
 def of_glendale(epochs: int, sensors: Sequence[str], *others: dict[str, Any]) -> DatasetConfig:
-    """rockfall_9 cut down to `epochs` training epochs of each sensor and size on Glendale at high noise, and to other parts."""
+    """Return rockfall_9 reduced to `epochs` training epochs of each sensor and size on Glendale at high noise, and to other
+    parts.
+    """
     values = load_dataset_config(bundled_config("datasets", "rockfall_9")).model_dump(mode="json")
     part = {"walls": ["glendale"], "noise": ["high"], "sizes": SIZES, "train": epochs}
     return DatasetConfig.model_validate({**values, "sensors": sensors, "parts": [part, *others]})
@@ -71,11 +74,11 @@ class Costs:
     epoch: dict[tuple[str, str, str], float]
 
     def of_set_up(self, planned: PlannedEpoch) -> float:
-        """Of the planned epoch's stage; a test's wall costs what the training's of its style does."""
+        """Return the cost of the planned epoch's stage; a test wall costs as much as the training wall of its style."""
         return self.set_up[planned.wall.removesuffix("-b"), planned.sensor]
 
     def of(self, planned: PlannedEpoch) -> float:
-        """Of the epoch itself; a size that was not timed on its wall costs as many times the medium one as on Glendale."""
+        """Return the cost of the epoch; for an untimed size, that of the medium size is scaled as on Glendale."""
         wall, sensor = planned.wall.removesuffix("-b"), planned.sensor
         if (wall, sensor, planned.size) in self.epoch:
             return self.epoch[wall, sensor, planned.size]
@@ -84,7 +87,7 @@ class Costs:
 
 
 def costs(config: DatasetConfig, made: Sequence[dict[str, Any]]) -> Costs:
-    """The means of what was made. The set-up's share of the processor time of the epoch that did it is that of its wall time."""
+    """Return the mean costs of epochs that were made; the set-up's share of processor time is that of its wall time."""
     plan = planned_epochs(config)
     set_up: dict[tuple[str, str], list[float]] = defaultdict(list)
     epoch: dict[tuple[str, str, str], list[float]] = defaultdict(list)
@@ -101,7 +104,7 @@ def costs(config: DatasetConfig, made: Sequence[dict[str, Any]]) -> Costs:
 
 
 def makespan(plan: Sequence[PlannedEpoch], workers: int, cost: Costs) -> float:
-    """Time until the last epoch of the plan is done, s, by the rule above."""
+    """Return the time until the last epoch of the plan is done, s, by the rule of the module."""
     free: list[tuple[float, int]] = [(0.0, number) for number in range(workers)]
     has: dict[int, object] = {}
     for run in runs([EpochOrder("", "", "", planned.index, planned.stage) for planned in plan], workers):
@@ -122,7 +125,7 @@ def print_stages(made: Sequence[dict[str, Any]]) -> None:
 
 
 def compare_workers(rounds: int) -> None:
-    """The small set by one and by two workers, in turns."""
+    """Make the small set by one and by two workers, in turns."""
     config = load_dataset_config(bundled_config("datasets", "small"))
     plan = planned_epochs(config)
     print("| workers | wall, s | tiles a minute | processor s a tile | made by set-ups |\n|---|---|---|---|---|")
@@ -144,7 +147,7 @@ def compare_workers(rounds: int) -> None:
 
 
 def project(epochs: int) -> None:
-    """Time epochs of Glendale, and one of each other wall, in this process; play the whole plan of rockfall_9 through."""
+    """Time epochs of Glendale, and one of each other wall, in this process; project the whole plan of rockfall_9."""
     bulga = {"walls": ["bulga"], "noise": ["high"], "sizes": ["medium"], "train": 1}
     tests = {"walls": ["bismantova", "pilkington"], "noise": ["7.5cm"], "sizes": ["medium"], "test": 1}
     config = of_glendale(epochs, ("stereo", "tls"), bulga, tests)
@@ -169,14 +172,14 @@ def project(epochs: int) -> None:
 
 
 def of_the_small_wall(epochs: int, sensor: str) -> DatasetConfig:
-    """The small set's wall, `epochs` times."""
+    """Return the small set's wall with this number of epochs."""
     values = load_dataset_config(bundled_config("datasets", "small")).model_dump(mode="json")
     part = {"walls": ["glendale"], "noise": ["high"], "sizes": ["medium"], "train": epochs}
     return DatasetConfig.model_validate({**values, "sensors": [sensor], "parts": [part]})
 
 
 def print_memory(epochs: int, sensor: str, small: bool) -> None:
-    """The peak after each tenth of the epochs."""
+    """Print the peak memory after each tenth of the epochs."""
     config = of_the_small_wall(epochs, sensor) if small else of_glendale(-(-epochs // len(SIZES)), (sensor,))
     _, summary = timed(config, 0)
     for number in range(0, len(summary.made), max(1, len(summary.made) // 10)):

@@ -1,9 +1,10 @@
-"""Noise of the difference maps of a data set's walls at its levels, outside blocks: what the scales in its config are chosen by.
+"""Measure the noise outside blocks of a data set's difference maps, by wall and noise level; the config's scales are chosen by
+it.
 
     python benchmarks/dataset_noise.py [CONFIG] [--maps 4] [--sensor stereo|tls] [--unit]
 
-Maps without blocks at half the walls' resolution and a GSD of 10 cm, as in noise_table.py (docs/explanation/noise.md);
-mean of the StD, mm, by wall and level, with the largest and smallest. --unit: at scale 1 in place of the config's.
+The maps have no blocks, half the walls' resolution and a GSD of 10 cm, as in noise_table.py (docs/explanation/noise.md). Printed
+are the mean StD, mm, and the smallest and largest. --unit: use scale 1 instead of the config's.
 """
 
 from __future__ import annotations

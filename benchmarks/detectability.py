@@ -1,7 +1,7 @@
-"""Detection probability of niches: the closed form of `scarpsim inspect` against simulated observations of a flat wall.
+"""Compare the detection probability of niches in `scarpsim inspect`, a closed form, with simulated observations of a flat wall.
 
-To reach: the standardised difference of each row within +-3.3 (one row in a thousand lies outside by chance).
-Rows at 45 degrees with a handful of points per niche may miss it: see the limits in pipeline/precision/detectability.py.
+Target: the standardised difference of each row is within +-3.3 (by chance, one row in a thousand is not). Rows at 45 degrees with
+few points in a niche may exceed it: see the limits in pipeline/precision/detectability.py.
 """
 
 from __future__ import annotations

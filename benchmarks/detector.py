@@ -1,9 +1,9 @@
-"""Training images per second and inference megapixels per second against the bare backbone and pyramid, in the same run.
+"""Measure training images per second and inference megapixels per second, compared with backbone and pyramid only.
 
     KERAS_BACKEND=tensorflow python benchmarks/detector.py [--config configs/detectors/fine.yaml] [--threads 1]
 
-To reach: half of the bare rate, forward and backward for training, forward for inference. Inference with a map's mirror images
-too (`head.mirrored: both`) is timed beside it. Processor times in turns, so that other work on the machine counts little; images
+Target: half of the bare rate (forward and backward for training, forward for inference). Inference with mirrored views
+(`head.mirrored: both`) is timed too. Processor times are taken in turns, so that other work on the machine hardly matters. Images
 are noise with a dozen blocks in each 256 px square.
 """
 

@@ -1,13 +1,13 @@
-"""What single choices of the detector's training are worth: short trainings of equal length, each with one choice undone.
+r"""Measure what single choices of the detector's training contribute: short trainings of equal length, each with one choice
+undone.
 
     python benchmarks/detector_ablation.py --set sets/mixed --test sets/detector_test --test sets/detector_test_mean \
         --out runs/ablation [--epochs 8] [--seeds 1 2] [--write]
 
-Small and medium blocks at one level of noise out of sets as in detector_table.py. Every network
-starts from random weights; the score that counts is set on the validation images, F1 is of all tests together. What is in --out
-already is not made again. The first row is trained once for each of --seeds, which tells how much chance does; the others are
-trained with the first of them and set against the mean of that row. --write puts the table into
-docs/validation/detector_training.md.
+The blocks are small and medium, at one noise level, from sets as in detector_table.py. Every network starts from random weights;
+score thresholds are set on the validation images; F1 is of all tests together. Results in --out are reused. The first row is
+trained once for each of --seeds, which shows the effect of chance; the others are trained with the first seed and compared with
+the mean of that row. --write puts the table into docs/validation/detector_training.md.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ DOCUMENT = Path(__file__).parents[1] / "docs" / "validation" / "detector_trainin
 MARKS = "<!-- ablation -->", "<!-- end of ablation -->"
 CONFIDENCE, OVERLAPS = 0.95, (0.25, 0.75)
 BATCH = 4
-"""Half of the config's: trainings are so short that steps count more than their noise."""
+"""Half of the config's batch: in short trainings, the number of steps matters more than their noise."""
 NOISE, SIZES = "2.5cm", ("small", "medium")
 ONE_WALL = {"wall": "glendale", "sensor": "stereo", "size_class": "medium"}
-"""The images on which scores are set where validation is not over all."""
+"""Images for setting scores where validation does not use all of them."""
 Coco = dict[str, Any]
 
 
@@ -46,8 +46,11 @@ Coco = dict[str, Any]
 class Change:
     """A choice undone.
 
-    training: overrides of the training's config; ignore: whether faint blocks are left out of the loss; one_wall: the network is
-    that of the first row, with its scores set on ONE_WALL alone.
+    Attributes
+    ----------
+    training : Overrides of the training's config.
+    ignore : Whether faint blocks are left out of the loss.
+    one_wall : Whether the network is that of the first row, with its scores set on ONE_WALL only.
     """
 
     name: str
@@ -67,7 +70,7 @@ CHANGES = (
 
 
 def figures(change: Change, seed: int, arguments: argparse.Namespace) -> list[float]:
-    """F1 of a training with that change and seed, by size and overlap, %."""
+    """Return F1, %, by size and overlap, of a training with that change and seed."""
     folder = arguments.out / f"{CHANGES.index(change)}_{seed}"
     tests = [part(each / "test", arguments.out / f"test_{number}") for number, each in enumerate(arguments.tests)]
     found = [folder / f"found_{number}" / "detections.json" for number in range(len(tests))]
@@ -86,7 +89,7 @@ def figures(change: Change, seed: int, arguments: argparse.Namespace) -> list[fl
 
 
 def trained(change: Change, seed: int, folder: Path, arguments: argparse.Namespace) -> Path:
-    """The detector of a training with that change."""
+    """Return the detector of a training with that change."""
     base = (
         f"training.epochs={arguments.epochs}",
         f"training.seed={seed}",
@@ -102,7 +105,7 @@ def trained(change: Change, seed: int, folder: Path, arguments: argparse.Namespa
 
 
 def one_wall(seed: int, folder: Path, arguments: argparse.Namespace) -> Path:
-    """The detector of the first row with its scores set on ONE_WALL; that row comes first."""
+    """Return the detector of the first row with its scores set on ONE_WALL; that row must come first."""
     validation = part(
         arguments.folder / "val",
         arguments.out / "one_wall" / "val",
@@ -114,7 +117,7 @@ def one_wall(seed: int, folder: Path, arguments: argparse.Namespace) -> Path:
 
 
 def part(folder: Path, out: Path, *, ignore: bool = True, wanted: Callable[[Coco], bool] = lambda image: True) -> Path:
-    """The images of a COCO folder at NOISE and of SIZES that are wanted, copied to `out` once."""
+    """Copy the wanted images of a COCO folder, at NOISE and of SIZES, to `out`, once."""
     if (out / "annotations.json").exists():
         return out
     whole = content(folder)

@@ -1,10 +1,10 @@
-"""F1 of detectors against the windows that they have learned from: what more training would give.
+"""Measure F1 of detectors against the number of training windows, to see what more training would give.
 
     python benchmarks/detector_curve.py --set runs/test [--set another] 38448=before 54468=later 70488=default [--write]
 
-Each detector is named with its windows, and its folder. Sets and detections as in detector_table.py, the detections kept in a
-folder beside each set's that is named by the windows; maps are looked at as they are, whatever a detector's `head.mirrored` says.
-Means over the cells of both sensors at a score of 0.95, masks. --write puts the table into docs/validation/detector_training.md.
+Each detector is given as its number of windows and its folder. Sets and detections are as in detector_table.py; detections are
+kept in a folder beside each set's, named by the windows. Mirrored views are not used. F1 is the mean over the cells of both
+sensors at a score of 0.95, for masks. --write puts the table into docs/validation/detector_training.md.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""How well a detector draws the blocks that it finds, and what stands in the way: boxes, outlines, the mask's grid, or the noise.
+"""Measure how well a detector draws the blocks that it finds, and what limits it: boxes, outlines, the mask's grid, or noise.
 
     python benchmarks/detector_drawn.py --set sets/mixed [--split val] [--model default] [--unmirrored] [--write]
 
-Of the blocks found (masks overlap by 0.25, score 0.95), the share with a mask that overlaps by 0.75: masks as they are, drawn in
-other boxes, with another margin or from another probability on, and the true masks cut or sampled as the masks found are. Each
-block counts that the network finds as it is, whatever is drawn then. Tiles of the detector's own size. --write puts the table
+Of the detected blocks (masks overlap by 0.25, score 0.95), it gives the share whose mask overlaps by 0.75: with masks as they
+are, drawn in other boxes, with another margin or probability threshold, and with the true masks cut or sampled like the predicted
+ones. Every variant counts the blocks that the unchanged network finds. Tiles have the detector's own size. --write puts the table
 into docs/validation/detector.md.
 """
 
@@ -35,7 +35,7 @@ MARKS = "<!-- drawn -->", "<!-- end of drawn -->"
 CONFIDENCE, FOUND, DRAWN = 0.95, 0.25, 0.75
 SIZES = ("small", "medium", "large")
 ENOUGH = 20
-"""Of fewer blocks no share is given."""
+"""Smallest number of blocks for which a share is given."""
 MARGINS = (0.0, 0.5, 2.0)
 RATIOS = ((4, 8), (8, 16), (16, 32), (32, np.inf))
 Boxes = NDArray[np.float32]
@@ -47,8 +47,12 @@ Drawing = Callable[["Tile"], Masks]
 class Tile:
     """A tile with the blocks found in it, one row each.
 
-    boxes: (n, 4); masks: (n, m, m) probabilities in mask_boxes (n, 4), the boxes with a margin (px) around; true_masks:
-    (n, size, size), true_boxes: (n, 4), of the blocks found; draw: the mask head in other boxes of the tile.
+    Attributes
+    ----------
+    boxes : (n, 4) boxes found.
+    masks, mask_boxes : (n, m, m) probabilities, in boxes (n, 4) with a margin, px.
+    true_masks, true_boxes : (n, size, size) and (n, 4) of the blocks found.
+    draw : Predicts masks in other boxes of the tile.
     """
 
     size: int
@@ -63,7 +67,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class Block:
-    """A block that was found. good: whether it overlaps by DRAWN, by drawing; edges: (4,) found minus true, px."""
+    """A detected block. good: whether each variant overlaps by DRAWN; edges: (4,) found minus true box, px."""
 
     size: str
     ratio: float
@@ -105,12 +109,12 @@ def sampled(masks: Masks, boxes: Boxes, cells: int) -> NDArray[np.float32]:
 
 
 def redrawn(tile: Tile, boxes: Boxes) -> Masks:
-    """What the mask head sees in other boxes."""
+    """Return what the mask head predicts in other boxes."""
     return pasted(tile.draw(boxes), boxes, tile.size)
 
 
 def with_margin(tile: Tile, margin: float) -> Masks:
-    """What it sees in the boxes found with another margin around."""
+    """Return what the mask head predicts in the found boxes with another margin."""
     return redrawn(tile, widened(tile.boxes, margin))
 
 

@@ -1,11 +1,10 @@
-"""What a detector gains where it also looks at a map's mirror images, and what that takes.
+"""Measure what mirrored views improve in a detector, and their cost.
 
     python benchmarks/detector_mirrored.py --set sets/mixed [--split val] [--every 3] [--model default] [--write]
 
-The views are those of pipeline/detection/inference/mirrored.py. F1 of masks by size at a score of 0.95, once the scores of each
-way of looking are set on the same tiles (`operating_point.best_shifts`), so the
-gain is rather too large than too small. Tiles of the
-detector's own size. --write puts the table into docs/validation/detector.md.
+The views are those of pipeline/detection/inference/mirrored.py. F1 of masks is given by size at a score of 0.95, with the scores
+of each variant set on the same tiles (`operating_point.best_shifts`), so that the gain is rather over- than underestimated. Tiles
+have the detector's own size. --write puts the table into docs/validation/detector.md.
 """
 
 from __future__ import annotations

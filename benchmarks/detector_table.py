@@ -1,14 +1,15 @@
-"""F1 of a detector and of the threshold baseline, beside the thesis's: four walls x three levels of noise x three sizes.
+"""Measure F1 of a detector and of the threshold baseline, compared with the thesis: four walls, three noise levels, three sizes.
 
-    scarpsim dataset configs/datasets/detector_test.yaml --out runs/detector_test       # goes on where it was interrupted
+    scarpsim dataset configs/datasets/detector_test.yaml --out runs/detector_test       # continues an interrupted run
     python benchmarks/detector_table.py --set runs/detector_test [--set another] [--model default] [--write]
 
-Each set, named by where its blocks lie (`rockfall.placement`), gets tables of the stereo pair's maps and of the laser
-scanner's. Detections are kept in a folder beside the set's (--out) and not made again. Confidence 0.95, and an IoU of 0.25 (was
-the block found?) and of 0.75 (how well is it drawn?) of masks and of boxes; of boxes at 0.75 the thesis has tables 5-9 to 5-12.
-To reach: more than the baseline wherever the baseline has less than 95 %. The baseline gets the lowest score to count, of a
-few, that is best for it over the cells of a table. --write puts the tables into
-docs/validation/detector_tables.md, their means over the walls into docs/validation/detector.md.
+Each set, named by the placement of its blocks (`rockfall.placement`), gets tables of the stereo pair's and of the laser scanner's
+maps. Detections are kept in a folder beside the set's (--out) and reused. The confidence is 0.95, with an IoU of 0.25 (is the
+block found?) and of 0.75 (is it well drawn?), of masks and of boxes; the thesis has tables 5-9 to 5-12 for boxes at 0.75.
+
+Target: more than the baseline wherever the baseline has less than 95 %. The baseline's score threshold is the best one, of a few,
+over the cells of a table. --write puts the tables into docs/validation/detector_tables.md, and their means over the walls into
+docs/validation/detector.md.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ BARS = (Bar(FOUND, "segm"), Bar(FOUND, "bbox"), Bar(DRAWN, "segm"), Bar(DRAWN, "
 
 @dataclass(frozen=True)
 class Tested:
-    """A test set and what the two detectors find in it. placement: of its blocks."""
+    """A test set, the placement of its blocks, and what the two detectors find in it."""
 
     placement: str
     truth: Coco
@@ -70,12 +71,12 @@ class Tested:
 
     @classmethod
     def of(cls, folder: Path, model: str, out: Path) -> Tested:
-        """The set in `folder`; detections, which `out` keeps, are made once."""
+        """Read the set in `folder`; detections are kept in `out` and made only once."""
         truth = json.loads((folder / "test" / "annotations.json").read_text(encoding="utf-8"))
         return cls(placement_of(folder), truth, *(detections(each, folder / "test", out) for each in (model, BASELINE)))
 
     def on(self, *sensors: str) -> Cells:
-        """The cells of the sensors, taken together."""
+        """Return the cells of these sensors, taken together."""
         cells: dict[str, list[int]] = {}
         for image in self.truth["images"]:
             if image["sensor"] in sensors:
@@ -84,14 +85,14 @@ class Tested:
 
 
 def placement_of(folder: Path) -> str:
-    """Where the blocks of a set lie, by its dataset.json; several, joined by `and`, where its sizes or sources differ."""
+    """Return the placement of a set's blocks, from its dataset.json; several are joined by `and`."""
     sources = json.loads((folder / "dataset.json").read_text(encoding="utf-8"))["sources"].values()
     found = {size["rockfall"]["placement"] for source in sources for size in source["config"]["sizes"].values()}
     return " and ".join(sorted(found))
 
 
 def detections(model: str, folder: Path, out: Path, *, unmirrored: bool = False) -> list[dict[str, Any]]:
-    """What a detector finds in a set's tests, made once. unmirrored: in maps as they are alone."""
+    """Return what a detector finds in a set's tests, made once. unmirrored: without mirrored views."""
     path = out / (BASELINE if model == BASELINE else "network") / "detections.json"
     if not path.exists():
         detect(model, [folder], path.parent, confidences=(LOWEST_SCORE,), pictures=False, unmirrored=unmirrored)
@@ -100,7 +101,7 @@ def detections(model: str, folder: Path, out: Path, *, unmirrored: bool = False)
 
 @dataclass(frozen=True)
 class Cells:
-    """The cells of one set: ids of images by `wall noise size`. sensors: whose images, in words."""
+    """The cells of one set: image ids by `wall noise size`. sensors: whose images, in words."""
 
     tested: Tested
     sensors: str
@@ -111,7 +112,7 @@ class Cells:
         return self._scores(self.tested.network, CONFIDENCE, bar)
 
     def baseline(self, bar: Bar) -> dict[str, Score]:
-        """The baseline's, at the one of BASELINE_SCORES with the largest mean F1."""
+        """Return the baseline's scores, at that of BASELINE_SCORES with the largest mean F1."""
         return max((self._scores(self.tested.baseline, lowest, bar) for lowest in BASELINE_SCORES), key=mean_f1)
 
     def _scores(self, found: list[dict[str, Any]], confidence: float, bar: Bar) -> dict[str, Score]:
@@ -120,7 +121,7 @@ class Cells:
 
     @cached_property
     def visible(self) -> dict[str, float]:
-        """Share of the blocks that stand out from the noise, to a filter that knows their shapes."""
+        """Return the share of blocks that stand out from the noise for a matched filter."""
         return {name: score.stand_out for name, score in self.network(BARS[0]).items()}
 
 
@@ -166,7 +167,7 @@ def summary(network: dict[str, Score], baseline: dict[str, Score]) -> str:
 
 
 def means(every: Sequence[Cells]) -> Iterator[str]:
-    """Lines of Markdown: means over the walls, and what parts the shortfall against the thesis has."""
+    """Yield lines of Markdown: means over the walls, and the components of the difference from the thesis."""
     heads = ("placement", "sensor", "size", "noise", "masks: 0.25, 0.75", "boxes: 0.25, 0.75", "baseline, masks: 0.25, 0.75")
     yield f"| {' | '.join((*heads, 'bound', 'thesis', 'lacks: map, found, drawn'))} |"
     yield "|---|---|---|---|---|---|---|---|---|---|"

@@ -1,12 +1,13 @@
-"""F1 on whole maps beside that on the tiles that they were cut into: what is a tile's edge, and what is the detector.
+r"""Compare F1 on whole maps with that on tiles, to separate effects of tile edges from those of the detector.
 
-    scarpsim dataset configs/datasets/detector_test.yaml --set tiles.size_px=1560 --set tiles.minimum_valid_share=0.05 \\
+    scarpsim dataset configs/datasets/detector_test.yaml --set tiles.size_px=1560 --set tiles.minimum_valid_share=0.05 \
         --set "sensors=[tls]" --set "parts.0.sizes=[large]" --set name=whole --out sets/whole
     python benchmarks/detector_whole.py --sets sets/detector_test sets/whole [--sets ...] [--write]
 
-The same epochs as configs/datasets/detector_test.yaml has, in tiles larger than a map. Cells that both sets have: wall, noise and
-size of one sensor. A cut block counts once for each tile that shows a part of it, a whole one once; `detect` lays its own windows
-over whole maps by a half. Everything else is as in detector_table.py. --write puts the table into docs/validation/detector.md.
+The epochs are those of configs/datasets/detector_test.yaml, in tiles larger than a map. Compared are cells that both sets have:
+wall, noise and size of one sensor. A block that tiles cut counts once for each tile that shows part of it, a whole one once;
+`detect` covers whole maps with half-overlapping windows. The rest is as in detector_table.py. --write puts the table into
+docs/validation/detector.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""The raster of a surface (heights and labels, 3500 x 1500 pixels) against the bare cast of the same rays; target: at most 2."""
+"""Measure the time of rasterising a surface (heights and labels, 3500 x 1500 pixels) against casting the same rays; target: at
+most 2.
+"""
 
 from __future__ import annotations
 

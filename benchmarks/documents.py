@@ -1,4 +1,4 @@
-"""Tables of measurements in documents."""
+"""Write tables of results into pages of the documentation."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from pipeline.formats.files.atomic import write_text
 
 
 def write_between(path: Path, marks: tuple[str, str], text: str) -> None:
-    """Put a text between two marks of a document, in place of what is there."""
+    """Replace the text between two marks of a document."""
     first, last = marks
     document = path.read_text(encoding="utf-8")
     write_text(path, re.sub(f"{first}.*{last}", lambda _: f"{first}\n{text}\n{last}", document, flags=re.DOTALL))
 
 
 def printed(rows: Iterable[str]) -> str:
-    """The rows of a table, each printed as it comes, as one text."""
+    """Print the rows of a table as they come, and return them as one text."""
     table = []
     for row in rows:
         print(row, flush=True)

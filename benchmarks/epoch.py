@@ -1,9 +1,10 @@
-"""One whole Glendale epoch with 1,500 blocks and all products, against the sum of the bare casts and booleans in it.
+"""Measure the time of one whole Glendale epoch with 1,500 blocks and all products, against the sum of its bare casts and
+booleans.
 
     python benchmarks/epoch.py [stereo|tls]     (GSD 2 cm; target: at most 5 times the sum, about 30 s, 4 GB)
 
-The sum: the casts of the observation and of the difference raster's pixels, each alone on rays that are ready in memory, and one
-Manifold boolean of the closed wall and all blocks, solids built. The reference epoch and the wall are made before.
+The sum has the casts of the observation and of the difference raster's pixels, each alone on rays in memory, and one Manifold
+boolean of the closed wall and all blocks with finished solids. The wall and the reference epoch are made before.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Every reader and every command with 500 damaged files, odd values or odd words of each kind, in place of the 25 of the tests.
+"""Try every reader and every command with 500 damaged files, odd values or odd arguments of each kind, instead of the tests' 25.
 
     python benchmarks/fuzz.py [EXAMPLES]
     python benchmarks/fuzz.py [EXAMPLES] --through [--commands evaluate detect ...]
 
-Ends with the exit status of pytest: 0 where each was read, or refused with one line. --through: the commands alone, each case a
-process of its own that goes on to its end, with bounds on time and memory; prints those that are answered badly.
+The exit status is that of pytest: 0 if each was read, or refused with one line. --through: only the commands, each case as its
+own process that runs to its end, with limits on time and memory; bad responses are printed.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
-"""`scarpsim gap`, all steps, by the number of points; to reach: a million of each sensor in 60 s on two cores and 4 GB, and
-20 million ranges in 6 GB.
+"""Measure time and memory of all steps of `scarpsim gap` by the number of points.
+
+Targets: a million points of each sensor in 60 s on two cores and 4 GB, and 20 million ranges in 6 GB.
 
     python benchmarks/gap.py [tls] [stereo] [--points 1000000 ...] [--write]
 
-The measurements are made by the challenge's generator, in a process of their own. Each is read and diagnosed with an empty kernel
-cache, as a new user's, and again with the kernels of that. To reach: 60 bare casts of the same rays, or 60 s. `--write` puts the
+The measurements are made by the closed-form generator, in its own process. Each is read and diagnosed with an empty kernel cache,
+as for a new user, and again with the kernels of that. Further target: 60 bare casts of the same rays, or 60 s. `--write` puts the
 table into docs/validation/gap.md.
 """
 

@@ -1,9 +1,9 @@
-"""Known effects put into one half of a scan whose other half is the reference: what is named beside the noise of both.
+"""Inject known effects into one half of a scan whose other half is the reference, to see what is named beside the noise of both.
 
     OMP_NUM_THREADS=1 python benchmarks/gap_reference_points.py [--out runs/reference_points] [--write]
 
-The scan is that of a workshop in closed form (benchmarks/workshop.py), the effects are those of the injections into real scans
-(benchmarks/gap_injections/formulas.py). --write: the table into docs/validation/gap_reference_points.md.
+The scan is that of a workshop in closed form (benchmarks/workshop.py); the effects are those injected into real scans
+(benchmarks/gap_injections/formulas.py). --write puts the table into docs/validation/gap_reference_points.md.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points.laz import write_laz
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
-from pipeline.gap.report.in_words import values as in_words
+from pipeline.gap.report.wording import format_parameters as in_words
 from pipeline.measurement.build import build
 from pipeline.measurement.request import Request
 
@@ -42,7 +42,7 @@ PUT: dict[str, tuple[str, dict[str, float]]] = {
 
 
 def made(out: Path) -> Path:
-    """The scan's one half against the other, with a model that says 1 mm."""
+    """Make the measurement of the scan's one half against the other, with a model of 1 mm noise."""
     out.mkdir(parents=True)
     (out / "model.yaml").write_text(yaml.safe_dump(MODEL))
     write_laz(out / "scan.laz", PointCloud(scan(STEP_DEG)[0]))
@@ -51,7 +51,7 @@ def made(out: Path) -> Path:
 
 
 def changed(folder: Path, out: Path, model: dict[str, Any], left_out: tuple[str, ...] = ()) -> Path:
-    """The same measurement with another model, and without some keys of its measurement.yaml."""
+    """Copy the measurement with another model, and without some keys of its measurement.yaml."""
     shutil.copytree(folder, out)
     (out / "model.yaml").write_text(yaml.safe_dump(model))
     values = yaml.safe_load((out / "measurement.yaml").read_text())
@@ -60,7 +60,7 @@ def changed(folder: Path, out: Path, model: dict[str, Any], left_out: tuple[str,
 
 
 def row(title: str, folder: Path) -> tuple[str, GapDiagnosis]:
-    """A line of the table."""
+    """Diagnose a measurement and return a line of the table."""
     found = diagnose(read_measurement(folder))
     named = "; ".join(f"`{each.name}` ({in_words(each)})" for each in found.effects) or "nothing"
     gap = found.gap

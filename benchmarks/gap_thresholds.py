@@ -1,10 +1,10 @@
-"""What each threshold of the diagnosis does when it is 0.7 and 1.4 times as large, on development cases.
+"""Measure the effect of each threshold of the diagnosis when it is 0.7 and 1.4 times as large, on development cases.
 
     python benchmarks/gap_thresholds.py --cases 24 --seed 3100 --out /tmp/thresholds --table docs/validation/gap_thresholds.md
 
-The first diagnosis of a case carries each threshold's other values along and notes which of them would have decided
-otherwise; only with those it is diagnosed again. Interrupted, it goes on where it was; `--minutes` ends it with the table of
-what there is; `--all` diagnoses again with those that make no difference too, and fails where one does.
+The first diagnosis of a case also carries each threshold's other values (benchmarks/varied.py) and records which of them would
+change a decision; only with those is it diagnosed again. An interrupted run continues. `--minutes` ends it with the table so far;
+`--all` also repeats the diagnosis with values that change no decision, and fails if one does.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from benchmarks.gap_challenge.cases import Case, make, plan
 from benchmarks.gap_challenge.score import score
 from benchmarks.varied import Setting, Varied
 from pipeline.formats.measurements.measurement import read_measurement
-from pipeline.gap.decisions import Decisions
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.report.report import to_dict
+from pipeline.gap.thresholds import Thresholds
 
 Json = dict[str, Any]
 FACTORS = (0.7, 1.4)
@@ -35,7 +35,7 @@ WRONGS = ("false alarm", "wrong name", "missed", "not answered unknown", "called
 
 
 class _Watched:
-    """Decisions whose values are `Varied`: which were asked for, and which would have decided otherwise."""
+    """Thresholds whose values are `Varied`: records which were used, and which would have changed a decision."""
 
     def __init__(self, values: Any, prefix: str, asked: set[str], matters: set[Setting]) -> None:
         self._values, self._prefix, self._asked, self._matters = values, prefix, asked, matters
@@ -53,7 +53,7 @@ class _Watched:
 
 @functools.cache
 def _others(key: str) -> dict[Setting, Any]:
-    """A threshold's other values; none for a factor that it cannot have."""
+    """Return a threshold's other values; none for an impossible factor."""
     group, name = key.split(".")
     found = {factor: scaled(key, factor) for factor in FACTORS}
     return {(key, factor): getattr(getattr(by, group), name) for factor, by in found.items() if by is not None}
@@ -61,33 +61,33 @@ def _others(key: str) -> dict[Setting, Any]:
 
 def keys() -> list[str]:
     """All thresholds, as group.key."""
-    return [f"{group}.{key}" for group, values in Decisions().model_dump().items() for key in values]
+    return [f"{group}.{key}" for group, values in Thresholds().model_dump().items() for key in values]
 
 
-def scaled(key: str, factor: float) -> Decisions | None:
-    """The usual decisions with one of them so many times as large; None where it may not be, or where whole numbers stay."""
+def scaled(key: str, factor: float) -> Thresholds | None:
+    """Return the usual thresholds with one of them scaled; None if the value is not allowed or does not change."""
     group, name = key.split(".")
-    values = Decisions().model_dump()
+    values = Thresholds().model_dump()
     old = values[group][name]
     new = max(round(factor * old), 1) if isinstance(old, int) else factor * old
     values[group][name] = new
     try:
-        return None if new == old else Decisions.model_validate(values)
+        return None if new == old else Thresholds.model_validate(values)
     except ValidationError:
         return None
 
 
-def answer(folder: Path, decisions: Any) -> Json:
-    """gap.json, or what went wrong."""
+def answer(folder: Path, thresholds: Any) -> Json:
+    """Return gap.json, or the error."""
     measurement = read_measurement(folder)
     try:
-        return to_dict(diagnose(measurement, decisions=decisions), measurement)
+        return to_dict(diagnose(measurement, thresholds=thresholds), measurement)
     except Exception as error:
         return {"error": repr(error)}
 
 
 def jobs(cases: list[Case], out: Path, *, everything: bool) -> Iterator[tuple[Case, str, float]]:
-    """What is to be diagnosed: each case as usual, and then with each threshold that makes a difference (or is asked for)."""
+    """Yield what to diagnose: each case as usual, then with each threshold that makes a difference (or was used)."""
     for case in cases:
         yield case, "usual", 1.0
     turns: Counter[Setting] = Counter()
@@ -101,14 +101,14 @@ def jobs(cases: list[Case], out: Path, *, everything: bool) -> Iterator[tuple[Ca
 
 
 def _asked(out: Path, case: Case, *, everything: bool) -> list[Setting]:
-    """Thresholds and factors that a case asked for, or only those that would have decided something in it otherwise."""
+    """Return thresholds and factors that a case used, or only those that would have changed a decision."""
     noted = json.loads((out / case.name / "asked.json").read_text())
     some = [(key, factor) for key in noted["asked"] for _, factor in _others(key)]
     return some if everything else [each for each in some if list(each) in noted["matters"]]
 
 
 def work(cases: list[Case], out: Path, minutes: float, *, everything: bool = False) -> None:
-    """Diagnose what has no answer yet, until the time is up; the usual answers in any case."""
+    """Diagnose cases without an answer until the time is up; those with the usual thresholds in any case."""
     end = time.monotonic() + 60 * minutes
     for case, key, factor in jobs(cases, out, everything=everything):
         folder = out / case.name
@@ -123,18 +123,18 @@ def work(cases: list[Case], out: Path, minutes: float, *, everything: bool = Fal
 
 
 def _usual(folder: Path) -> Json:
-    """gap.json with the usual decisions, watched: which were asked for and which make a difference is noted beside it."""
+    """Diagnose with the usual thresholds, and record which were used and which make a difference."""
     asked: set[str] = set()
     matters: set[Setting] = set()
     measurement = read_measurement(folder / "case")
-    watched: Any = _Watched(Decisions(), "", asked, matters)
-    found = to_dict(diagnose(measurement, decisions=watched), measurement)
+    watched: Any = _Watched(Thresholds(), "", asked, matters)
+    found = to_dict(diagnose(measurement, thresholds=watched), measurement)
     (folder / "asked.json").write_text(json.dumps({"asked": sorted(asked), "matters": sorted(matters)}))
     return found
 
 
 def _check_followed(cases: list[Case], out: Path) -> None:
-    """Raise ValueError where a threshold that was noted to make no difference makes one."""
+    """Raise ValueError if a threshold recorded as making no difference makes one."""
     for case in cases:
         usual = json.loads((out / case.name / "usual@1.json").read_text())
         for key, factor in set(_asked(out, case, everything=True)) - set(_asked(out, case, everything=False)):
@@ -144,7 +144,7 @@ def _check_followed(cases: list[Case], out: Path) -> None:
 
 
 def _bare(found: Json) -> Json:
-    """Of an answer what may not depend on a threshold that decides nothing."""
+    """Return the parts of an answer that must not depend on a threshold that decides nothing."""
     return {key: value for key, value in found.items() if key not in ("seconds", "timings", "decisions")}
 
 
@@ -154,7 +154,7 @@ def _row(truth: Json, folder: Path, name: str) -> Json | None:
 
 
 def table(cases: list[Case], out: Path) -> str:
-    """One line for each threshold that some case asked for: how many answers change, and what becomes wrong or right."""
+    """Return one line for each threshold that some case used: how many answers change, and become wrong or right."""
     cells: dict[str, dict[float, list[tuple[Json, Json]]]] = {}
     for case in cases:
         folder = out / case.name
@@ -170,7 +170,7 @@ def table(cases: list[Case], out: Path) -> str:
     for key in keys():
         if key in cells:
             group, name = key.split(".")
-            value = getattr(getattr(Decisions(), group), name)
+            value = getattr(getattr(Thresholds(), group), name)
             lines.append(f"| `{key}` | {value:g} | " + " | ".join(_side(cells[key].get(factor, [])) for factor in FACTORS) + " |")
     return "\n".join(lines)
 
@@ -230,10 +230,10 @@ who wonder whether a default decides their case. `--set` changes a threshold for
 
     scarpsim gap my_measurement --set mean.class_margin=4 --set points.fewest=500 --out diagnosis
 
-Each threshold of `pipeline/gap/decisions.py` was set to 0.7 and 1.4 times its value, on development cases of some thousand points
-of the [closed-form generator](gap_challenge.md). The table counts the cases that use the threshold, those whose answer (verdict
-or names) changes, and what becomes wrong or right. A threshold that no case uses, or that is newer than the run, is not listed.
-"-" means that the value is not allowed, or that the time was up.
+Each threshold of `pipeline/gap/thresholds.py` was set to 0.7 and 1.4 times its value, on development cases of some thousand
+points of the [closed-form generator](gap_challenge.md). The table counts the cases that use the threshold, those whose
+answer (verdict or names) changes, and what becomes wrong or right. A threshold that no case uses, or that is newer than the
+run, is not listed. "-" means that the value is not allowed, or that the time was up.
 
 A few cases show which thresholds are near an edge, not how often they decide."""
 

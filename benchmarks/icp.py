@@ -1,7 +1,8 @@
-"""ICP on a million points against Open3D's own: time from arrays to transform, and the RMS that is left.
+"""Compare ICP on a million points with Open3D's: time from arrays to transform, and remaining RMS distance.
 
-Both register the same noisy cloud to the same reference with the same normals, offset and correspondence distance; the tree is
-part of the time; the RMS of both transforms is measured on all the points by one function. Best of `REPEATS` alternating runs.
+Both register the same noisy cloud to the same reference with the same normals, offset and correspondence distance; building the
+tree is part of the time; the RMS of both transforms is measured on all points by one function. The best of `REPEATS` alternating
+runs counts.
 """
 
 from __future__ import annotations

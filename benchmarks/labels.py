@@ -1,9 +1,10 @@
-"""How well labels show the true outlines of what fell: share of blocks with an IoU of 0.75 or better, by size and noise.
+"""Measure how well labels show the true outlines of fallen blocks: share with an IoU of at least 0.75, by size and noise.
 
     python benchmarks/labels.py [--epochs 1] [--width 24 --height 14]
 
-True outline: the pixels where the untouched wall lies inside the block, from the block's mesh and the wall's height, without
-carving, sensor or labels. `placed`: the same where the outline is moved as the whole map is (its orientation's errors).
+The true outline consists of the pixels where the untouched wall lies inside the block, from the block's mesh and the wall's
+height, without carving, sensor or labels. `placed`: the same with the outline moved like the whole map (by errors of its
+orientation).
 """
 
 from __future__ import annotations

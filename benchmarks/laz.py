@@ -1,6 +1,6 @@
-"""LAZ against laspy: 3 M points of a scan with intensity, GPS time and three extra dimensions, written and read.
+"""Compare LAZ with laspy: 3 M points of a scan with intensity, GPS time and three extra dimensions, written and read.
 
-To reach: writing not slower than laspy's own, reading at least a million points a second on two cores.
+Target: writing not slower than laspy's own, reading at least a million points per second on two cores.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Pairs of pictures with known disparities: rendered walls (ray-traced truth) and the Middlebury motorcycle (measured truth).
+"""Stereo pairs with known disparities: rendered walls (ray-traced truth) and the Middlebury motorcycle (measured truth).
 
-Disparities are in px of the matched pictures: cells of the depth map.
+Disparities are in px of the matched pictures, that is, in cells of the depth map.
 """
 
 from __future__ import annotations

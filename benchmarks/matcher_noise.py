@@ -1,9 +1,8 @@
-"""The simulated matching noise fitted to the errors of semi-global matching,
-and both in one table (docs/validation/matching.md).
+"""Fit the simulated matching noise to the errors of semi-global matching, and tabulate both (docs/validation/matching.md).
 
-Fitted by differential evolution and a simplex search on two rendered walls, once for SGBM and once for SGBM with refinement;
-validated on walls and on real pictures (the Middlebury motorcycle) that the fit has not seen. Pixels are those of the matched
-pictures, so the model's lengths, given in px of the full frame, count by the reduction (4 at medium quality).
+The fit uses differential evolution and a simplex search on two rendered walls, once for SGBM and once for SGBM with refinement.
+It is validated on walls and real pictures (the Middlebury motorcycle) that it has not seen. Pixels are those of the matched
+pictures; the model's lengths, in px of the full frame, are scaled by the reduction (4 at medium quality).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the benchmarks share: interleaved timing, peak memory, and the bare casts they are compared with."""
+"""Functions that benchmarks share: interleaved timing, peak memory, and the bare casts for comparison."""
 
 from __future__ import annotations
 

@@ -33,10 +33,10 @@ from pipeline.change.m3c2 import M3c2Config, m3c2  # noqa: E402
 from pipeline.formats.point_cloud import PointCloud  # noqa: E402
 from pipeline.formats.points.laz import read_laz, write_laz  # noqa: E402
 from pipeline.formats.rasters.geotiff import read_geotiff  # noqa: E402
-from pipeline.monitor.options import MonitorOptions  # noqa: E402
-from pipeline.monitor.products import Result  # noqa: E402
-from pipeline.monitor.reading import read_epoch  # noqa: E402
-from pipeline.monitor.run import monitor_paths  # noqa: E402
+from pipeline.monitoring.options import MonitorOptions  # noqa: E402
+from pipeline.monitoring.products import Result  # noqa: E402
+from pipeline.monitoring.reading import read_epoch  # noqa: E402
+from pipeline.monitoring.run import monitor_paths  # noqa: E402
 from pipeline.registration.rigid import RigidTransform  # noqa: E402
 from scene.geometry.frame import WallFrame  # noqa: E402
 from scene.geometry.mesh import FloatArray  # noqa: E402

@@ -1,11 +1,12 @@
-"""How deep the niches of small blocks are, and how many of them stand out: by placement, and on coarser and smoother walls.
+"""Measure how deep the niches of small blocks are, and how many stand out from the noise, by placement and on coarser, smoother
+walls.
 
     python benchmarks/niche_depth.py [--width 24 --height 14] [--maps 2] [--write]
 
-The thesis carves its blocks out of Metashape's mesh of a wall, made from depth maps of a quarter of the images' resolution: its
-vertices are farther apart, and it is smoother than rock. Here the relief of a Glendale wall, sampled every centimetre, goes
-through a Gaussian filter and is sampled anew. Small blocks as in configs/datasets/detector_test.yaml, stereo pair, surfaces by
-vertices. --write puts the table into docs/validation/detector_bound.md.
+The thesis carves its blocks out of Metashape's mesh of a wall, made from depth maps at a quarter of the images' resolution: its
+vertices are farther apart, and it is smoother than rock. Here the relief of a Glendale wall, sampled every centimetre, is
+smoothed by a Gaussian filter and sampled again. Small blocks are as in configs/datasets/detector_test.yaml, with a stereo pair
+and surfaces by vertices. --write puts the table into docs/validation/detector_bound.md.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from documents import printed, write_between
 from scipy import ndimage
 from upper_bound import DOCUMENT, WALL, Niches, observed
 
-from pipeline.change.annotate import STANDS_OUT
+from pipeline.change.annotate import DETECTABLE_SNR
 from pipeline.config.bundled import bundled_config
 from pipeline.dataset.config import DatasetConfig, load_dataset_config
 from pipeline.dataset.plan import planned_epochs, simulation_of
@@ -80,7 +81,7 @@ def rows(extent: dict[str, float], maps: int) -> Iterator[str]:
     yield "|---" * len(heads) + "|"
     for case in CASES:
         found = niches(config, case, extent, maps)
-        shares = [np.mean([ratio > STANDS_OUT for each in found[noise] for ratio in each.ratios]) for noise in config.noise]
+        shares = [np.mean([ratio > DETECTABLE_SNR for each in found[noise] for ratio in each.ratios]) for noise in config.noise]
         every = [each for level in found.values() for each in level]
         depth, rise = (np.median([one for each in every for one in getattr(each, name)]) for name in ("depths", "rise"))
         placement, spacing, sigma = case

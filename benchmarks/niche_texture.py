@@ -1,12 +1,11 @@
-"""Whether a niche's floor scatters as the wall around it does, or gives the niche away by its texture.
+"""Check whether a niche's floor has the same fine noise as the wall around it, or gives the niche away by its texture.
 
     python benchmarks/niche_texture.py --set sets/detector_test_mean --set sets/direct [--write]
 
-A pixel's fine deviation is that from the mean of the 3 x 3 px around it. Inside: the median of its magnitude over those of a
-niche's pixels that are EROSION_PX or more from the outline, so that the rim has no part; around: over those of a ring that is
-as far from every outline. Niches of which fewer than FEWEST pixels are left are not counted. A detector that learns from maps
-on which the two differ learns a texture that measured clouds do not have.
---write puts the table into docs/validation/detector.md.
+A pixel's fine deviation is that from the mean of its 3 x 3 neighbourhood. Inside is the median of its magnitude over those pixels
+of a niche at least EROSION_PX from the outline, so that the rim does not count; around is that over a ring equally far from every
+outline. Niches with fewer than FEWEST remaining pixels do not count. From maps on which the two differ, a detector learns a
+texture that measured clouds do not have. --write puts the table into docs/validation/detector.md.
 """
 
 from __future__ import annotations

@@ -1,12 +1,13 @@
-"""Noise of simulated difference maps of the Glendale site, after ICP and without blocks, against the thesis's tables 5-1 to 5-3.
+"""Compare the noise of simulated difference maps of the Glendale site, after ICP and without blocks, with the thesis (tables 5-1
+to 5-3).
 
     python benchmarks/noise_table.py [--maps 45] [--levels high medium low] [--parameters | --readings]
         [--write]
 
-Each map differs two observations of one wall with noise drawn anew in both. Finished maps are kept under --out, so an interrupted
-run goes on where it was. --parameters: the noise of each parameter alone instead; --readings: the printed noise drawn in
-other ways; --faithful: glendale_high, medium and low by vertices against a reference without noise, as the data sets have them.
---write puts the table into docs/validation/noise.md.
+Each map is the difference of two observations of one wall with independent noise. Finished maps are kept under --out, so that an
+interrupted run continues. --parameters: only the noise of each parameter; --readings: the printed noise drawn in other ways;
+--faithful: glendale_high, medium and low by vertices against a reference without noise, as in the data sets. --write puts the
+table into docs/validation/noise.md.
 """
 
 from __future__ import annotations

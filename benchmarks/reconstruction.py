@@ -1,4 +1,4 @@
-"""Direct triangulation against COLMAP's fusion and Poisson surface, each against the wall as it really is (low quality)."""
+"""Compare direct triangulation with COLMAP's fusion and Poisson surface, each against the true wall (low quality)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Real matching of a full Glendale pair (7360 x 4912, medium) against the bare render and the bare OpenCV matching; target: 1.5.
+"""Measure real matching of a full Glendale pair (7360 x 4912, medium) against the bare render and OpenCV matching; target: 1.5.
 
-Bare: the same photographs (rays, texture, shadows), and one call of OpenCV's matcher on each tile of the rectified pictures.
+Bare means the same photographs (rays, texture, shadows), and one call of OpenCV's matcher on each tile of the rectified pictures.
 """
 
 from __future__ import annotations

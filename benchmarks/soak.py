@@ -1,4 +1,4 @@
-"""Two hundred epochs of a small wall in one process: does its memory grow?
+"""Check whether the memory of a process grows over two hundred epochs of a small wall.
 
     python benchmarks/soak.py [stereo|tls] [EPOCHS]
 

@@ -1,4 +1,6 @@
-"""One stereo observation at medium quality on 1.3 M triangles against the bare ray casts it needs; target: at most 3 times."""
+"""Measure one stereo observation at medium quality on 1.3 M triangles against the bare ray casts it needs; target: at most 3
+times.
+"""
 
 from __future__ import annotations
 

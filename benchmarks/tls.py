@@ -1,8 +1,8 @@
-"""One TLS observation of 5 M pulses on 1.3 M triangles against the bare cast of the same rays and against Open3D's cast_rays.
+"""Measure one TLS observation of 5 M pulses on 1.3 M triangles against casting the same rays, and against Open3D's cast_rays.
 
     python benchmarks/tls.py [--avx2]           (as on a processor without AVX-512)
 
-To reach: at least 0.5 of the bare rate, and at least Open3D's.
+Target: at least 0.5 of the bare rate, and at least Open3D's.
 """
 
 from __future__ import annotations

@@ -1,15 +1,16 @@
-"""One TLS observation of 1 M pulses with 19 sub-rays each on 1.3 M triangles against the bare cast of the same 19 M rays.
+"""Measure one TLS observation of 1 M pulses with 19 sub-rays each on 1.3 M triangles against casting the same 19 M rays.
 
     python benchmarks/tls_beam.py [--avx2]      (as on a processor without AVX-512)
 
-The bare cast has the rays of a pulse one after another, the quickest order; beside it stands that of one set of all pulses after
-another. To reach: at least 0.5 of the bare ray rate, and no bias of the footprint above 0.1 mm on a rough wall.
+The bare cast has the rays of a pulse one after another, the fastest order; the order by sub-ray is timed too. Target: at least
+0.5 of the bare ray rate, and a bias of the footprint below 0.1 mm on a rough wall.
 
-What is the mean range of a beam without bias? Were all echoes equally strong, that of the axes: the mean over a scan is one over
-all directions, whatever the beam's width. They are not: an echo's power goes with albedo times the cosine of incidence, so a beam
-that meets two surfaces leans to the one hit more squarely. On a rough wall the near rim of an edge is round and hit obliquely,
-the rock behind it squarely: in the mean over all pulses, edges lie some 0.2 mm too far, as they do for a real scanner. So the
-sub-rays are held against the axis with equal echoes, and with the echoes as they are against a beam of 61 sub-rays.
+The unbiased mean range needs a definition. If all echoes were equally strong, the mean over a scan would be that of the axes, as
+a mean over all directions does not depend on the beam's width. But the power of an echo is proportional to albedo times the
+cosine of the incidence angle, so that a beam that meets two surfaces is drawn to the one hit more squarely. On a rough wall, the
+near rim of an edge is round and hit obliquely, the rock behind it squarely: on average, edges are some 0.2 mm too far, as for a
+real scanner. The sub-rays are therefore compared with the axis at equal echoes, and, with true echoes, with a beam of 61
+sub-rays.
 """
 
 from __future__ import annotations

@@ -1,11 +1,12 @@
-"""From a mesh file to a LAS file as one process, on the scene on which HELIOS++ 2.0.1 was measured, and a soak of 100 epochs.
+"""Measure a whole process from mesh file to LAS file, on the scene on which HELIOS++ 2.0.1 was measured, and a soak of 100
+epochs.
 
     python benchmarks/tls_process.py            (3 M pulses at 105 m, 1.3 M triangles; with one ray and with 19 sub-rays)
     python benchmarks/tls_process.py --soak     (100 epochs in one process: the memory after each ten)
 
-HELIOS++ on 2 cores (ENGINEERING.md): 446-504 k pulses/s with one ray, 93-104 k with 19; 22-25 s and 45 s from file to file;
-3.6 GiB; a rough wall 8.6 mm too near. To reach: 8 and 5 times its pulses/s, a quarter of its time, 1.5 GiB, 0.1 mm, no growth.
-Its times are not taken in the same run, as it is not installed here.
+HELIOS++ on 2 cores (ENGINEERING.md): 446-504 k pulses/s with one ray, 93-104 k with 19; 22-25 s and 45 s from file to file; 3.6
+GiB; a rough wall 8.6 mm too near. Targets: 8 and 5 times its pulses/s, a quarter of its time, 1.5 GiB, 0.1 mm, no growth.
+HELIOS++ is not installed here, so its times are not from the same run.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
-"""What any detector could find: share of blocks with a matched-filter signal-to-noise ratio above 4, by way and placement.
+"""Measure what any detector could find: share of blocks with a matched-filter signal-to-noise ratio above 4, by surface and
+placement.
 
     python benchmarks/upper_bound.py [--width 24 --height 14] [--write]
 
-A Glendale wall, blocks as in configs/datasets/detector_test.yaml, seen by the stereo pair; noise of 2.5, 5 and 7.5 cm. Beside the
-shares: median depth of a niche (rock removed over its outline) and the share of its bounding box that it fills. --write puts the
-table into docs/validation/detector_bound.md.
+The wall is Glendale, blocks are as in configs/datasets/detector_test.yaml, the sensor is the stereo pair; noise is 2.5, 5 and 7.5
+cm. Also given are the median depth of a niche (removed rock over its outline) and the share of its bounding box that it fills.
+--write puts the table into docs/validation/detector_bound.md.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from documents import printed, write_between
 
-from pipeline.change.annotate import STANDS_OUT, AnnotationConfig, block_annotations
+from pipeline.change.annotate import DETECTABLE_SNR, AnnotationConfig, block_annotations
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import SimulationConfig
 from pipeline.dataset.config import load_dataset_config
@@ -51,7 +52,7 @@ def rows(width_m: float, height_m: float) -> Iterator[str]:
                 rockfall = simulation.rockfall.model_copy(update={"placement": placement})
                 way = {"wall": wall, "rockfall": rockfall, "reconstruction": reconstruction, "depth_map": depth_map}
                 found = observed(simulation.model_copy(update=way), config.sizes[size].blocks_per_m2)
-                shares.append(f"{100 * np.mean(np.array(found.ratios) > STANDS_OUT):.0f} %")
+                shares.append(f"{100 * np.mean(np.array(found.ratios) > DETECTABLE_SNR):.0f} %")
                 depths += found.depths
                 filled += found.filled
             name = f"{reconstruction}, {depth_map}" if reconstruction == "direct" else reconstruction
@@ -61,8 +62,9 @@ def rows(width_m: float, height_m: float) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class Niches:
-    """Of the blocks of one epoch: signal-to-noise ratios; depths of the niches that show, m, and the shares of their boxes that
-    they fill; rise: how far the blocks' centres lie above the median surface within their contours, m."""
+    """Niches of the blocks of one epoch: signal-to-noise ratios; depths of the visible niches, m, and shares of their boxes that
+    they fill; rise: height of the blocks' centres above the median surface within their contours, m.
+    """
 
     ratios: list[float]
     depths: list[float]

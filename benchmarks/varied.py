@@ -1,7 +1,7 @@
-"""A number that is carried along beside what it would be if a setting were another, and that notes where that makes a difference.
+"""A number that also carries its values under other settings, and records which setting would change a decision.
 
-What is computed with it is computed with each of its other values too; what compares it, compares them too. As long as no
-comparison comes out otherwise and nothing else looks at its value, the same program with the other setting would do the same.
+What is computed with the number is computed with each of its other values too, and comparisons likewise. As long as no comparison
+differs and nothing else looks at the value, the same program with the other setting would do the same.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Setting = tuple[str, float]
 
 
 class Varied:
-    """A value, what it would be with other settings, and the set in which those that make a difference are noted."""
+    """A value, its values with other settings, and the set that records settings that make a difference."""
 
     def __init__(self, value: Any, others: dict[Setting, Any], matters: set[Setting]) -> None:
         self.value, self.others, self.matters = value, others, matters
@@ -26,7 +26,7 @@ class Varied:
         return _applied(lambda *values: function(*values, **options), inputs)
 
     def __getattr__(self, name: str) -> Any:
-        """Anything else that is asked of the value is beyond what can be followed."""
+        """Refuse all other uses of the value, which cannot be followed."""
         if name.startswith("__array_"):
             raise AttributeError(name)
         return getattr(self._seen(), name)
@@ -70,7 +70,9 @@ class Varied:
 
 
 def _applied(function: Callable[..., Any], inputs: tuple[Any, ...]) -> Any:
-    """The function of the values and of the others. Where it decides (true or false), those that decide otherwise are noted."""
+    """Apply the function to the value and to its alternatives; if it decides (true or false), record those that
+    decide otherwise.
+    """
     varied = [each for each in inputs if isinstance(each, Varied)]
     matters = varied[0].matters
     value = function(*(each.value if isinstance(each, Varied) else each for each in inputs))

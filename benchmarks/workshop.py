@@ -1,4 +1,6 @@
-"""A laser scan of a workshop in closed form, NumPy alone: floor, walls, a box, a ball and pipes, curved and with edges."""
+"""Simulate a laser scan of a workshop in closed form, with NumPy only: floor, walls, a box, a ball and pipes, curved and with
+edges.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ def rays(azimuth: Array, zenith: Array) -> Array:
 
 
 def ranges(ray: Array) -> Array:
-    """(n,) distance of what each ray from the origin meets first, m."""
+    """Return the (n,) distance of what each ray from the origin meets first, m."""
     with np.errstate(all="ignore"):
         planes = [-1.6 / ray[:, 2], 3.2 / ray[:, 2], 9.0 / ray[:, 1], -6.0 / ray[:, 0], 7.0 / ray[:, 0]]
         pipes = [_pipe(ray, (-2.8, 7.0), 0.45), _pipe(ray, (4.2, 7.5), 0.6), _pipe(ray, (1.6, 5.0), 0.12)]
@@ -37,15 +39,15 @@ def _ball(ray: Array, middle: tuple[float, ...], radius_m: float) -> Array:
 
 
 def _pipe(ray: Array, middle: tuple[float, float], radius_m: float) -> Array:
-    """Upright, with its middle at x and y."""
+    """Return the distance to an upright pipe with its axis at x and y."""
     flat, along = np.sum(ray[:, :2] ** 2, axis=1), ray[:, :2] @ np.array(middle)
     return np.asarray((along - np.sqrt(along**2 - flat * (np.dot(middle, middle) - radius_m**2))) / flat)
 
 
 def scan(step_deg: float, seed: int = 1, noise_m: float = NOISE_M) -> tuple[Array, Array]:
-    """Points (n, 3) in the scanner's frame, m, line after line, and the number (n,) of each one's line.
+    """Return points (n, 3) in the scanner's frame, m, line after line, and the number (n,) of each point's line.
 
-    Where a beam meets an edge its range is the mean over seven rays, as mixed points are; one pulse in a hundred is lost.
+    At an edge, the range is the mean over seven rays, as for mixed points; one pulse in a hundred is lost.
     """
     rng = np.random.default_rng(seed)
     azimuth, zenith = np.radians(np.arange(35.0, 145.0, step_deg)), np.radians(np.arange(45.0, 125.0, step_deg))

@@ -25,10 +25,10 @@ from pipeline.formats.cameras.cameras import write_cameras_yaml
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.formats.meshes.ply import write_ply, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.gap.naming.entries import Named
+from pipeline.gap.naming.named_effects import NamedEffect
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
-from pipeline.gap.report.in_words import values
-from pipeline.gap.report.report import summary, write
+from pipeline.gap.report.report import summarise, write_report
+from pipeline.gap.report.wording import format_parameters
 from scene.appearance.illumination import IlluminationConfig
 from scene.appearance.texture import TextureConfig
 from scene.common.keyed_random import KeyedRandom
@@ -153,8 +153,8 @@ def run(pairs: Iterator[Pair], out: Path) -> list[tuple[str, GapDiagnosis]]:
         write_measurement(folder, pair)
         measurement = read_measurement(folder)
         diagnosis = diagnose(measurement)
-        write(folder / "gap", diagnosis, measurement)
-        sys.stdout.write(f"{pair.name}: {summary(diagnosis)}\n")
+        write_report(folder / "gap", diagnosis, measurement)
+        sys.stdout.write(f"{pair.name}: {summarise(diagnosis)}\n")
         found.append((pair.name, diagnosis))
     return found
 
@@ -166,7 +166,10 @@ def table(found: list[tuple[str, GapDiagnosis]]) -> str:
         "|---|---|---|---|---|---|---|---|",
     ]
     for name, each in found:
-        named = "; ".join(f"`{effect.effect.tag()}` ({values(effect)}){_class(effect)}" for effect in each.effects) or "nothing"
+        named = (
+            "; ".join(f"`{effect.effect.tag()}` ({format_parameters(effect)}){_class(effect)}" for effect in each.effects)
+            or "nothing"
+        )
         gap = each.gap
         figures = ["", "", "", ""]
         if gap is not None:
@@ -177,7 +180,7 @@ def table(found: list[tuple[str, GapDiagnosis]]) -> str:
     return "\n".join(rows)
 
 
-def _class(effect: Named) -> str:
+def _class(effect: NamedEffect) -> str:
     """Words for what an effect cannot be told from, or for one that describes and does not explain."""
     if effect.kind == "empirical":
         return ", as a description"

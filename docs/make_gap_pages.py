@@ -1,10 +1,10 @@
-"""The pages in docs/reference/gap: one for each verdict of `scarpsim gap` with an example, and the table from symptoms to causes.
+"""Write the pages in docs/reference/gap: one for each verdict of `scarpsim gap` with an example, and a table of symptoms.
 
     PYTHONPATH=tests python docs/make_gap_pages.py [symptoms] [VERDICT ...]
 
-Symptoms: a wall in Glendale's style is observed with each effect of the catalogue at its typical values and without it, as for
-the gallery; the difference is registered to the wall by a shift and a turn, as a diagnosis does, and what is left is mapped and
-sorted by the covariate that it depends on. Examples: measurements by the tests' generator (tests/gap_cases.py), diagnosed.
+Symptoms: a wall in Glendale's style is observed with and without each effect of the catalogue, as for the gallery. The difference
+is registered by a shift and a rotation, as a diagnosis does. The rest is mapped and sorted by the covariate that it depends on.
+Examples: measurements by the tests' generator (tests/gap_cases.py), diagnosed.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from pipeline.formats.measurements.measurement import Measurement, StereoMeasure
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.gap.naming.verdict import VERDICTS
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
-from pipeline.gap.report.covariate_ranking import bins, where
+from pipeline.gap.report.covariate_ranking import quantile_bins, rank_disagreements
 from pipeline.gap.report.figures import gap_figure, maps_figure
-from pipeline.gap.report.in_words import paragraph
-from pipeline.gap.report.report import summary
+from pipeline.gap.report.report import summarise
+from pipeline.gap.report.wording import paragraph
 from pipeline.gap.residuals.alignment import compute_residuals
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.survey.identifiability import SIMILAR_COSINE, Identifiability, identifiability
@@ -66,7 +66,7 @@ _WORDS = {
 
 @dataclass(frozen=True)
 class Symptom:
-    """How an effect shows. kind: of _KINDS; pattern: in words; left: share that survives the pose fit."""
+    """How an effect shows. kind: key of _KINDS; pattern: in words; left: share that the pose fit leaves."""
 
     name: str
     kind: str
@@ -77,14 +77,14 @@ class Symptom:
 
 @dataclass(frozen=True)
 class View:
-    """One sensor's cells without any effect, as residuals with pose and covariates. cells: (n,) flat cell of each row."""
+    """Residuals of one sensor without any effect, with pose and covariates. cells: (n,) flat index of the cell of each row."""
 
     residuals: Residuals
     cells: NDArray[np.int64]
 
     @classmethod
     def of(cls, stage: Stage, sensor: str) -> View:
-        """The sensor of the gallery in front of the gallery's wall."""
+        """Place the sensor of the gallery in front of the gallery's wall."""
         seen, target = stage.without[sensor], Target(stage.wall)
         valid = np.flatnonzero(seen.valid.ravel())
         points, reference, frame = seen.points.reshape(-1, 3)[valid], stage.caster.mesh, stage.frame
@@ -109,7 +109,7 @@ class View:
 
 
 def symptom(view: View, effect: type[Effect], comparison: Comparison, *, on_the_mean: bool) -> Symptom:
-    """What an effect leaves after registration, and what that depends on. on_the_mean: its signature is one of the mean."""
+    """Return what an effect leaves after registration and what that depends on. on_the_mean: whether it is systematic."""
     name, r = f"{effect.sensor}.{effect.model_fields['name'].default}", view.residuals
     metres = comparison.difference.ravel()[view.cells]
     known = np.isfinite(metres) & r.usable
@@ -122,7 +122,7 @@ def symptom(view: View, effect: type[Effect], comparison: Comparison, *, on_the_
     lost = comparison.lost.ravel()[view.cells]
     same = float(np.mean(np.abs(left[np.isfinite(left)]) > _NOTHING)) < _LOST
     if same and comparison.gained.sum() > _LOST * len(view.cells):
-        kind, pattern = "gained", "points stand where only one camera sees the rock"
+        kind, pattern = "gained", "there are points where only one camera sees the rock"
     else:
         kind, pattern = _mean_pattern(r, left, kept) if on_the_mean else _other_pattern(r, left, kept, lost)
     return Symptom(name, kind, pattern, share, _picture(r, 1e3 * left * r.unit_m, lost))
@@ -136,7 +136,7 @@ def _mean_pattern(r: Residuals, left: FloatArray, kept: NDArray[np.bool_]) -> tu
         also = f" (and {', '.join(with_it)}, which vary together here)" if with_it else ""
         return "mean", f"the mean follows the {_WORDS[best[0]]}{also}"
     if _explained_by(_pixels(r)[kept], left[kept]) > _SMOOTH:
-        return "smooth", "the mean varies smoothly over the wall, along no single covariate"
+        return "smooth", "the mean varies smoothly over the wall, but follows no single covariate"
     return "relief", f"the mean follows the relief, facet by facet; of single covariates the {_WORDS[best[0]]} explains most"
 
 
@@ -145,7 +145,7 @@ def _other_pattern(r: Residuals, left: FloatArray, kept: NDArray[np.bool_], lost
     size, edges = np.abs(left), np.isfinite(left) & ~r.usable
     if lost.mean() > _LOST and np.median(size[kept]) < _NOTHING:
         shares = {name: _explained(x, lost.astype(float)) for name, x in covariates.items()}
-        return "lost", f"returns are missing, most of all by {_WORDS[max(shares, key=lambda key: shares[key])]}"
+        return "lost", f"returns are missing, mostly depending on {_WORDS[max(shares, key=lambda key: shares[key])]}"
     if np.mean(size[edges] > _NOTHING) > _AT_EDGES * np.mean(size[kept] > _NOTHING) or (
         np.median(size[edges]) > _AT_EDGES * np.median(size[kept])
     ):
@@ -153,13 +153,13 @@ def _other_pattern(r: Residuals, left: FloatArray, kept: NDArray[np.bool_], lost
     spreads = {name: _explained(x[kept], size[kept]) for name, x in covariates.items()}
     name = max(spreads, key=lambda key: spreads[key])
     if spreads[name] > 0.02:
-        return "spread", f"the mean stays, the spread depends on the {_WORDS[name]}"
-    return "spread", "the mean stays, the spread is larger everywhere alike"
+        return "spread", f"the mean is unchanged, the standard deviation depends on the {_WORDS[name]}"
+    return "spread", "the mean is unchanged, the standard deviation is larger everywhere by the same amount"
 
 
 def _explained(x: FloatArray, values: FloatArray) -> float:
     """Share of the variance of the values that lies between bins of x."""
-    edges, group = bins(x, _BINS)
+    edges, group = quantile_bins(x, _BINS)
     return _explained_by(group, values) if len(edges) > 2 else 0.0
 
 
@@ -205,23 +205,25 @@ _KINDS = {
     "mean": "The mean of the residual follows one covariate",
     "smooth": "The mean varies smoothly over the wall",
     "relief": "The mean follows the relief",
-    "spread": "The spread is not what the model says",
+    "spread": "The standard deviation differs from the model",
     "edges": "Residuals at depth edges",
     "lost": "Returns are missing",
-    "gained": "Points where the model has none",
+    "gained": "Points where the model predicts none",
 }
 
 
 def symptoms_page(found: list[Symptom], tables: dict[str, Identifiability]) -> str:
-    """The table from the pattern in the residual map to the likely effect."""
+    """Return the page with the table from the pattern in the residual map to the likely effect."""
     lines = [
         "# From symptom to cause",
         "",
-        "Written by `docs/make_gap_pages.py` from the effects themselves; do not edit. Each effect of the catalogue at its"
-        " typical values, on a wall in Glendale's style seen from 105 m, without noise: recorded range or depth with the"
-        " effect minus that without it, **after a shift and a turn of the sensor are fitted**, mm; black: returns lost."
-        " Your wall and distance change the pattern: `scarpsim gap --identifiability CONFIG` computes what can be told apart"
-        " there.",
+        "This page shows how each effect of the catalogue looks in a map of the residuals, for users who see a pattern and look"
+        " for its cause. `docs/make_gap_pages.py` writes it from the effects; do not edit it.",
+        "",
+        "Each map shows one effect at its typical values, on a wall in Glendale's style seen from 105 m, without noise. The "
+        "colour is the recorded range or depth with the effect minus that without it, **after a shift and a rotation of the "
+        "sensor are fitted**, in mm. Black: returns lost. The pattern depends on wall and distance. `scarpsim gap "
+        "--identifiability CONFIG` computes which effects can be told apart at your site.",
         "",
         f'"Looks like" lists effects whose signature has a cosine of at least {SIMILAR_COSINE:g} with this one on that wall.',
     ]
@@ -270,7 +272,7 @@ def make_symptoms() -> None:
 
 @dataclass(frozen=True)
 class Verdict:
-    """A verdict's page: when it is given, what to do, and a case of tests/gap_cases.py that gets it."""
+    """Content of a verdict's page: when it is given, what to do, and an example that gets it (made by tests/gap_cases.py)."""
 
     when: str
     what_to_do: str
@@ -293,56 +295,60 @@ def _case(**values: Any) -> Callable[[Path], None]:
 
 
 def verdicts() -> dict[str, Verdict]:
-    """By name, with their examples."""
+    """Return the verdicts by name, with their examples."""
     return {
         "named": Verdict(
-            "The model without the effect is rejected (p-value of the largest gain over all candidates at most 0.004), one effect"
-            " of the catalogue explains the disagreement, no free form explains clearly more, and no other effect comes near it.",
-            "Look at the effect's value against what the maker or a calibration says, and simulate on with model_after.yaml.",
+            "The model without the effect is rejected (p-value of the best candidate at most 0.004). One effect of the "
+            "catalogue explains the disagreement, no non-parametric term explains clearly more, and no other effect scores "
+            "nearly as much.",
+            "Compare the effect's value with the manufacturer's or a calibration's, and simulate with model_after.yaml.",
             "A mirror that wobbles by 80 microradians with a period of 37 scan lines.",
             _case(seed=11, angles=_wobble),
         ),
         "several": Verdict(
-            "As `named`, for more than one effect at once: each still gains beside the others.",
-            "The effects are sorted by how much they explain. Each has its own class; a class of more than one is no name yet.",
+            "As for `named`, with more than one effect: each improves the model beside the others.",
+            "The effects are sorted by how much they explain. Each has its own equivalence class; if it has several members, "
+            "the effect is not identified yet.",
             "The wobble above, and noise that falls with the received power.",
             _case(seed=12, angles=_wobble, ranges=_noisy),
         ),
         "ambiguous": Verdict(
-            "Something of the catalogue explains the disagreement, but others explain it as well: their score is within 3 of the"
-            " best one's (e^3 = 20 in likelihood). `cannot_be_told_from` holds the class.",
-            "Make the measurement in `split_by`, or ask `scarpsim gap --identifiability` what would part the class at this site."
-            " The model after serves surveys of the same geometry, whichever of the class is true; elsewhere it may be wrong.",
+            "An effect of the catalogue explains the disagreement, but other effects explain it as well: their score is within "
+            "3 of the best one (a factor of 20 in likelihood). `cannot_be_told_from` lists this equivalence class.",
+            "Make the measurement in `split_by`, or see with `scarpsim gap --identifiability` what would separate the class at "
+            "this site. model_after.yaml is right for surveys of the same geometry, whichever effect is true; elsewhere it may "
+            "be wrong.",
             "An offset of all ranges by 2 mm: most of it looks like a shift of the scanner, the rest like a scale.",
             _case(seed=13, ranges=lambda scan: scan.R + 0.002),
         ),
         "unknown": Verdict(
-            "The model is rejected, and a free form of a covariate explains clearly more (a score higher by 5) than any "
-            "effect of the catalogue, so the nearest name would be wrong; or nothing that was tried holds on held-out "
-            "blocks, and still the gap lies above the floor by more than its uncertainty or what remains has a p-value of"
-            " 0.01 or less: then the report says where and how large. So it is where effects were named, and they leave most"
-            " of the gap open, or that p-value beside a gap too small to tell what they are worth.",
-            "Read along which covariate it goes and in what form; the empirical term in model_after.yaml lets simulations go on."
-            " Outside the covariate's range that was measured it says nothing.",
+            "The model is rejected, and the catalogue does not explain why. There are three cases. A non-parametric term of a "
+            "covariate explains clearly more (a score higher by 5) than any effect of the catalogue. Or nothing that was tried "
+            "passes validation, although the gap exceeds the floor by more than its uncertainty or the misfit has a p-value of "
+            "at most 0.01; the report then says where and how large. Or effects were named, but they leave most of the gap "
+            "open, or a misfit with that p-value beside a gap too small to show what they are worth.",
+            "See on which covariate it depends, and in what form. The empirical term in model_after.yaml reproduces it in "
+            "simulations, but only within the measured range of the covariate.",
             "Ranges that jump by 4 mm in the middle of the scan, as after a knock.",
             _case(seed=18, ranges=lambda scan: scan.R + 0.002 * np.where(scan.az > 1.6, 1.0, -1.0)),
         ),
         "no_gap": Verdict(
-            "Nothing was named, the gap is within its uncertainty of the floor, and what remains has a p-value above "
-            "0.01. Registration is a nuisance and is reported, regions where rock moved are set aside and listed under "
-            "`scene_changes`: neither is a gap. A model that predicts more spread than there is is told so, with the "
-            "noise that would fit (`lower_noise` under `remaining`).",
-            "Nothing has to be added. How large an effect could hide: `scarpsim gap MEASUREMENT --identifiability`.",
-            "Nothing but noise, a pose slightly off, a reference wrong by fractions of a millimetre, lost returns.",
+            "No effect was named, the gap is within its uncertainty of the floor, and the misfit has a p-value above 0.01."
+            " Registration and regions where rock moved (`scene_changes`) are reported, but do not count as a gap. If the model"
+            " predicts more noise than there is, the report says so with the noise that would fit (`lower_noise` under"
+            " `remaining`).",
+            "Nothing has to be added. `scarpsim gap MEASUREMENT --identifiability` tells how large an effect could remain "
+            "unseen.",
+            "Noise, a slightly wrong pose, a reference that errs by fractions of a millimetre, and lost returns.",
             _case(seed=1),
         ),
         "insufficient_data": Verdict(
-            "Fewer than 800 points lie on smooth parts of the reference, where a residual has a meaning; or nothing was "
-            "named and too few of them are held out to measure a gap; or nothing closes the gap and 30 % of the points or "
-            "more lie off the reference together with their neighbours, by more than 3 predicted sigmas and 20 mm: much of "
-            "the wall moved, or the reference is of another place or time.",
-            "Scan more finely, or bring a reference that covers what was scanned. Where much moved: `stable_areas` where "
-            "nothing did, or a reference of the same time.",
+            "Fewer than 800 points lie on smooth parts of the reference, where residuals are meaningful. Or nothing was named "
+            "and there are too few validation points to measure a gap. Or much of the wall moved, or the reference shows "
+            "another place or time: nothing closes the gap, and at least 30 % of the points lie off the reference together with "
+            "their neighbours, by more than 3 predicted standard deviations and 20 mm.",
+            "Scan more densely, or use a reference that covers the scan. If much moved, add `stable_areas` where nothing moved, "
+            "or use a reference of the same time.",
             "A scan in steps of 0.05 rad.",
             _case(seed=1, step_rad=0.05),
         ),
@@ -350,7 +356,7 @@ def verdicts() -> dict[str, Verdict]:
 
 
 def verdict_page(name: str, verdict: Verdict, found: GapDiagnosis) -> str:
-    """The Markdown page."""
+    """Return the Markdown page of a verdict."""
     pictures = [f"![maps](images/verdict_{name}.png)"] if found.gap is not None else []
     pictures += [f"![gap](images/gap_{name}.png)"] if found.gap is not None else []
     parts = [
@@ -359,8 +365,8 @@ def verdict_page(name: str, verdict: Verdict, found: GapDiagnosis) -> str:
         f"**Given when**: {verdict.when}",
         f"**What to do**: {verdict.what_to_do}",
         f"## Example\n\n{verdict.case} Made by the tests' generator; this page is by `docs/make_gap_pages.py`.",
-        f"> {paragraph(found, where(found))}",
-        f"```text\n{summary(found)}\n```",
+        f"> {paragraph(found, rank_disagreements(found))}",
+        f"```text\n{summarise(found)}\n```",
         *pictures,
         "[From symptom to cause](symptoms.md)",
     ]
@@ -368,7 +374,7 @@ def verdict_page(name: str, verdict: Verdict, found: GapDiagnosis) -> str:
 
 
 def make_verdicts(wanted: list[str]) -> None:
-    """Write docs/reference/gap/<verdict>.md and pictures; says where an example gets another verdict than its page's."""
+    """Write docs/reference/gap/<verdict>.md and its figures. Exits if an example gets another verdict than that of its page."""
     (FOLDER / "images").mkdir(parents=True, exist_ok=True)
     for name, verdict in verdicts().items():
         if wanted and name not in wanted:
@@ -377,7 +383,7 @@ def make_verdicts(wanted: list[str]) -> None:
             verdict.make(Path(folder))
             found = diagnose(read_measurement(Path(folder)))
         if found.verdict != name:
-            raise SystemExit(f"the example of {name} is {found.verdict}: {summary(found)}")
+            raise SystemExit(f"the example of {name} is {found.verdict}: {summarise(found)}")
         (FOLDER / f"{name}.md").write_text(verdict_page(name, verdict, found))
         if found.gap is not None:
             (FOLDER / "images" / f"verdict_{name}.png").write_bytes(small_png(maps_figure(found)))
@@ -385,7 +391,7 @@ def make_verdicts(wanted: list[str]) -> None:
 
 
 def small_png(png: bytes) -> bytes:
-    """The picture at two thirds of its size, PNG of 64 colours."""
+    """Return the picture at two thirds of its size, as a PNG of 64 colours."""
     buffer = io.BytesIO()
     picture = Image.open(io.BytesIO(png)).convert("RGB")
     picture = picture.resize((picture.width * 2 // 3, picture.height * 2 // 3), Image.Resampling.LANCZOS)

@@ -1,10 +1,10 @@
-"""Simulate what a stereo pair and a laser scanner measure on a rock wall, from Python as from the shell.
+"""Simulate what a stereo pair and a laser scanner measure on a rock wall, from Python or from the shell.
 
     from pipeline import simulate, open_run
     run = simulate("glendale", "tls", rockfall__count=20)
     run[1].difference                                     # xarray.DataArray, m
 
-Every name is loaded when it is asked for; docs/reference/python.md lists what is public.
+Each name is loaded when it is first used. The public names are listed in docs/reference/python.md.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ CAMERA = Camera(1000, 800, 1000.0, *[0.0] * 10, position=np.zeros(3), rotation=n
     ("values", "nodata", "words"),
     [
         (np.zeros((4, 5), np.complex64), "nan", "complex64"),
-        (np.zeros((4, 5), np.float32), "none", "states 'none' for no data"),
+        (np.zeros((4, 5), np.float32), "none", "states 'none' for missing data"),
         (np.full((4, 5), 1e300), "nan", "infinite or huge"),
     ],
 )
@@ -120,7 +120,7 @@ def test_powers_whose_median_is_0_have_a_reference() -> None:
 
 def test_a_reference_of_one_place_is_named() -> None:
     points = np.random.default_rng(1).uniform(0, 10, (100, 3))
-    with pytest.raises(InputError, match="vertices of the reference are the same place"):
+    with pytest.raises(InputError, match="vertices of the reference are at the same place"):
         check_same_unit(points, np.zeros((7, 3)), "scan", "m", "m")
 
 
@@ -135,12 +135,12 @@ def test_a_sensor_stands_on_the_earth(values: dict[str, float]) -> None:
     ("words", "said"),
     [
         ("surface a.xyz --seen-from 1e300 0 0 --out b.ply", "--seen-from: got '1e300'"),
-        ("measurement a.xyz a.xyz --reference b.ply --scanner riegl_vz400i --out out", "names a file twice"),
+        ("measurement a.xyz a.xyz --reference b.ply --scanner riegl_vz400i --out out", "a file is given twice"),
         ("measurement a.xyz --reference b.ply --scanner riegl_vz400i --position 1e300,0,0 --out out", "got '1e300,0,0'"),
-        ("train a --out used", "add --resume to go on"),
-        ("train a --out out --resume", "begin it without --resume"),
+        ("train a --out used", "add --resume to continue"),
+        ("train a --out out --resume", "start a training without --resume"),
         ("detect baseline a.tif a.tif --out out", "is given 2 times"),
-        ("gap a --out a.xyz/out", "cannot be a folder to write into"),
+        ("gap a --out a.xyz/out", "cannot be used as a folder"),
         ("train a --out used --resume", "there is no training"),
         ("compare a.xyz --epochs=", "--epochs is empty"),
     ],

@@ -19,6 +19,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+import yaml
 from tiny_dataset import tiny as tiny_config
 from tiny_dataset import tiny_set
 
@@ -34,6 +35,7 @@ ELSEWHERE = {
     "gap_injections/run": "tests/test_gap_injections.py",
     "gap_judge/run": "tests/test_gap_judge.py",
     "gap_thresholds": "tests/test_varied.py",
+    "readers/draw": "tests/test_generated_pages.py",
     "field_reports/run": "tests/test_field_reports.py",
     **dict.fromkeys(
         ("detector", "detector_ablation", "detector_curve", "detector_drawn", "detector_mirrored", "detector_table"),
@@ -72,6 +74,7 @@ SMALL_SITE = (
     "difference.gsd_m=0.1",
     "depth_map=high",
 )
+SMALL_KEYS = [each.split("=") for each in SMALL_SITE if "=" in each]
 SCRIPTS: dict[str, Tiny] = {
     "calibrate_recovery": Tiny(("--trials", "1", "--out", "recovery")),
     "calibrate_speed": Tiny(
@@ -85,7 +88,10 @@ SCRIPTS: dict[str, Tiny] = {
     "difference": Tiny(values={"PIXELS": (70, 30), "SAMPLES": (18, 30)}),
     "epoch": Tiny(arguments=("stereo",), overrides=SMALL_SITE),
     "gap": Tiny(("tls", "--points", "3000")),
-    "gap_reference_points": Tiny(("--out", "points")),
+    "gap_reference_points": Tiny(
+        ("--out", "points"),
+        values={"STEP_DEG": 0.5, "PUT": {"an offset of 4 mm": ("range_offset", {"offset_m": 0.004})}},
+    ),
     "icp": Tiny(values={"COLUMNS": 40, "ROWS": 30, "REPEATS": 1}),
     "labels": Tiny(
         ("--width", "6", "--height", "4"),
@@ -93,6 +99,13 @@ SCRIPTS: dict[str, Tiny] = {
     ),
     "laz": Tiny(values={"LINES": 20, "PULSES": 15, "ROUNDS": 1}),
     "m3c2_agreement": Tiny(("--set", *" --set ".join(SMALL_SITE).split())),
+    "monitor": Tiny(
+        ("--parts", "simulated", "cliff", "--epochs", "1"),
+        values={
+            "SITES": {"small": ("tls", None, {key.replace(".", "__"): yaml.safe_load(value) for key, value in SMALL_KEYS})},
+            "CLIFF": Path("nowhere"),
+        },
+    ),
     "matcher_noise": Tiny(
         ("--generations", "1", "--motorcycle", "none"),
         values={"FITTED_ON": (("glendale", 7),), "VALIDATED_ON": (("bismantova", 3),), "POLISHING": 1},

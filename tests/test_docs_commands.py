@@ -191,6 +191,7 @@ RESOLVED = (
 """Take minutes, or work on results: their words are parsed, their configs read, and each --set must be seen in the config."""
 
 PARSED = (
+    "scarpsim view april",
     "scarpsim monitor march.laz april.laz --out april",
     "scarpsim monitor scans/2026-*.laz --workers 2 --out year",
     "scarpsim monitor scans/2026-*.laz --workers 2 --out year --resume",

@@ -50,7 +50,7 @@ import json
 from pathlib import Path
 from pipeline import configure, make_wall
 from pipeline.cli.json_schema import json_schema
-from pipeline.comparison.sensor_setups import contestants
+from pipeline.comparison.sensor_setups import sensor_setups
 from pipeline.formats.points.points import read_points
 from scene import InputError
 
@@ -63,7 +63,7 @@ print(json.dumps({
     "sigma": config.tls_model().noise.range_sigma_m,
     "width": float(make_wall(style="quarry", resolution_m=0.5).bounds[1][0]),
     "points": read_points(Path("cloud.toy")).points.tolist(),
-    "compared": [each.name for each in contestants(["toy_one"])],
+    "compared": [each.name for each in sensor_setups(["toy_one"])],
     "hint": hint,
     "schema": "quarry" in json.dumps(json_schema("simulation")),
 }))

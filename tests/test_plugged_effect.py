@@ -46,7 +46,7 @@ from types import SimpleNamespace
 import numpy as np
 from pipeline.gap.residuals.residuals import NOT_SHARED
 from pipeline.gap.mean.signatures import mean_families
-from pipeline.gap.other.spread import spread_candidates
+from pipeline.gap.noise_and_edges.variance_model import spread_candidates
 from pipeline.cli.json_schema import json_schema
 from scene.common.keyed_random import KeyedRandom
 from sensors.effects import TLS_EFFECTS, catalogue

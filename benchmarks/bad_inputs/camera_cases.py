@@ -1,4 +1,4 @@
-"""Cameras of other programs that `gap` cannot take: COLMAP's text model, Metashape's XML, OpenCV's calibrations."""
+"""Bad inputs for `gap`: camera files of other programs (COLMAP's text model, Metashape's XML, OpenCV's calibrations)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sensors.cameras.camera import Camera
 
 
 def _camera_files(write: Callable[[Path], object], *changes: Change) -> Change:
-    """pair/ with its cameras in another program's file or folder, cameras.yaml replaced by it."""
+    """Replace cameras.yaml of pair/ by a file or folder of another program."""
 
     def change(folder: Path) -> None:
         write(folder)
@@ -36,7 +36,7 @@ def _as_colmap(folder: Path) -> None:
 
 
 def _plain(camera: Camera) -> Camera:
-    """Without what the others' models lack."""
+    """Return the camera without parameters that the other models lack."""
     return replace(camera, b2=0.0, k4=0.0)
 
 
@@ -55,7 +55,7 @@ def _as_opencv(folder: Path) -> None:
 
 
 def words(name: str, old: str, new: str, count: int = 1) -> Change:
-    """Other words in a text file; ValueError where the old ones are not there."""
+    """Replace words in a text file; raise ValueError if they are not there."""
 
     def change(folder: Path) -> None:
         content = (folder / name).read_text()
@@ -67,7 +67,7 @@ def words(name: str, old: str, new: str, count: int = 1) -> Change:
 
 
 def _line(name: str, number: int, content: str) -> Change:
-    """Another line, counted from 0, in a text file."""
+    """Replace a line, counted from 0, in a text file."""
 
     def change(folder: Path) -> None:
         lines = (folder / name).read_text().splitlines()

@@ -1,8 +1,9 @@
-"""One bad input: what is spoilt, the command that gets it, and whether its answer is a good one.
+"""Define a bad input: what is damaged, the command that gets it, and whether the command's response is good.
 
-A good answer is exit status 0 or 2, no traceback, one line of error after a 2, no file left behind or changed by it, less than
-2 GB and 20 s of processor time, user and system, of the process and all that it started: other work on the machine makes no
-difference. It ends within three minutes on the wall's clock too, as one that waits for ever takes no processor time.
+A good response has exit status 0 or 2, no traceback, and one line of error after a 2. It leaves or changes no file. It uses less
+than 2 GB, and less than 20 s of processor time (user and system) of the process and all its children, so that other work on the
+machine does not matter. It also ends within three minutes of wall time, since a process that waits forever uses no processor
+time.
 """
 
 from __future__ import annotations
@@ -25,13 +26,21 @@ from benchmarks.bad_inputs.preloaded import MOST_WALL_S, Ended, Order, Preloaded
 MOST_SECONDS, MOST_GB = 20.0, 2.0
 _LONGEST_LINE = 1500
 PORT_IN_USE = 18_937
-"""`view` reads what it is given and then finds its port taken: with another it would stay."""
+"""Port that is in use, so that `view` ends after reading its input instead of serving it."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A bad input. name: as in the list of found ones, where it is from there; needs: the materials that are copied into the
-    folder; spoil: makes the folder's files bad; words: of the command; codes: exit statuses that are right."""
+    """A bad input.
+
+    Attributes
+    ----------
+    name : Name of the case, as in the list of found ones if it is from there.
+    needs : Materials that are copied into the folder.
+    spoil : Damages files in the folder.
+    words : Words of the command.
+    codes : Exit statuses that are right.
+    """
 
     name: str
     words: tuple[str, ...]
@@ -46,8 +55,15 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a command did. seconds: of processor time; wall_s: until it ended; problems: empty for a good answer; line: the last
-    that it printed."""
+    """Response of a command.
+
+    Attributes
+    ----------
+    seconds : Processor time, s.
+    wall_s : Wall time until it ended, s.
+    problems : What is wrong with the response; empty for a good one.
+    line : The last line that it printed.
+    """
 
     case: Case
     code: int
@@ -59,9 +75,10 @@ class Outcome:
 
 
 def tried(case: Case, materials: Path, folder: Path, forked_from: Preloaded | None = None) -> Outcome:
-    """Spoil copies of the materials in `folder`, which is made, and run the command there as a process of its own.
+    """Damage copies of the materials in a new `folder` and run the command there as its own process.
 
-    forked_from: without it in this process, which is faster; its memory is not looked at, and it is stopped by an alarm.
+    forked_from: process to fork from; None: run in this process, which is faster, without a check of memory and with an alarm as
+    the time limit.
     """
     folder.mkdir(parents=True)
     for name in case.needs:
@@ -120,7 +137,7 @@ def _is_error_document(out: str) -> bool:
 
 
 def _files(folder: Path) -> dict[str, tuple[int, int, int]]:
-    """Size, time of change and kind of all that a folder holds, by name; links are not followed."""
+    """Return size, time of change and kind of everything in a folder, by name, without following links."""
     found = {}
     for base, folders, files in os.walk(folder):
         for name in [*folders, *files]:
@@ -132,7 +149,7 @@ def _files(folder: Path) -> dict[str, tuple[int, int, int]]:
 
 
 def _run(words: tuple[str, ...], folder: Path, forked_from: Preloaded) -> tuple[Ended, str, str]:
-    """How it ended, stdout and stderr."""
+    """Run a command in a forked process; return how it ended, stdout and stderr."""
     out, error = folder.with_suffix(".out"), folder.with_suffix(".err")
     ended = forked_from.run(Order(words, str(folder), str(out), str(error)))
     texts = [path.read_text(encoding="utf-8", errors="replace") for path in (out, error)]

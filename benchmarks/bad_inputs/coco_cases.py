@@ -1,4 +1,4 @@
-"""COCO files, maps, detectors and sets that `evaluate`, `detect` and `train` cannot use."""
+"""Bad inputs for `evaluate`, `detect` and `train`: COCO files, maps, detectors and data sets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Configs of data sets and finished sets that `dataset` cannot use."""
+"""Bad inputs for `dataset`: configs, and finished data sets that were damaged."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def _twice(folder: Path) -> None:
 
 
 def _epochs(value: Any) -> Change:
-    """dataset.json with other epochs, its checksum as it should be."""
+    """Change the epochs in dataset.json and correct its checksum."""
 
     def change(folder: Path) -> None:
         from pipeline.dataset.records import _digest, _text

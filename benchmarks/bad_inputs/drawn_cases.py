@@ -1,7 +1,7 @@
-"""Bad inputs drawn at random, of a structure: for each command good words and files, of which some are spoilt.
+"""Bad inputs drawn at random: for each command good arguments and files, some of which are damaged.
 
-`drawn` gives a case for a command; hypothesis draws it. tests/test_fuzz_commands.py tries 25 of each command up to where its
-work begins, `python benchmarks/fuzz.py` 500, and `python benchmarks/fuzz.py --through` some to their end.
+`drawn` gives a case of a command to hypothesis. tests/test_fuzz_commands.py tries 25 of each command up to where its work begins,
+`python benchmarks/fuzz.py` 500, and `python benchmarks/fuzz.py --through` runs some to their end.
 """
 
 from __future__ import annotations
@@ -126,7 +126,9 @@ _ODD_WORDS = (
     *("seed=" + "9" * 30, "seed=&a [*a]", "wall=!!set {}", "epochs=1e9", "rockfall.count=1e12"),
 )
 _QUIET_OPTIONS = ("--help", "--debug", "--port", "--workers", "--scheduler", "--threads")
-"""Not drawn: a help text, a traceback and a page are what is asked for; others start processes, which have tests of their own."""
+"""Options that are not drawn: help texts and tracebacks are correct responses; the others start processes, which have their own
+tests.
+"""
 _FACTORS = (0.0, -1.0, 1e-300, 1e-9, 1e3, 1e9, 1e30, 1e300, math.nan, math.inf)
 ODD_VALUES = st.one_of(
     st.none(),
@@ -144,7 +146,7 @@ ODD_VALUES = st.one_of(
 
 
 def drawn(draw: Draw, command: str, good: Path) -> Case:
-    """A case of the command; good: the folder of the materials."""
+    """Draw a case of the command; good: folder of the materials."""
     set_up: SetUp = draw(st.sampled_from(SET_UPS[command]))
     what = draw(st.sampled_from(["words", "file", "file", "both"])) if set_up.files else "words"
     words, spoils = set_up.words, [_beside]
@@ -157,7 +159,7 @@ def drawn(draw: Draw, command: str, good: Path) -> Case:
 
 
 def _beside(folder: Path) -> None:
-    """What odd words may name: a loop of links and a pipe."""
+    """Create what odd arguments may name: a loop of links and a pipe."""
     instead("loop", link("loop"))(folder)
     instead("pipe", pipe)(folder)
 
@@ -184,7 +186,7 @@ def _spoilt_words(draw: Draw, command: str, words: tuple[str, ...]) -> tuple[str
 
 
 def _options(command: str) -> list[tuple[str, int]]:
-    """The options of a command's parser, and how many values each takes."""
+    """Return the options of a command's parser, with their numbers of values."""
     from pipeline.cli.main import COMMANDS, command_parser
 
     actions: list[argparse.Action] = command_parser(command, COMMANDS[command])._actions
@@ -228,7 +230,7 @@ def _replaced(draw: Draw, name: str) -> Change:
 
 
 def places(values: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """The path to every value in nested mappings and lists."""
+    """Yield the path to every value in nested mappings and lists."""
     for key, value in values.items() if isinstance(values, dict) else enumerate(values):
         yield (*path, key)
         if isinstance(value, dict | list):
@@ -236,7 +238,7 @@ def places(values: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]
 
 
 def _odd_value(draw: Draw, name: str, good: Path) -> Change:
-    """A value of another kind, a number of another size, a key less or one more, somewhere in the file."""
+    """Draw a change of the file: a value of another type or size, or a key missing or added."""
     content = (good / name).read_text()
     values = yaml.safe_load(content) if name.endswith(".yaml") else json.loads(content)
     values = copy.deepcopy(values)
@@ -271,7 +273,7 @@ def _dumped(name: str, values: Any) -> bytes:
 
 
 def _odd_coordinates(draw: Draw, name: str) -> Change:
-    """Points or vertices scaled, shifted, fewer, some of them odd, or in another order."""
+    """Draw a change of points or vertices: scaled, shifted, subsampled, partly odd, or reordered."""
     kind = draw(st.sampled_from(["scale", "axis", "shift", "few", "some", "one place", "shuffled"]))
     factor, axis = draw(st.sampled_from(_FACTORS)), draw(st.integers(0, 2))
     count = draw(st.integers(0, 60))
@@ -332,7 +334,7 @@ def _odd_map(draw: Draw, name: str) -> Change:
 
 
 def _odd_bytes(draw: Draw, name: str, size: int) -> Change:
-    """The file cut, with bytes changed, put in or zeroed, more often near its beginning."""
+    """Draw a change of the file's bytes: cut, changed, inserted or zeroed, more often near its beginning."""
     at = draw(st.integers(0, max(size - 1, 0)) | st.integers(0, max(min(size, 400) - 1, 0)))
     kind, new = draw(st.sampled_from(["cut", "change", "insert", "zero", "twice"])), draw(st.binary(min_size=1, max_size=8))
 

@@ -1,4 +1,6 @@
-"""Files of other programs that are odd and not cut: properties, links, compressed bombs, camera files, sparse giants."""
+"""Bad inputs that are valid but unusual files of other programs: properties, links, compression bombs, camera files, sparse
+giants.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,7 @@ _TAIL = ("--reference", "raw/wall.ply", "--scanner", "riegl_vz400i", "--out", "o
 
 
 def sparse(name: str, gigabytes: float = 60) -> Change:
-    """A file that says that it is so large and takes no room on the disk."""
+    """Create a file that claims this size but uses no space on the disk."""
 
     def change(folder: Path) -> None:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -34,7 +36,7 @@ def sparse(name: str, gigabytes: float = 60) -> Change:
 
 
 def _ply_with(*names: str, value: float = 1.0) -> Change:
-    """measurement/scan.ply as text with more properties of these names."""
+    """Write measurement/scan.ply as text with additional properties of these names."""
 
     def change(folder: Path) -> None:
         found = read_points(folder / "measurement/scan.ply").points
@@ -170,7 +172,7 @@ _MESHES: dict[str, tuple[str, Change]] = {
 
 
 def zlib_bomb(path: Path, gigabytes: float = 3.0) -> None:
-    """A TIFF of 64 x 64 px whose one compressed tile becomes gigabytes."""
+    """Write a TIFF of 64 x 64 px whose one compressed tile decompresses to gigabytes."""
     import tifffile
 
     tifffile.imwrite(path, np.zeros((64, 64), np.float32), compression="zlib", tile=(64, 64))
@@ -187,7 +189,7 @@ def zlib_bomb(path: Path, gigabytes: float = 3.0) -> None:
 
 
 def _tags(**values: Any) -> Change:
-    """dem.tif with other values of its tags."""
+    """Change values of tags of dem.tif."""
 
     def change(folder: Path) -> None:
         import tifffile
@@ -201,7 +203,7 @@ def _tags(**values: Any) -> Change:
 
 
 def _looped(folder: Path) -> None:
-    """dem.tif whose directory of tags is followed by itself."""
+    """Make the tag directory of dem.tif refer to itself."""
     shutil.copy(folder / "run/difference_001.tif", folder / "dem.tif")
     data = bytearray((folder / "dem.tif").read_bytes())
     (start,) = struct.unpack_from("<I", data, 4)
@@ -237,7 +239,7 @@ _TIFFS: dict[str, Change] = {
 
 
 def _in_xml(old: str, new: str) -> Change:
-    """raw/scan.e57 with other words in its XML, no longer ones, its checksums as they should be."""
+    """Replace words by shorter ones in the XML of raw/scan.e57, and correct its checksums."""
 
     def change(folder: Path) -> None:
         in_e57(folder / "raw/scan.e57", old, new)

@@ -1,4 +1,4 @@
-"""Runs and sets that `export` cannot make a picture, a glTF, a YOLO set or a list of: spoilt after they were written."""
+"""Bad inputs for `export`: runs and data sets that were damaged after they were written."""
 
 from __future__ import annotations
 

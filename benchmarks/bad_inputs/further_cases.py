@@ -1,4 +1,4 @@
-"""More of the same kinds, thought of after the others were cured: each command with what its own tests do not hold."""
+"""Further bad inputs for all commands, of kinds that the other modules and the commands' own tests lack."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measurements, and what else `gap` gets, that cannot be used."""
+"""Bad inputs for `gap`: measurements, and its other arguments."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _GLTF = '{"asset": {"version": "2.0"}, "buffers": [{"uri": "/etc/passwd", "byteL
 _ENTITIES = '<!DOCTYPE a [<!ENTITY b "cc"><!ENTITY d "&b;&b;">]><document>&d;</document>'
 _AWAY = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
 FACTOR, OFFSET = 131, 155
-"""Places of the first scale factor and the first offset in the header of a LAS file."""
+"""Offsets of the first scale factor and the first coordinate offset in the header of a LAS file."""
 
 
 def _cloud(count: int) -> Change:

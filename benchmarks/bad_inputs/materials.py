@@ -1,4 +1,4 @@
-"""Good inputs of every command, made once; each bad input is a copy of them with something spoilt."""
+"""Make good inputs of all commands, once; each bad input is a copy of them with something damaged."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SITE: dict[str, Any] = {
     "icp": {"max_iteration": 2},
     "calibration": {"windows": 6, "window_px": 16, "simulations": 60},
 }
-"""So small that an ordinary calibration of its run, of some 450 simulated epochs, takes 15 s of processor time."""
+"""A site so small that a calibration of its run, with some 450 simulated epochs, takes 15 s of processor time."""
 SET: dict[str, Any] = {
     "name": "tiny",
     "seed": 3,
@@ -61,15 +61,20 @@ WIDTH, HEIGHT = 48, 32
 
 
 def make_materials(folder: Path, *, diagnosed: bool = True) -> None:
-    """site.yaml, set.yaml; run/, set/, measurement/, raw/, pair/, detector/, diagnosis/; truth.json, found.json. diagnosed:
-    whether diagnosis/, which takes longest, is among them. Raises RuntimeError where a command fails on them."""
+    """Make all good inputs.
+
+    They are site.yaml, set.yaml; run/, set/, measurement/, raw/, pair/, detector/, diagnosis/; truth.json, found.json. diagnosed:
+    whether to make diagnosis/, which takes longest. Raises RuntimeError if a command fails on them.
+    """
     _make_all(folder, SITE, SET, 4_000)
     if diagnosed:
         _called("gap", str(folder / "measurement"), "--out", str(folder / "diagnosis"))
 
 
 def make_small(folder: Path) -> None:
-    """The same of a few hundred pixels and points, in seconds, with diagnosis/ and events/ written as their commands would."""
+    """Make good inputs of a few hundred pixels and points, in seconds, with diagnosis/ and events/ as their commands would write
+    them.
+    """
     site = {**SITE, "epochs": 1, "wall": {**SITE["wall"], "width_m": 4.0, "height_m": 3.0, "resolution_m": 0.2}}
     site |= {"scanner": {"azimuth_step_rad": 0.01, "zenith_step_rad": 0.01}, "rockfall": {"count": 2, "size_m": 0.5}}
     wall = {key: value for key, value in site.items() if key not in ("seed", "epochs", "calibration")}
@@ -82,7 +87,7 @@ def make_small(folder: Path) -> None:
 
 
 def _make_all(folder: Path, site: dict[str, Any], matrix: dict[str, Any], points: int) -> None:
-    """All but diagnosis/ and events/, of a site's config and a set's; points: of each measurement."""
+    """Make all but diagnosis/ and events/, from the configs of a site and of a set; points: number in each measurement."""
     folder.mkdir(parents=True)
     (folder / "site.yaml").write_text(yaml.safe_dump(site))
     (folder / "set.yaml").write_text(yaml.safe_dump(matrix))
@@ -96,7 +101,7 @@ def _make_all(folder: Path, site: dict[str, Any], matrix: dict[str, Any], points
 
 
 def _diagnosis(folder: Path, points: FloatArray) -> None:
-    """What `view` reads of a diagnosis."""
+    """Write what `view` reads of a diagnosis."""
     extra = {"residual_m": points[:, 0] * 1e-4, "held_out": np.arange(len(points), dtype=np.uint8) % 2}
     for name in ("before", "after"):
         write_laz(folder / f"{name}.laz", PointCloud(points, extra=extra))
@@ -110,7 +115,7 @@ def _called(*words: str) -> None:
 
 
 def _raw(folder: Path) -> None:
-    """raw/: the points of measurement/ and its wall, both in the scanner's frame."""
+    """Write raw/: the points of measurement/ and its wall, both in the scanner's frame."""
     given = yaml.safe_load((folder / "measurement/measurement.yaml").read_text())["scanner"]
     position, rotation = np.array(given["position_m"]), np.array(given["rotation"])
     (folder / "raw").mkdir()
@@ -121,7 +126,7 @@ def _raw(folder: Path) -> None:
 
 
 def _coco(folder: Path) -> None:
-    """truth.json, of two images with two blocks each, and found.json, the same with scores."""
+    """Write truth.json, with two blocks in each of two images, and found.json, the same with scores."""
     images = [
         {"id": 1 + number, "file_name": f"{number}.tif", "width": WIDTH, "height": HEIGHT, "noise": "low"} for number in range(2)
     ]

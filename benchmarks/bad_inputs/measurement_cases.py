@@ -1,4 +1,4 @@
-"""Measurements of more kinds that `gap` cannot take: epochs, channels, pixels, surfaces."""
+"""Bad inputs for `gap`: measurements with wrong epochs, channels, pixels or surfaces."""
 
 from __future__ import annotations
 

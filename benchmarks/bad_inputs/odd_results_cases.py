@@ -1,4 +1,4 @@
-"""Results of other commands, and of other programs in their places, that a command cannot go on with: odd, and not cut."""
+"""Bad inputs that are results of other commands or programs: unusual content in complete files."""
 
 from __future__ import annotations
 

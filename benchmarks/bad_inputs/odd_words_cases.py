@@ -1,4 +1,6 @@
-"""Words of the command line that nobody meant: empty, doubled, in other scripts; and names that are odd but right."""
+"""Bad inputs on the command line: arguments that are empty, repeated or in other scripts, and names that are unusual
+but right.
+"""
 
 from __future__ import annotations
 

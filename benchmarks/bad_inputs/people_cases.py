@@ -1,5 +1,6 @@
-"""Mistakes that people make with names, places and numbers: another program's notation, one place for input and output, folders
-in which something else lies too, and records that fit no other file of theirs."""
+"""Bad inputs that are mistakes people make: another program's notation, one place for input and output, stray files in a folder,
+records that do not fit the other files.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What other programs leave in a file's place: failed downloads, pointers to files, archives, blocks that were never written."""
+"""Bad inputs that other programs leave in a file's place: failed downloads, pointers to files, archives, unwritten blocks."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CONTENTS: dict[str, bytes] = {
     "a pickle": b"\x80\x04\x95\x1c" + bytes(7) + b"\x8c\x05posix\x94\x8c\x06system\x94\x93\x94\x8c\x04true\x94\x85\x94R\x94.",
     "a certificate's text": b"-----BEGIN CERTIFICATE-----\nMIIB\n-----END CERTIFICATE-----\n",
 }
-"""By what they are, as bytes."""
+"""Content of each kind, as bytes."""
 _OUT = ("--out", "out", "--quiet")
 _RAW = ("--scanner", "riegl_vz400i", *_OUT)
 _TO_WALL = ("--reference", "raw/wall.ply", *_RAW)
@@ -94,9 +94,9 @@ _PLACES: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "export: points": ("run/epoch_001/points.laz", ("export", "run", "scan", "--out", "a.gif", "--quiet"), ("run",)),
     "export: annotations": ("set/val/annotations.json", ("export", "set", "yolo", *_OUT), ("set",)),
 }  # fmt: skip
-"""The file's name, the command's words and what it needs."""
+"""For each place, the file's name, the command's words and the materials that it needs."""
 _EACH = 4
-"""Contents that a place gets, the next ones in turn."""
+"""Number of contents that each place gets, in turn."""
 
 
 def _in_turn() -> Iterator[str]:

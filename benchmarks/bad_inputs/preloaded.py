@@ -1,8 +1,8 @@
-"""Commands as processes of their own, forked from one that has imported what they need: seconds less for each.
+"""Run commands as processes forked from one that has already imported what they need, which saves seconds for each.
 
-Dr.Jit's threads do not survive a fork: it computes in one thread then, and cannot end its own, so that a command that is forked
-from a process with it ends at once after its last line. TensorFlow is never imported before. Run as a program, this takes orders
-as lines of JSON and answers each with a line.
+Dr.Jit's threads do not survive a fork: it then computes in one thread and cannot end its own threads, so that a forked command
+ends immediately after its last line. TensorFlow is never imported before the fork. Run as a program, this module takes orders as
+lines of JSON and answers each with a line.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import psutil
 
 ROOT = Path(__file__).parents[2]
 MOST_WALL_S, MOST_OWN_S, MOST_GB = 180.0, 60.0, 4.0
-"""A command that goes on for longer, on the wall's clock or the processor's, or takes more memory, is killed."""
+"""Limits of wall time, s, processor time, s, and memory, GB, at which a command is killed."""
 _LOOKS_AFTER_S = 0.5
 LIBRARIES = (
     *("cv2", "dash", "flask", "jinja2", "laspy", "manifold3d", "matplotlib.backends.backend_agg", "matplotlib.figure", "numpy"),
@@ -38,7 +38,7 @@ ROOMS = (
 
 @dataclass(frozen=True)
 class Order:
-    """A command's words, the folder that it runs in and the files of its output."""
+    """A command's words, its working folder and the files for its output."""
 
     words: tuple[str, ...]
     folder: str
@@ -48,7 +48,9 @@ class Order:
 
 @dataclass(frozen=True)
 class Ended:
-    """Exit status, seconds on the wall's clock and of processor time of all its processes, peak memory of the largest one."""
+    """How a command ended: exit status, wall time and processor time of all its processes, s, and peak memory of the largest one,
+    GB.
+    """
 
     code: int
     wall_s: float
@@ -57,8 +59,11 @@ class Ended:
 
 
 class Preloaded:
-    """The process that commands are forked from; close it. rooms: the program's own modules are imported too, and Dr.Jit;
-    bytecode: a folder of one's own where that of the modules is kept, as an installation has it."""
+    """The process that commands are forked from; it must be closed.
+
+    rooms: whether the program's own modules and Dr.Jit are imported too; bytecode: folder for the modules' bytecode, as in an
+    installation.
+    """
 
     def __init__(self, bytecode: Path, *, rooms: bool) -> None:
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONPYCACHEPREFIX": str(bytecode)}
@@ -84,7 +89,7 @@ class Preloaded:
 
 
 def serve(modules: list[str]) -> int:
-    """Fork a process for each order; only such a process returns before the orders end, with its command's exit status."""
+    """Fork a process for each order; only these processes return before the orders end, with the exit status of their command."""
     for name in modules:
         importlib.import_module(name)
     ends_at_once = "drjit" in sys.modules
@@ -117,7 +122,7 @@ def _command(order: Order) -> int:
 
 
 def _waited(process: int, began: float) -> Ended:
-    """How a process ends, by force where it takes too much."""
+    """Wait until a process ends, and kill it at a limit."""
     tree, looked, forced = _Tree(process), began, False
     while True:
         ended, status, usage = os.wait4(process, 0 if forced else os.WNOHANG)
@@ -136,7 +141,7 @@ def _waited(process: int, began: float) -> Ended:
 
 
 class _Tree:
-    """A process and all that it started. own_s: their processor time, user and system, with those that have ended since."""
+    """A process and all its descendants. own_s: their processor time, user and system, including those that have ended."""
 
     def __init__(self, process: int) -> None:
         self._process = process
@@ -148,7 +153,7 @@ class _Tree:
         return sum(self._own_s.values())
 
     def look(self) -> None:
-        """Take the processes as they are now; one that ends meanwhile keeps what it had."""
+        """Update the list of processes; one that ends keeps its last values."""
         with suppress(psutil.Error):
             first = psutil.Process(self._process)
             for each in [first, *first.children(recursive=True)]:

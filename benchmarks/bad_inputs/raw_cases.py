@@ -1,4 +1,4 @@
-"""Raw files that `measurement`, `gap SCAN --reference` and `surface` cannot use."""
+"""Bad inputs for `measurement`, `gap SCAN --reference` and `surface`: raw files."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from pipeline.formats.points.points import read_points
 
 SCAN, WALL = "raw/scan.ply", "raw/wall.ply"
 FACTOR, OFFSET = 131, 155
-"""Places of the first scale factor and the first offset in the header of a LAS file."""
+"""Offsets of the first scale factor and the first coordinate offset in the header of a LAS file."""
 _COUNT = 'recordCount="3606">\n        '
 _TAIL = ("--reference", WALL, "--scanner", "riegl_vz400i", "--out", "out", "--quiet")
 
 
 def _as(suffix: str, move: object = None, values: object = None) -> Change:
-    """raw/scan with another suffix and other points (n, 3), scanner frame."""
+    """Write raw/scan with another suffix and other points (n, 3), scanner frame."""
 
     def change(folder: Path) -> None:
         found = read_points(folder / SCAN).points
@@ -91,7 +91,7 @@ def _in_e57(old: str, new: str) -> Change:
 
 
 def in_e57(path: Path, old: str, new: str) -> None:
-    """Other words, no longer ones, in the XML of an E57 file; the checksums of its pages are made right again."""
+    """Replace words by shorter ones in the XML of an E57 file, and correct the checksums of its pages."""
     data = path.read_bytes()
     body = b"".join(data[k : k + 1020] for k in range(0, len(data), 1024)).replace(old.encode(), new.ljust(len(old)).encode())
     pages = [body[k : k + 1020] for k in range(0, len(body), 1020)]
@@ -333,7 +333,7 @@ _CLOUDS = (
 
 
 def _beside(folder: Path) -> None:
-    """What the words name: a pipe, a bomb, a loop of links, scans as text."""
+    """Create what the arguments name: a pipe, a bomb, a loop of links, scans as text."""
     pipe(folder / "pipe.yaml")
     (folder / "bomb.yaml").write_text(merge_bomb())
     (folder / "loop").symlink_to("loop")

@@ -1,13 +1,13 @@
-"""Bad inputs, each to its command: how many are answered well.
+"""Try all bad inputs on their commands and count good responses.
 
     python benchmarks/bad_inputs/run.py [--listed] [--only WORD ...] [--jobs 2] [--state FOLDER]
         [--table docs/validation/robustness.md]
 
-Each runs as a process of its own, some seconds long, on copies of small good inputs that are made first, those of listed.txt
-before the others. Prints those that are answered badly (see case.py for what that is), and counts by command; exit status 1 where
-there are any. --state keeps the good inputs and each answer in a folder, so that a count that was stopped goes on where it was;
-with --again those answered badly are tried once more; with --kept none is tried, and what is kept is counted. --table writes the
-counts into the page.
+Each input runs as its own process, for some seconds, on copies of small good inputs that are made first; those of listed.txt come
+first. Prints the bad responses (see case.py) and counts by command; the exit status is 1 if there are any.
+
+--state keeps the good inputs and each response in a folder, so that an interrupted run continues. With --again, bad responses are
+tried once more; with --kept, nothing is tried and kept responses are counted. --table writes the counts into the page.
 """
 
 from __future__ import annotations
@@ -68,14 +68,14 @@ def all_cases() -> list[Case]:
 
 
 def listed_cases() -> list[Case]:
-    """Those of listed.txt; KeyError for a name that no case has."""
+    """Return the cases of listed.txt; raise KeyError for an unknown name."""
     known = {case.name: case for case in all_cases()}
     lines = (Path(__file__).parent / "listed.txt").read_text(encoding="utf-8").splitlines()
     return [known[name] for name in lines if not name.startswith("#")]
 
 
 def listed_first(cases: Sequence[Case]) -> list[Case]:
-    """The cases, those of listed.txt before the others."""
+    """Return the cases with those of listed.txt first."""
     listed = {case.name for case in listed_cases()}
     return sorted(cases, key=lambda case: case.name not in listed)
 
@@ -89,7 +89,7 @@ def run(
     fresh: bool = True,
     heard: Callable[[Outcome], object] = lambda outcome: None,
 ) -> list[Outcome]:
-    """Try each case, in the order given; `heard` gets each outcome as it comes. fresh: see `Preloaded`."""
+    """Try each case, in order; `heard` gets each outcome as it comes. fresh: see `Preloaded`."""
     with tempfile.TemporaryDirectory(prefix="bad_inputs_") as name:
         folder = Path(name)
         good = materials or folder / "materials"
@@ -120,7 +120,7 @@ def run(
 
 
 class Kept:
-    """The outcomes in a file, a line of JSON for each; of a case tried again the last one counts."""
+    """Outcomes in a file, one line of JSON each; if a case is tried again, its last line counts."""
 
     def __init__(self, file: Path) -> None:
         self._file = file
@@ -131,7 +131,7 @@ class Kept:
             lines.write(json.dumps(values) + "\n")
 
     def outcomes(self, cases: Iterable[Case]) -> list[Outcome]:
-        """Those of these cases that were tried."""
+        """Return the outcomes of these cases that were tried."""
         lines = self._file.read_text(encoding="utf-8").splitlines() if self._file.exists() else []
         found = {values["case"]: values for values in map(json.loads, lines)}
         tried_ = [(case, found[case.name]) for case in cases if case.name in found]
@@ -144,7 +144,7 @@ def said(outcome: Outcome) -> str:
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
-    """Markdown: inputs tried and answered well, by command."""
+    """Return a Markdown table of inputs tried and good responses, by command."""
     tried_, good = Counter(each.case.command for each in outcomes), Counter(o.case.command for o in outcomes if not o.problems)
     rows = [f"| `{name}` | {count} | {good[name]} |" for name, count in sorted(tried_.items())]
     total = f"| all | {len(outcomes)} | {sum(good.values())} |"

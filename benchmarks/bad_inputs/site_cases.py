@@ -1,4 +1,4 @@
-"""Configs, runs and maps that `simulate`, `inspect`, `compare`, `icp-study`, `calibrate` and `view` cannot use."""
+"""Bad inputs for `simulate`, `inspect`, `compare`, `icp-study`, `calibrate` and `view`: configs, runs and maps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small changes to files, each a function that takes a case's folder."""
+"""Functions that return a small change of a file in a case's folder."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ Change = Callable[[Path], object]
 Array = np.ndarray[Any, np.dtype[np.float64]]
 NAN, INFINITE = math.nan, math.inf
 GONE = object()
-"""Value of a key that is taken out."""
+"""Value that removes a key."""
 
 
 def both(*changes: Change) -> Change:
-    """One after the other."""
+    """Apply changes one after the other."""
 
     def change(folder: Path) -> None:
         for each in changes:
@@ -38,7 +38,7 @@ def both(*changes: Change) -> Change:
 
 
 def text(name: str, content: str | bytes) -> Change:
-    """A file with this content."""
+    """Replace the content of a file."""
 
     def change(folder: Path) -> None:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -48,7 +48,7 @@ def text(name: str, content: str | bytes) -> Change:
 
 
 def put(name: str, /, **values: Any) -> Change:
-    """A YAML or JSON file with values at places `a__b__0`; GONE takes a key out."""
+    """Set values of a YAML or JSON file at places such as `a__b__0`; GONE removes a key."""
 
     def change(folder: Path) -> None:
         path = folder / name
@@ -72,7 +72,7 @@ def _place(content: Any, keys: list[str], value: Any) -> None:
 
 
 def whole(name: str, value: Any) -> Change:
-    """A JSON or YAML file that holds `value` alone."""
+    """Write a JSON or YAML file that contains only `value`."""
     return text(name, json.dumps(value))
 
 
@@ -81,7 +81,7 @@ def gone(name: str) -> Change:
 
 
 def cut(name: str, share: float = 0.5) -> Change:
-    """The first part of the file."""
+    """Keep only the first part of a file."""
 
     def change(folder: Path) -> None:
         data = (folder / name).read_bytes()
@@ -91,7 +91,7 @@ def cut(name: str, share: float = 0.5) -> Change:
 
 
 def at(name: str, place: int, form: str, value: float) -> Change:
-    """Some bytes of a file replaced; form: as `struct` has it."""
+    """Replace bytes of a file at an offset; form: as in `struct`."""
 
     def change(folder: Path) -> None:
         data = bytearray((folder / name).read_bytes())
@@ -102,7 +102,7 @@ def at(name: str, place: int, form: str, value: float) -> Change:
 
 
 def instead(name: str, make: Callable[[Path], object]) -> Change:
-    """Something else in the place of a file or at a new name: a folder, a pipe, a link."""
+    """Put something else in the place of a file, or at a new name: a folder, a pipe, a link."""
 
     def change(folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
@@ -120,7 +120,7 @@ def pipe(path: Path) -> None:
 
 
 def points(move: Callable[[Array], Array], /, **keys: Any) -> Change:
-    """measurement/ with other points, (n, 3), scanner frame, to (m, 3), as XYZ; keys: of measurement.yaml."""
+    """Write measurement/ with other points (n, 3), scanner frame, mapped to (m, 3), as XYZ; keys: of measurement.yaml."""
 
     def change(folder: Path) -> None:
         found = read_points(folder / "measurement/scan.ply").points
@@ -131,7 +131,7 @@ def points(move: Callable[[Array], Array], /, **keys: Any) -> Change:
 
 
 def as_laz(*changes: Change) -> Change:
-    """measurement/ with its points as scan.laz, then changed."""
+    """Write the points of measurement/ as scan.laz, then change it."""
 
     def change(folder: Path) -> None:
         cloud = read_points(folder / "measurement/scan.ply")
@@ -143,7 +143,7 @@ def as_laz(*changes: Change) -> Change:
 
 
 def mesh(name: str, move: Callable[[Array], Array], faces: Callable[[Any], Any] = lambda faces: faces) -> Change:
-    """A PLY mesh with other vertices (n, 3), as text."""
+    """Move the vertices (n, 3) of a PLY mesh, and write it as text."""
 
     def change(folder: Path) -> None:
         found = read_ply(folder / name)
@@ -162,7 +162,7 @@ def write_mesh(path: Path, vertices: Array, faces: Any) -> None:
 
 
 def claiming_tiff(path: Path, height: int = 30000, width: int = 30000) -> None:
-    """A file of some hundred bytes that says that it holds an image of that size."""
+    """Write a TIFF of a few hundred bytes that claims an image of this size."""
     tifffile.imwrite(path, np.zeros((64, 64), np.float32), compression="zlib", tile=(64, 64))
     with tifffile.TiffFile(path, mode="r+b") as file:
         tags = file.pages.first.tags
@@ -171,7 +171,7 @@ def claiming_tiff(path: Path, height: int = 30000, width: int = 30000) -> None:
 
 
 def map_of(values: Any) -> Callable[[Path], object]:
-    """A GeoTIFF of 0.05 m with these values (h, w)."""
+    """Return a function that writes a GeoTIFF with pixels of 0.05 m and these values (h, w)."""
     from pipeline.formats.rasters.geotiff import write_geotiff
     from scene.geometry.grid import Grid
 
@@ -180,14 +180,14 @@ def map_of(values: Any) -> Callable[[Path], object]:
 
 
 def bomb(levels: int = 10) -> str:
-    """Lines that stand for 9 to the power of `levels` values."""
+    """Return YAML lines that expand to 9 to the power of `levels` values."""
     lines = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]"]
     lines += [f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 9)}]" for level in range(1, levels + 1)]
     return "\n".join([*lines, f"wall: *a{levels}", ""])
 
 
 def merge_bomb(levels: int = 10) -> str:
-    """Lines whose merge keys, followed one by one, stand for 9 to the power of `levels` mappings."""
+    """Return YAML lines whose merge keys expand to 9 to the power of `levels` mappings."""
     lines = ["a0: &a0 {k0: 1}"]
     lines += [f"a{level}: &a{level} {{<<: [{', '.join([f'*a{level - 1}'] * 9)}], k{level}: 1}}" for level in range(1, levels + 1)]
     return "\n".join([*lines, f"wall: {{<<: *a{levels}}}", ""])

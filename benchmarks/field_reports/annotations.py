@@ -1,4 +1,4 @@
-"""Reports of annotations in COCO's form."""
+"""Public reports about COCO annotations."""
 
 from __future__ import annotations
 

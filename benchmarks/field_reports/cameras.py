@@ -1,4 +1,4 @@
-"""Reports of camera files: Metashape XML and COLMAP text."""
+"""Public reports about camera files: Metashape XML and COLMAP text."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reports of meshes: OBJ, PLY, STL."""
+"""Public reports about meshes: OBJ, PLY, STL."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reports of point clouds: LAS, E57, PTX, PTS, PLY."""
+"""Public reports about point clouds: LAS, E57, PTX, PTS, PLY."""
 
 from __future__ import annotations
 

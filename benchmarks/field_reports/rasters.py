@@ -1,4 +1,4 @@
-"""Reports of elevation models: GeoTIFF."""
+"""Public reports about elevation models: GeoTIFF."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _matrix_alone(folder: Path) -> str:
 
 def _turned(folder: Path) -> str:
     path = _written(folder, _matrix(0.001))
-    return refused(lambda: read_raster(path), folder, "dem.tif", "turned")
+    return refused(lambda: read_raster(path), folder, "dem.tif", "rotated")
 
 
 REPORTS = (

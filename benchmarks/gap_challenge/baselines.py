@@ -1,5 +1,7 @@
-"""What the diagnosis is compared with: the largest |z| and plain BIC, both taking residuals for independent; and the control,
-the share of the gap that wrong effects close on blocks that their fit has not seen."""
+"""Baselines for the diagnosis: the largest |z|, and plain BIC, both of which take residuals as independent.
+
+It also computes the control: the share of the gap that wrong effects close on validation blocks, which their fit has not seen.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ _CLIP, _ROUNDS, _MOST_POINTS, _BLOCKS = 5.0, 2, 20_000, 12
 
 @dataclass(frozen=True)
 class Data:
-    """Residuals against reference and survey (n,), predicted sigma (n,), effect of the pose (n, 6), place (n, 2)."""
+    """Inputs of the baselines: residuals against reference and survey (n,), predicted sigma (n,), effect of the pose (n, 6),
+    place (n, 2).
+    """
 
     value: Array
     sigma: Array
@@ -27,8 +31,11 @@ class Data:
 
 
 def rivals(data: Data, families: Families, forms: Mapping[str, Sequence[Array]], truth: list[Array]) -> dict[str, Any]:
-    """The baselines' answers, and for each effect on the mean the share of the gap that it closes where `truth` closes all:
-    on the blocks of its fit, by which the best is chosen, and on held-out blocks, by which it is judged."""
+    """Return the baselines' answers, and the control of each effect on the mean.
+
+    The control is the share of the gap that an effect closes, where `truth` closes all: on the blocks of its fit, by which the
+    best effect is chosen, and on validation blocks, by which it is judged.
+    """
     sound = _sound(data)
     rows = sound[:: max(len(sound) // _MOST_POINTS, 1)]
     weight = 1 / data.sigma[rows, None]
@@ -48,7 +55,7 @@ def rivals(data: Data, families: Families, forms: Mapping[str, Sequence[Array]],
 
 
 def _sound(data: Data) -> Array:
-    """Rows within some sigmas of a robust registration."""
+    """Return the rows within some sigmas of a robust registration."""
     kept = np.arange(len(data.value))
     for _ in range(_ROUNDS):
         pose = np.linalg.lstsq(data.pose[kept] / data.sigma[kept, None], data.value[kept] / data.sigma[kept], rcond=None)[0]
@@ -58,7 +65,9 @@ def _sound(data: Data) -> Array:
 
 
 def _gains(pose: Array, design: Array, value: Array, held_out: Array) -> tuple[float, float]:
-    """Drop of the weighted squares when `design` joins the pose, fitted off the held-out blocks: there, and on these."""
+    """Return the decrease of the weighted squares when `design` is fitted beside the pose: on validation blocks, and on those of
+    the fit.
+    """
     left = []
     for columns in (pose, np.concatenate([pose, design], axis=1)):
         size = np.linalg.norm(columns, axis=0)
@@ -69,7 +78,7 @@ def _gains(pose: Array, design: Array, value: Array, held_out: Array) -> tuple[f
 
 
 def _spread(value: Array, relative: Mapping[str, list[Array]]) -> dict[str, float]:
-    """Score statistic of each effect on the spread, in standard deviations."""
+    """Return the score statistic of each variance effect, in standard deviations."""
     return {
         name: max(float((value**2 - 1) @ form / np.sqrt(2 * np.sum(form**2))) for form in several)
         for name, several in relative.items()
@@ -79,7 +88,9 @@ def _spread(value: Array, relative: Mapping[str, list[Array]]) -> dict[str, floa
 def _answers(
     pose: Array, designs: Mapping[str, list[Array]], value: Array, relative: Mapping[str, list[Array]]
 ) -> dict[str, str]:
-    """The names that the two baselines give; "" for nothing. Effects on the spread are tried on what the best mean leaves."""
+    """Return the names that the two baselines give; "" for none. Variance effects are tried on the residuals of the best mean
+    effect.
+    """
     fixed = basis(pose)
     value = value - fixed @ (fixed.T @ value)
     z, bic, best = {}, {}, (-np.inf, value)

@@ -1,4 +1,6 @@
-"""Which cases a challenge holds: strata by quota, every effect in turn, numbers shuffled; folders and truths apart."""
+"""Plan and make the cases of an evaluation: strata by quota, every effect in turn, shuffled numbers; folders separate from
+truths.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ _LARGE_EVERY, _LARGE = 40, 150_000
 
 @dataclass(frozen=True)
 class Case:
-    """One case to be. number: its name; seed: of everything in it; kinds: effects by name, off-catalogue forms too."""
+    """A planned case. number: its name; seed: of everything in it; kinds: effects by name, including forms outside
+    the catalogue.
+    """
 
     number: int
     seed: tuple[int, int]
@@ -39,12 +43,12 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Of the folder and of the truth's file."""
+        """Name of the folder and of the truth's file."""
         return f"{self.number:04d}"
 
 
 def plan(count: int, seed: int, small: bool = False) -> list[Case]:
-    """The cases of a challenge, by number. small: cases of some thousand points, for a test."""
+    """Return the cases of an evaluation, by number. small: with only some thousand points, for a test."""
     random = np.random.default_rng([seed, 1])
     numbers = random.permutation(count)
     decks = {(sensor, off): _Deck(_MAKERS[sensor], off, random) for sensor in _MAKERS for off in (False, True)}
@@ -64,7 +68,7 @@ def plan(count: int, seed: int, small: bool = False) -> list[Case]:
 
 
 class _Deck:
-    """Effects in a drawn order, again and again."""
+    """Deals effects in random order, repeatedly."""
 
     def __init__(self, maker: Any, off: bool, random: np.random.Generator) -> None:
         self._names = random.permutation(maker.OFF_CATALOGUE if off else maker.CATALOGUE).tolist()

@@ -1,4 +1,4 @@
-"""Rays against a triangle mesh with Open3D (Embree), hits computed again in float64 on the plane of the triangle."""
+"""Cast rays against a triangle mesh with Open3D (Embree); hits are computed again in float64 on the plane of the triangle."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 AT_ONCE = 1_000_000
-"""Rays in memory with what is computed of each (some 300 bytes)."""
+"""Rays in memory at a time with everything computed for them (some 300 bytes each)."""
 
 
 class Surface:
-    """A mesh that answers rays. vertices: (v, 3) m, within some hundred metres of the origin; faces: (f, 3)."""
+    """A mesh for ray casting. vertices: (v, 3) m, within a few hundred metres of the origin; faces: (f, 3)."""
 
     def __init__(self, vertices: Array, faces: Any) -> None:
         import open3d as o3d
@@ -24,9 +24,8 @@ class Surface:
         )
 
     def cast(self, origin: Array, ray: Array) -> tuple[Array, Array]:
-        """Distance (n,) in lengths of `ray` (n, 3), NaN where nothing is hit, and unit normal (n, 3) of what is hit.
-
-        origin: (3,) or (n, 3).
+        """Return distances (n,) in lengths of `ray` (n, 3), NaN without a hit, and unit normals (n, 3); origin: (3,) or
+        (n, 3).
         """
         start = np.broadcast_to(origin, ray.shape)
         distance, normal = np.empty(len(ray)), np.empty(ray.shape)

@@ -1,4 +1,4 @@
-"""The files of a measurement folder, written as CONTRACT.md fixes them."""
+"""Write the files of a measurement folder, as CONTRACT.md specifies them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def write_yaml(path: Path, values: dict[str, Any]) -> None:
 
 
 def plain(value: Any) -> Any:
-    """The same in types that YAML and JSON know."""
+    """Convert values to types that YAML and JSON have."""
     if isinstance(value, dict):
         return {key: plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple):

@@ -1,9 +1,10 @@
-"""The challenge of GAP.md: hidden-truth measurements, each diagnosed by the public command `scarpsim gap`, and scored.
+"""Evaluate `scarpsim gap` on closed-form measurements with hidden truth, as GAP.md specifies: make, diagnose by the command, and
+score.
 
     python benchmarks/gap_challenge/run.py --cases 60 --seed 1 --jobs 1 --out /tmp/challenge
 
-Interrupted, it goes on where it was. Under --out: cases/ (what the diagnosis is given), truth/ (which a process that diagnoses
-may not open), answers/ (gap.json of each), results.json and table.md.
+An interrupted run continues. Under --out are cases/ (what the diagnosis gets), truth/ (which a diagnosing process must not open),
+answers/ (gap.json of each), results.json and table.md.
 """
 
 from __future__ import annotations
@@ -48,8 +49,10 @@ def run(
     stratum: str | None = None,
     sensor: str | None = None,
 ) -> dict[str, Any]:
-    """Make what is missing, diagnose what has no answer, score. keep: leave the measurements and all that the command writes;
-    stratum, sensor: those of the cases alone."""
+    """Make missing cases, diagnose those without an answer, and score.
+
+    keep: keep the measurements and everything that the command writes; stratum, sensor: only these cases.
+    """
     out.mkdir(parents=True, exist_ok=True)
     every = plan(count, seed, small)
     cases = [case for case in every if case.stratum == (stratum or case.stratum) and case.sensor == (sensor or case.sensor)]
@@ -72,7 +75,7 @@ def run(
 
 
 def _commit() -> str:
-    """The commit of the program, "" outside of a checkout."""
+    """Return the commit of the program; "" outside of a checkout."""
     command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
 
@@ -104,9 +107,9 @@ def _make(job: tuple[Case, Path, Path]) -> None:
 
 
 class _Worker:
-    """A process that diagnoses folder after folder, so that imports are paid once.
+    """A process that diagnoses one folder after another, so that imports are paid once.
 
-    cores: its own, since threads of several that wait for each other on shared ones cost several times the time.
+    cores: its own cores, since threads that wait for each other on shared ones take several times as long.
     """
 
     def __init__(self, hidden: Path, cores: set[int]) -> None:
@@ -124,7 +127,7 @@ class _Worker:
         self.here.send((str(folder), str(result)))
 
     def spent_s(self) -> float:
-        """Processor time since the case was given."""
+        """Processor time since the case was given, s."""
         return self._processor_s() - self._before_s
 
     def _processor_s(self) -> float:
@@ -185,7 +188,7 @@ def _keep_answer(out: Path, case: Case, reply: dict[str, Any], keep: bool) -> No
 
 
 def _serve(pipe: Connection, hidden: str) -> None:
-    """Diagnose until the parent goes. An attempt to open anything in `hidden` is an error."""
+    """Diagnose until the parent ends; an attempt to open anything in `hidden` is an error."""
     sys.addaudithook(_guard(Path(hidden).resolve()))
     (command,) = entry_points(group="console_scripts", name="scarpsim")
     main = command.load()
@@ -205,7 +208,7 @@ def _guard(hidden: Path) -> Callable[[str, tuple[Any, ...]], None]:
 
 
 def _diagnosed(main: Callable[[list[str]], int], folder: str, result: Path) -> dict[str, Any]:
-    """gap.json with the wall time, or what went wrong."""
+    """Return gap.json with the wall time, or the error."""
     said, start = io.StringIO(), time.perf_counter()
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):

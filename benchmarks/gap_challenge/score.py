@@ -1,4 +1,4 @@
-"""Answers against truths: the figures of GAP.md's table, confusion, detection curves, coverage, control and baselines."""
+"""Score answers against truths: the figures of GAP.md's table, confusion, detection curves, coverage, control and baselines."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ import numpy as np
 
 Json = dict[str, Any]
 CLEAR = 8.0
-"""Signal-to-noise x sin(angle to the nearest other effect) from which an answer is expected to be right."""
+"""Signal-to-noise ratio x sin(angle to the nearest other effect) from which an answer should be right."""
 _ALONE = 0.05
-"""Share of an effect's square that another may take over for the effect to be unlike all others."""
+"""Largest share of an effect's square that another may explain for the effect to be unlike all others."""
 _Z90 = 1.6449
 _BINS = (0.0, 2.0, 4.0, 6.0, 8.0, 12.0, 20.0, 40.0, np.inf)
 _NAMING = ("named", "several", "ambiguous", "unknown")
 
 
 def score(pairs: list[tuple[Json, Json]]) -> Json:
-    """pairs: truth and answer of each case."""
+    """Score pairs of truth and answer."""
     rows = [_row(truth, answer) for truth, answer in pairs]
     return {
         "figures": _figures(rows),
@@ -38,7 +38,7 @@ def score(pairs: list[tuple[Json, Json]]) -> Json:
 
 
 def _row(truth: Json, answer: Json) -> Json:
-    """One case: what was true, what was said, and what is wrong with it."""
+    """Compare one answer with its truth, and list what is wrong with it."""
     said = answer.get("effects", [])
     named = [
         {"name": _bare(e["name"]), "class": [_bare(e["name"]), *map(_bare, e["cannot_be_told_from"])]}
@@ -97,7 +97,7 @@ def _what_is_wrong(row: Json) -> str:
 
 
 def _intervals(true: list[Json], said: list[Json]) -> list[Json]:
-    """Parameters of effects named by their own name: value, standard deviation, truth."""
+    """Return the parameters of effects that are named by their own name: value, standard deviation, truth."""
     found = []
     for effect in true:
         for each in said:
@@ -130,8 +130,11 @@ def _off(key: str, truth: float, given: Json | None) -> Json:
 
 
 def _control(truth: Json, named: list[Json]) -> Json | None:
-    """Share of the held-out gap that the best effect outside the answered class closes, best by its fit, where one clear effect
-    on the mean was named; and what of the signature's square the angle to the nearest other effect leaves to that, 1 - sin^2."""
+    """Return the share of the gap on validation blocks that the best wrong effect closes, if one clear mean effect was named.
+
+    The wrong effect is outside of the answered class and best by its fit. Also returned is the share of the signature's square
+    that the angle to the nearest other effect leaves to that one, 1 - sin^2.
+    """
     if truth["stratum"] != "one" or not truth["closed_by"] or not named or not _clear(truth["effects"][0]):
         return None
     true = truth["effects"][0]
@@ -206,7 +209,7 @@ def _figures(rows: list[Json]) -> list[Json]:
 
 
 def _insides(rows: Iterable[Json]) -> list[bool]:
-    """Of each interval of an effect that was named, and for the right camera, whether it holds the truth."""
+    """Return, for each interval of a named effect of the right camera, whether it contains the truth."""
     return [each["inside"] for row in rows for each in row["intervals"] if each["same_camera"] and each["inside"] is not None]
 
 
@@ -217,7 +220,7 @@ def _pooled(gaps: Any) -> float | None:
 
 
 def wilson(successes: int, count: int) -> tuple[float, float]:
-    """95 % interval of a share (Wilson 1927)."""
+    """Return the 95 % interval of a share (Wilson 1927)."""
     if count == 0:
         return 0.0, 1.0
     z, p = 1.96, successes / count
@@ -226,7 +229,7 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
 
 
 def _share(what: str, of: list[Any], hit: Any, goal: str, limits: tuple[float, float] | None) -> Json:
-    """A row of the table; what its 95 % interval does not settle is undecided."""
+    """Return a row of the table; it is undecided if its 95 % interval does not settle it."""
     count, successes = len(of), sum(bool(hit(item)) for item in of)
     value = successes / count if count else None
     low, high = wilson(successes, count)
@@ -237,7 +240,7 @@ def _share(what: str, of: list[Any], hit: Any, goal: str, limits: tuple[float, f
 
 
 def _settled(low: float, high: float, successes: int, limits: tuple[float, float]) -> str:
-    """Whether all of an interval lies within the limits, none of it, or neither; of limits that are one number, by the count."""
+    """Return whether all of an interval is within the limits, none of it, or neither; equal limits are decided by the count."""
     if limits == (0.0, 0.0):
         return "no" if successes else "yes"
     if limits[0] <= low and high <= limits[1]:
@@ -252,7 +255,7 @@ def _number(what: str, values: list[float], statistic: Any, goal: str, limits: t
 
 
 def answer_of(row: Json, hit: bool) -> str:
-    """In which column of the confusion matrix an effect's case falls."""
+    """Return the column of the confusion matrix of an effect's case."""
     if row["verdict"] in ("error", "insufficient_data"):
         return row["verdict"]
     if hit:
@@ -265,7 +268,7 @@ def answer_of(row: Json, hit: bool) -> str:
 
 
 def _confusion(rows: list[Json]) -> Json:
-    """Truth (name, or stratum) to what was answered, counted; for a class its members in order of merit."""
+    """Count answers by truth (name or stratum); a class gives its members in order of likelihood."""
     found: dict[str, Counter[str]] = {}
     for row in rows:
         said = " + ".join(" ~ ".join(each["class"]) for each in row["named"])
@@ -276,7 +279,7 @@ def _confusion(rows: list[Json]) -> Json:
 
 
 def _by_effect(rows: list[Json]) -> Json:
-    """Per true effect or stratum: how often each kind of answer."""
+    """Count the kinds of answers by true effect or stratum."""
     found: dict[str, Counter[str]] = {}
     for row in rows:
         if row["stratum"] in ("none", "change", "off"):
@@ -290,7 +293,7 @@ def _by_effect(rows: list[Json]) -> Json:
 
 
 def _curve(rows: list[Json]) -> list[Json]:
-    """By bins: share of single effects at which anything was found (bins of S/N), and the right class (bins of S/N x sin)."""
+    """Return, by bins, the share of single effects for which anything was found (by S/N), and the right class (by S/N x sin)."""
     single = [row for row in rows if row["stratum"] == "one"]
     found = []
     for low, high in pairwise(_BINS):
@@ -310,7 +313,7 @@ def _curve(rows: list[Json]) -> list[Json]:
 
 
 def _coverage(rows: list[Json]) -> Json:
-    """Per parameter: intervals of 90 % that hold the truth, of how many."""
+    """Return, for each parameter, how many of its 90 % intervals contain the truth."""
     found: dict[str, list[bool]] = {}
     for row in rows:
         for each in row["intervals"]:
@@ -320,7 +323,7 @@ def _coverage(rows: list[Json]) -> Json:
 
 
 def _baseline(rows: list[Json], name: str) -> Json:
-    """The same questions to a baseline, which gives one name or none."""
+    """Score a baseline, which gives one name or none, in the same way."""
     quiet = [row for row in rows if row["stratum"] in ("none",)]
     change = [row for row in rows if row["stratum"] == "change"]
     clear = [row for row in rows if row["stratum"] == "one" and _clear(row["true"][0])]

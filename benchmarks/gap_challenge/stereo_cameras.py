@@ -13,7 +13,7 @@ from benchmarks.gap_challenge.walls import turn
 INTERIOR = ("f_px", "cx_px", "cy_px", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
 _UNDISTORTIONS = 25
 _BLIND_M = 0.04
-"""A point counts as seen where the ray towards it meets the surface at most this far before it."""
+"""A point is visible if the ray towards it meets the surface at most this far in front of it, m."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Jitter:
-    """dx = amplitude sin(2 pi row / rows + phase), recorded minus ideal column."""
+    """Row jitter dx = amplitude sin(2 pi row / rows + phase), recorded minus ideal column."""
 
     amplitude: float = 0.0
     rows: float = 1.0
@@ -73,19 +73,19 @@ class Jitter:
 
 @dataclass(frozen=True)
 class Pair:
-    """Two cameras as they really are or as the calibration has them."""
+    """Two cameras, as they really are or as calibrated."""
 
     left: Frame
     right: Frame
     jitter: dict[str, Jitter] = field(default_factory=dict)
 
     def each(self, camera: str, change: Any) -> Pair:
-        """With `change` applied to left, right or both."""
+        """Return the pair with `change` applied to left, right or both."""
         sides = ("left", "right") if camera == "both" else (camera,)
         return replace(self, **{side: change(getattr(self, side)) for side in sides})
 
     def moved(self, shift: Array, rotation: Array) -> Pair:
-        """Both cameras moved as one body, about the left one."""
+        """Return the pair moved as one body about the left camera."""
         centre = self.left.position
         return self.each(
             "both",
@@ -93,7 +93,7 @@ class Pair:
         )
 
     def matches(self, surface: Surface, u: Array, v: Array) -> tuple[Array, Array, Array]:
-        """Where the right camera records what the left one records at (u, v): columns, rows, and the points (n, 3)."""
+        """Return where the right camera records what the left one records at (u, v): columns, rows, and the points (n, 3)."""
         still = Jitter()
         ray = self.left.rays(u - self.jitter.get("left", still).at(v), v)
         distance, _ = surface.cast(self.left.position, ray)
@@ -111,7 +111,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Rectified:
-    """The nominal pair turned to the normal case: rows to camera axes; d = f (x_left - x_right) = f base / Z."""
+    """The nominal pair rotated to the normal case: rows to camera axes; d = f (x_left - x_right) = f base / Z."""
 
     pair: Pair
     f: float

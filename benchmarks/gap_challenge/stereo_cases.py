@@ -1,4 +1,6 @@
-"""A stereo pair's measurement folder: matches by brute-force projection through the real cameras, points by the nominal ones."""
+"""Make a stereo pair's measurement folder: matches by brute-force projection through the real cameras, points by the nominal
+ones.
+"""
 
 from __future__ import annotations
 
@@ -44,16 +46,25 @@ Drawn = list[tuple[str, Parameters, Strength]]
 _LOST = 0.02
 _STEP_PX = 32.0
 _POSES = 5
-"""Steps of Gauss-Newton to the pose that fits: after three what is left changes by 2 % or less, for turns of 20 mrad too."""
+"""Gauss-Newton steps for the best pose; after three, the residuals change by at most 2 %, also for rotations of 20 mrad."""
 _STEEP, _WEIGHTLESS = 6.0, 1e12
-"""Differences of neighbours beyond so many typical ones are depth steps, where the surface as known is not known well enough to
-count towards an effect's strength; the variance, px^2, that says so."""
+"""Neighbours that differ by more than so many typical differences are depth steps, where the reference is not known well enough
+to count for an effect's strength; variance, px^2, that expresses this.
+"""
 
 
 @dataclass(frozen=True)
 class Set:
-    """What stands where. nominal: the calibrated pair, local frame; pose: shift (m) and turn (rad) of both cameras against it;
-    registration: of the points afterwards; noise: parallax and regularization, px; cells: left pixels (rows, columns)."""
+    """The set-up of a case.
+
+    Attributes
+    ----------
+    nominal : The calibrated pair, local frame.
+    pose : Shift (m) and rotation (rad) of both cameras relative to it.
+    registration : Registration of the points afterwards.
+    noise : Parallax and regularisation noise, px.
+    cells : Left pixels (rows, columns).
+    """
 
     wall: Wall
     real: Surface
@@ -77,12 +88,12 @@ class Set:
         return self.place.rotation.T
 
     def as_placed(self) -> Pair:
-        """The calibrated pair where it really stood."""
+        """Return the calibrated pair where it really stood."""
         return self.nominal.pair.moved(self.pose[:3], small_turn(self.pose[3:]))
 
 
 def make(folder: Path, random: Random, kinds: list[str], falls: int, points: int, nodes: int) -> dict[str, Any]:
-    """Write a measurement with the effects `kinds`; returns its truth."""
+    """Write a measurement with the effects `kinds`, and return its truth."""
     scene = _draw(random, kinds, falls, points, nodes)
     plain, where = _disparity(scene, scene.nominal.pair, scene.known)
     usable = np.isfinite(plain) & scene.nominal.pair.seen_by_right(scene.known, np.nan_to_num(where))
@@ -181,7 +192,7 @@ def _camera(random: Random, pixels: tuple[int, int], f: float, position: Array, 
 
 
 def _cells(left: Frame, wall: Wall, points: int, random: Random) -> tuple[Array, Array, int]:
-    """Left pixels in a raster over what the wall takes of the frame."""
+    """Return left pixels in a raster over the part of the frame that the wall fills."""
     u, v = left.project(wall.vertices)
     ends = [(max(values.min(), 1.0), min(values.max(), size - 1.0)) for values, size in ((u, left.width), (v, left.height))]
     step = int(max(np.rint(np.sqrt((ends[0][1] - ends[0][0]) * (ends[1][1] - ends[1][0]) / points)), 2))
@@ -192,7 +203,7 @@ def _cells(left: Frame, wall: Wall, points: int, random: Random) -> tuple[Array,
 
 
 def _disparity(scene: Set, real: Pair, surface: Surface, rows: Any = slice(None)) -> tuple[Array, Array]:
-    """(n,) disparity in the nominal rectified pair of what the real pair sees at the left pixels, and the points."""
+    """Return the (n,) disparity, in the nominal rectified pair, of what the real pair sees at the left pixels, and the points."""
     u, v = scene.u.ravel()[rows], scene.v.ravel()[rows]
     u_right, v_right, points = real.matches(surface, u, v)
     return scene.nominal.disparity(u, v, u_right, v_right), points
@@ -208,7 +219,7 @@ def _blobs(scene: Set, where: Array, random: Random) -> Array:
 
 
 def _at_steps(disparity: Array) -> Array:
-    """(h, w) whether a pixel lies beside a depth step, or beside one without a disparity."""
+    """Return the (h, w) mask of pixels beside a depth step, or beside a pixel without a disparity."""
     found = np.zeros(disparity.shape, dtype=bool)
     for axis in (0, 1):
         steps = np.diff(disparity, axis=axis)
@@ -233,7 +244,7 @@ def _seen(scene: Set, real: Pair, part: Image) -> Array:
 
 
 def _columns(scene: Set, part: Image) -> tuple[Array, dict[str, list[Array]]]:
-    """Effect of the pose (n, 6), and the designs of every effect on the mean."""
+    """Return the effect of the pose (n, 6), and the designs of every mean effect."""
     pose = []
     for axis in range(6):
         nudge = np.zeros(6)
@@ -264,7 +275,7 @@ def _drawn(
     chosen: Array,
     random: Random,
 ) -> Drawn:
-    """Effects with magnitudes such that each alone is as strong as is drawn for it; strengths are those beside the others."""
+    """Draw effects, each scaled so that it alone has its drawn strength; returned strengths are those beside the others."""
     white = np.full(len(part.u), scene.noise[0] ** 2 + 4 / 9 * scene.noise[1] ** 2)
     unknown = np.where(_at_steps(plain.reshape(scene.u.shape)).ravel()[chosen], _WEIGHTLESS, 0.0)
     found: list[tuple[str, Parameters, Strength | None]] = []
@@ -303,17 +314,19 @@ def _drawn(
 
 
 def _shown(scene: Set, kind: str, p: Parameters, part: Image) -> Array:
-    """(n,) mean change of the disparity. Locking acts on the noisy disparity, which leaves less of its mean over the true one."""
+    """Return the (n,) mean change of the disparity. Locking acts on the noisy disparity, which reduces its mean over the true
+    one.
+    """
     damping = float(np.exp(-2 * np.pi**2 * scene.noise[0] ** 2)) if kind == "pixel_locking" else 1.0
     return damping * _signature(scene, kind, p, part)
 
 
 def _left_by_pose(scene: Set, kind: str, p: Parameters, part: Image, base: Array, whiten: Whitener) -> Array:
-    """(n,) mean change of the disparity where both cameras stand so that least of it shows, by Gauss-Newton.
+    """Return the (n,) mean change of the disparity at the pose of both cameras that hides most of it, by Gauss-Newton.
 
-    base: (n, 6) its change by shifts (m) and turns (rad) of both. A principal point 10 px off is mostly a turn of both cameras.
-    By slopes along the surface where the pixels were, much of it stays beside ledges; with the turn itself they see the same
-    places as before, and nothing does.
+    base: (n, 6) change by shifts (m) and rotations (rad) of both. A principal point 10 px off is mostly a rotation of both
+    cameras. Linearised at the original pixels, much of it would remain beside ledges; with the rotation itself, the cameras see
+    the same places as before, and nothing remains.
     """
     shown = _shown(scene, kind, p, part)
     if kind not in effects.CAMERA:
@@ -332,8 +345,11 @@ def _left_by_pose(scene: Set, kind: str, p: Parameters, part: Image, base: Array
 
 
 def _whitener(scene: Set, variance: Array, part: Image, where: Array, p: Parameters) -> Whitener:
-    """Correlated: the reference's error, by its change of the disparity. The regularization counts as white noise of its power at
-    the effect's wavelength: N sigma^2 for N points per node of its grid, less for a short row jitter (sinc^4)."""
+    """Return the whitening. Its correlated part is the reference's error, by its change of the disparity.
+
+    Regularisation noise counts as white noise with its power at the effect's wavelength: N sigma^2 for N points per node of its
+    grid, less for a short row jitter (sinc^4).
+    """
     at = where[:, [0, 2]]
     waved = wave_numbers(scene.reference[1], 200, np.random.default_rng(0))
     angle = at @ waved.T
@@ -344,7 +360,7 @@ def _whitener(scene: Set, variance: Array, part: Image, where: Array, p: Paramet
 
 
 def _regularization(scene: Set, part: Image, unit: Parameters, target: float) -> tuple[Parameters, Strength]:
-    """By the variance of the grid's nodes, each seen through the noise of the pixels around it."""
+    """Draw regularisation noise, whose strength follows from the variance of the grid's nodes seen through the pixels' noise."""
     step = unit["step_px"]
     nodes = len(np.unique(np.floor(part.u / step) + 10_000 * np.floor(part.v / step)))
     noise = scene.noise[0] ** 2 * nodes / len(part.u) + 4 / 9 * scene.noise[1] ** 2 * min(1.0, (_STEP_PX / step) ** 2)
@@ -355,7 +371,7 @@ def _regularization(scene: Set, part: Image, unit: Parameters, target: float) ->
 
 
 def _raster(kind: str, scene: Set, plain: Array, chosen: Array, white: float, random: Random) -> tuple[Parameters, Strength]:
-    """Effects on neighbourhoods, whose size is drawn and whose strength is what it comes to on the reference."""
+    """Draw an effect on neighbourhoods: its size is drawn, and its strength is what that gives on the reference."""
     key, low, high = {
         "edge_fattening": ("radius_px", 1.0, 4.0),
         "smoothing": ("sigma_px", 0.4, 3.0),
@@ -373,7 +389,7 @@ def _raster(kind: str, scene: Set, plain: Array, chosen: Array, white: float, ra
 
 
 def _observe(scene: Set, drawn: Drawn, blob: Array, random: Random) -> Array:
-    """(n,) disparities found at the left pixels, NaN without a match: expose, match, fill."""
+    """Return the (n,) disparities found at the left pixels, NaN without a match: expose, match, fill."""
     real = scene.as_placed()
     jitter = {}
     for name, p, _ in drawn:
@@ -420,7 +436,7 @@ def _grid_noise(sigma: float, step: float, image: Image, random: Random) -> Arra
 
 
 def _write(folder: Path, scene: Set, found: Array, kept: Array) -> None:
-    """The folder; pixels that are not given are simply absent."""
+    """Write the folder; optional fields that are not given are absent."""
     u, v = scene.u.ravel()[kept], scene.v.ravel()[kept]
     points = scene.nominal.points(u, v, found[kept])
     centre = points.mean(axis=0)

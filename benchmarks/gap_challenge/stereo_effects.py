@@ -1,4 +1,4 @@
-"""The stereo effects of EFFECTS.md in closed form or by brute force, with forms that are not in it; recorded = true + effect."""
+"""Stereo effects of EFFECTS.md in closed form or by brute force, and forms outside the catalogue; recorded = true + effect."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CAMERA: dict[str, tuple[float, float]] = {
     "camera_kappa": (1e-5, 4e-3),
     "camera_shift": (1e-3, 0.2),
 }
-"""Effects on the real cameras: an amplitude to start from, and the largest that is drawn."""
+"""Effects on the real cameras, with an initial amplitude and the largest drawn one."""
 IMAGE: dict[str, tuple[float, float]] = {"row_jitter": (0.02, 3.0), "pixel_locking": (0.01, 0.4)}
 SPREAD: dict[str, tuple[float, float]] = {"parallax_noise": (0.05, 1.5), "regularization_noise": (0.02, 1.0)}
 RASTER = ("edge_fattening", "smoothing", "occlusion_fill")
@@ -39,7 +39,7 @@ OFF_MEAN: dict[str, tuple[float, float]] = {
 }
 OFF_SPREAD: dict[str, tuple[float, float]] = {"off_spread_radius": (0.05, 1.5), "off_spread_half": (0.05, 1.5)}
 _ONE_SIDED = ("camera_omega", "camera_phi", "camera_kappa", "camera_shift", "row_jitter")
-"""Of these, `both` is a registration, or nearly."""
+"""Effects that, on both cameras, are (nearly) a registration."""
 _SETS = {
     "focal_length": [("delta_px",)],
     "principal_point_x": [("delta_px",)],
@@ -54,13 +54,13 @@ _SETS = {
 }
 _INTERIOR = {"focal_length": "f_px", "principal_point_x": "cx_px", "principal_point_y": "cy_px"}
 _STEP_PX, _SLOPE = 2.0, 0.35
-"""Neighbours whose disparities differ by more, or by more than this slope, are a depth step."""
+"""Neighbours whose disparities differ by more than this, px, or by more than this slope, are a depth step."""
 _FIXED = {"camera", "rows_per_cycle", "phase_rad", "step_px", "where", "width", "row"}
 
 
 @dataclass(frozen=True)
 class Image:
-    """What disparity errors depend on, per left pixel: column and row, disparity (px), right row, and the frame's size."""
+    """What disparity errors depend on, for each left pixel: column and row, disparity (px), right row, and the frame's size."""
 
     u: Array
     v: Array
@@ -70,12 +70,12 @@ class Image:
 
 
 def sides(name: str) -> tuple[str, ...]:
-    """The cameras that an effect is tried in."""
+    """Return the cameras on which an effect is tried."""
     return ("left", "right") if name in _ONE_SIDED else ("left", "right", "both")
 
 
 def shape(name: str, image: Image, random: Random) -> Parameters:
-    """An effect at the amplitude it starts from, its other parameters drawn."""
+    """Return an effect at its initial amplitude, with random other parameters."""
     size = {**CAMERA, **IMAGE, **SPREAD, **OFF_MEAN, **OFF_SPREAD}[name][0]
     sign, phase = size * random.choice([-1.0, 1.0]), float(random.uniform(-np.pi, np.pi))
     if name in CAMERA:
@@ -96,7 +96,7 @@ def shape(name: str, image: Image, random: Random) -> Parameters:
 
 
 def times(parameters: Parameters, factor: float) -> Parameters:
-    """The same effect, larger."""
+    """Return the same effect, scaled."""
     return {key: value if key in _FIXED else value * factor for key, value in parameters.items()}
 
 
@@ -120,7 +120,7 @@ def real_pair(pair: Pair, name: str, p: Parameters, world: Array) -> Pair:
 
 
 def disparity_errors(name: str, p: Parameters, image: Image) -> Array:
-    """(n,) px, of what acts on the disparity itself."""
+    """Return the (n,) errors, px, of effects on the disparity itself."""
     u, v = image.u, image.v
     match name:
         case "pixel_locking":
@@ -139,7 +139,7 @@ def disparity_errors(name: str, p: Parameters, image: Image) -> Array:
 
 
 def variance(name: str, p: Parameters, image: Image) -> Array:
-    """(n,) px^2, of white noise that is added."""
+    """Return the (n,) variance, px^2, of added white noise."""
     match name:
         case "parallax_noise":
             return np.full_like(image.u, p["sigma_px"] ** 2)
@@ -155,7 +155,7 @@ def _standard(values: Array) -> Array:
 
 
 def variants() -> list[tuple[str, list[Parameters]]]:
-    """Unit effects on the cameras whose errors span each effect's: name, and parameters of each column."""
+    """Return unit effects on the cameras whose errors span each effect's: name, and parameters of each column."""
     return [
         (name, [{"camera": camera, **{key: CAMERA[name][0] * (key == chosen) for key in names}} for chosen in names])
         for name in CAMERA
@@ -165,7 +165,7 @@ def variants() -> list[tuple[str, list[Parameters]]]:
 
 
 def waves(image: Image) -> dict[str, list[Array]]:
-    """Designs of row jitter, rows per cycle on a grid, and of pixel locking at any phase."""
+    """Return designs of row jitter, with rows per cycle on a grid, and of pixel locking at any phase."""
     height = float(np.ptp(image.v))
     frequencies = np.linspace(0.7 / height, 1 / 38, 40)
     jitter = [_sine(2 * np.pi * rows * f) for rows in (image.v, image.v_right) for f in frequencies]
@@ -177,7 +177,7 @@ def _sine(angle: Array) -> Array:
 
 
 def raster_effect(name: str, p: Parameters, disparity: Array, step: int) -> Array:
-    """(rows, columns) disparities after an effect that looks at neighbours; NaN where there is no match. step: px per cell."""
+    """Return (rows, columns) disparities after an effect on neighbourhoods; NaN without a match. step: px per cell."""
     if name == "smoothing":
         known = np.isfinite(disparity)
         weight = ndimage.gaussian_filter(known.astype(float), p["sigma_px"] / step)
@@ -195,7 +195,7 @@ def raster_effect(name: str, p: Parameters, disparity: Array, step: int) -> Arra
 
 
 def _filled(disparity: Array, reach: int) -> Array:
-    """Strips without a match, at most `reach` cells wide, at the farther of their two ends' disparities, row by row."""
+    """Fill strips without a match, at most `reach` cells wide, with the farther disparity of their two ends, row by row."""
     rows, columns = disparity.shape
     known = np.isfinite(disparity)
     index = np.broadcast_to(np.arange(columns), disparity.shape)

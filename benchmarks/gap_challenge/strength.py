@@ -1,9 +1,10 @@
-"""How strongly an effect stands out, and from which other effects: distances between what they predict, the pose fitted away.
+"""Compute how strongly an effect stands out, and from which other effects: distances between their predictions after the pose
+fit.
 
-For an effect on the mean the distance is that of Mahalanobis: white noise within cells, and between cells also the reference's
-error, correlated over metres. For an effect on the spread or on losses it is the square root of twice the Kullback-Leibler
-divergence per measurement, summed, which is the same thing for small effects. The distance to "nothing" is the signal-to-noise
-ratio; to an effect of another class at its best parameters it is signal-to-noise x sin(angle between the signatures).
+For a mean effect it is the Mahalanobis distance, with white noise within cells and, between cells, also the reference's error,
+correlated over metres. For an effect on variance or losses it is the square root of twice the Kullback-Leibler divergence, summed
+over the measurements, which is the same for small effects. The distance to "nothing" is the signal-to-noise ratio; that to an
+effect of another class at its best parameters is signal-to-noise ratio x sin(angle between the signatures).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from benchmarks.gap_challenge.casting import Array
 
 Families = Mapping[str, Sequence[Array]]
-"""Candidates by name; each variant a design (n, k)."""
+"""Candidate effects by name; each variant is a design (n, k)."""
 _CELLS = 450
 _MOST_POINTS = 9000
 _LARGEST = 1e4
@@ -27,8 +28,15 @@ _TARGETS = (2.0, 120.0)
 
 @dataclass(frozen=True)
 class Strength:
-    """snr; nearest: the effect of another class that comes nearest; distance: to it, snr x sin(angle); alike: effects whose
-    signature is the same but for less than a tenth (sin < 0.1), which make one class with this one whatever its strength."""
+    """Strength of an effect.
+
+    Attributes
+    ----------
+    snr : Signal-to-noise ratio.
+    nearest : The nearest effect of another class.
+    distance : Distance to it, snr x sin(angle).
+    alike : Effects whose signature differs by less than a tenth (sin < 0.1), which form one class with this one.
+    """
 
     snr: float
     nearest: str
@@ -54,9 +62,10 @@ class Strength:
 
 
 class Whitener:
-    """Columns over points to columns of independent unit errors.
+    """Transforms columns over points to columns with independent unit errors.
 
-    sigma: (n,) white; at: (n, 2) m; features: (n, f) shapes whose sum with independent normal weights is the correlated error.
+    sigma: (n,) white noise; at: (n, 2) m; features: (n, f) shapes whose sum with independent normal weights is the correlated
+    error.
     """
 
     def __init__(self, sigma: Array, at: Array, features: Array) -> None:
@@ -88,14 +97,16 @@ class Whitener:
 
 
 def basis(columns: Array) -> Array:
-    """Orthonormal columns that span the same; columns that add nothing are left out."""
+    """Return orthonormal columns that span the same space, without redundant ones."""
     size = np.linalg.norm(columns, axis=0)
     q, r = np.linalg.qr(columns / np.where(size > 0, size, 1.0))
     return q[:, np.abs(np.diag(r)) > 1e-7]
 
 
 def mean_strength(name: str, signature: Array, base: Array, families: Families, whiten: Whitener) -> Strength:
-    """Of a mean effect with range or disparity errors `signature` (n,), after columns `base` (n, b) have been fitted."""
+    """Return the strength of a mean effect with range or disparity errors `signature` (n,), after fitting the columns `base` (n,
+    b).
+    """
     fixed = basis(whiten(base))
     clean = _without(fixed, whiten(signature))[:, 0]
     snr = float(np.linalg.norm(clean))
@@ -120,13 +131,15 @@ def _nearest(clean: Array, fixed: Array, variants: Sequence[Array], whiten: Whit
 
 
 def spread_distance(true: Array, assumed: Array) -> float:
-    """Between normal errors of variances (n,)."""
+    """Return the distance between normal errors with variances (n,)."""
     ratio = true / assumed
     return float(np.sqrt(max(np.sum(ratio - 1 - np.log(ratio)), 0.0)))
 
 
 def spread_strength(name: str, added: Array, variance: Array, forms: Mapping[str, Sequence[Array]]) -> Strength:
-    """Of an effect that adds a variance (n,) to what the model predicts; forms: of the other effects, to be scaled."""
+    """Return the strength of an effect that adds a variance (n,) to the model's; forms: variances of the other effects, to be
+    scaled.
+    """
     true = variance + added
     scales = np.concatenate([[0.0], np.geomspace(1e-3, 30, 60)])
     others = {
@@ -141,30 +154,30 @@ def spread_strength(name: str, added: Array, variance: Array, forms: Mapping[str
 
 
 def loss_distance(true: Array, assumed: Array) -> float:
-    """Between chances of a loss (n,)."""
+    """Return the distance between probabilities of loss (n,)."""
     p, q = np.clip(true, 1e-6, 1 - 1e-6), np.clip(assumed, 1e-6, 1 - 1e-6)
     return float(np.sqrt(max(2 * np.sum(p * np.log(p / q) + (1 - p) * np.log((1 - p) / (1 - q))), 0.0)))
 
 
 @dataclass(frozen=True)
 class Target:
-    """How strong an effect is to be: its signal-to-noise ratio, or what of that is its own beside the nearest other effect."""
+    """Wanted strength of an effect: its signal-to-noise ratio, or its distance from the nearest other effect."""
 
     value: float
     own: bool
 
     @classmethod
     def draw(cls, random: np.random.Generator) -> Target:
-        """From below what can be detected to far above it."""
+        """Draw a strength from below the detection limit to far above it."""
         return cls(float(np.exp(random.uniform(*np.log(_TARGETS)))), bool(random.uniform() < 0.5))
 
     def of(self, strength: Strength) -> float:
-        """The figure that is to reach the value."""
+        """Return the figure that must reach the value."""
         return strength.distance if self.own else strength.snr
 
 
 def scaled(snr_of: Callable[[float], float], target: float, most: float) -> float:
-    """The factor, at most `most`, at which a growing strength reaches its target; to a percent."""
+    """Return the factor, at most `most`, at which a growing strength reaches its target, to a percent."""
     low, high = most * 1e-6, most
     if snr_of(high) <= target:
         return most

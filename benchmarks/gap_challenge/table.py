@@ -1,4 +1,4 @@
-"""The results as a page of the documentation."""
+"""Write the results as a page of the documentation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A laser scanner's measurement folder: closed-form effects, rays by Open3D, nuisances always on."""
+"""Make a laser scanner's measurement folder: closed-form effects, rays by Open3D, nuisance effects always on."""
 
 from __future__ import annotations
 
@@ -43,18 +43,27 @@ OFF_CATALOGUE = (*effects.OFF_MEAN, *effects.OFF_SPREAD, *effects.OFF_LOSS)
 _LINEAR, _SPREADING = {**effects.MEAN, **effects.OFF_MEAN}, {**effects.SPREAD, **effects.OFF_SPREAD}
 _LOST = 0.01
 _GRAZING, _STEEP = 0.02, 0.12
-"""Cosines of the incidence: below the first nothing comes back; below the second a case's own figures leave a return out."""
+"""Cosines of the incidence angle: below the first there is no return; below the second a case's own figures ignore a return."""
 _MOST_PULSES = 200_000
-"""Strengths and rivals are those on so many pulses at most, evenly chosen: a hundred signatures of 20 million fill no memory."""
+"""Strengths and alternatives are computed on at most this many, evenly chosen pulses, to limit the memory for a hundred
+signatures.
+"""
 _PULSE_M = 0.45
-"""Echoes nearer than this run into one: half the length of a 3 ns pulse."""
+"""Echoes nearer than this merge into one, m: half the length of a 3 ns pulse."""
 _WHITE_ALBEDO, _SMOOTH_ALBEDO = 0.25, 0.3
 
 
 @dataclass(frozen=True)
 class Set:
-    """What stands where. real: the surface scanned; known: the reference, local frame; position, rotation: nominal, scanner to
-    local; true_position, true_rotation: of the scanner as it stood; reference: standard deviation and length of its error, m."""
+    """The set-up of a case.
+
+    Attributes
+    ----------
+    real, known : Scanned surface, and reference, local frame.
+    position, rotation : Nominal pose, scanner to local frame.
+    true_position, true_rotation : True pose.
+    reference : Standard deviation and correlation length of the reference's error, m.
+    """
 
     wall: Wall
     real: Surface
@@ -86,7 +95,7 @@ class Shot:
 
 
 def make(folder: Path, random: Random, kinds: list[str], falls: int, points: int, nodes: int) -> dict[str, Any]:
-    """Write a measurement with the effects `kinds`; returns its truth."""
+    """Write a measurement with the effects `kinds`, and return its truth."""
     scene = _draw(random, kinds, falls, points, nodes)
     rays, pose, at = _expected(scene)
     albedo, blob = _albedo(scene, rays, random), _blobs(scene, at, random)
@@ -154,7 +163,7 @@ def _draw(random: Random, kinds: list[str], falls: int, points: int, nodes: int)
 
 
 def _known(kinds: list[str], random: Random) -> list[tuple[str, Parameters]]:
-    """What the model has right already: in one case of eight an effect that is in the data and in model.yaml."""
+    """Return effects that the model already contains: in one case of eight, one that is in the data and in model.yaml."""
     known = {
         "range_scale": {"scale_ppm": float(random.uniform(20, 80))},
         "vertical_index": {"offset_rad": float(random.uniform(5e-5, 3e-4))},
@@ -164,7 +173,7 @@ def _known(kinds: list[str], random: Random) -> list[tuple[str, Parameters]]:
 
 
 def _pattern(wall: Wall, position: Array, rotation: Array, points: int, random: Random) -> tuple[Array, Array]:
-    """Azimuths and zeniths that cover the wall, or nearly."""
+    """Return azimuths and zenith angles that cover the wall, or nearly."""
     x, y, z = ((wall.vertices - position) @ rotation).T
     middle = np.arctan2(y.mean(), x.mean())
     azimuth = middle + np.angle(np.exp(1j * (np.arctan2(y, x) - middle)))
@@ -182,14 +191,14 @@ def _directions(azimuth: Array, zenith: Array) -> Array:
 
 
 def _grid(scene: Set) -> tuple[Array, Array, Array, Array]:
-    """Azimuth, zenith, line and share of the duration of every pulse."""
+    """Return azimuth, zenith angle, line and share of the duration of every pulse."""
     az, ze = (grid.ravel() for grid in np.meshgrid(scene.azimuth, scene.zenith, indexing="ij"))
     line = np.repeat(np.arange(len(scene.azimuth)), len(scene.zenith)).astype(float)
     return az, ze, line, np.arange(len(az)) / (len(az) - 1)
 
 
 def _expected(scene: Set) -> tuple[Rays, Array, Array]:
-    """What the reference and the survey predict for every pulse: rays, effect of the pose (n, 6), (n, 2) where on the wall."""
+    """Return what reference and survey predict for every pulse: rays, effect of the pose (n, 6), place on the wall (n, 2)."""
     grid = _grid(scene)
     parts = [_expected_of(scene, *(each[first : first + AT_ONCE] for each in grid)) for first in range(0, len(grid[0]), AT_ONCE)]
     rays, pose, at = zip(*parts, strict=True)
@@ -216,7 +225,7 @@ def _albedo(scene: Set, rays: Rays, random: Random) -> Array:
 
 
 def _blobs(scene: Set, at: Array, random: Random) -> Array:
-    """(n,) pulses that shrubs swallow: a few round patches."""
+    """Return the (n,) pulses that shrubs intercept: a few round patches."""
     hidden = np.zeros(len(at), dtype=bool)
     if scene.blobs:
         for _ in range(random.integers(1, 5)):
@@ -226,14 +235,14 @@ def _blobs(scene: Set, at: Array, random: Random) -> Array:
 
 
 def _sigma(scene: Set, rays: Rays) -> Array:
-    """(n,) what the model predicts for the standard deviation of a range, m."""
+    """Return the (n,) standard deviation of a range that the model predicts, m."""
     return np.sqrt(scene.sigma[0] ** 2 + scene.sigma[1] ** 2 * (rays.by_az**2 + rays.by_ze**2))
 
 
 def _drawn(
     scene: Set, kinds: list[str], rays: Rays, usable: Array, pose: Array, at: Array, random: Random
 ) -> list[tuple[str, Parameters, Strength]]:
-    """Effects with magnitudes such that each alone is as strong as is drawn for it; strengths are those beside the others."""
+    """Draw effects, each scaled so that it alone has its drawn strength; returned strengths are those beside the others."""
     part, sigma = rays.part(usable), _sigma(scene, rays.part(usable))
     families, forms = effects.families(part, scene.fields), effects.forms(part, scene.fields)
     found: list[tuple[str, Parameters, Strength | None]] = []
@@ -278,7 +287,7 @@ def _whitener(scene: Set, sigma: Array, at: Array) -> Whitener:
 
 
 def _special(kind: str, scene: Set, rays: Rays, sigma: Array, random: Random) -> tuple[Parameters, Strength]:
-    """Steps of the range, footprints and losses, which are neither a mean nor a spread."""
+    """Draw range quantisation, footprints and losses, which are neither mean nor variance effects."""
     base = np.full(len(rays.R), _LOST)
     if kind == "range_quantization":
         step = float(np.exp(random.uniform(np.log(2e-4), np.log(0.02))))
@@ -325,7 +334,9 @@ def _special(kind: str, scene: Set, rays: Rays, sigma: Array, random: Random) ->
 
 
 def _footprint(scene: Set, rays: Rays, p: Parameters, seen: Surface | None = None) -> tuple[Array, Array]:
-    """Range by the whole beam (n,), and cosine on the axis: 19 sub-rays of a Gaussian beam, echoes within a pulse merged."""
+    """Return the range by the whole beam (n,), and the cosine on the axis: 19 sub-rays of a Gaussian beam, with echoes within a
+    pulse merged.
+    """
     surface = scene.known if seen is None else seen
     position, rotation = (scene.position, scene.rotation) if seen is None else (scene.true_position, scene.true_rotation)
     radius = np.concatenate([[0.0], np.full(6, 0.5), np.full(12, 1.0)]) * p["divergence_rad"] / 2
@@ -357,7 +368,7 @@ def _merged(ranges: Array, powers: Array, mode: str) -> Array:
 
 
 def _shoot(scene: Set, drawn: list[tuple[str, Parameters]], albedo: Array, blob: Array, random: Random) -> Shot:
-    """The scan with all effects, in the order of the chain: aim, footprint, range, return."""
+    """Simulate the scan with all effects, in their physical order: aim, footprint, range, return."""
     az, ze, line, share = _grid(scene)
     nothing = np.zeros_like(az)
     aimed = Rays(az, ze, nothing, nothing + 1, nothing + 1, line, share, nothing, nothing)
@@ -392,7 +403,7 @@ def _shoot(scene: Set, drawn: list[tuple[str, Parameters]], albedo: Array, blob:
 
 
 def _returned(name: str, p: Parameters, rays: Rays, ranges: Array, random: Random) -> Array:
-    """Recorded ranges after steps and losses."""
+    """Return recorded ranges after quantisation and losses."""
     match name:
         case "range_quantization":
             return p["step_m"] * np.rint(ranges / p["step_m"])
@@ -411,7 +422,7 @@ def _returned(name: str, p: Parameters, rays: Rays, ranges: Array, random: Rando
 
 
 def _write(folder: Path, scene: Set, shot: Shot, kept: Array) -> None:
-    """The folder; fields that are not given are simply absent."""
+    """Write the folder; optional fields that are not given are absent."""
     az, ze, _, share = _grid(scene)
     points = (_directions(az, ze) * shot.ranges[:, None])[kept]
     if scene.frame == "world":

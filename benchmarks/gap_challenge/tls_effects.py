@@ -1,4 +1,4 @@
-"""The laser scanner's effects of EFFECTS.md in closed form, with forms that are not in it; recorded = true + effect."""
+"""Laser scanner effects of EFFECTS.md in closed form, and forms outside the catalogue; recorded = true + effect."""
 
 from __future__ import annotations
 
@@ -16,8 +16,11 @@ SECOND = np.pi / 180 / 3600
 
 @dataclass(frozen=True)
 class Rays:
-    """What the effects depend on, per pulse: angles (rad, as recorded), range (m), cosine of the incidence, received power, scan
-    line, share of the scan's duration, and the slopes of the range by azimuth and zenith (m per rad)."""
+    """What effects depend on, for each pulse.
+
+    They are angles (rad, as recorded), range (m), cosine of the incidence angle, received power, scan line, share of the scan's
+    duration, and derivatives of the range by azimuth and zenith angle (m per rad).
+    """
 
     az: Array
     ze: Array
@@ -53,7 +56,7 @@ MEAN: dict[str, tuple[float, float]] = {
     "wobble": (5 * SECOND, 60 * SECOND),
     "tilt_drift": (10 * SECOND, 150 * SECOND),
 }
-"""Effects on the mean: an amplitude to start from, and the largest that is drawn."""
+"""Mean effects, with an initial amplitude and the largest drawn one."""
 SPREAD: dict[str, tuple[float, float]] = {
     "range_noise": (1e-3, 0.02),
     "range_noise_proportional": (20.0, 600.0),
@@ -91,7 +94,7 @@ OFF_LOSS = ("off_loss_sector",)
 
 
 def shape(name: str, rays: Rays, random: Random) -> Parameters:
-    """An effect on mean or spread at the amplitude it starts from, its other parameters drawn."""
+    """Return a mean or variance effect at its initial amplitude, with random other parameters."""
     size = {**MEAN, **SPREAD, **OFF_MEAN, **OFF_SPREAD}[name][0]
     sign = size * random.choice([-1.0, 1.0])
     phase = random.uniform(-np.pi, np.pi)
@@ -152,12 +155,12 @@ _KEYS = {
     "range_noise_incidence": "sigma_m",
 }
 _FACETS = np.array([0.0, 1.0, -0.6, 0.3, -0.2])
-"""Range offsets of a mirror's facets, over the size; of each line the next."""
+"""Range offsets of a mirror's facets, as multiples of the size; lines use them in turn."""
 _FIXED = {"facets", "period_m", "phase_rad", "lines_per_cycle", "exponent", "where", "period", "length", "rate"}
 
 
 def times(parameters: Parameters, factor: float) -> Parameters:
-    """The same effect, larger."""
+    """Return the same effect, scaled."""
     return {key: value if key in _FIXED else value * factor for key, value in parameters.items()}
 
 
@@ -216,7 +219,7 @@ def range_errors(name: str, p: Parameters, rays: Rays) -> Array:
 
 
 def signature(name: str, p: Parameters, rays: Rays) -> Array:
-    """(n,) what an effect adds to the recorded range at the recorded direction, to first order, m."""
+    """Return what an effect adds to the recorded range (n,) at the recorded direction, linearised, m."""
     azimuth, zenith = angle_errors(name, p, rays)
     return range_errors(name, p, rays) - rays.by_az * azimuth - rays.by_ze * zenith
 
@@ -246,7 +249,7 @@ def _standard(values: Array) -> Array:
 
 
 def families(rays: Rays, fields_known: set[str]) -> dict[str, list[Array]]:
-    """Designs of all effects on the mean that the fields allow, periods on a grid."""
+    """Return designs of all mean effects that the fields allow, with periods on a grid."""
     cot, one = 1 / np.tan(rays.ze), np.ones_like(rays.R)
     found = {
         "range_offset": [one],
@@ -276,7 +279,7 @@ def _sine(factor: Array, angle: Array) -> Array:
 
 
 def forms(rays: Rays, fields_known: set[str]) -> dict[str, list[Array]]:
-    """Variances (n,) of all effects on the spread that the fields allow, to be scaled."""
+    """Return variances (n,) of all variance effects that the fields allow, to be scaled."""
     found = {
         "range_noise": [np.ones_like(rays.R)],
         "range_noise_proportional": [rays.R**2],

@@ -1,4 +1,4 @@
-"""Walls as height fields: shape, fallen blocks, the reference's correlated error, and where they stand in the world."""
+"""Walls as height fields: shape, fallen blocks, the reference's correlated error, and their place in the world."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SHORTEST, _LONGEST = 0.7, 2.0
 
 @dataclass(frozen=True)
 class Wall:
-    """Depth y (m, into the slope) at the nodes of a grid over x (along the wall) and z (up); seen from -y. Local frame."""
+    """Depth y (m, into the slope) at the nodes of a grid over x (along the wall) and z (up), seen from -y; local frame."""
 
     spacing: float
     depth: Array
@@ -58,7 +58,7 @@ class Wall:
 
 @dataclass(frozen=True)
 class Place:
-    """Where the local frame lies in the world: turned about the vertical, then shifted."""
+    """Place of the local frame in the world: rotated about the vertical, then shifted."""
 
     yaw: float
     shift: Array
@@ -75,7 +75,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Fall:
-    """A region that moved. x, z: centre; half: half sides; angle: of the sides; depth: m, into the slope where positive."""
+    """A region that moved. x, z: centre; half: half sides; angle: of the sides; depth: m, positive into the slope."""
 
     x: float
     z: float
@@ -128,7 +128,7 @@ def waves(x: Array, z: Array, length: float, random: Random) -> Array:
 
 
 def draw_wall(random: Random, nodes: int, steps: bool) -> Wall:
-    """A wall of some size, lean, bend, undulation and, where `steps`, ledges of a few decimetres to more than a metre."""
+    """Draw a wall's size, lean, bend, undulation and, if `steps`, ledges of a few decimetres to more than a metre."""
     width, height = random.uniform(22, 65), random.uniform(12, 38)
     spacing = float(np.sqrt(width * height / nodes))
     wall = Wall(spacing, np.zeros((int(width / spacing) + 1, int(height / spacing) + 1)))
@@ -145,7 +145,7 @@ def draw_wall(random: Random, nodes: int, steps: bool) -> Wall:
 
 
 def draw_falls(wall: Wall, count: int, random: Random) -> list[Fall]:
-    """Blocks that are gone (nine of ten) or debris that has come, away from the wall's border."""
+    """Draw missing blocks (nine of ten) or deposited debris, away from the wall's border."""
     width, height = wall.size
     found = []
     for _ in range(count):
@@ -157,5 +157,5 @@ def draw_falls(wall: Wall, count: int, random: Random) -> list[Fall]:
 
 
 def draw_place(random: Random) -> Place:
-    """Anywhere on a map."""
+    """Draw a place on a map."""
     return Place(random.uniform(-np.pi, np.pi), np.array([*random.uniform(100, 9000, 2), random.uniform(50, 400)]))

@@ -1,4 +1,4 @@
-"""Real measurements without anything put into them: folders as `scarpsim measurement` builds them, and the raw values in them."""
+"""Real measurements before an effect is injected: folders as `scarpsim measurement` builds them, and their raw values."""
 
 from __future__ import annotations
 
@@ -27,16 +27,22 @@ DATA = Path(__file__).resolve().parents[2].parent / "shared/data"
 F_PX, BASE_M, OPTICS = 994.978, 0.193001, Optics(994.978, 311.193, 254.877, 31.086)
 """Middlebury's calibration of the motorcycle."""
 _JUMP_PX = 1.0
-"""Neighbouring disparities that differ by more belong to two surfaces."""
+"""Neighbouring disparities that differ by more, px, are of two surfaces."""
 _BELIEVED = {"parallax_sigma_px": 0.05, "regularization_sigma_px": 0.0, "regularization_step_px": 32}
 _ROCKS_POSITION = (547449.975, 149565.052, 724.844)
-"""Proposed by `scarpsim measurement`: the file does not say where the scanner stood."""
+"""Position proposed by `scarpsim measurement`, as the file does not state where the scanner stood."""
 
 
 @dataclass(frozen=True)
 class Base:
-    """What an effect is put into. make: writes the measurement's folder; put: writes another with an effect, its name, its values
-    and a seed; about: for people."""
+    """A measurement into which effects are injected.
+
+    Attributes
+    ----------
+    make : Writes the measurement's folder.
+    put : Writes another folder with an effect, given its name, values and a seed.
+    about : Description.
+    """
 
     name: str
     about: str
@@ -45,7 +51,10 @@ class Base:
 
 
 def forest(azimuth_deg: tuple[float, float], zenith_deg: tuple[float, float], step: int = 1) -> Callable[[Path], None]:
-    """Every second pulse of a window of the scan in the forest against the others; step: takes every n-th pair of pulses."""
+    """Return a function that makes a measurement of a window of the forest scan: every second pulse against the others.
+
+    step: takes every n-th pair of pulses.
+    """
 
     def make(folder: Path) -> None:
         held = np.load(DATA / "tls_forest_vz400i/TLS_scan.npz")
@@ -64,7 +73,7 @@ def forest(azimuth_deg: tuple[float, float], zenith_deg: tuple[float, float], st
 
 
 def rocks(folder: Path) -> None:
-    """Every second point of the file against the others."""
+    """Make a measurement of every second point of the file against the others."""
     values = np.loadtxt(DATA / "tls_rock_blocks/Blocs_EGU_avant.txt")
     scan = folder.with_suffix(".xyz")
     np.savetxt(scan, values, fmt="%.6f")
@@ -78,7 +87,7 @@ def _thin(path: Path, step: int) -> None:
 
 
 def put_scanned(base: Path, out: Path, name: str, p: Values, seed: int) -> None:
-    """A copy of a scan's folder with an effect in its points."""
+    """Copy a scan's folder with an effect in its points."""
     _copied(base, out)
     about = yaml.safe_load((base / "measurement.yaml").read_text())
     position, rotation = (np.array(about["scanner"][key]) for key in ("position_m", "rotation"))
@@ -90,7 +99,7 @@ def put_scanned(base: Path, out: Path, name: str, p: Values, seed: int) -> None:
 
 
 def structured_light(folder: Path) -> None:
-    """The measured disparities of odd rows against those of even rows."""
+    """Make a measurement of the measured disparities of odd rows against those of even rows."""
     true = _measured()
     rows = np.zeros(len(true), dtype=bool)
     rows[1::2] = True
@@ -100,7 +109,7 @@ def structured_light(folder: Path) -> None:
 
 
 def refined(folder: Path) -> None:
-    """Disparities that the refined semi-global matcher finds in the photographs, against the measured ones."""
+    """Make a measurement of disparities found by the refined semi-global matcher against the measured ones."""
     left, right = (
         np.asarray(cv2.imread(str(DATA / f"stereo_motorcycle/motorcycle_{side}.png"), cv2.IMREAD_GRAYSCALE), dtype=np.float32)
         for side in ("left", "right")
@@ -118,7 +127,9 @@ def _measured() -> Array:
 
 
 def _write_pair(folder: Path, true: Array, found: Array) -> None:
-    """A pair's folder: the surface of disparities `true`, the points of `found` (rows, columns), which stay beside them."""
+    """Write a pair's folder: the surface of disparities `true`, and the points of `found` (rows, columns), which are
+    also kept.
+    """
     folder.mkdir(parents=True)
     even = true.copy()
     if np.isnan(found[::2]).all():
@@ -133,7 +144,7 @@ def _write_pair(folder: Path, true: Array, found: Array) -> None:
 
 
 def put_matched(base: Path, out: Path, name: str, p: Values, seed: int, most: int = 16_000) -> None:
-    """A copy of a pair's folder with an effect in its disparities; most: points, on a raster."""
+    """Copy a pair's folder with an effect in its disparities; most: number of points, on a raster."""
     if out != base:
         _copied(base, out)
     rng = np.random.default_rng(seed)
@@ -176,7 +187,7 @@ def _cameras(shape: tuple[int, ...]) -> CameraPair:
 
 
 def _surface(true: Array, row_px: int) -> TriangleMesh:
-    """Disparities of every `row_px`-th row as a mesh, cut where they jump."""
+    """Mesh the disparities of every `row_px`-th row, cut at jumps."""
     rows, columns = np.indices(true.shape)
     vertices = _point(columns.ravel(), row_px * rows.ravel(), true.ravel())
     number = np.arange(true.size).reshape(true.shape)

@@ -1,4 +1,4 @@
-"""What is put into which measurement, at which sizes."""
+"""Cases of the evaluation: which effect is injected into which measurement, at which sizes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from benchmarks.gap_injections.formulas import Values
 
 @dataclass(frozen=True)
 class Case:
-    """One injection. effect: `none` for the measurement as it is."""
+    """One injection. effect: `none` for the unchanged measurement."""
 
     number: int
     base: str

@@ -1,5 +1,7 @@
-"""Effects in closed form on measured ranges, angles and disparities: NumPy and SciPy alone, nothing of the project; the sign is
-recorded = true + effect, as EFFECTS.md has it. Names that begin with off_ are of no catalogue."""
+"""Effects in closed form on measured ranges, angles and disparities, with NumPy and SciPy only and nothing of the project.
+
+The sign is recorded = true + effect, as in EFFECTS.md. Names that begin with off_ are outside the catalogue.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ _LEAST_COSINE = 0.1
 
 @dataclass(frozen=True)
 class Scan:
-    """Points of a scanner. az, ze: recorded angles, rad; R: m; line: scan line; cos_i: of the incidence; power: None without."""
+    """Points of a scanner. az, ze: recorded angles, rad; R: range, m; line: scan line; cos_i: cosine of incidence; power: or
+    None.
+    """
 
     az: Array
     ze: Array
@@ -53,7 +57,7 @@ def _cosine(points: Array, surface: Array) -> Array:
 
 
 def scanned(name: str, p: Values, scan: Scan, rng: np.random.Generator) -> Scan:
-    """The scan with an effect in it."""
+    """Return the scan with an effect."""
     az, ze, R = scan.az, scan.ze, scan.R
     n = len(R)
     slant = 1 / scan.cos_i - 1
@@ -112,7 +116,7 @@ def scanned(name: str, p: Values, scan: Scan, rng: np.random.Generator) -> Scan:
 
 @dataclass(frozen=True)
 class Matched:
-    """Matched points of a rectified pair. u, v: left pixel (0.5 in the middle of the first); d: disparity, px."""
+    """Matched points of a rectified pair. u, v: left pixel (0.5 at the middle of the first); d: disparity, px."""
 
     u: Array
     v: Array
@@ -121,7 +125,7 @@ class Matched:
 
 @dataclass(frozen=True)
 class Optics:
-    """f, cx, cy: px; cx, cy from the centre of the first pixel; offset: px to be added to a disparity."""
+    """Camera constants. f, cx, cy: px, with cx, cy from the centre of the first pixel; offset: px added to a disparity."""
 
     f: float
     cx: float
@@ -130,7 +134,9 @@ class Optics:
 
 
 def matched(name: str, p: Values, seen: Matched, optics: Optics, rng: np.random.Generator) -> Matched:
-    """Disparities with an effect of a point: what moves the left image's point moves its place and its disparity."""
+    """Return disparities with an effect on single points; an effect on the left image moves both place and disparity of
+    a point.
+    """
     u, v, d = seen.u, seen.v, seen.d
     x, y = (u - 0.5 - optics.cx) / optics.f, (v - 0.5 - optics.cy) / optics.f
     none = np.zeros_like(u)
@@ -160,7 +166,7 @@ def matched(name: str, p: Values, seen: Matched, optics: Optics, rng: np.random.
 
 
 def in_raster(name: str, p: Values, raster: Array, rng: np.random.Generator) -> Array:
-    """A raster (rows, columns) of disparities, px, NaN where there are none, with an effect of a neighbourhood."""
+    """Return a raster (rows, columns) of disparities, px, NaN where there are none, with an effect on neighbourhoods."""
     known = np.isfinite(raster)
     match name:
         case "smoothing":
@@ -178,7 +184,7 @@ def in_raster(name: str, p: Values, raster: Array, rng: np.random.Generator) -> 
 
 
 def _on_nodes(shape: tuple[int, ...], step: float, rng: np.random.Generator) -> Array:
-    """(rows, columns) standard normal values on nodes `step` px apart, between them bilinear."""
+    """Return (rows, columns) standard normal values on nodes `step` px apart, interpolated bilinearly."""
     rows, columns = (np.arange(size) / step for size in shape[:2])
     nodes = rng.standard_normal((int(rows[-1]) + 2, int(columns[-1]) + 2))
     i, j = rows.astype(int)[:, None], columns.astype(int)[None, :]

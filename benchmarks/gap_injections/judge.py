@@ -1,4 +1,4 @@
-"""What is right and wrong in an answer."""
+"""Judge an answer: which names, sizes and rejections are right."""
 
 from __future__ import annotations
 
@@ -17,17 +17,19 @@ SIZES = {
     "pixel_locking": "amplitude_px", "parallax_noise": "sigma_px", "regularization_noise": "sigma_px", "smoothing": "sigma_px",
     "edge_fattening": "radius_px",
 }  # fmt: skip
-"""The parameter by which an effect's size is told."""
+"""Parameter that states an effect's size."""
 _SIGMAS, _SHARE = 3.0, 0.15
 
 
 def judged(answer: Json, before: frozenset[str] = frozenset()) -> Json:
-    """A row of the table. before: effects that the measurement is said to have without an injection, which are not blamed for it.
+    """Return a row of the table with the judgement of an answer.
 
-    judgement: right (named, of the size that was put in, nothing else blamed), class (among those that cannot be told apart),
-    size (named, of another size), wrong (another effect is blamed, beside it or alone), missed (no effect of the catalogue is
-    named), described (the effect is there with its size, but as an empirical term, not as the cause), refused. Off the catalogue:
-    right where no name is given.
+    The judgement is one of: right (named, with the injected size, and nothing else blamed); class (among effects that cannot be
+    told apart); size (named, with another size); wrong (another effect is blamed, in addition or alone); missed (no effect of the
+    catalogue is named); described (the effect is found with its size, but as an empirical term); refused. Outside the catalogue,
+    an answer without a name is right.
+
+    before: effects that the measurement is said to have without an injection, which do not count as wrong.
     """
     case = answer["case"]
     effect, said = case["effect"], answer["effects"]
@@ -75,7 +77,7 @@ def _size(said: Json, effect: str) -> Json:
 
 
 def _of_size(said: Json, effect: str, values: Json) -> bool:
-    """Whether the size is within three standard errors or 15 % of what was put in, and a period within 5 %."""
+    """Whether the size is within three standard errors or 15 % of the injected one, and a period within 5 %."""
     size, true = _size(said, effect), values[SIZES[effect]]
     # the other camera the other way is the same disparity; of a wave that is its phase
     turned = said["parameters"].get("camera", {}).get("value") == "right" and not SIZES[effect].startswith("amplitude")

@@ -1,4 +1,4 @@
-"""The table of injections as a page of the documentation."""
+"""Write the table of injections as a page of the documentation."""
 
 from __future__ import annotations
 

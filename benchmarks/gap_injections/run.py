@@ -1,9 +1,9 @@
-"""Known effects put into real measurements, each diagnosed as `scarpsim gap` does it, and judged.
+"""Inject known effects into real measurements, diagnose each like `scarpsim gap`, and judge the answers.
 
     OMP_NUM_THREADS=1 python benchmarks/gap_injections/run.py --out /tmp/injections [--page docs/validation/gap_injections.md]
 
-Interrupted, it goes on where it was. Under --out: bases/ (the measurements as they are), cases/ (with an effect put into them;
-each is a folder that `scarpsim gap` takes), answers/ and results.json. The data lie in ../shared/data.
+An interrupted run continues. Under --out are bases/ (the unchanged measurements), cases/ (with an effect; each is a folder for
+`scarpsim gap`), answers/ and results.json. The data are in ../shared/data.
 """
 
 from __future__ import annotations
@@ -41,12 +41,13 @@ _NOISES = {
     "tls.angle_noise": "angle_sigma_rad",
     "stereo.parallax_noise": "parallax_sigma_px",
 }
-"""White noises that a model has as such."""
+"""White noise that a model has as its own parameters."""
 
 
 def base_folder(name: str, out: Path) -> Path:
-    """The folder of a measurement without an effect, with the white noise that its own diagnoses propose; made and diagnosed the
-    first time. What else they say stays open."""
+    """Return the folder of an unchanged measurement, with the white noise that its own diagnosis proposes, made and diagnosed
+    once.
+    """
     folder = out / "bases" / name
     answer = out / "answers" / f"{name}.json"
     if folder.exists() and answer.exists():
@@ -70,7 +71,7 @@ def base_folder(name: str, out: Path) -> Path:
 
 
 def white_noise(said: Json, believed: dict[str, float]) -> dict[str, float]:
-    """Values of a model's noise by what was said of it: too large, or more white noise beside it."""
+    """Return values of a model's noise according to a diagnosis: too large, or with additional white noise."""
     found = dict(said["lower_noise"])
     for each in said["effects"]:
         key = _NOISES.get(each["name"])
@@ -81,7 +82,7 @@ def white_noise(said: Json, believed: dict[str, float]) -> dict[str, float]:
 
 
 def diagnosed(folder: Path) -> Json:
-    """What the diagnosis of a folder says, as gap.json has it, with the processor time."""
+    """Return gap.json of a folder's diagnosis, with the processor time."""
     start = time.process_time()
     try:
         return {**told(diagnose(read_measurement(folder))), "cpu_s": time.process_time() - start}
@@ -106,8 +107,10 @@ def told(found: GapDiagnosis) -> Json:
 
 
 def strength(effect: str, base: Path, folder: Path) -> float | None:
-    """Signal-to-noise of what was put in, in white noise: of the change of the residuals' mean beyond what a pose takes, or, of
-    noise, of the change of their variance; None where a folder cannot be read."""
+    """Return the signal-to-noise ratio of an injection in white noise; None if a folder cannot be read.
+
+    It is that of the change of the residuals' mean that a pose does not explain, or, for noise, of the change of their variance.
+    """
     try:
         before, after = registered_residuals(base), registered_residuals(folder)
     except InputError:
@@ -125,13 +128,13 @@ def strength(effect: str, base: Path, folder: Path) -> float | None:
 
 @cache
 def registered_residuals(folder: Path) -> Residuals:
-    """Of a measurement's folder."""
+    """Return the residuals of a measurement's folder after registration."""
     found = compute_residuals(read_measurement(folder))
     return replace(found, value=fit_pose_robustly(found)[0])
 
 
 def answered(case: Case, out: Path) -> Json:
-    """The answer to a case, kept under `out`."""
+    """Return the answer to a case, kept under `out`."""
     path = out / "answers" / f"{case.name}.json"
     if path.exists():
         return json.loads(path.read_text())
@@ -143,7 +146,7 @@ def answered(case: Case, out: Path) -> Json:
 
 
 def named_before(base: str, out: Path) -> frozenset[str]:
-    """Effects of the catalogue that a measurement is said to have as it is."""
+    """Return effects of the catalogue that the unchanged measurement is said to have."""
     found = json.loads((out / "answers" / f"{base}.json").read_text())
     last = found.get("as_diagnosed", found["as_it_is"])
     return frozenset(each["name"].partition(".")[2] for each in last["effects"] if each["kind"] == "physical")
@@ -155,7 +158,7 @@ def _write(path: Path, values: Any) -> None:
 
 
 def run(out: Path, cases: tuple[Case, ...] = CASES) -> list[Json]:
-    """Answers with what is right and wrong in them."""
+    """Return the judged answers to all cases."""
     found = []
     for case in cases:
         row = judged(answered(case, out), named_before(case.base, out))

@@ -1,1 +1,3 @@
-"""A second judge of `scarpsim gap`: folders of its own making with hidden truth, and a table of what was answered."""
+"""A second generator for evaluating `scarpsim gap`, written from the specification only: folders with hidden truth, and their
+scores.
+"""

@@ -1,4 +1,4 @@
-"""What each case is: its kind and effects by seed and number, its folder, and the truth that is kept outside of it."""
+"""Define each case by seed and number: kind and effects, its folder, and the truth kept outside of it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BY_FRACTION = {"pixel_locking", "half_pixel_locking"}
 
 @dataclass(frozen=True)
 class Case:
-    """Number, sensor, kind (none, change, off, two, one), names of its effects."""
+    """Number, sensor, kind (none, change, off, two, one), and names of its effects."""
 
     number: int
     sensor: str
@@ -60,7 +60,7 @@ def _dealer(decks: dict[str, list[str]], rng: Rng, full: dict[str, list[str]]) -
 
 
 def build(case: Case, seed: int, where: Path, count: int | None = None) -> dict[str, Any]:
-    """Writes the measurement folder `where`; returns the truth. `count`: about how many points (default: drawn)."""
+    """Write the measurement folder `where` and return the truth; `count`: approximate number of points (default: random)."""
     rng = np.random.default_rng([seed, case.number, SENSORS.index(case.sensor)])
     many = count or int(np.exp(rng.uniform(np.log(9e3), np.log(6e4))))
     where.mkdir(parents=True, exist_ok=True)
@@ -148,7 +148,9 @@ def _write_rest(where: Path, reference: Surface, wall: Frame, sheet: dict[str, A
 def _sized(
     case: Case, sensor: Any, catalogue: Any, strength: Any, shot: Any, rng: Rng
 ) -> tuple[dict[str, Parameters], dict[str, dict[str, Any]]]:
-    """Parameters of each effect of the case, and how clear each is: ratio wanted, reached, and apart from the nearest."""
+    """Return the parameters of each effect of the case, and its clarity: wanted ratio, reached ratio, and distance from the
+    nearest effect.
+    """
     effects, clear = {}, {}
     for name in case.names:
         effect = catalogue[name]
@@ -163,7 +165,7 @@ def _sized(
 
 
 def _truth(site: Any, effects: dict[str, Parameters], clear: dict[str, dict[str, Any]], points: int) -> dict[str, Any]:
-    """What both sensors' truths hold."""
+    """Return what the truths of both sensors contain."""
     error = {"kind": site.error.kind, "sigma_m": site.error.sigma, "patch_m": site.error.patch}
     moved = [_box(site, each) for each in site.changes]
     return {"effects": effects, "clear": clear, "changes": moved, "wall": site.kind, "error": error, "points": points}
@@ -179,6 +181,6 @@ def _box(site: Any, change: walls.Change) -> list[float]:
 
 
 def save_truth(truth: dict[str, Any], path: Path) -> None:
-    """As indented JSON."""
+    """Write the truth as indented JSON."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(truth, indent=1))

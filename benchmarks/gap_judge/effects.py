@@ -1,4 +1,4 @@
-"""What an effect is to the judge, for both sensors: how it acts, how its size is set, which of its parameters may be judged."""
+"""Effects of both sensors in this generator: how they act, how their size is set, and which of their parameters are judged."""
 
 from __future__ import annotations
 
@@ -20,12 +20,16 @@ def nothing_else(rng: np.random.Generator, shot: Any) -> Parameters:
 
 @dataclass(frozen=True)
 class Effect:
-    """One way to depart from the model.
+    """One deviation from the model.
 
-    `stage` says how `act(parameters, shot)` is used (see the sensors' modules); `sizes` are the parameters that carry the size,
-    at a typical value; they are scaled together until the strength is the one drawn, at most to `most` times the typical value
-    (a few times the largest size of EFFECTS.md: beyond, no instrument would leave the factory).
-    `others` draws the rest. `judged` are the parameters whose interval is judged.
+    Attributes
+    ----------
+    stage : How `act(parameters, shot)` is used (see the sensors' modules).
+    sizes : Parameters that carry the size, at a typical value. They are scaled together to the drawn strength, at most to `most`
+        times the
+        typical value (a few times the largest size of EFFECTS.md, beyond which no instrument would leave the factory).
+    others : Draws the remaining parameters.
+    judged : Parameters whose interval is judged.
     """
 
     stage: str
@@ -37,7 +41,7 @@ class Effect:
     judged: tuple[str, ...] = field(default=())
 
     def draw(self, rng: np.random.Generator, shot: Any) -> Parameters:
-        """Parameters at the typical size; sizes that may be of either sign get one."""
+        """Draw parameters at the typical size, with random signs for sizes that may have either."""
         either = {key for key in self.sizes if self.stage in SIGNED and key not in UNSIGNED}
         signs = {key: float(rng.choice([-1.0, 1.0])) if key in either else 1.0 for key in self.sizes}
         return {**self.others(rng, shot), **{key: signs[key] * size * rng.uniform(0.7, 1.4) for key, size in self.sizes.items()}}
@@ -65,11 +69,16 @@ def solve_size(effect: Effect, parameters: Parameters, strength: Callable[[Param
 
 @dataclass(frozen=True)
 class Whitening:
-    """Weights displacements by what is known of the noise, so that a length is a signal-to-noise ratio.
+    """Weights displacements by the known noise, so that a length is a signal-to-noise ratio.
 
-    variance: (n,) of a point's noise; patch: (n,) number of the patch over which the reference's error is alike; patch_variance:
-    (n,) of that error as it enters the observable. In each patch the mean carries 1 / (error + noise / n) of weight, and what
-    differs within the patch 1 / noise. pose: (n, 6) what the six pose parameters do.
+    In each patch, the mean has the weight 1 / (error + noise / n), and deviations within the patch 1 / noise.
+
+    Attributes
+    ----------
+    variance : (n,) variance of a point's noise.
+    patch : (n,) number of the patch over which the reference's error is constant.
+    patch_variance : (n,) variance of that error in the observable.
+    pose : (n, 6) effect of the six pose parameters.
     """
 
     variance: Array
@@ -78,7 +87,7 @@ class Whitening:
     pose: Array
 
     def white(self, columns: Array) -> Array:
-        """(n + patches, k) of (n, k): what differs within patches, then the patches' means."""
+        """Transform (n, k) to (n + patches, k): deviations within patches, then the patches' means."""
         weight = 1 / self.variance
         total = np.maximum(np.bincount(self.patch, weight), 1e-12)
         error = np.bincount(self.patch, weight * self.patch_variance) / total
@@ -87,7 +96,9 @@ class Whitening:
         return np.concatenate([within, means / np.sqrt(error + 1 / total)[:, None]])
 
     def strength(self, shift: Array, other: Array | None = None) -> float:
-        """Signal-to-noise ratio of (n,) `shift` after the best-fit pose and (n, k) `other`; a point counts 9 at most."""
+        """Return the signal-to-noise ratio of a (n,) `shift` after fitting the pose and (n, k) `other`; a point counts 9
+        at most.
+        """
         nuisance = self.white(self.pose if other is None else np.concatenate([self.pose, other], axis=1))
         wanted = self.white(shift[:, None])[:, 0]
         scale = np.maximum(np.linalg.norm(nuisance, axis=0), 1e-30)
@@ -97,19 +108,21 @@ class Whitening:
 
 
 def alternatives(effect: Effect, rng: np.random.Generator, shot: Any) -> list[Parameters]:
-    """Parameters that span what an effect can do linearly: each size by itself, each at two phases."""
+    """Return parameters that span the effect linearly: each size alone, each at two phases."""
     drawn = effect.draw(rng, shot)
     only = [{**drawn, **{key: drawn[key] * (key == one) for key in effect.sizes}} for one in effect.sizes]
     return [{**each, **({"phase_rad": p} if "phase_rad" in each else {})} for each in only for p in (0.0, np.pi / 2)]
 
 
 def spread_strength(added: Array, variance: Array) -> float:
-    """Root of twice the information of (n,) added variance against the known variance: sqrt(2 sum KL)."""
+    """Return the root of twice the information of (n,) added variance relative to the known variance: sqrt(2 sum KL)."""
     ratio = np.clip((variance + added) / variance, 1.0, 50.0)
     return float(np.sqrt(np.sum(ratio - 1 - np.log(ratio))))
 
 
 def loss_strength(lost: Array, base: float) -> float:
-    """Root of twice the information of returns lost with probability (n,) `lost` on top of a share `base` lost anywhere."""
+    """Return the root of twice the information of returns lost with probability (n,) `lost`, beside a share `base`
+    lost anywhere.
+    """
     p = np.clip(base + (1 - base) * lost, 1e-6, 1 - 1e-6)
     return float(np.sqrt(2 * np.sum(p * np.log(p / base) + (1 - p) * np.log((1 - p) / (1 - base)))))

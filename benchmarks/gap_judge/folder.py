@@ -1,4 +1,4 @@
-"""Writes measurement folders as CONTRACT.md words them: PLY (binary), .xyz, and the YAML files, by NumPy alone."""
+"""Write measurement folders as CONTRACT.md specifies them: PLY (binary), .xyz, and the YAML files, with NumPy only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Judges answers against truths, and writes the table: one per sensor, binomial 95 % intervals, every case that is not right."""
+"""Judge answers against truths and write the table: for each sensor, with binomial 95 % intervals, and every case that is not
+right.
+"""
 
 from __future__ import annotations
 
@@ -34,13 +36,13 @@ effect, and "apart" what the nearest other effect leaves of it. Intervals are bi
 """
 LEVEL_90 = float(norm.ppf(0.95))
 EDGED = ("strips", "tiles")
-"""Errors of the reference that jump along whole lines, which from one station look as a sensor's do."""
+"""Errors of the reference with jumps along whole lines, which look like sensor errors from one station."""
 EITHER_SIGN = {"tilt_drift"}  # EFFECTS.md does not say which way the tilt turns
 
 
 @dataclass(frozen=True)
 class Result:
-    """One case: its truth, what was answered, how that is judged; (inside, all) of the 90 % intervals that could be judged."""
+    """One case: its truth, its answer and the judgement; (inside, all) of the 90 % intervals that can be judged."""
 
     truth: dict[str, Any]
     answer: dict[str, Any]
@@ -51,12 +53,12 @@ class Result:
 
     @property
     def right(self) -> bool:
-        """Whether the answer is the one to give."""
+        """Whether the answer is right."""
         return self.outcome in RIGHT[self.truth["kind"]]
 
     @property
     def clarity(self) -> float:
-        """The least clear effect's signal-to-noise ratio, after its nearest neighbour where there is one; inf without effects."""
+        """Signal-to-noise ratio of the least clear effect, after its nearest neighbour if there is one; inf without effects."""
         ratios = [each.get("apart", each["ratio"]) for each in self.truth["clear"].values()]
         return min(ratios, default=np.inf)
 
@@ -75,8 +77,11 @@ def judged(out: Path, name: str) -> Result:
 
 
 def outcome(truth: dict[str, Any], answer: dict[str, Any]) -> str:
-    """One of OUTCOMES. `class`: each true effect is in the class of an answer; `more`: that, and others besides; `part`: some of
-    the true effects and nothing wrong."""
+    """Return one of OUTCOMES.
+
+    `class`: each true effect is in the class of an answer; `more`: the same, with others in addition; `part`: some of the true
+    effects and nothing wrong.
+    """
     if answer["verdict"] in ("error", "insufficient_data", "no_gap", "unknown"):
         return str(answer["verdict"])
     true = set(truth["effects"]) if truth["kind"] in ("one", "two") else set()
@@ -97,7 +102,9 @@ def _short(name: str) -> str:
 
 
 def intervals(truth: dict[str, Any], effect: dict[str, Any]) -> list[tuple[str, bool]]:
-    """For each parameter of a named effect that may be judged: what it says, and whether the 90 % interval holds the truth."""
+    """Return, for each parameter of a named effect that may be judged, the statement and whether the 90 % interval contains the
+    truth.
+    """
     name = _short(effect["name"])
     known = {**laser_effects.CATALOGUE, **stereo_effects.CATALOGUE}.get(name)
     true, said = truth["effects"].get(name), effect["parameters"]
@@ -113,7 +120,7 @@ def _interval(name: str, key: str, true: dict[str, Any], said: dict[str, float])
 
 
 def share(count: int, total: int) -> str:
-    """`count / total (percentage; 95 % Clopper-Pearson interval)`."""
+    """Format `count / total (percentage; 95 % Clopper-Pearson interval)`."""
     if not total:
         return "-"
     low = beta.ppf(0.025, count, total - count + 1) if count else 0.0
@@ -122,9 +129,9 @@ def share(count: int, total: int) -> str:
 
 
 def table(results: list[Result], command: str, commit: str) -> str:
-    """Markdown: for each sensor the outcomes by kind, the rates, and the cases that are not right.
+    """Return Markdown: for each sensor the outcomes by kind, the rates, and the cases that are not right.
 
-    command, commit: what made it, and of which program.
+    command, commit: the command that made it, and the program's commit.
     """
     made_by = f"Made by `{command}`, commit {commit}."
     text = f"# Measurements of a second generator\n\n{_in_short(results)}\n{_ABOUT}\n{made_by}\n\n{_WORDS}"
@@ -171,7 +178,7 @@ def _outcomes(results: list[Result]) -> str:
 
 
 def _rates(results: list[Result]) -> str:
-    """The figures of GAP.md that this judge can give."""
+    """Return those figures of GAP.md that this generator can give."""
     clear = [each for each in results if each.truth["kind"] in ("one", "two") and each.clarity >= CLEAR]
     quiet = [each for each in results if each.truth["kind"] == "none"]
     moved = [each for each in results if each.truth["kind"] == "change"]

@@ -1,4 +1,6 @@
-"""A laser scan in closed form: pattern, aim, ray casting, footprint, range, power, return, record. recorded = true + effect."""
+"""Simulate a laser scan in closed form: pattern, aim, ray casting, footprint, range, power, return, record; recorded = true +
+effect.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,7 @@ RINGS = ((0.349, 6), (0.854, 12))  # radius over the beam's (1/e^2), rays: each 
 
 @dataclass(frozen=True)
 class Site:
-    """Reference and true surface (wall's frame), that frame in the world, the scanner as surveyed and as it stands."""
+    """Reference and true surface (wall's frame), that frame in the world, and the scanner as surveyed and as it stands."""
 
     kind: str
     reference: Surface
@@ -64,7 +66,9 @@ class Noise:
 
 @dataclass(frozen=True)
 class Scan:
-    """Recorded pulses that came back: points (n, 3) in the surveyed scanner's frame, power, time s; and how many were sent."""
+    """Recorded pulses that returned: points (n, 3) in the surveyed scanner's frame, power, time, s; and the number of pulses
+    sent.
+    """
 
     points: Array
     power: Array
@@ -87,7 +91,7 @@ def cast(surface: Surface, site: Site, rays: Array) -> tuple[Hits, Array, Array]
 
 
 def look(site: Site, pattern: Pattern, rho_seed: int) -> tuple[Shot, Array, Array]:
-    """What the pulses would meet without noise and effects, with the places (n, 3) and the normals (n, 3), wall's frame."""
+    """Return what the pulses would meet without noise and effects, with places (n, 3) and normals (n, 3), wall's frame."""
     azimuth, zenith, line = pattern.angles()
     hits, places, cosine = cast(site.reference, site, directions(azimuth, zenith))
     range_m = np.where(hits.found, hits.distance, 1.0)
@@ -98,7 +102,7 @@ def look(site: Site, pattern: Pattern, rho_seed: int) -> tuple[Shot, Array, Arra
 
 
 class Strength:
-    """Signal-to-noise ratios of effects on one site and pattern, from tangent planes (only footprints are cast)."""
+    """Signal-to-noise ratios of effects for one site and pattern, from tangent planes (only footprints are cast)."""
 
     def __init__(self, site: Site, pattern: Pattern, noise: Noise, rho_seed: int, losses: float) -> None:
         shot, places, normal = look(site, pattern, rho_seed)
@@ -129,7 +133,7 @@ class Strength:
         return spread_strength(self._added(effect, parameters), self.variance)
 
     def apart(self, name: str, parameters: Parameters, rng: Rng) -> tuple[float, str]:
-        """Ratio left after the nearest other effect of the catalogue that acts on the mean took its share, and its name."""
+        """Return the ratio after the nearest other mean effect of the catalogue took its share, and that effect's name."""
         wanted, found = self._shift(EFFECTS[name], parameters), {}
         for other in sorted(set(CATALOGUE) - {name} - SHAPED):
             if CATALOGUE[other].stage in ("range", "aim"):
@@ -148,7 +152,7 @@ class Strength:
         return np.clip(self.shot.range_m * (ratio - 1), -0.5, 0.5)
 
     def _mixed(self, parameters: Parameters) -> float:
-        """By how much the ranges of footprints differ from those of rays; a pulse counts 9 at most."""
+        """Return the difference between ranges of footprints and of rays as a ratio; a pulse counts 9 at most."""
         far = self.shot.range_m
         mixed, met = _footprint(self.site, self.ray, parameters["divergence_rad"], parameters["mode"], far, far > 0)
         return float(np.sqrt(np.sum(np.where(met, np.minimum((mixed - far) ** 2 / self.variance, 9.0), 0.0))))
@@ -209,7 +213,7 @@ def _emitted(
 
 
 def _footprint(site: Site, rays: Array, divergence_rad: float, mode: str, centre: Array, met: Mask) -> tuple[Array, Mask]:
-    """Range and return of a Gaussian beam (full angle at 1/e^2): 18 rays round the middle one, of equal power, merged."""
+    """Return range and return of a Gaussian beam (full angle at 1/e^2): 18 rays of equal power around the middle one, merged."""
     side = np.cross(rays, [0.0, 0.0, 1.0])
     side = side / np.linalg.norm(side, axis=1, keepdims=True)
     up = np.cross(side, rays)
@@ -225,7 +229,7 @@ def _footprint(site: Site, rays: Array, divergence_rad: float, mode: str, centre
 
 
 def _merged(ranges: Array, weights: Array, mode: str, centre: Array) -> tuple[Array, Mask]:
-    """The range that sub-rays (n, m) make together: their mean, or the mean of the first or the strongest cluster of echoes."""
+    """Return the range of merged sub-rays (n, m): their mean, or the mean of the first or the strongest cluster of echoes."""
     order = np.argsort(ranges, axis=1)
     ranges, weights = np.take_along_axis(ranges, order, 1), np.take_along_axis(weights, order, 1)
     weights = np.where(np.isfinite(ranges), weights, 0.0)
@@ -242,7 +246,7 @@ def _merged(ranges: Array, weights: Array, mode: str, centre: Array) -> tuple[Ar
 
 
 def lost(site: Site, pattern: Pattern, shot: Shot, places: Array, losses: dict[str, Any], rng: Rng) -> Mask:
-    """(n,) pulses without a record: at random, under bushes, in gaps of scan lines, and where double echoes were removed."""
+    """Return the (n,) pulses without a record: at random, under bushes, in gaps of scan lines, and from removed double echoes."""
     gone = rng.random(len(shot.line)) < losses["share"]
     gone |= walls.vegetation(site.reference, places[:, 0], places[:, 2], rng, losses["bushes"])
     for _ in range(losses["gaps"]):
@@ -258,7 +262,7 @@ def lost(site: Site, pattern: Pattern, shot: Shot, places: Array, losses: dict[s
 
 
 def place(rng: Rng, count: int, noise: Noise, change_count: int) -> tuple[Site, Pattern]:
-    """A site with a wall, a scanner that stands in front, aside or below, and a pattern of about `count` pulses on the wall."""
+    """Draw a site with a wall, a scanner in front, aside or below, and a pattern with about `count` pulses on the wall."""
     kind = str(rng.choice(list(walls.WALLS)))
     width, tall = rng.uniform(30, 60), rng.uniform(18, 32)
     reference = walls.make(kind, rng, width, tall, float(np.exp(rng.uniform(np.log(0.1), np.log(0.3)))))
@@ -279,7 +283,7 @@ def place(rng: Rng, count: int, noise: Noise, change_count: int) -> tuple[Site, 
 
 
 def _pattern(site: Site, rng: Rng, count: int) -> Pattern:
-    """Angular steps (unequal) and sector so that about `count` pulses go to the wall."""
+    """Return angular steps (unequal) and a sector so that about `count` pulses hit the wall."""
     seen = site.surveyed.inward(site.wall.outward(site.reference.vertices()))
     range_m = np.linalg.norm(seen, axis=1)
     azimuth, zenith = np.arctan2(seen[:, 1], seen[:, 0]), np.arccos(seen[:, 2] / range_m)

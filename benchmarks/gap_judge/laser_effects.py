@@ -1,8 +1,9 @@
-"""Effects of a laser scanner as EFFECTS.md words them, recorded = true + effect, and others that the catalogue does not have.
+"""Laser scanner effects as EFFECTS.md specifies them, recorded = true + effect, and others outside the catalogue.
 
-Stages: `aim` gives (2, n) recorded minus true azimuth and zenith, rad; `range` (n,) m added to the range; `spread` (n,) m, the
-standard deviation of white noise added in quadrature; `ray_spread` (2, n) rad, of the true ray about the recorded one; `step` the
-step in m to which ranges are rounded; `loss` (n,) probability that a return is lost; `footprint` the beam's full angle, rad.
+Stages: `aim` gives (2, n) recorded minus true azimuth and zenith angle, rad; `range` (n,) m added to the range; `spread` (n,) m,
+the standard deviation of white noise added in quadrature; `ray_spread` (2, n) rad, that of the true ray about the recorded one;
+`step` the step in m to which ranges are rounded; `loss` the (n,) probability that a return is lost; `footprint` the beam's full
+angle, rad.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True)
 class Shot:
-    """What an effect may depend on, each (n,): recorded angles rad, scan line, time 0..1, range m, incidence's cosine, power."""
+    """What an effect may depend on, each (n,): recorded angles, rad; scan line; time, 0..1; range, m; cosine of
+    incidence; power.
+    """
 
     azimuth: Array
     zenith: Array
@@ -63,7 +66,7 @@ def _beam(rng: Rng, shot: Shot) -> Parameters:
 
 
 def _tilted(p: Parameters, shot: Shot) -> Array:
-    """Recorded minus true angles of rays that a tilt about x and y by rate * time carried along."""
+    """Return recorded minus true angles of rays that a tilt about x and y by rate * time moved."""
     x, y = p["rate_x_rad"] * shot.time, p["rate_y_rad"] * shot.time
     c, s, cot = np.cos(shot.azimuth), np.sin(shot.azimuth), 1 / np.tan(shot.zenith)
     # true = recorded + rate x direction: the azimuth turns by -cot z (x cos az + y sin az), the zenith by y cos az - x sin az
@@ -173,7 +176,7 @@ def _bump(rng: Rng, shot: Shot) -> Parameters:
 
 
 def _corner(p: Parameters, s: Shot) -> Array:
-    """Echoes that went round by a second wall: longer ranges where the wall is met at between 35 and 55 degrees."""
+    """Return the longer ranges of echoes via a second wall, where the wall is met at 35 to 55 degrees."""
     return p["amplitude_m"] * ((s.cosine > 0.57) & (s.cosine < 0.82))
 
 

@@ -1,10 +1,10 @@
-"""Makes cases, asks `scarpsim gap` about each, judges the answers.
+"""Evaluate `scarpsim gap` on measurements of the second generator: make cases, run the command on each, judge the answers.
 
     python benchmarks/gap_judge/run.py --cases 40 --seed 77 --out /tmp/judge [--sensor tls|stereo]
         [--table docs/validation/gap_second_generator.md]
 
-In DIR: `cases/0007` the measurement folder, `truth/0007.json` what is in it, `answers/0007` what the command wrote. Cases that
-were built or answered are not built or answered again.
+In --out, `cases/0007` is the measurement folder, `truth/0007.json` its truth, `answers/0007` what the command wrote. Cases that
+were already made or answered are not repeated.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ LONGEST_S = 900
 
 
 def make(case: cases.Case, seed: int, out: Path) -> Path:
-    """The case's folder; its truth goes beside the folders, and is written last."""
+    """Make the case's folder; its truth is written last, outside of the folders."""
     where, truth = out / "cases" / f"{case.number:04d}", out / "truth" / f"{case.number:04d}.json"
     if not truth.exists():
         cases.save_truth(cases.build(case, seed, where), truth)
@@ -33,7 +33,7 @@ def make(case: cases.Case, seed: int, out: Path) -> Path:
 
 
 def ask(folder: Path, answer: Path) -> None:
-    """Runs the command; what it said goes to answer/said.json: exit status, seconds, last words."""
+    """Run the command; its exit status, seconds and last words are written to answer/said.json."""
     if (answer / "said.json").exists():
         return
     answer.mkdir(parents=True, exist_ok=True)
@@ -48,7 +48,7 @@ def ask(folder: Path, answer: Path) -> None:
 
 
 def main() -> None:
-    """Builds all, asks all, judges all."""
+    """Make, ask and judge all cases."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=40, help="how many")
     parser.add_argument("--seed", type=int, default=77)

@@ -1,4 +1,6 @@
-"""A stereo pair in closed form: real cameras, rays cast from both, disparities along rectified rows, nominal reconstruction."""
+"""Simulate a stereo pair in closed form: real cameras, rays cast from both, disparities along rectified rows, nominal
+reconstruction.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,7 @@ OUTLIER_Z2 = 9.0  # no pixel counts for more, as no robust judge lets it
 
 @dataclass(frozen=True)
 class Site:
-    """Reference and true surface (wall's frame), where that frame is said to be and where it is, the nominal pair."""
+    """Reference and true surface (wall's frame), that frame's stated and true place, and the nominal pair."""
 
     kind: str
     reference: Surface
@@ -35,7 +37,7 @@ class Site:
 
 @dataclass(frozen=True)
 class Noise:
-    """White noise and a grid of Gaussian values, interpolated with `order`, of the disparity, px."""
+    """White noise, and a grid of Gaussian values interpolated with `order`, of the disparity, px."""
 
     white_px: float
     grid_px: float
@@ -55,7 +57,7 @@ class Cloud:
 
 @dataclass(frozen=True)
 class View:
-    """What left pixels see: disparities as the nominal pair takes them (n,) px, normals and places (n, 3), wall's frame."""
+    """What left pixels see: disparities by the nominal pair (n,), px; normals and places (n, 3), wall's frame."""
 
     disparity: Array
     normal: Array
@@ -73,7 +75,7 @@ def raster(pair: Pair, stride: float) -> tuple[Array, tuple[int, int]]:
 
 
 def view(surface: Surface, wall: Frame, nominal: Pair, real: tuple[Camera, Camera], pixels: Array) -> View:
-    """Casts left pixels through the real left camera, looks for what they meet in the real right one."""
+    """Cast left pixels through the real left camera, and find what they meet in the real right one."""
     left, right = (camera.frame.within(wall) for camera in real)
     rays = real[0].rays(pixels) @ left.rotation.T
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
@@ -100,7 +102,7 @@ def real_pair(pair: Pair, effects: dict[str, Parameters]) -> tuple[Camera, Camer
 
 
 def match(site: Site, seen: View, pixels: Array, shape: tuple[int, int], stride: float) -> Match:
-    """What effects of the matcher may depend on, for all left pixels (disparity NaN where nothing is matched)."""
+    """Return what effects of the matcher may depend on, for all left pixels (disparity NaN without a match)."""
     return Match(pixels[:, 0], pixels[:, 1], seen.disparity, site.pair, stride, shape)
 
 
@@ -129,7 +131,7 @@ class Strength:
         self.whitening = Whitening(self.variance, patch, patch_variance, self._pose(per_metre))
 
     def _pose(self, per_metre: Array) -> Array:
-        """(n, 6) disparity per metre and per radian of a rigid movement of the wall: towards the camera it grows."""
+        """Return the (n, 6) disparity per metre and per radian of a rigid movement of the wall; it grows towards the camera."""
         middle = self.place - self.place.mean(axis=0)
         return np.concatenate([self.normal, np.cross(middle, self.normal)], axis=1) * per_metre[:, None]
 
@@ -147,7 +149,9 @@ class Strength:
         return 0.0
 
     def _field(self, parameters: Parameters) -> float:
-        """A grid's node is seen by (step / stride)^2 points; below it lie white noise, the model's own grid, the reference."""
+        """Return the ratio of a grid noise: a node is seen by (step / stride)^2 points, against white noise, the model's own
+        grid, the reference.
+        """
         many = max((parameters["step_px"] / self.stride) ** 2, 1.0)
         own = max((self.noise.step_px / self.stride) ** 2, 1.0)
         known = self.noise.white_px**2 / many + self.noise.grid_px**2 * min(own / many, 1.0)
@@ -156,7 +160,7 @@ class Strength:
         return spread_strength(np.full(nodes, parameters["sigma_px"] ** 2 * 4 / 9), np.full(nodes, known))
 
     def apart(self, name: str, parameters: Parameters, rng: Rng) -> tuple[float, str]:
-        """Ratio left after the nearest other effect of the catalogue that acts on the mean took its share, and its name."""
+        """Return the ratio after the nearest other mean effect of the catalogue took its share, and that effect's name."""
         wanted, found = self._shift(EFFECTS[name], parameters), {}
         for other in sorted(set(CATALOGUE) - {name} - SHAPED):
             if CATALOGUE[other].stage == "camera":
@@ -212,7 +216,9 @@ def _drawn(rng: Rng, noise: Noise, chosen: dict[str, list[tuple[Effect, Paramete
 
 
 def filled(disparity: Array, hidden: Mask, reach: float) -> Array:
-    """Half-occluded pixels (rows, columns) within `reach` columns of matched background get its disparity (the smaller side)."""
+    """Give half-occluded pixels (rows, columns) within `reach` columns of matched background its disparity (that of the smaller
+    side).
+    """
     columns = np.arange(disparity.shape[1])
     there = np.isfinite(disparity)
     before = np.maximum.accumulate(np.where(there, columns, -1), axis=1)
@@ -234,9 +240,10 @@ def _camera(rng: Rng, width: int, height: int, frame: Frame) -> Camera:
 
 
 def place(rng: Rng, change_count: int, reference_share: float, straight: bool) -> Site:
-    """A wall and a pair before it. `straight`: the normal case with one body, where a disparity has but one meaning.
+    """Draw a wall and a pair in front of it.
 
-    reference_share: error of the reference as it would show, in px of disparity.
+    straight: the normal case with one camera body, where a disparity has only one meaning; reference_share: error of the
+    reference in px of disparity.
     """
     kind = str(rng.choice(list(walls.WALLS)))
     width, tall = rng.uniform(36, 64), rng.uniform(24, 40)
@@ -261,7 +268,9 @@ def place(rng: Rng, change_count: int, reference_share: float, straight: bool) -
 
 
 def _aimed(rng: Rng, body: Camera, at: Array, loose: float) -> Camera:
-    """The body at `at` (wall's frame), looking at the wall's middle half-way (convergent), a little askew; x right, y down."""
+    """Return the camera at `at` (wall's frame) that looks half-way to the wall's middle (convergent), slightly askew; x right, y
+    down.
+    """
     toe = loose * rng.uniform(0.2, 1.0) * np.arctan2(at[0], at[1])
     facing = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
     askew = small_turn(loose * rng.normal(0, [0.01, 0.004, 0.01]))

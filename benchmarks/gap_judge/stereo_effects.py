@@ -1,9 +1,9 @@
-"""Effects of a stereo pair as EFFECTS.md words them, real minus nominal or recorded = true + effect, and others of our own.
+"""Stereo effects as EFFECTS.md specifies them, real minus nominal or recorded = true + effect, and others outside the catalogue.
 
 Stages: `camera` gives (left, right), the real cameras from the nominal ones; `disparity` (n,) px added to the disparity; `spread`
-(n,) px, white noise in quadrature; `field` (rows, columns) px, drawn anew, added; `map` turns the map of disparities (rows,
-columns; NaN where none) into another; `fill` says how far into half-occluded strips disparities reach, px.
-texture_noise is left out: it needs the pictures, which a measurement folder does not hold.
+(n,) px, white noise in quadrature; `field` (rows, columns) px, random each time, added; `map` transforms the map of disparities
+(rows, columns; NaN where none); `fill` says how far disparities reach into half-occluded strips, px. texture_noise is left out
+because it needs the pictures, which a measurement folder does not have.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class Match:
 
 
 def grid_noise(rng: Rng, shape: tuple[int, int], stride: float, step_px: float, order: int = 1) -> Array:
-    """(rows, columns) unit Gaussian values on a grid of `step_px`, interpolated to every `stride` px.
+    """Return (rows, columns) unit Gaussian values on a grid of `step_px`, interpolated to every `stride` px.
 
-    order 1: linearly; 3: by cubic splines, brought to the spread that the linear field has (two thirds on average).
+    order 1: linear; 3: cubic splines, scaled to the standard deviation of the linear field (two thirds on average).
     """
     count = [int(np.ceil(n * stride / step_px)) + 3 for n in shape]
     begin = rng.uniform(0, 1, 2)
@@ -101,7 +101,7 @@ def _any_side(rng: Rng, match: Match) -> Parameters:
 
 
 def fattened(p: Parameters, disparity: Array, stride: float) -> Array:
-    """The largest disparity within `radius_px` where it stands out by more than a step: foreground spreads over background."""
+    """Return the largest disparity within `radius_px` where it exceeds a step: foreground spreads over background."""
     reach = p["radius_px"] / stride
     rows, columns = np.mgrid[-int(reach) : int(reach) + 1, -int(reach) : int(reach) + 1]
     disc = rows**2 + columns**2 <= reach**2
@@ -123,7 +123,7 @@ def _jitter(rng: Rng, match: Match) -> Parameters:
 
 
 def _strides(name: str, low: float, high: float) -> Any:
-    """Draws the parameter `name`, px, as so many strides."""
+    """Return a function that draws the parameter `name`, px, as a number of strides."""
     return lambda rng, match: {name: float(match.stride * rng.uniform(low, high))}
 
 

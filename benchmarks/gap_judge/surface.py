@@ -1,7 +1,7 @@
-"""A triangulated height field y = h(x, z) over an upright plane, and an exact caster of rays against it; NumPy alone.
+"""A triangulated height field y = h(x, z) over a vertical plane, and exact ray casting against it, with NumPy only.
 
 Local frame: x along the wall, y out of it (towards the sensors), z up. A step of h over one cell is a ledge, a roof or a joint's
-flank, so that what stands out above what stands back is an overhang. Each cell is split along its diagonal from (low x, low z).
+flank, so that a part in front of the part below is an overhang. Each cell is split along its diagonal from (low x, low z).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Mask = np.ndarray[Any, np.dtype[np.bool_]]
 
 @dataclass(frozen=True)
 class Hits:
-    """What rays met: `distance` (n,) m, inf where nothing; `normal` (n, 3) unit, out of the wall, zero where nothing."""
+    """What rays met: `distance` (n,) m, inf without a hit; `normal` (n, 3) unit, out of the wall, zero without a hit."""
 
     distance: Array
     normal: Array
@@ -72,10 +72,10 @@ class Surface:
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     def cast(self, origin: Array, direction: Array) -> Hits:
-        """First hits of rays from `origin` (3,) or (n, 3) along unit `direction` (n, 3), local frame.
+        """Return the first hits of rays from `origin` (3,) or (n, 3) along unit `direction` (n, 3), local frame.
 
-        Walks from grid line to grid line; between two of them, and on either side of the diagonal, h is linear along the ray,
-        so that a change of sign of y - h there is a hit, and its place is exact.
+        It walks from grid line to grid line. Between two of them, on each side of the diagonal, h is linear along the ray, so
+        that a change of sign of y - h is a hit with an exact place.
         """
         origin = np.broadcast_to(origin, direction.shape)
         start, end = self._slab(origin, direction)
@@ -90,7 +90,7 @@ class Surface:
         return Hits(distance, normal)
 
     def _slab(self, origin: Array, direction: Array) -> tuple[Array, Array]:
-        """Where each ray enters and leaves the box round the surface, m along it."""
+        """Return where each ray enters and leaves the surface's bounding box, m along it."""
         low = np.array([self.x[0], self.height.min() - 1e-6, self.z[0]])
         high = np.array([self.x[-1], self.height.max() + 1e-6, self.z[-1]])
         safe = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
@@ -99,7 +99,7 @@ class Surface:
 
 
 class _Walk:
-    """Rays on their way over the grid: `near` is how far each has come, m; `above` its y - h there."""
+    """Rays on their way over the grid: `near` is the distance reached, m; `above` is y - h there."""
 
     def __init__(self, surface: Surface, origin: Array, direction: Array, near: Array, end: Array) -> None:
         self.surface, self.origin, self.direction, self.near, self.end = surface, origin, direction, near, end
@@ -114,7 +114,7 @@ class _Walk:
         return point[:, 1] - self.surface.at(self.i, self.j, point[:, 0], point[:, 2])
 
     def step(self) -> tuple[Mask, Mask]:
-        """Crosses one cell; which rays hit in it, and which left the grid."""
+        """Cross one cell; return which rays hit in it, and which left the grid."""
         x, z = self.surface.x, self.surface.z
         to_x = _crossing(self.origin[:, 0], self.direction[:, 0], x[self.i], x[self.i + 1])
         to_z = _crossing(self.origin[:, 2], self.direction[:, 2], z[self.j], z[self.j + 1])

@@ -1,4 +1,6 @@
-"""Walls that are no smooth height fields, errors of their reference, and rock that moved. Local frame of `surface.py`; metres."""
+"""Walls that are not smooth height fields, errors of their reference, and rock that moved; local frame of
+`surface.py`, metres.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ Rng = np.random.Generator
 
 
 def fractal(shape: tuple[int, ...], rng: Rng, exponent: float, longest: float = 1.0) -> Array:
-    """(a, b) a field of unit spread whose power falls with frequency to the power -2 exponent; none longer than `longest`."""
+    """Return an (a, b) field of unit variance whose power falls with frequency to the power -2 exponent, with wavelengths up to
+    `longest`.
+    """
     kx, kz = np.fft.fftfreq(2 * shape[0])[:, None] * shape[0], np.fft.rfftfreq(2 * shape[1])[None] * shape[1]
     k = np.hypot(kx * max(shape) / shape[0], kz * max(shape) / shape[1])
     amplitude = np.where(k >= 1.0 / longest, np.maximum(k, 0.5) ** -exponent, 0.0)
@@ -59,7 +63,7 @@ def portal(x: Array, z: Array, rng: Rng) -> Array:
 
 
 def roofs(x: Array, z: Array, rng: Rng) -> Array:
-    """A cliff whose upper parts stand out (roofs), cut by upright joints, with talus at its foot."""
+    """Return a cliff whose upper parts overhang (roofs), cut by vertical joints, with talus at its foot."""
     height = np.zeros_like(z)
     for place in rng.uniform(6, z.max(), 4):
         edge = place + rng.uniform(-0.4, 0.4) * x + 1.5 * fractal(x.shape, rng, 2.2, 0.5)[:, :1]
@@ -91,7 +95,7 @@ WALLS: dict[str, Callable[[Array, Array, Rng], Array]] = {
 
 
 def make(kind: str, rng: Rng, width: float, height: float, spacing: float) -> Surface:
-    """A wall of `width` x `height` m on grid lines about `spacing` m apart, centred on x = 0, from z = 0 up."""
+    """Make a wall of `width` x `height` m on grid lines about `spacing` m apart, centred on x = 0, from z = 0 up."""
     x, z = lines(width, spacing, rng, -width / 2), lines(height, spacing * rng.uniform(0.8, 1.25), rng)
     return Surface(x, z, WALLS[kind](*np.meshgrid(x, z, indexing="ij"), rng))
 
@@ -101,7 +105,7 @@ BEND = 0.15  # a bend as large as the other errors could not be told from a lens
 
 @dataclass(frozen=True)
 class ReferenceError:
-    """True minus reference: `field` (a, b) m along y, of spread `sigma` m, alike over about `patch` m."""
+    """True minus reference: `field` (a, b) m along y, with standard deviation `sigma` m, correlated over about `patch` m."""
 
     kind: str
     field: Array
@@ -110,7 +114,7 @@ class ReferenceError:
 
 
 def reference_error(surface: Surface, rng: Rng, sigma: float) -> ReferenceError:
-    """An error of the reference as strips of flight lines, tiles, a fractal or a bend leave it."""
+    """Draw an error of the reference as flight strips, tiles, a fractal or a bend cause it."""
     kind = str(rng.choice(["strips", "tiles", "fractal", "bend"]))
     x, z = np.meshgrid(surface.x, surface.z, indexing="ij")
     width, tall = np.ptp(surface.x), np.ptp(surface.z)
@@ -144,7 +148,7 @@ class Change:
 
 
 def changes(surface: Surface, rng: Rng, count: int) -> list[Change]:
-    """Fallen blocks (the surface moves in), and for some of them debris at the foot (it moves out)."""
+    """Draw fallen blocks (the surface moves in), some with debris at the foot (it moves out)."""
     found = []
     width, tall = np.ptp(surface.x), np.ptp(surface.z)
     for _ in range(count):

@@ -1,5 +1,5 @@
-"""Offer the program as Python functions: what `from pipeline import ...` gives.
+"""Provide the program as Python functions: what `from pipeline import ...` gives.
 
-Results are the field's own types: NumPy and xarray arrays, GeoDataFrames, meshes.
-Start with `runs.py` (`simulate`, `open_run`).
+Results have the types that the field uses: NumPy and xarray arrays, GeoDataFrames, meshes. Start with `runs.py` (`simulate`,
+`open_run`).
 """

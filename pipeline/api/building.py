@@ -1,6 +1,7 @@
-"""Building blocks: a wall, blocks, a sensor of one's own, and what becomes of an observation; each one call on arrays.
+"""Provide the single steps of a simulation as functions on arrays: make a wall, place blocks, observe, mesh, register, compare.
 
-Everything after `stage` is in the wall frame: x along the wall, y up the wall, z towards the sensor, m.
+Use them to build an experiment that `simulate` does not cover. After `stage` everything is in the wall frame: x along the
+wall, y up the wall, z towards the sensor, m.
 """
 
 from __future__ import annotations
@@ -44,14 +45,37 @@ _FEWEST_FOR_NORMALS = 3
 
 
 def make_wall(seed: int = 1, **keys: Any) -> Mesh:
-    """A wall made by rule, world frame. keys: a config's of `wall`: style="glendale", width_m, height_m, resolution_m, ..."""
+    """Make a procedural wall.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the wall's shape.
+    **keys
+        Keys of a config's `wall` section: style="glendale", width_m, height_m, resolution_m, ...
+
+    Returns
+    -------
+    Mesh
+        The wall in the world frame, m.
+    """
     return Mesh.of(parse(ProceduralWall, keys, "make_wall").mesh(KeyedRandom(seed)))
 
 
 def open_wall(path: Path | str | Sequence[Path | str], **keys: Any) -> Mesh:
-    """Read a wall from a mesh file, or from several that make up the scene, mended as a simulation mends it.
+    """Read a wall from mesh files and repair it as a simulation does.
 
-    keys: unit, flipped, albedo, as in a config's `wall`. The mesh is in the files' coordinates, m.
+    Parameters
+    ----------
+    path : path, or list of paths
+        A mesh file, or the several files that make up the scene.
+    **keys
+        Keys of a config's `wall` section: unit, flipped, albedo.
+
+    Returns
+    -------
+    Mesh
+        The wall in the files' coordinates, m.
     """
     mesh = str(path) if isinstance(path, Path | str) else [str(each) for each in path]
     return Mesh.of(parse(ImportedWall, {"mesh": mesh, **keys}, "open_wall").load()[0])
@@ -66,9 +90,21 @@ def stage(
     model: Any = None,
     **overrides: Any,
 ) -> SensorSite:
-    """A wall (world frame; none: the config's) in its frame with a sensor before it: `.mesh`, `.frame`, `.sensor`, `.viewpoints`.
+    """Place a sensor in front of a wall and transform the wall into the wall frame.
 
-    The wall frame's z axis points to the sensor, which the config places; config, model, overrides: as `configure` takes them.
+    Parameters
+    ----------
+    wall : TriangleMesh, optional
+        The wall in the world frame, m. Default: the config's wall.
+    sensor : "tls" or "stereo", optional
+        The sensor. May be omitted if the config has only one.
+    config, seed, model, **overrides
+        The config, which also places the sensor; see `configure`.
+
+    Returns
+    -------
+    SensorSite
+        `.mesh` (wall frame), `.frame` (the wall frame, whose z axis points to the sensor), `.sensor`, `.viewpoints`.
     """
     resolved = configure(config, sensor, seed=seed, model=model, **overrides)
     given = None if wall is None else Wall(wall, (), "wall")
@@ -83,45 +119,127 @@ def make_blocks(
     shape: Literal["cube", "sphere"] = "cube",
     subdivisions: int = 2,
 ) -> solids.Blocks:
-    """Blocks where and as large as they are wanted, wall frame, m; their labels count from 1.
+    """Make blocks of given positions and sizes, labelled from 1.
 
-    centres: (k, 3); sizes: (k, 3) lengths of the axes, or (k,) of all three; rotations_rad: (k, 3) about x, then y, then z.
+    Parameters
+    ----------
+    centres : (k, 3) array
+        Centres of the blocks, wall frame, m.
+    sizes : (k, 3) or (k,) array
+        Lengths of the three axes, or one length for all three, m.
+    rotations_rad : (k, 3) array, optional
+        Rotation angles about x, then y, then z. Default: no rotation.
+    shape : "cube" or "sphere"
+        Shape of all blocks.
+    subdivisions : int
+        How often the faces of the basic shape are subdivided.
+
+    Returns
+    -------
+    Blocks
+        The blocks as closed meshes, wall frame.
+
+    Raises
+    ------
+    InputError
+        If the arrays have other shapes, are not finite, or a size is not positive.
     """
     place = _table(centres, "centres")
     size = np.asarray(sizes, dtype=np.float64)
     size = _table(np.repeat(size[:, None], 3, axis=1) if size.ndim == 1 else size, "sizes", len(place))
     turn = np.zeros_like(place) if rotations_rad is None else _table(rotations_rad, "rotations_rad", len(place))
     if not (size > 0).all():
-        raise InputError(f"holds {size.min():g} m", where="sizes", allowed="above 0")
+        raise InputError(f"got {size.min():g} m", where="sizes", allowed="above 0")
     return solids.make_regular_blocks(place, size, turn, shape, subdivisions)
 
 
 def place_blocks(mesh: TriangleMesh, seed: int = 1, **keys: Any) -> solids.Blocks:
-    """Blocks drawn at random on a wall, wall frame. keys: those of a config's `rockfall`: count, shape, size_m, ..."""
+    """Draw blocks at random positions on a wall.
+
+    Parameters
+    ----------
+    mesh : TriangleMesh
+        The wall, wall frame, m.
+    seed : int
+        Seed of positions, sizes and shapes.
+    **keys
+        Keys of a config's `rockfall` section: count, shape, size_m, ...
+
+    Returns
+    -------
+    Blocks
+        The blocks, wall frame.
+    """
     config = parse(solids.RockfallConfig, keys, "place_blocks")
     return solids.place_blocks(config, mesh, KeyedRandom(seed).child("blocks"))
 
 
 def carve(mesh: TriangleMesh, blocks: solids.Blocks) -> carving.Carved:
-    """The wall without its blocks: `.mesh`, whose faces know their block, and `.removed_volume_m3`, (k,)."""
+    """Remove blocks from a wall.
+
+    Returns
+    -------
+    Carved
+        `.mesh`, whose `face_block` labels the faces of each niche, and `.removed_volume_m3` (k,).
+    """
     return carving.carve(mesh, blocks)
 
 
 def observe(mesh: TriangleMesh, sensor: Sensor, seed: int = 1) -> Observation:
-    """One look of a sensor, `stage(...).sensor` or one's own, at a mesh in its frame; the same seed gives the same bytes."""
+    """Observe a mesh once with a sensor.
+
+    Parameters
+    ----------
+    mesh : TriangleMesh
+        The scene in the sensor's frame, usually the wall frame, m.
+    sensor : Sensor
+        `stage(...).sensor`, or an object of your own with the same method `observe`.
+    seed : int
+        Seed of the noise. The same seed gives identical bytes.
+
+    Returns
+    -------
+    Observation
+        The points on the sensor's grid.
+    """
     return sensor.observe(RayCaster(mesh), KeyedRandom(seed))
 
 
 def reconstruct(observation: Observation, **keys: Any) -> Mesh:
-    """The surface through the points of an observation's grid. keys: those of a config's `surface`: method, depth_step_m, ..."""
+    """Mesh an observation through its grid of points.
+
+    Parameters
+    ----------
+    observation : Observation
+        Result of `observe`.
+    **keys
+        Keys of a config's `surface` section: method, depth_step_m, ...
+
+    Returns
+    -------
+    Mesh
+        The surface in the frame of the observation, m.
+    """
     return Mesh.of(mesh_observation(observation, parse(SurfaceConfig, keys, "reconstruct")))
 
 
 def mesh_points(points: ArrayLike, viewpoint: ArrayLike, **keys: Any) -> Mesh:
-    """Make the surface through unorganised points (n, 3), m, in their frame, as it is seen from `viewpoint` (3,), m.
+    """Mesh unorganised points as they are seen from a viewpoint.
 
-    keys: method ("triangulation" between the points, or "poisson", which needs the extra `poisson`), poisson_depth,
-    poisson_trim_spacings.
+    Parameters
+    ----------
+    points : (n, 3) array
+        Points in any frame, m.
+    viewpoint : (3,) array
+        Where the sensor stood, in the same frame, m.
+    **keys
+        method ("triangulation" between the points, or "poisson", which needs the extra `poisson`), poisson_depth,
+        poisson_trim_spacings.
+
+    Returns
+    -------
+    Mesh
+        The surface in the frame of the points, m.
     """
     config = parse(CloudConfig, keys, "mesh_points")
     eye = _table(np.reshape(np.asarray(viewpoint), (1, -1)), "viewpoint", 1)[0]
@@ -134,12 +252,12 @@ def register(moving: Any, reference: Any, seed: int = 1, **keys: Any) -> icp.Reg
     Parameters
     ----------
     moving, reference : mesh or (n, 3) array
-        In one frame, m. Vertices of a mesh that no triangle with an area uses are left out. Where the reference is an array and
-        the distance is measured along normals, they are estimated from the 24 nearest points of each.
+        Both in one frame, m. Vertices that no triangle of positive area uses are ignored. If the reference is an array and
+        distances are measured along normals, the normals are estimated from the 24 nearest points of each point.
     seed : int
-        Of the random subsets that ICP begins with.
+        Seed of the random subsets that ICP starts with.
     **keys
-        Those of a config's `icp`, such as method="point_to_point".
+        Keys of a config's `icp` section, such as method="point_to_point".
 
     Returns
     -------
@@ -149,7 +267,7 @@ def register(moving: Any, reference: Any, seed: int = 1, **keys: Any) -> icp.Reg
     Raises
     ------
     InputError
-        For points that are too few, not finite or on a line, and for wrong keys.
+        If the points are too few, not finite or collinear, or a key is wrong.
     """
     config = parse(icp.IcpConfig, keys, "register")
     points, normals = _surface_points(reference, "reference")
@@ -159,7 +277,21 @@ def register(moving: Any, reference: Any, seed: int = 1, **keys: Any) -> icp.Reg
 
 
 def difference(reference: TriangleMesh, epoch: TriangleMesh, gsd_m: float = 0.02) -> xarray.DataArray:
-    """(y, x) reference minus epoch along z, m, missing rock positive, NaN without data; coordinate `block`: epoch's labels."""
+    """Map the change between two surfaces along z.
+
+    Parameters
+    ----------
+    reference, epoch : TriangleMesh
+        The surfaces before and after, wall frame, m.
+    gsd_m : float
+        Side of a pixel, m.
+
+    Returns
+    -------
+    xarray.DataArray
+        (y, x) reference minus epoch, m. Missing rock is positive, NaN means no data. The coordinate `block` has the epoch's
+        block labels.
+    """
     grid = rasters.raster_grid(reference.bounds, parse(rasters.DifferenceConfig, {"gsd_m": gsd_m}, "difference"))
     before, after = rasters.surface_raster(reference, grid), rasters.surface_raster(epoch, grid)
     change = data_array(rasters.difference(before, after), grid, "difference", DIFFERENCE)
@@ -167,7 +299,10 @@ def difference(reference: TriangleMesh, epoch: TriangleMesh, gsd_m: float = 0.02
 
 
 def _surface_points(given: Any, name: str) -> tuple[FloatArray, FloatArray | None]:
-    """Points (n, 3) of a mesh or an array, and a mesh's vertex normals; vertices without a normal belong to no surface."""
+    """Return the points (n, 3) of a mesh or an array, and the vertex normals of a mesh (None for an array).
+
+    Vertices without a normal are dropped, because they belong to no surface.
+    """
     if not isinstance(given, TriangleMesh):
         points = _table(given, name)
         rounded = rounded_axes(points)
@@ -181,7 +316,7 @@ def _surface_points(given: Any, name: str) -> tuple[FloatArray, FloatArray | Non
 
 
 def _table(values: ArrayLike, name: str, rows: int | None = None) -> Any:
-    """(n, 3) float64, finite."""
+    """Return the values as a finite (n, 3) float64 array; raise InputError for other shapes."""
     array = np.asarray(values, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3 or not len(array) or (rows is not None and len(array) != rows):
         raise InputError(f"have the shape {array.shape}", where=name, allowed=f"({'n' if rows is None else rows}, 3)")

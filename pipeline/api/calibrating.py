@@ -1,4 +1,4 @@
-"""`calibrate`: noise parameters fitted to measured epochs."""
+"""Provide `calibrate`, which fits a sensor's noise parameters to measured epochs."""
 
 from __future__ import annotations
 
@@ -36,11 +36,29 @@ def calibrate(
     progress: Show = "auto",
     **overrides: Any,
 ) -> Calibration:
-    """Fit the noise of a sensor's model to measured epochs; the same as `scarpsim calibrate`.
+    """Fit the noise of a sensor model to measured epochs, as `scarpsim calibrate` does.
 
-    measured: a folder with measurement.yaml or with difference maps, GeoTIFFs, or a run. config: the site, none: that of a run
-    among `measured`, else the demo's; model, overrides: as `configure` takes them. greedy: the thesis's search too, for
-    comparison. out: a folder for report and files, none: nothing is written.
+    Parameters
+    ----------
+    measured : path, Run, or a list of them
+        A folder with measurement.yaml, a folder with difference maps, difference maps (GeoTIFF), or a run.
+    config : optional
+        The site; see `configure`. Default: the config of a run among `measured`, or else the demo.
+    sensor : "tls" or "stereo", optional
+        What measured. Default: as the inputs say.
+    greedy : bool
+        Also run the greedy search of the thesis, for comparison.
+    out : path, optional
+        Folder for the report and files. Default: nothing is written.
+    seed, model, **overrides
+        See `configure`.
+    progress : "auto" or bool
+        Whether progress is shown; "auto": in notebooks and on terminals.
+
+    Returns
+    -------
+    Calibration
+        The fitted parameters with their confidence intervals.
     """
     inputs = paths(measured)
     given = config_of(inputs) if config is None else config
@@ -55,43 +73,53 @@ def calibrate(
 
 @dataclass(frozen=True, repr=False)
 class Calibration:
-    """Fitted noise. figures: everything, as `pipeline.calibration` has it; inputs: what it was fitted to."""
+    """Result of `calibrate`: the fitted noise of a sensor.
+
+    Attributes
+    ----------
+    figures : CalibrationResult
+        All results, as `pipeline.calibration` computes them.
+    inputs : tuple of Path
+        The files and folders that the noise was fitted to.
+    """
 
     figures: fitting.CalibrationResult
     inputs: tuple[Path, ...]
 
     @property
     def model(self) -> Any:
-        """The sensor model with the fitted noise: `simulate(config, model=found.model)`."""
+        """The sensor model with the fitted noise, for `simulate(config, model=calibration.model)`."""
         return self.figures.model
 
     @property
     def parameters(self) -> pandas.DataFrame:
-        """value, low and high (of the confidence interval) of each parameter, in the unit of its name."""
+        """One row per noise parameter: value, and low and high end of its confidence interval, in the unit of its name."""
         found = self.figures.found
         values = {name: np.exp(each) for name, each in (("value", found.x), ("low", found.low), ("high", found.high))}
         return frame_of(values, self.figures.parameters.names, "parameter")
 
     @property
     def systematic(self) -> xarray.DataArray:
-        """(y, x) the mean of the measured maps, m."""
+        """Mean of the measured difference maps, (y, x), m."""
         return data_array(self.figures.systematic, self.figures.inputs.grid, "systematic", "mean of the measured maps")
 
     @property
     def warnings(self) -> list[str]:
-        """What has to be known before the values are used."""
+        """Limitations to know before the values are used, as sentences."""
         return warnings(self.figures)
 
     def summary(self) -> str:
-        """The result in a few lines of text."""
+        """Return the result as a few lines of text."""
         return summary(self.figures)
 
     def plot(self, kind: str = "windows") -> Picture:
-        """A picture of the report: windows, measured, systematic, distribution, statistics, epochs."""
+        """Return a figure of the report: windows, measured, systematic, distribution, statistics or epochs."""
         return Picture(pick({name: png for name, _, png in pictures(self.figures, None)}, kind, "plot"))
 
     def write(self, out: Path | str) -> Path:
-        """Write the folder that `scarpsim calibrate` fills; returns its report.html. InputError where it is in use."""
+        """Write the folder that `scarpsim calibrate` writes; return its report.html. Raises InputError if the folder is in
+        use.
+        """
         return write(Path(out), self.figures.config, self.figures, self.inputs)
 
     def __repr__(self) -> str:

@@ -1,4 +1,4 @@
-"""`compare`: several sensors in front of one wall."""
+"""Provide `compare`, which simulates several sensors in front of one wall."""
 
 from __future__ import annotations
 
@@ -36,12 +36,34 @@ def compare(
     progress: Show = "auto",
     **overrides: Any,
 ) -> Comparison:
-    """Compare sensors on the first one's wall and the same blocks; the same as `scarpsim compare`.
+    """Compare sensors on the first one's wall with the same blocks, as `scarpsim compare` does.
 
-    sensors: configs, their files or values, runs, bundled sites, scanners ("riegl_vz400i"), noise models, or a mapping of names
-    to them; a config with both sensors gives two. sizes_m: of the blocks in the first and the last epoch, None: the config's.
-    measured: folders of measured epochs to put beside. own_step: presets scan with their own angular step. out: a
-    folder for report and files, none: nothing is written. overrides: of every config, as `configure` takes them.
+    Parameters
+    ----------
+    *sensors : config, path, name, Run, or one mapping of names to these
+        Configs or their values or files, runs, bundled sites, scanners ("riegl_vz400i") or noise models. A config with both
+        kinds of sensor counts as two.
+    epochs : int
+        Number of epochs with rockfall.
+    sizes_m : (float, float) or None
+        Block size in the first and in the last epoch, m. None: the blocks of the config.
+    measured : sequence of paths
+        Folders of measured epochs to show next to the simulated ones.
+    own_step : bool
+        Let scanner presets use their own angular step. Otherwise all use the step of the first config.
+    out : path, optional
+        Folder for the report and files. Default: nothing is written.
+    seed : int, optional
+        Seed of all random numbers. Default: the first config's.
+    progress : "auto" or bool
+        Whether progress is shown; "auto": in notebooks and on terminals.
+    **overrides
+        Changes to every config; see `configure`.
+
+    Returns
+    -------
+    Comparison
+        Noise, level of detection and detected blocks of each sensor.
     """
     given = _given(sensors, seed, overrides)
     found = sensor_setups(given, keywords(overrides), seed, own_step=own_step)
@@ -54,28 +76,34 @@ def compare(
 
 @dataclass(frozen=True, repr=False)
 class Comparison:
-    """Sensors compared. figures: everything, as `pipeline.comparison` has it."""
+    """Result of `compare`.
+
+    Attributes
+    ----------
+    figures : ComparedSensors
+        All results, as `pipeline.comparison` computes them.
+    """
 
     figures: Figures
 
     @property
     def names(self) -> list[str]:
-        """Of the sensors, in their order."""
+        """Names of the sensors, in the order in which they were given."""
         return [each.name for each in self.figures.found]
 
     @property
     def table(self) -> pandas.DataFrame:
-        """A row for each sensor, by name: noise, level of detection, smallest block, completeness; SI."""
+        """One row per sensor, indexed by name: noise, level of detection, smallest block, completeness; SI units."""
         return frame(map(_row, self.figures.found)).set_index("name")
 
     @property
     def blocks(self) -> pandas.DataFrame:
-        """A row for each block and sensor: its size, whether it was in view and seen, true and measured volume; SI."""
+        """One row per block and sensor: size, whether it was in view and seen, true and measured volume; SI units."""
         found = self.figures.found
         return frame({"sensor": each.name, **block.to_dict()} for each in found for block in each.detection.blocks)
 
     def differences(self, sensor: str) -> xarray.DataArray:
-        """(epoch, y, x) difference maps of a sensor by its name, m."""
+        """Return the difference maps of the sensor called `sensor`, (epoch, y, x), m."""
         trial = self.figures.trial
         if sensor not in self.names:
             raise InputError(
@@ -86,23 +114,23 @@ class Comparison:
 
     @property
     def level_of_detection(self) -> xarray.Dataset:
-        """The 95 % level of detection of a pixel, m, a map for each sensor."""
+        """Level of detection (95 %) of each pixel, m; one map per sensor."""
         grid = self.figures.trial.grid
         return dataset({
             each.name: data_array(each.noise.level, grid, each.name, "95 % level of detection") for each in self.figures.found
         })  # fmt: skip
 
     def summary(self) -> str:
-        """The main figures as lines of text."""
+        """Return the main results as lines of text."""
         return summary(self.figures)
 
     def plot(self, kind: str = "maps") -> Picture:
-        """A picture of the report: maps, level_of_detection, noise, by_covariate, detection, size_and_depth."""
+        """Return a figure of the report: maps, level_of_detection, noise, by_covariate, detection or size_and_depth."""
         drawn = pictures(self.figures)
         return Picture(pick({name.removesuffix(".png"): png for name, png in drawn.items()}, kind, "plot"))
 
     def write(self, out: Path | str) -> Path:
-        """Write the folder that `scarpsim compare` fills; returns its report.html. InputError where it is in use."""
+        """Write the folder that `scarpsim compare` writes; return its report.html. Raises InputError if the folder is in use."""
         return write_comparison(Path(out), self.figures)
 
     def __repr__(self) -> str:
@@ -113,9 +141,11 @@ class Comparison:
 
 
 def _given(sensors: Sequence[Any], seed: int | None, overrides: Mapping[str, Any]) -> list[Given]:
-    """What is to be compared as `sensor_setups` takes it: names of files and presets, and configs with a name."""
+    """Turn the arguments of `compare` into what `sensor_setups` takes: names of files and presets, or pairs of a name and a
+    config.
+    """
     if not sensors:
-        raise InputError("names no sensor", where="compare", remedy='compare("glendale", "riegl_vz400i")')
+        raise InputError("got no sensor", where="compare", remedy='write for example compare("glendale", "riegl_vz400i")')
     only = sensors[0]
     if len(sensors) == 1 and isinstance(only, Mapping) and not set(only) & set(SimulationConfig.model_fields):
         named = [(str(name), each) for name, each in only.items()]
@@ -128,6 +158,7 @@ def _given(sensors: Sequence[Any], seed: int | None, overrides: Mapping[str, Any
 
 
 def _row(found: SensorAssessment) -> dict[str, Any]:
+    """Return one sensor's row of `Comparison.table`."""
     curve, blocks = found.detection.by_size, found.detection.blocks
     return {
         "name": found.name,

@@ -1,4 +1,4 @@
-"""From what a call names, a config object, a file, a bundled name, keywords, to one resolved config."""
+"""Turn the `config` argument of a call (config object, file, bundled name, keywords) into one resolved config."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pipeline.config.simulation import SensorName, SimulationConfig, load_config
 from scene.common.errors import InputError
 
 ConfigLike = SimulationConfig | Mapping[str, Any] | str | os.PathLike[str] | None
-"""A config, its values, a file, a bundled site's name, or a run's folder; None: the demo."""
+"""A config object, a mapping of its keys, a file, the name of a bundled site, or the folder of a run. None means the demo."""
 
 
 def configure(
@@ -27,12 +27,34 @@ def configure(
     model: Any = None,
     **overrides: Any,
 ) -> SimulationConfig:
-    """The config that a call names, resolved; what `simulate`, `plan`, `compare` and `calibrate` do with their first argument.
+    """Return the resolved config that a call describes.
 
-    config: a SimulationConfig, a mapping of its keys, a YAML file, a bundled site such as "glendale", a run's folder; None: the
-    demo's. model: a sensor model, its file or bundled name ("glendale_high"), in place of the config's. overrides: as `--set`
-    of the command line, with two underscores for the dot: rockfall__count=5, wall={"mesh": "wall.ply"}. Raises InputError for
-    whatever is wrong.
+    `simulate`, `plan`, `compare` and `calibrate` treat their arguments in this way.
+
+    Parameters
+    ----------
+    config : optional
+        A SimulationConfig, a mapping of its keys, a YAML file, a bundled site such as "glendale", or a run's folder. Default:
+        the demo.
+    sensor : "tls" or "stereo", optional
+        The sensor that the config is for.
+    seed : int, optional
+        Seed of all random numbers. Default: the config's.
+    model : optional
+        A sensor model, its file or its bundled name ("glendale_high"), instead of the config's.
+    **overrides
+        Changed keys, as with `--set` on the command line but with two underscores for the dot: rockfall__count=5,
+        wall={"mesh": "wall.ply"}.
+
+    Returns
+    -------
+    SimulationConfig
+        The complete, checked config.
+
+    Raises
+    ------
+    InputError
+        If anything in it is wrong.
     """
     check_sensor(sensor)
     changes = keywords({**({} if model is None else {"sensor": model}), **overrides})
@@ -45,13 +67,13 @@ def configure(
 
 
 def check_sensor(sensor: str | None) -> None:
-    """Raise InputError for a word that names no sensor."""
+    """Raise InputError if `sensor` is neither None nor the name of a kind of sensor."""
     if sensor not in (None, "stereo", "tls"):
         raise InputError(f"got {sensor!r:.80}", where="sensor", allowed="'stereo', 'tls'")
 
 
 def one_sensor(config: SimulationConfig, sensor: SensorName | None) -> SensorName:
-    """The sensor that is meant: the one named, or the only one that the config has a model of."""
+    """Return the sensor that was asked for, or the only one that the config has a model of."""
     if sensor is not None:
         return sensor
     names = config.sensor_names()
@@ -61,12 +83,12 @@ def one_sensor(config: SimulationConfig, sensor: SensorName | None) -> SensorNam
 
 
 def keywords(values: Mapping[str, Any]) -> list[Override]:
-    """Keywords as overrides: two underscores stand for the dot."""
+    """Return keyword arguments as config overrides; two underscores in a keyword stand for the dot."""
     return [Override(tuple(name.split("__")), plain(value), f"{name}={value!r:.80}") for name, value in values.items()]
 
 
 def plain(value: Any) -> Any:
-    """The value in the types that a YAML file has: of models their fields, of paths their text, of arrays lists."""
+    """Return a value in the types of a YAML file: models become mappings, paths text, arrays lists."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")
     if isinstance(value, Mapping):
@@ -79,10 +101,10 @@ def plain(value: Any) -> Any:
 
 
 def paths(values: Any) -> list[Path]:
-    """One path or several as a list; objects with a `folder`, such as a run, stand for it."""
+    """Return one path or several as a list; an object with a `folder`, such as a run, stands for its folder."""
     several: Sequence[Any] = values if isinstance(values, list | tuple) else [values]
     return [Path(getattr(each, "folder", each)) for each in several]
 
 
 Show = Literal["auto"] | bool
-"""Whether progress is shown: "auto" in notebooks and on terminals."""
+"""Whether progress is shown; "auto": in notebooks and on terminals."""

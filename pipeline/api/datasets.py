@@ -1,4 +1,4 @@
-"""`make_dataset`: labelled tiles of difference maps."""
+"""Provide `make_dataset`, which makes labelled tiles of difference maps for training."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import pandas
 
 DatasetLike = DatasetConfig | Mapping[str, Any] | str | os.PathLike[str]
-"""A data set's config, its values, a file, or a bundled name such as "small"."""
+"""The config of a data set, a mapping of its keys, a file, or a bundled name such as "small"."""
 
 
 def make_dataset(
@@ -37,10 +37,29 @@ def make_dataset(
     progress: Show = "auto",
     **overrides: Any,
 ) -> DataSet:
-    """Make a set of annotated tiles, or what is missing of it; the same as `scarpsim dataset`.
+    """Make a set of annotated tiles, or complete an unfinished one, as `scarpsim dataset` does.
 
-    config: a DatasetConfig, a mapping of its keys, a YAML file or a bundled name; a wall may be a SimulationConfig. out: the
-    set's folder; workers: local processes, 0: this one; scheduler: of Dask, instead. overrides: as `configure` has them.
+    Parameters
+    ----------
+    config : DatasetConfig, mapping, path or name
+        The config of the set. A wall in it may be a SimulationConfig.
+    out : path
+        Folder of the set.
+    workers : int
+        Number of local worker processes; 0: this process alone.
+    scheduler : str
+        Address of a Dask scheduler to use instead of local processes.
+    seed : int, optional
+        Seed of all random numbers. Default: the config's.
+    progress : "auto" or bool
+        Whether progress is shown; "auto": in notebooks and on terminals.
+    **overrides
+        Changed keys of the config; see `configure`.
+
+    Returns
+    -------
+    DataSet
+        The finished set.
     """
     changes = keywords(overrides)
     if isinstance(config, DatasetConfig | Mapping):
@@ -54,27 +73,33 @@ def make_dataset(
 
 @dataclass(frozen=True, repr=False)
 class DataSet:
-    """A data set by its folder."""
+    """A data set on disk.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder of the set.
+    """
 
     folder: Path
 
     @property
     def splits(self) -> list[str]:
-        """Those that the set has, of train, val and test."""
+        """The splits that the set has, out of train, val and test."""
         return [name for name in SPLITS if (self.folder / name / "annotations.json").is_file()]
 
     @property
     def record(self) -> dict[str, Any]:
-        """dataset.json: configs, versions, whether it is complete."""
+        """Content of dataset.json: configs, versions, and whether the set is complete."""
         return read_dataset_file(self.folder)
 
     def tiles(self, split: str = "train", **filters: str) -> Tiles:
-        """The tiles of a split as arrays; filters: sensor, wall, noise, size_class."""
+        """Return the tiles of a split as arrays, optionally only those of one sensor, wall, noise or size_class."""
         return Tiles(self.folder / pick({name: name for name in self.splits}, split, str(self.folder)), **filters)
 
     @property
     def table(self) -> pandas.DataFrame:
-        """A row for each tile: split, file_name, sensor, wall, noise, size_class, blocks, ..."""
+        """One row per tile: split, file_name, sensor, wall, noise, size_class, blocks, ..."""
         rows = []
         for split in self.splits:
             content = read_coco(self.folder / split / "annotations.json")
@@ -85,7 +110,7 @@ class DataSet:
         return frame(rows)
 
     def plot(self, kind: str | None = None) -> Picture:
-        """A picture of the set's card."""
+        """Return a figure of the set's data card, by name. Default: the first."""
         drawn = {path.stem: path for path in sorted((self.folder / "card").glob("*.png"))}
         return Picture(pick(drawn, kind, str(self.folder)).read_bytes())
 

@@ -1,4 +1,4 @@
-"""`detect`: rockfalls in difference maps."""
+"""Provide `detect`, which finds rockfalls in difference maps."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 _COMMAND = "import sys; from pipeline.cli.main import main; sys.exit(main(sys.argv[1:]))"
 _WRONG_INPUT = 2
 _SHOWN = 10
-"""Blocks in a notebook's view."""
-_WAITING = "the detector, after TensorFlow, which takes ten seconds and more to load"
+"""Most events that the notebook view lists."""
+_WAITING = "detector (TensorFlow takes ten seconds or more to load)"
 
 
 def detect(
@@ -40,12 +40,31 @@ def detect(
     unmirrored: bool = False,
     progress: Show = "auto",
 ) -> Detections:
-    """Find the blocks in difference maps; the same as `scarpsim detect`.
+    """Find fallen blocks in difference maps, as `scarpsim detect` does.
 
-    maps: DataArrays (y, x) in m, runs, TIFF files, folders with annotations.json, one or a list; model: "default" (the weights
-    that come with scarpsim) or a trained detector's folder, either by TensorFlow in a process of its own, or "baseline", a
-    threshold. out: a folder for COCO files, tables, masks and overlays; none: a temporary one, removed when the result goes.
-    unmirrored: the network looks at maps as they are, not at their mirror images too, which is faster and finds less.
+    A network runs in a process of its own, because TensorFlow and the ray tracer cannot share one.
+
+    Parameters
+    ----------
+    maps : DataArray, Run, path, or a list of them
+        Difference maps (y, x) in m, runs, TIFF files, or folders with annotations.json.
+    model : path or str
+        "default" (the network that comes with scarpsim), "baseline" (a threshold, no network), or the folder of a trained
+        detector.
+    confidence : float or sequence of floats
+        Smallest score to accept. The result uses the smallest of several.
+    out : path, optional
+        Folder for COCO files, tables, masks and overlays. Default: a temporary folder, which is deleted together with the
+        result.
+    unmirrored : bool
+        Show the network only the maps and not their mirror images. This is faster and finds less.
+    progress : "auto" or bool
+        Whether progress is shown; "auto": in notebooks and on terminals.
+
+    Returns
+    -------
+    Detections
+        The events that were found.
     """
     confidences = run.sorted_confidences([confidence] if isinstance(confidence, int | float) else confidence)
     kept = tempfile.TemporaryDirectory(prefix="scarpsim_detect_") if out is None else None
@@ -64,7 +83,19 @@ def detect(
 
 @dataclass(frozen=True, repr=False)
 class Detections:
-    """What was found. folder: of the files; found: the events with a score of `confidence` and more, best first in each map."""
+    """Result of `detect`.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder with the written files.
+    found : tuple of Event
+        The events with a score of at least `confidence`, in each map sorted by descending score.
+    confidence : float
+        Smallest accepted score.
+    temporary : TemporaryDirectory, optional
+        Owner of a temporary `folder`, which it deletes when the result is no longer used.
+    """
 
     folder: Path
     found: tuple[Event, ...]
@@ -76,7 +107,9 @@ class Detections:
 
     @property
     def events(self) -> geopandas.GeoDataFrame:
-        """A row for each event: image, number, place, area, depth, volume, score; SI; geometry: its rectangle, wall frame."""
+        """One row per event: image, number, position, area, depth, volume, score; SI units. The geometry is its rectangle, wall
+        frame.
+        """
         bounds = [
             [each.x_m - each.width_m / 2, each.y_m - each.height_m / 2, each.x_m + each.width_m / 2, each.y_m + each.height_m / 2]
             for each in self.found
@@ -85,16 +118,16 @@ class Detections:
 
     @property
     def volume_m3(self) -> float:
-        """Of all events together."""
+        """Total volume of all events."""
         return sum(each.volume_m3 for each in self.found)
 
     def plot(self, image: str | None = None) -> Picture:
-        """The outlines over a map, by the stem of its name; none: the first."""
+        """Return the outlines drawn over a map, chosen by the stem of its file name. Default: the first map."""
         drawn = {path.name.removesuffix("_detections.png"): path for path in sorted(self.folder.glob("*_detections.png"))}
         return Picture(pick(drawn, image, "plot").read_bytes())
 
     def summary(self) -> str:
-        """One line."""
+        """Return the number of events and their volume as one line of text."""
         return f"{len(self)} blocks with a score of {self.confidence:g} or more, {self.volume_m3:.3g} m³"
 
     def __repr__(self) -> str:
@@ -109,19 +142,21 @@ class Detections:
 
 
 def _several(maps: Any) -> list[Any]:
+    """Return the maps as a list; arrays with an epoch axis become one map per epoch."""
     found = list(maps) if isinstance(maps, list | tuple) else [maps]
     found = [part for each in found for part in (list(each) if _is_array(each) and each.ndim == 3 else [each])]
     if not found:
-        raise InputError("names no map", where="detect")
+        raise InputError("got no map", where="detect", remedy="give at least one difference map or run")
     return found
 
 
 def _is_array(value: Any) -> bool:
+    """Return whether a value is an xarray.DataArray, without importing xarray."""
     return hasattr(value, "dims") and hasattr(value, "coords")
 
 
 def _place(given: Any, folder: Path, number: int) -> Path:
-    """The path of an input; a DataArray is written first."""
+    """Return the path of an input; a DataArray is first written as a GeoTIFF into `folder`."""
     if not _is_array(given):
         return Path(getattr(given, "folder", given))
     path = folder / f"{given.name or 'map'}_{number:03d}.tif"
@@ -130,10 +165,14 @@ def _place(given: Any, folder: Path, number: int) -> Path:
 
 
 def _in_another_process(model: str, places: Sequence[Path], out: Path, confidences: Sequence[float], *, unmirrored: bool) -> None:
-    """`scarpsim detect` as a command: TensorFlow and the ray tracer's compiler do not belong into one process."""
+    """Run `scarpsim detect` as a command, because TensorFlow and the ray tracer's compiler cannot share a process."""
     words = [model, *map(str, places), "--out", str(out), *(f"--confidence={value:g}" for value in confidences), "--quiet"]
     command = [sys.executable, "-c", _COMMAND, "detect", *words, *["--unmirrored"] * unmirrored]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        message = done.stderr.strip().splitlines()[-1].removeprefix("error: ") if done.stderr.strip() else "ended without a word"
+        message = (
+            done.stderr.strip().splitlines()[-1].removeprefix("error: ")
+            if done.stderr.strip()
+            else "the detector's process ended without a message"
+        )
         raise InputError(message) if done.returncode == _WRONG_INPUT else OutsideError(message)

@@ -1,4 +1,4 @@
-"""Libraries of the extra `notebook`, loaded where one of their types is asked for."""
+"""Load the optional libraries, mostly of the extra `notebook`, when one of their types is needed."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from scene.common.errors import InputError
 from scene.common.extras import how_to_install
 
 EXTRAS = {"open3d": "poisson"}
-"""The extra of a library; of all others it is `notebook`."""
+"""Extra that installs a library; libraries not listed belong to `notebook`."""
 
 
 def library(name: str) -> Any:
-    """The module `name` of an optional library; raises InputError that names the extra where it does not load."""
+    """Import an optional library; raise InputError that names the extra to install if it does not load."""
     try:
         return import_module(name)
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""Rasters over the wall as xarray.DataArray with coordinates, units and the coordinate system of the wall frame."""
+"""Convert rasters of the wall to and from xarray.DataArray, with coordinates, units and the wall frame as coordinate system."""
 
 from __future__ import annotations
 
@@ -19,16 +19,32 @@ if TYPE_CHECKING:
 
 DIFFERENCE = "reference minus epoch; missing rock positive"
 _SPREAD = 1e-6
-"""Share of a pixel by which the steps of a map's coordinates may differ."""
+"""Largest difference between the steps of a map's coordinates, as a share of a pixel, for which the pixels count as square."""
 
 
 def data_array(
     values: NDArray[Any], grid: Grid, name: str, long_name: str, *, units: str = "m", frame: WallFrame | None = None
 ) -> xarray.DataArray:
-    """A raster (h, w), or several (e, h, w) of epochs 1 to e, of `grid` as a DataArray.
+    """Return rasters on one grid as a DataArray with coordinates.
 
-    x, y: the pixels' centres, wall frame, m; `rio.crs`: the wall frame, a local system, as the GeoTIFFs have it. frame: then
-    `matrix_world_to_wall`, (4, 4) by rows, stands in the attributes.
+    Parameters
+    ----------
+    values : (h, w) or (e, h, w) array
+        One raster, or the rasters of epochs 1 to e.
+    grid : Grid
+        Position of the pixels in the wall frame.
+    name, long_name : str
+        Name of the array, and its description in the attributes.
+    units : str
+        Unit of the values.
+    frame : WallFrame, optional
+        If given, its matrix (4, 4) from world to wall is stored by rows in the attribute `matrix_world_to_wall`.
+
+    Returns
+    -------
+    xarray.DataArray
+        x and y are the pixels' centres, wall frame, m. `.rio.crs` is the wall frame as a local coordinate system, as in the
+        GeoTIFFs.
     """
     xarray = library("xarray")
     library("rioxarray")  # gives DataArrays their `.rio`
@@ -50,25 +66,25 @@ def data_array(
 
 
 def dataset(rasters: Mapping[str, xarray.DataArray]) -> xarray.Dataset:
-    """Rasters of one grid by name."""
+    """Combine rasters of one grid into a Dataset, by name."""
     return library("xarray").Dataset(dict(rasters))
 
 
 def raster_of(array: Any, where: str) -> tuple[NDArray[np.float32], Grid]:
-    """(h, w) float32 values of a DataArray and the grid of its coordinates, row 0 at the largest y.
+    """Return the values of a DataArray, (h, w) float32 with row 0 at the largest y, and the grid of its coordinates.
 
-    Raises InputError where it has other dimensions than y and x, or pixels that are not square.
+    Raises InputError if it has other dimensions than y and x, or pixels that are not square.
     """
     if set(array.dims) != {"y", "x"}:
         raise InputError(f"has the dimensions {', '.join(map(str, array.dims))}", where=where, allowed="y, x")
     array = array.sortby("y", ascending=False).sortby("x").transpose("y", "x")
     x, y = (np.asarray(array[name], dtype=np.float64) for name in ("x", "y"))
     if min(len(x), len(y)) < 2:
-        raise InputError(f"has {len(y)} x {len(x)} pixels", where=where, allowed="2 x 2 and more")
+        raise InputError(f"has {len(y)} x {len(x)} pixels", where=where, allowed="at least 2 x 2")
     steps = np.concatenate([np.diff(x), -np.diff(y)])
     gsd = float(np.median(steps))
     if not (gsd > 0 and np.ptp(steps) <= _SPREAD * gsd):
-        problem = f"pixels of {steps.min():g} to {steps.max():g} m"
+        problem = f"has pixels of {steps.min():g} to {steps.max():g} m"
         raise InputError(problem, where=where, allowed="square pixels of one size", remedy="resample it with array.interp")
     grid = Grid(float(x[0] - gsd / 2), float(y[0] + gsd / 2), gsd, len(x), len(y))
     return np.asarray(array.values, dtype=np.float32), grid

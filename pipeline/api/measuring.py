@@ -1,4 +1,4 @@
-"""`measure` and `diagnose`: what was measured, and what its model does not explain."""
+"""Provide `measure` and `diagnose`: load a measurement, and find out what its sensor model does not explain."""
 
 from __future__ import annotations
 
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     import pandas
 
 _SCALE_SIGMAS = 6.0
+"""Half range of the residual plots' colour scale, in robust standard deviations (1.4826 MAD)."""
 
 
 def measure(
@@ -60,25 +61,50 @@ def measure(
     cameras: Any = None,
     **keys: Any,
 ) -> Measurement:
-    """A measurement: a folder with measurement.yaml, the parts of one, or what a run's sensor saw of the untouched wall.
+    """Load a measurement from a folder, from its parts, or from a simulated run.
 
-    given: a folder; or a run, of which `model` may be believed something else than what it was made with. reference: the known
-    surface, world frame: a mesh or its file; points: (n, 3) array, `Points`, a file, or a list of these, an epoch each; model:
-    what is believed of the sensor: a model, its keys, a file, a bundled name; None: the default one; cameras: nominal pair or
-    its file (stereo). keys: those of measurement.yaml beyond: frame ("world", of the points, or "scanner"),
-    scanner={"position_m": ..., "rotation": ...}, pattern, stable_areas. Raises InputError for whatever does not fit together.
+    A run gives its reference epoch, measured against its own wall.
+
+    Parameters
+    ----------
+    given : path or Run, optional
+        A folder with measurement.yaml, or a run. Not needed if `reference` and `points` are given.
+    sensor : "tls" or "stereo"
+        What measured the points.
+    reference : mesh or path, optional
+        The known surface, world frame, m.
+    points : (n, 3) array, Points, path, or a list of them, optional
+        The measured points, m; one entry of a list per epoch.
+    model : model, mapping, path or name, optional
+        The sensor model to test. With a run it may differ from the model that made the run. Default: the run's model, or else
+        the default model of the sensor.
+    cameras : CameraPair or path, optional
+        The nominal camera pair (stereo only).
+    **keys
+        Further keys of measurement.yaml: frame ("world", or "scanner", of the points), scanner={"position_m": ..., "rotation":
+        ...}, pattern, stable_areas.
+
+    Returns
+    -------
+    Measurement
+        The points, the reference and the sensor model, checked and in the wall frame.
+
+    Raises
+    ------
+    InputError
+        If the parts are incomplete or do not fit together.
     """
     if isinstance(given, Run):
         return _of_run(given, model)
     if given is not None:
         return Measurement(read_measurement(Path(given)))
     if reference is None or points is None:
-        raise InputError("needs a folder, or reference and points", where="measure")
+        raise InputError("got neither a folder nor both reference and points", where="measure", remedy="give one of the two")
     values = {"sensor": sensor, "reference": "reference", "points": "points", "model": "model", **plain(keys)}
     config = parse(MeasurementConfig, values, "measure")
     pair = nominal_pair(Path(cameras)) if isinstance(cameras, str | os.PathLike) else cameras
     if sensor == "stereo" and not isinstance(pair, CameraPair | None):
-        raise InputError(f"got {type(pair).__name__}", where="cameras", allowed="a CameraPair or a file, none if not known")
+        raise InputError(f"got {type(pair).__name__}", where="cameras", allowed="a CameraPair, a file, or None if unknown")
     mesh, notes = (reference, ()) if isinstance(reference, TriangleMesh) else read_reference(Path(reference))
     material = Material(mesh, _clouds(points), _model(model, sensor), pair if sensor == "stereo" else None, notes)
     return Measurement(assembled(config, material, "reference", "measure"))
@@ -86,32 +112,38 @@ def measure(
 
 @dataclass(frozen=True, repr=False)
 class Measurement:
-    """What was measured, with what predicts it. held: everything, as `pipeline.formats.measurements.measurement` has it."""
+    """Measured points with the reference surface and the sensor model that predict them.
+
+    Attributes
+    ----------
+    held : pipeline.formats.measurements.measurement.Measurement
+        All parts, as the diagnosis uses them.
+    """
 
     held: Measured
 
     @property
     def sensor(self) -> str:
-        """stereo or tls."""
+        """ "stereo" or "tls"."""
         return self.held.sensor
 
     @property
     def model(self) -> Any:
-        """What is believed of the sensor."""
+        """The sensor model to be tested."""
         return self.held.model
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What should be said of the files."""
+        """Remarks of the readers about the files, as sentences."""
         return self.held.notes
 
     @property
     def points(self) -> Points:
-        """The measured points, wall frame."""
+        """The measured points, wall frame, m."""
         return Points.of(self.held.cloud)
 
     def plot(self) -> Picture:
-        """The points over the wall, coloured by their height over it."""
+        """Return a plot of the points, coloured by their z coordinate in the wall frame."""
         return self.points.plot("z")
 
     def __repr__(self) -> str:
@@ -126,10 +158,23 @@ class Measurement:
 def diagnose(
     measurement: Measurement | Path | str, *, seed: int = 1, out: Path | str | None = None, progress: Show = "auto"
 ) -> Diagnosis:
-    """Find where a measurement and its model disagree, name the effect, add it, measure the gap again; as `scarpsim gap`.
+    """Find where a measurement and its sensor model disagree and name the effects that explain it, as `scarpsim gap` does.
 
-    measurement: as `measure` gives it, or its folder; seed: of the null distributions; out: a folder for report and files, none:
-    nothing is written.
+    Parameters
+    ----------
+    measurement : Measurement or path
+        Result of `measure`, or the folder of a measurement.
+    seed : int
+        Seed of the simulated null distributions.
+    out : path, optional
+        Folder for the report and files. Default: nothing is written.
+    progress : "auto" or bool
+        Whether progress is shown; "auto": in notebooks and on terminals.
+
+    Returns
+    -------
+    Diagnosis
+        The verdict, the named effects, and the gap before and after they are added to the model.
     """
     measured = measurement if isinstance(measurement, Measurement) else measure(measurement)
     steps = iter(workflow.STEPS)
@@ -151,19 +196,27 @@ def diagnose(
 
 @dataclass(frozen=True, repr=False)
 class Diagnosis:
-    """What was found. found: everything, as `pipeline.gap` has it; measurement: of what."""
+    """Result of `diagnose`.
+
+    Attributes
+    ----------
+    found : GapDiagnosis
+        All results, as `pipeline.gap` computes them.
+    measurement : Measurement
+        The measurement that was diagnosed.
+    """
 
     found: workflow.GapDiagnosis
     measurement: Measurement
 
     @property
     def verdict(self) -> str:
-        """named, several, ambiguous, unknown, no_gap or insufficient_data."""
+        """One of named, several, ambiguous, unknown, no_gap and insufficient_data."""
         return self.found.verdict
 
     @property
     def effects(self) -> pandas.DataFrame:
-        """A row for each parameter of each named effect: value, std, kind, what it cannot be told from, p_value; SI."""
+        """One row per parameter of each named effect: value, std, kind, indistinguishable effects, p_value; SI units."""
         rows = []
         for each in self.found.effects:
             held = each.to_dict()
@@ -174,8 +227,9 @@ class Diagnosis:
 
     @property
     def changes(self) -> geopandas.GeoDataFrame:
-        """Regions where the scene itself moved: volume_m3 with volume_std_m3, offset_m, place; geometry: the rectangle around,
-        wall frame."""
+        """Regions where the scene itself changed: volume_m3, volume_std_m3, offset_m, position. The geometry is the bounding
+        rectangle, wall frame.
+        """
         rows, bounds = [], []
         for each in self.found.changes:
             world = self.measurement.held.frame.to_world(each.corners.mean(axis=0))
@@ -186,7 +240,9 @@ class Diagnosis:
 
     @property
     def residuals(self) -> Points:
-        """The points that were compared, wall frame, with before_m, after_m (measured minus predicted depth) and held_out."""
+        """The compared points, wall frame, with the channels before_m and after_m (measured minus predicted depth) and
+        held_out.
+        """
         found, cloud = self.found, self.measurement.held.cloud
         depth, index = found.residuals.depth_m, found.residuals.index
         channels = {"before_m": found.before * depth, "after_m": found.after * depth, "held_out": found.held_out}
@@ -194,24 +250,26 @@ class Diagnosis:
 
     @property
     def model_after(self) -> Any:
-        """The sensor model with the named effects: `simulate(config, model=found.model_after)`."""
+        """The sensor model with the named effects, for `simulate(config, model=diagnosis.model_after)`."""
         return self.found.model_after
 
     @property
     def gap(self) -> dict[str, Any] | None:
-        """before, after, floor, unit, closed, ... on held-out points; None where it was not measured."""
+        """The gap on validation points: before, after, floor, unit, closed, ... None if it was not measured."""
         return self.found.gap.to_dict() if self.found.gap else None
 
     def to_dict(self) -> dict[str, Any]:
-        """gap.json."""
+        """Return the content of gap.json."""
         return report.to_dict(self.found, self.measurement.held)
 
     def summary(self) -> str:
-        """The verdict in some lines of text."""
-        return report.summary(self.found)
+        """Return the verdict as a few lines of text."""
+        return report.summarise(self.found)
 
     def plot(self, kind: str = "maps") -> Picture:
-        """A picture of the report: maps, profiles, gap, identifiability; or `before`, `after`: residuals over the wall."""
+        """Return a figure of the report (maps, profiles, gap, identifiability), or the residuals over the wall (before,
+        after).
+        """
         if kind in ("before", "after"):
             points = self.residuals
             scale = 1.4826 * float(np.median(np.abs(points["after_m"] - np.median(points["after_m"]))))
@@ -219,7 +277,7 @@ class Diagnosis:
         return Picture(pick(self._drawn(), kind, "plot")())
 
     def _drawn(self) -> dict[str, Callable[[], bytes]]:
-        """The report's pictures that there are of this diagnosis."""
+        """Return the functions that draw the report's figures, by name, without those that this diagnosis has no data for."""
         found, table = self.found, self.found.identifiability
         drawn: dict[str, Callable[[], bytes]] = {}
         if len(found.residuals):
@@ -232,8 +290,8 @@ class Diagnosis:
         return drawn
 
     def write(self, out: Path | str) -> Path:
-        """Write the files of `scarpsim gap`; returns report.html."""
-        return report.write(Path(out), self.found, self.measurement.held)
+        """Write the folder that `scarpsim gap` writes; return its report.html."""
+        return report.write_report(Path(out), self.found, self.measurement.held)
 
     def __repr__(self) -> str:
         return f"<Diagnosis: {self.verdict}, {len(self.found.effects)} effects>"
@@ -244,10 +302,12 @@ class Diagnosis:
 
 
 def _of_run(run: Run, model: Any) -> Measurement:
-    """The reference epoch of a run as a measurement of its wall."""
+    """Return the reference epoch of a run as a measurement of the run's own wall."""
     site = prepare_site(run.config, run.sensor, KeyedRandom(run.config.seed))
     if site.further_stations:
-        raise InputError("has several stations", where=str(run.folder), remedy="give reference, points and scanner of one")
+        raise InputError(
+            "the run has several stations", where=str(run.folder), remedy="give reference, points and scanner of one station"
+        )
     world = site.mesh.with_vertices(site.frame.to_world(site.mesh.vertices))
     cloud = run[0].points.cloud()
     points = replace(cloud, points=site.frame.to_world(cloud.points), extra={})
@@ -260,10 +320,10 @@ def _of_run(run: Run, model: Any) -> Measurement:
 
 
 def _clouds(points: Any) -> dict[str, PointCloud]:
-    """Point clouds by what errors call them."""
+    """Return the point clouds, keyed by the name that error messages use."""
     several = points if isinstance(points, list | tuple) else [points]
     if not several:
-        raise InputError("names no points", where="measure")
+        raise InputError("got no points", where="measure", remedy="give an array, Points or a file")
     found = {}
     for number, each in enumerate(several, start=1):
         if isinstance(each, str | os.PathLike):
@@ -284,6 +344,7 @@ def _clouds(points: Any) -> dict[str, PointCloud]:
 
 
 def _model(model: Any, sensor: str) -> Any:
+    """Return a sensor model from a file, a bundled name, a mapping or a model."""
     if isinstance(model, str | os.PathLike):
         return read_model(model_file(os.fspath(model)))
     values = plain(model) if model is not None else {}

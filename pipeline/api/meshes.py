@@ -1,4 +1,4 @@
-"""Meshes with the ways that people take them on: pictures, files, other libraries."""
+"""Provide `Mesh`, a triangle mesh that plots itself, reads and writes files, and converts to other libraries."""
 
 from __future__ import annotations
 
@@ -16,51 +16,62 @@ from scene.geometry.mesh import TriangleMesh
 
 
 class Mesh(TriangleMesh):
-    """Triangles with shared vertices, counter-clockwise seen from the sensors' side.
+    """Triangles with shared vertices, counter-clockwise as seen from the sensor's side.
 
-    vertices: (n, 3) float64, m; faces: (m, 3) int32; vertex_albedo: (n,) float32 in [0, 1]; vertex_block, face_block: (n,), (m,)
-    int32, the block whose removal made it, 0 elsewhere; each of the last three may be None.
+    Attributes
+    ----------
+    vertices : (n, 3) float64
+        Coordinates, m.
+    faces : (m, 3) int32
+        Indices of the vertices.
+    vertex_albedo : (n,) float32 or None
+        Reflectance in [0, 1].
+    vertex_block, face_block : (n,) and (m,) int32, or None
+        Label of the block whose removal exposed the vertex or face; 0 elsewhere.
     """
 
     @classmethod
     def of(cls, mesh: TriangleMesh) -> Self:
+        """Return another kind of triangle mesh as a `Mesh`, without copying."""
         return cls(mesh.vertices, mesh.faces, mesh.vertex_albedo, mesh.vertex_block, mesh.face_block)
 
     @classmethod
     def from_arrays(cls, vertices: ArrayLike, faces: ArrayLike) -> Self:
-        """vertices: (n, 3), m; faces: (m, 3) indices. Raises InputError for other shapes and for indices beyond the vertices."""
+        """Return a mesh of vertices (n, 3), m, and faces (m, 3) of vertex indices; raise InputError for other shapes or
+        indices.
+        """
         corners, triangles = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
         for name, array in (("vertices", corners), ("faces", triangles)):
             if array.ndim != 2 or array.shape[1] != 3 or not len(array):
                 raise InputError(f"have the shape {array.shape}", where=name, allowed="(n, 3)")
         if triangles.dtype.kind not in "iu" or triangles.min() < 0 or triangles.max() >= len(corners):
-            raise InputError("are no indices of the vertices", where="faces", allowed=f"0 to {len(corners) - 1}")
+            raise InputError("are not all vertex indices", where="faces", allowed=f"whole numbers from 0 to {len(corners) - 1}")
         if not np.isfinite(corners).all():
             raise InputError("are not all finite", where="vertices")
         return cls(corners, triangles.astype(np.int32))
 
     @classmethod
     def read(cls, path: Path | str) -> Self:
-        """A PLY file, as `save` writes it; unlike `open_wall` nothing is mended."""
+        """Read a PLY file as `save` writes it. Unlike `open_wall` it repairs nothing."""
         return cls.of(read_ply(Path(path)))
 
     def save(self, path: Path | str) -> Path:
-        """Write a PLY file; returns its path."""
+        """Write a PLY file; return its path."""
         write_ply(Path(path), self)
         return Path(path)
 
     def to_trimesh(self) -> Any:
-        """A trimesh.Trimesh."""
+        """Convert to a trimesh.Trimesh."""
         return library("trimesh").Trimesh(self.vertices, self.faces, process=False)
 
     def to_open3d(self) -> Any:
-        """An open3d.geometry.TriangleMesh."""
+        """Convert to an open3d.geometry.TriangleMesh."""
         open3d = library("open3d")
         vertices = open3d.utility.Vector3dVector(self.vertices)
         return open3d.geometry.TriangleMesh(vertices, open3d.utility.Vector3iVector(self.faces))
 
     def to_pyvista(self) -> Any:
-        """A pyvista.PolyData with blocks and albedo, where the mesh has them."""
+        """Convert to a pyvista.PolyData, with block labels and albedo if the mesh has them."""
         faces = np.concatenate([np.full((len(self.faces), 1), 3, self.faces.dtype), self.faces], axis=1)
         made = library("pyvista").PolyData(self.vertices, faces.ravel())
         if self.vertex_albedo is not None:
@@ -70,7 +81,9 @@ class Mesh(TriangleMesh):
         return made
 
     def plot(self, gsd_m: float | None = None) -> Picture:
-        """A hillshade, looked at along the normal of the mean plane; gsd_m: side of a pixel, none: for 100,000 of them."""
+        """Return a hillshade, viewed along the normal of the mean plane. gsd_m: side of a pixel, m; default: about 100,000
+        pixels.
+        """
         from pipeline.precision.surface import wall_raster
         from pipeline.report.figures import hillshade_figure
         from scene.geometry.frame import WallFrame

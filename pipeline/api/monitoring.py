@@ -1,4 +1,4 @@
-"""`monitor`: what fell between real epochs."""
+"""Provide `monitor`, which finds what fell between real epochs."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from pipeline.api.maps import DIFFERENCE, data_array
 from pipeline.api.pictures import Picture, html_table
 from pipeline.api.tables import frame
 from pipeline.formats.rasters.geotiff import read_geotiff
-from pipeline.monitor.options import MonitorOptions
-from pipeline.monitor.outlines import in_survey
-from pipeline.monitor.products import COLUMNS, Result
-from pipeline.monitor.report import headline
-from pipeline.monitor.run import monitor_paths
+from pipeline.monitoring.options import MonitorOptions
+from pipeline.monitoring.outlines import in_survey
+from pipeline.monitoring.products import COLUMNS, Result
+from pipeline.monitoring.report import headline
+from pipeline.monitoring.run import monitor_paths
 from pipeline.report.notebook_progress import python_progress
 from scene.common.errors import InputError
 
@@ -40,7 +40,7 @@ def monitor(
     progress: Show = "auto",
     **options: Any,
 ) -> Monitoring:
-    """Compare real epochs of a wall with the first one; the same as `scarpsim monitor`.
+    """Compare real epochs of a wall with the first one and list what fell, as `scarpsim monitor` does.
 
     Parameters
     ----------
@@ -49,23 +49,26 @@ def monitor(
     out : path
         New folder for the products.
     times : sequence of str
-        Time of each epoch, ISO 8601; none: as the files say.
+        Time of each epoch, ISO 8601. Default: as the files say.
     workers : int
-        Processes.
+        Number of processes.
     resume : bool
-        Go on with what is finished in `out`.
-    progress : "auto", True or False
+        Continue an interrupted monitoring in `out`.
+    progress : "auto" or bool
+        Whether progress is shown; "auto": in notebooks and on terminals.
     **options
-        Those of `MonitorOptions`: position, direction, gsd_m, stable, unit, columns, scanner, model, photographs, detector, seed.
+        Fields of `MonitorOptions`: position, direction, gsd_m, stable, unit, columns, scanner, model, photographs, detector,
+        seed.
 
     Returns
     -------
     Monitoring
+        Difference maps, events and registrations of all epochs.
 
     Raises
     ------
     InputError
-        For whatever is wrong in the files, for epochs that do not meet, and for unknown options.
+        If a file is wrong, epochs do not overlap, or an option is unknown.
     """
     unknown = sorted(set(options) - set(MonitorOptions.__dataclass_fields__))
     if unknown:
@@ -90,25 +93,33 @@ def monitor(
 
 @dataclass(frozen=True, repr=False)
 class Monitoring:
-    """A finished monitoring. result: folder, sources, site and epochs."""
+    """Result of `monitor`.
+
+    Attributes
+    ----------
+    result : pipeline.monitoring.products.Result
+        Folder, sources, site and epochs, as `pipeline.monitoring` computes them.
+    """
 
     result: Result
 
     @property
     def folder(self) -> Path:
-        """Where the products lie."""
+        """Folder with the written products."""
         return self.result.folder
 
     @property
     def differences(self) -> xarray.DataArray:
-        """(epoch, y, x) reference minus epoch along the wall's normal, m, missing rock positive, NaN without data."""
+        """Difference maps, (epoch, y, x), m: reference minus epoch along the wall's normal, missing rock positive, NaN without
+        data.
+        """
         xarray = library("xarray")
         maps = [self._map("difference", epoch.number) for epoch in self.result.epochs]
         return xarray.concat(maps, dim=xarray.IndexVariable("epoch", [epoch.number for epoch in self.result.epochs]))
 
     @property
     def events(self) -> geopandas.GeoDataFrame:
-        """A row for each event and epoch, as events.csv has them; geometry: the outline in survey coordinates."""
+        """One row per event and epoch, with the columns of events.csv. The geometry is the outline in survey coordinates."""
         geopandas, shapely = library("geopandas"), library("shapely")
         site = self.result.site
         heights = site.reference.raster.height
@@ -119,11 +130,11 @@ class Monitoring:
 
     @property
     def registration(self) -> dict[int, dict[str, Any]]:
-        """How each epoch was registered on the reference, wall frame, as monitor.json has it."""
+        """Registration of each epoch on the reference, wall frame, as in monitor.json; keyed by the epoch's number."""
         return {epoch.number: epoch.record.registration for epoch in self.result.epochs}
 
     def plot(self, epoch: int | None = None) -> Picture:
-        """The map of an epoch with the outlines of its events; none: the last one."""
+        """Return the difference map of an epoch with the outlines of its events. Default: the last epoch."""
         number = self.result.epochs[-1].number if epoch is None else epoch
         path = self.folder / f"map_{number:03d}.png"
         if not path.is_file():
@@ -131,7 +142,7 @@ class Monitoring:
         return Picture(path.read_bytes())
 
     def summary(self) -> str:
-        """One line an epoch."""
+        """Return the result as text, one line per epoch."""
         return "\n".join(headline(self.result))
 
     def __repr__(self) -> str:
@@ -142,5 +153,6 @@ class Monitoring:
         return html_table(self.summary(), rows, self.plot())
 
     def _map(self, kind: str, number: int) -> xarray.DataArray:
+        """Return a GeoTIFF of an epoch as a DataArray."""
         values, grid = read_geotiff(self.folder / f"{kind}_{number:03d}.tif")
         return data_array(values, grid, kind, DIFFERENCE)

@@ -1,4 +1,4 @@
-"""Pictures and tables as notebooks show them."""
+"""Show pictures and tables in notebooks."""
 
 from __future__ import annotations
 
@@ -18,12 +18,18 @@ _THUMBNAIL_PX = 640
 
 @dataclass(frozen=True, repr=False)
 class Picture:
-    """A picture as the reports have it. png: its bytes; a notebook shows it."""
+    """A figure as in the reports, which a notebook displays.
+
+    Attributes
+    ----------
+    png : bytes
+        Content of the PNG file.
+    """
 
     png: bytes
 
     def save(self, path: Path | str) -> Path:
-        """Write the PNG file; returns its path."""
+        """Write the PNG file; return its path."""
         write_bytes(Path(path), self.png)
         return Path(path)
 
@@ -34,7 +40,7 @@ class Picture:
         return self.png
 
     def small(self) -> bytes:
-        """PNG of the picture, not wider than a table."""
+        """Return a thumbnail as PNG bytes, small enough for a notebook's table."""
         from PIL import Image
 
         with Image.open(io.BytesIO(self.png)) as picture:
@@ -45,9 +51,9 @@ class Picture:
 
 
 def pick(pictures: Mapping[str, Any], kind: str | None, where: str) -> Any:
-    """The picture called `kind`, or the first; raises InputError with the names that there are."""
+    """Return the picture called `kind`, or the first if `kind` is None; raise InputError with the available names otherwise."""
     if not pictures:
-        raise InputError("there is no picture of it", where=where)
+        raise InputError("has no pictures", where=where)
     if kind is None:
         return next(iter(pictures.values()))
     if kind not in pictures:
@@ -58,7 +64,7 @@ def pick(pictures: Mapping[str, Any], kind: str | None, where: str) -> Any:
 
 
 def html_table(title: str, rows: Mapping[str, Any], picture: Picture | None = None) -> str:
-    """A heading, a table of two columns and a small picture, for `_repr_html_`."""
+    """Return HTML of a heading, a table of two columns and a small picture, for `_repr_html_`."""
     lines = "".join(
         f"<tr><th style='text-align:left'>{_text(name)}</th><td>{_text(value)}</td></tr>" for name, value in rows.items()
     )
@@ -67,4 +73,5 @@ def html_table(title: str, rows: Mapping[str, Any], picture: Picture | None = No
 
 
 def _text(value: Any) -> str:
+    """Return a value as escaped HTML text."""
     return html.escape(str(value))

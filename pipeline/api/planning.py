@@ -1,4 +1,4 @@
-"""`plan`: what a set-up promises before anything is simulated."""
+"""Provide `plan`, which predicts what a set-up achieves without simulating it."""
 
 from __future__ import annotations
 
@@ -32,10 +32,23 @@ def plan(
     progress: Show = "auto",
     **overrides: Any,
 ) -> Plans:
-    """Map precision, spacing, blind spots and the smallest block of a set-up; the same as `scarpsim inspect`.
+    """Map the precision, point spacing, blind spots and smallest detectable block of a set-up, as `scarpsim inspect` does.
 
-    config, model, overrides: as `configure` takes them; sensor: none: all of the config; out: a folder for report and maps, none:
-    nothing is written.
+    Parameters
+    ----------
+    config, seed, model, **overrides
+        The set-up; see `configure`.
+    sensor : "tls" or "stereo", optional
+        The sensor to plan. Default: all sensors of the config.
+    out : path, optional
+        Folder for the report and maps. Default: nothing is written.
+    progress : "auto" or bool
+        Whether progress is shown; "auto": in notebooks and on terminals.
+
+    Returns
+    -------
+    Plans
+        One plan per sensor.
     """
     resolved = configure(config, sensor, seed=seed, model=model, **overrides)
     sensors = [one_sensor(resolved, sensor)] if sensor else resolved.sensor_names()
@@ -48,13 +61,21 @@ def plan(
 
 @dataclass(frozen=True, repr=False)
 class SensorPlan:
-    """What one sensor promises. promise: everything, as `pipeline.planning` has it."""
+    """Predicted performance of one sensor.
+
+    Attributes
+    ----------
+    promise : pipeline.planning.maps.Plan
+        All results, as `pipeline.planning` computes them.
+    """
 
     promise: Promise
 
     @property
     def maps(self) -> xarray.Dataset:
-        """All maps by name (smallest_block_m, normal_sigma_m, incidence_rad, ...), SI, NaN where nothing is seen."""
+        """All maps by name (smallest_block_m, normal_sigma_m, incidence_rad, ...), SI units; NaN where the sensor sees
+        nothing.
+        """
         raster = self.promise.raster
         return dataset({
             each.name: data_array(raster.image(each.values), raster.grid, each.name, each.title, units=each.si_unit)
@@ -63,21 +84,21 @@ class SensorPlan:
 
     @property
     def figures(self) -> dict[str, float]:
-        """Single numbers by name: share of the wall seen, pulses, seconds_to_scan, base_m, ...; SI."""
+        """Single numbers by name: visible share of the wall, pulses, seconds_to_scan, base_m, ...; SI units."""
         return dict(self.promise.figures)
 
     @property
     def table(self) -> pandas.DataFrame:
-        """A row for each map: its value in the middle of the wall, median, 5 and 95 % quantile; SI."""
+        """One row per map: its value in the middle of the wall, median, 5 % and 95 % quantile; SI units."""
         middle = self.promise.in_middle
         return frame({"map": each.name, **each.summary(middle)} for each in self.promise.maps).set_index("map")
 
     def summary(self) -> str:
-        """The figures as lines of text."""
+        """Return the main numbers as lines of text."""
         return summary(self.promise)
 
     def plot(self, kind: str = "smallest_block_m") -> Picture:
-        """A picture of a map, by its name."""
+        """Return a figure of the map called `kind`."""
         chosen = pick({each.name: each for each in self.promise.maps}, kind, "plot")
         return Picture(map_picture(self.promise, chosen))
 
@@ -90,7 +111,15 @@ class SensorPlan:
 
 @dataclass(frozen=True, repr=False)
 class Plans:
-    """The plans of a config's sensors; of several stations first all together, then each."""
+    """The plans of a config's sensors; with several stations, first the plan of all together, then one of each.
+
+    Attributes
+    ----------
+    config : SimulationConfig
+        The config that was planned.
+    plans : tuple of SensorPlan
+        The plans, also available by index and iteration.
+    """
 
     config: SimulationConfig
     plans: tuple[SensorPlan, ...]
@@ -105,15 +134,15 @@ class Plans:
         return iter(self.plans)
 
     def summary(self) -> str:
-        """The figures as lines of text."""
+        """Return the main numbers of all plans as lines of text."""
         return "\n\n".join(each.summary() for each in self.plans)
 
     def plot(self, kind: str = "smallest_block_m") -> Picture:
-        """A picture of the first plan."""
+        """Return a figure of the first plan's map called `kind`."""
         return self[0].plot(kind)
 
     def write(self, out: Path | str) -> Path:
-        """Write the folder that `scarpsim inspect` fills; returns its report.html. InputError where it is in use."""
+        """Write the folder that `scarpsim inspect` writes; return its report.html. Raises InputError if the folder is in use."""
         return write_plans(Path(out), self.config, [each.promise for each in self.plans])
 
     def __repr__(self) -> str:

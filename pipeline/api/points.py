@@ -1,4 +1,4 @@
-"""Points as a structured array that goes over to the libraries that people look at points with."""
+"""Provide `Points`, a structured array of points that plots itself, writes files and converts to other libraries."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _AXES = ("x", "y", "z")
 
 
 class Points(np.ndarray[Any, Any]):
-    """(n,) structured array of points: x, y, z (float64, m), then what was recorded or is known of each.
+    """Structured array (n,) of points: x, y, z (float64, m), then the recorded or computed channels.
 
-    `points["x"]` is an array, `points[points["intensity"] > 0.5]` are points again.
+    `points["x"]` is an array; `points[points["intensity"] > 0.5]` is a `Points` again.
     """
 
     @classmethod
     def of(cls, cloud: PointCloud) -> Self:
-        """The points of a cloud, in its frame; its channels keep their types."""
+        """Return the points of a cloud, in its frame; its channels keep their types."""
         channels = {name: cloud.points[:, axis] for axis, name in enumerate(_AXES)}
         optional = {"intensity": cloud.intensity, "gps_time": cloud.gps_time}
         channels |= {name: np.asarray(values) for name, values in (optional | cloud.extra).items() if values is not None}
@@ -46,17 +46,17 @@ class Points(np.ndarray[Any, Any]):
 
     @property
     def xyz(self) -> FloatArray:
-        """(n, 3) coordinates, m."""
+        """Coordinates (n, 3), m."""
         return np.stack([self[name] for name in _AXES], axis=-1)
 
     def cloud(self) -> PointCloud:
-        """The same as files are written from."""
+        """Return the points as a PointCloud, the type that the file writers take."""
         further = {name: self[name] for name in self.dtype.names or () if name not in _AXES}
         intensity = further.pop("intensity", further.pop(EXACT_INTENSITY, None))
         return PointCloud(self.xyz, intensity, further.pop("gps_time", None), further)
 
     def save(self, path: Path | str) -> Path:
-        """Write .laz (.copc.laz: as COPC), .las, .ply, .pcd or .xyz; returns the path. Raises InputError for another suffix."""
+        """Write .laz (.copc.laz for COPC), .las, .ply, .pcd or .xyz; return the path. Raises InputError for another suffix."""
         path, cloud = Path(path), self.cloud()
         if path.suffix in (".laz", ".las"):
             write_cloud(path, cloud)
@@ -67,13 +67,11 @@ class Points(np.ndarray[Any, Any]):
         elif path.suffix in (".xyz", ".txt"):
             write_xyz(path, cloud)
         else:
-            raise InputError(
-                f"is of an unknown format '{path.suffix}'", where=str(path), allowed=".laz .copc.laz .las .ply .pcd .xyz"
-            )
+            raise InputError(f"unknown format '{path.suffix}'", where=str(path), allowed=".laz .copc.laz .las .ply .pcd .xyz")
         return path
 
     def to_open3d(self) -> Any:
-        """An open3d.geometry.PointCloud, grey by intensity where there is one."""
+        """Convert to an open3d.geometry.PointCloud, grey by intensity if there is one."""
         geometry, utility = library("open3d").geometry, library("open3d").utility
         cloud = geometry.PointCloud(utility.Vector3dVector(self.xyz))
         if "intensity" in (self.dtype.names or ()):
@@ -82,7 +80,7 @@ class Points(np.ndarray[Any, Any]):
         return cloud
 
     def to_pyvista(self) -> Any:
-        """A pyvista.PolyData with the channels as point data."""
+        """Convert to a pyvista.PolyData with the channels as point data."""
         cloud = library("pyvista").PolyData(self.xyz)
         for name in self.dtype.names or ():
             if name not in _AXES:
@@ -90,9 +88,9 @@ class Points(np.ndarray[Any, Any]):
         return cloud
 
     def plot(self, channel: str = "z") -> Picture:
-        """The points over x and y, coloured by a channel; of many a regular part."""
+        """Return a plot of the points over x and y, coloured by a channel. At most 100,000 points are drawn."""
         if channel not in (self.dtype.names or ()):
-            raise InputError(f"no channel '{channel}'", where="points", allowed=", ".join(self.dtype.names or ()))
+            raise InputError(f"there is no channel '{channel}'", where="points", allowed=", ".join(self.dtype.names or ()))
         return scatter(self.xyz[:, :2], np.asarray(self[channel], dtype=np.float64), channel)
 
     def _repr_html_(self) -> str:
@@ -102,10 +100,27 @@ class Points(np.ndarray[Any, Any]):
 
 
 def scatter(at: NDArray[Any], values: NDArray[Any], label: str, limit: float | None = None) -> Picture:
-    """Points (n, 2), m, coloured by values (n,); limit: of a scale on both sides of zero, red above."""
+    """Draw points coloured by their values.
+
+    Parameters
+    ----------
+    at : (n, 2) array
+        Positions, m. At most 100,000 of them are drawn, at regular steps.
+    values : (n,) array
+        Values to colour by.
+    label : str
+        Label of the colour bar.
+    limit : float, optional
+        Ends of a diverging colour scale, -limit to limit, red above zero. Default: a sequential scale over all values.
+
+    Returns
+    -------
+    Picture
+        The figure.
+    """
     from matplotlib.figure import Figure
 
-    from pipeline.report.figures import COLOURS, DPI, SEQUENTIAL, dress, png_bytes
+    from pipeline.report.figures import COLOURS, DPI, SEQUENTIAL, label_axes, png_bytes
 
     step = max(1, -(-len(at) // _MOST_DRAWN))
     figure = Figure(figsize=(9.6, 5.4), dpi=DPI, layout="constrained")
@@ -113,11 +128,12 @@ def scatter(at: NDArray[Any], values: NDArray[Any], label: str, limit: float | N
     scale = {"cmap": SEQUENTIAL} if limit is None else {"cmap": COLOURS, "vmin": -limit, "vmax": limit}
     drawn: Any = axes.scatter(*at[::step].T, c=values[::step], s=1.5, linewidths=0, **scale)
     axes.set_aspect("equal")
-    dress(axes, "x, m", "y, m")
+    label_axes(axes, "x, m", "y, m")
     figure.colorbar(drawn, ax=axes, label=label, shrink=0.8)
     return Picture(png_bytes(figure))
 
 
 def _range(values: NDArray[Any]) -> str:
+    """Return the smallest and the largest finite value as text."""
     known = values[np.isfinite(values)] if values.dtype.kind == "f" else values
     return f"{known.min():.6g} to {known.max():.6g}" if len(known) else "none"

@@ -1,4 +1,4 @@
-"""`simulate` and `open_run`: a run as an object."""
+"""Provide `simulate` and `open_run`, which give a run's results as a `Run`."""
 
 from __future__ import annotations
 
@@ -31,10 +31,12 @@ if TYPE_CHECKING:
     import xarray
 
 PICTURES = ("difference", "blocks", "hillshade", "histogram", "icp", "m3c2")
+"""Names of an epoch's figures in the report."""
 _COLUMNS = (
     "epoch", "block", "shape", "size_x_m", "size_y_m", "size_z_m", "volume_m3", "measured_volume_m3", "measured_area_m2",
     "measured_mean_depth_m", "position_x_m", "position_y_m", "position_z_m", "world_x_m", "world_y_m", "world_z_m", "annotated",
 )  # fmt: skip
+"""Columns of `Run.blocks`, in order."""
 
 
 def simulate(
@@ -48,10 +50,25 @@ def simulate(
     progress: Show = "auto",
     **overrides: Any,
 ) -> Run:
-    """Observe a wall before and after rocks fall; the same as the command `simulate`.
+    """Simulate how a sensor observes a wall before and after rockfall, as the command `simulate` does.
 
-    config, model, overrides: as `configure` takes them; sensor: "tls" or "stereo", may be left out where the config has a model
-    of one only; out: folder of the run, none: a new one under runs/; resume: go on with an interrupted run in `out`.
+    Parameters
+    ----------
+    config, seed, model, **overrides
+        The site; see `configure`.
+    sensor : "tls" or "stereo", optional
+        The sensor. May be omitted if the config has a model of only one.
+    out : path, optional
+        Folder of the run. Default: a new one under runs/.
+    resume : bool
+        Continue the interrupted run in `out`.
+    progress : "auto" or bool
+        Whether progress is shown; "auto": in notebooks and on terminals.
+
+    Returns
+    -------
+    Run
+        The finished run.
     """
     from pipeline.run import simulation
 
@@ -63,54 +80,63 @@ def simulate(
 
 
 def open_run(folder: Path | str) -> Run:
-    """A finished or interrupted run by its folder. Raises InputError where it is none."""
+    """Open a finished or interrupted run by its folder. Raises InputError if the folder has no run."""
     run = Run(Path(folder))
     if "wall_frame" not in run.record:
-        raise InputError("the run has not finished an epoch", where=str(folder), remedy="go on with simulate(..., resume=True)")
+        raise InputError(
+            "the run has not finished an epoch", where=str(folder), remedy="continue with simulate(..., resume=True)"
+        )
     return run
 
 
 @dataclass(frozen=True, repr=False)
 class Run:
-    """A run's folder, read when it is asked for. `run[0]` is the reference, `run[1]` the first epoch after rocks fell."""
+    """A run on disk, whose files are read when they are needed. `run[0]` is the reference epoch, `run[1]` the first after
+    rockfall.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder of the run.
+    """
 
     folder: Path
 
     @cached_property
     def _files(self) -> RunFiles:
         if not (self.folder / RUN_FILE).exists():
-            raise InputError(f"holds no {RUN_FILE}", where=str(self.folder), remedy="name a run's folder")
+            raise InputError(f"contains no {RUN_FILE}", where=str(self.folder), remedy="give the folder of a run")
         return RunFiles(self.folder)
 
     @property
     def record(self) -> dict[str, Any]:
-        """run.json, checked."""
+        """Content of run.json, checked."""
         return self._files.record
 
     @cached_property
     def config(self) -> SimulationConfig:
-        """The resolved config."""
+        """The resolved config that made the run."""
         return load_config(self.folder / RUN_FILE, [], None, None)
 
     @property
     def sensor(self) -> SensorName:
-        """stereo or tls."""
+        """ "stereo" or "tls"."""
         return "stereo" if self.record["sensor"] == "stereo" else "tls"
 
     @property
     def report(self) -> Path:
-        """report.html."""
+        """Path of report.html."""
         return self.folder / "report.html"
 
     @cached_property
     def frame(self) -> WallFrame:
-        """The wall frame: `run.frame.to_world(points)`, (..., 3), m, and `to_wall`."""
+        """The wall frame, with `to_world(points)` and `to_wall(points)`, (..., 3), m."""
         held = self.record["wall_frame"]
         return WallFrame(np.array(held["rotation"]), np.array(held["origin_m"]))
 
     @property
     def annotations(self) -> dict[str, Any]:
-        """annotations.json, COCO."""
+        """Content of annotations.json, in COCO format."""
         return read_annotations(self.folder / "annotations.json")
 
     @property
@@ -119,7 +145,7 @@ class Run:
         return [Epoch(self, int(record["epoch"])) for record in self.record["epochs"][1:]]
 
     def __len__(self) -> int:
-        """How many epochs there are, the reference included."""
+        """Return the number of epochs, including the reference."""
         return len(self.record["epochs"])
 
     def __getitem__(self, number: int) -> Epoch:
@@ -129,22 +155,24 @@ class Run:
 
     @property
     def differences(self) -> xarray.DataArray:
-        """(epoch, y, x) float32, m, the difference maps of all epochs; NaN without data."""
+        """Difference maps of all epochs, (epoch, y, x) float32, m; NaN without data."""
         maps, grids = zip(*(read_geotiff(each.file("difference", ".tif")) for each in self.epochs), strict=True)
         return data_array(np.stack(maps), grids[0], "difference", DIFFERENCE, frame=self.frame)
 
     @property
     def blocks(self) -> geopandas.GeoDataFrame:
-        """What fell in all epochs: see `Epoch.blocks`."""
+        """The fallen blocks of all epochs; see `Epoch.blocks`."""
         return _blocks(self.epochs)
 
     @property
     def statistics(self) -> pandas.DataFrame:
-        """A row for each epoch: the differences outside the blocks (count, median_m, nmad_m, ...), and how it was registered."""
+        """One row per epoch: statistics of the differences outside the blocks (count, median_m, nmad_m, ...), RMS of the
+        registration.
+        """
         return frame(each.statistics for each in self.epochs)
 
     def plot(self, kind: str = "difference", epoch: int = 1) -> Picture:
-        """A picture of the report, of an epoch: difference, blocks, hillshade, histogram, icp or m3c2."""
+        """Return a figure of the report of one epoch: difference, blocks, hillshade, histogram, icp or m3c2."""
         return self[epoch].plot(kind)
 
     def __repr__(self) -> str:
@@ -159,18 +187,26 @@ class Run:
 
 @dataclass(frozen=True, repr=False)
 class Epoch:
-    """One epoch of a run, wall frame; of number 0, the reference, there is no difference."""
+    """One epoch of a run, wall frame. Epoch 0 is the reference and has no difference map.
+
+    Attributes
+    ----------
+    run : Run
+        The run that the epoch belongs to.
+    number : int
+        Number of the epoch; 0 is the reference.
+    """
 
     run: Run
     number: int
 
     @property
     def folder(self) -> Path:
-        """Of the epoch's own files."""
+        """Folder of the epoch's own files."""
         return epoch_folder(self.run.folder, self.number)
 
     def file(self, kind: str, suffix: str) -> Path:
-        """A file of the epoch in the run's folder; raises InputError where the run has none."""
+        """Return the path of one of the epoch's files in the run's folder; raise InputError if it does not exist."""
         path = self.run.folder / f"{kind}_{self.number:03d}{suffix}"
         if not path.is_file():
             kinds = [name for name in PICTURES if (self.run.folder / f"{name}_{self.number:03d}{suffix}").is_file()]
@@ -186,39 +222,39 @@ class Epoch:
 
     @property
     def difference(self) -> xarray.DataArray:
-        """(y, x) float32, m, reference minus epoch, missing rock positive, NaN without data."""
+        """Difference map, (y, x) float32, m: reference minus epoch, missing rock positive, NaN without data."""
         values, grid = read_geotiff(self.file("difference", ".tif"))
         return data_array(values, grid, "difference", DIFFERENCE, frame=self.run.frame)
 
     @property
     def m3c2(self) -> xarray.DataArray:
-        """(y, x) M3C2 distances, m, of a run whose config asks for them."""
+        """Map of M3C2 distances, (y, x), m, if the run's config asked for them."""
         values, grid = read_geotiff(self.file("m3c2", ".tif"))
         return data_array(values, grid, "m3c2", "M3C2 distance; missing rock positive", frame=self.run.frame)
 
     @property
     def points(self) -> Points:
-        """The sensor's points."""
+        """The points that the sensor measured."""
         return Points.of(self.run._files.points(self.number))
 
     @property
     def surface(self) -> Mesh:
-        """The reconstructed mesh."""
+        """The mesh reconstructed from the points."""
         return Mesh.of(self.run._files.surface(self.number))
 
     @property
     def truth(self) -> Mesh:
-        """The wall as it really is."""
+        """The true mesh of the wall."""
         return Mesh.of(self.run._files.surface(self.number, "truth"))
 
     @property
     def blocks(self) -> geopandas.GeoDataFrame:
-        """What fell: a row for each block, its truth and what the map shows of it; geometry: its bounding rectangle."""
+        """One row per fallen block: its true values and what the difference map shows. The geometry is its bounding rectangle."""
         return _blocks([self])
 
     @property
     def statistics(self) -> dict[str, Any]:
-        """The differences outside the blocks, SI, and the RMS of the registration."""
+        """Statistics of the differences outside the blocks, SI units, and the RMS of the registration."""
         outside = self.record.get("statistics", {}).get("outside_blocks")
         if outside is None:
             raise InputError(f"epoch {self.number} has no statistics", where=str(self.run.folder / RUN_FILE))
@@ -226,20 +262,22 @@ class Epoch:
         return {"epoch": self.number, **outside, "registration_rms_m": registration and registration.get("rms_m")}
 
     def summary(self) -> str:
-        """One line."""
+        """Return the number of blocks and the noise as one line of text."""
         blocks, found = len(self.record["blocks"]), self.statistics
         return (
             f"{blocks} blocks fell; outside of them NMAD {millimetres(found['nmad_m'])}, median {millimetres(found['median_m'])}"
         )
 
     def plot(self, kind: str = "difference") -> Picture:
-        """A picture of the report: difference, blocks, hillshade, histogram, icp or m3c2; of the reference its hillshade."""
+        """Return a figure of the report: difference, blocks, hillshade, histogram, icp or m3c2. The reference has only its
+        hillshade.
+        """
         if self.number == 0:
             return Picture((self.run.folder / "reference.png").read_bytes())
         return Picture(self.file(pick(dict(zip(PICTURES, PICTURES, strict=True)), kind, "plot"), ".png").read_bytes())
 
     def save_gltf(self, path: Path | str) -> Path:
-        """Write the surface as .glb, coloured by the difference, each niche a part of its own; returns the path."""
+        """Write the surface as .glb, coloured by the difference, with each niche as a separate part; return the path."""
         from pipeline.export.exported_run import ExportedRun
         from pipeline.export.gltf import save_gltf
 
@@ -256,6 +294,7 @@ class Epoch:
 
 
 def _blocks(epochs: list[Epoch]) -> geopandas.GeoDataFrame:
+    """Return the table of the blocks that fell in some epochs."""
     rows, bounds = [], []
     for epoch in epochs:
         annotations = epoch.run.annotations

@@ -1,4 +1,4 @@
-"""Blocks and events as GeoDataFrames in the wall frame, other tables as DataFrames."""
+"""Make GeoDataFrames of things with a position on the wall, and DataFrames of everything else."""
 
 from __future__ import annotations
 
@@ -14,25 +14,35 @@ if TYPE_CHECKING:
 
 
 def frame(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> pandas.DataFrame:
-    """A table of rows; columns: their order where there may be no rows."""
+    """Return a DataFrame of rows; `columns` gives their order, also when there are no rows."""
     return library("pandas").DataFrame(list(rows), columns=columns)
 
 
 def boxes(
     rows: Iterable[Mapping[str, Any]], bounds: Iterable[Sequence[float]], columns: Sequence[str] | None = None
 ) -> geopandas.GeoDataFrame:
-    """A table whose rows lie at rectangles on the wall. bounds: x_min, y_min, x_max, y_max of each, wall frame, m."""
+    """Return a GeoDataFrame in the wall frame with a rectangle per row.
+
+    Parameters
+    ----------
+    rows : iterable of mappings
+        The rows of the table.
+    bounds : iterable of (x_min, y_min, x_max, y_max)
+        Rectangle of each row, wall frame, m.
+    columns : sequence of str, optional
+        Order of the columns, also when there are no rows.
+    """
     shapely, geopandas = library("shapely"), library("geopandas")
     geometry = [shapely.box(*bound) for bound in bounds]
     return geopandas.GeoDataFrame(frame(rows, columns), geometry=geometry, crs=wall_frame_wkt())
 
 
 def spread_out(name: str, values: Sequence[float], axes: str = "xyz", unit: str = "_m") -> dict[str, float]:
-    """A vector as one column for each axis: position_x_m, position_y_m, ..."""
+    """Return a vector as one column per axis: position_x_m, position_y_m, ..."""
     return {f"{name}_{axis}{unit}": value for axis, value in zip(axes, values, strict=True)}
 
 
 def frame_of(columns: Mapping[str, Any], index: Sequence[str], name: str) -> pandas.DataFrame:
-    """A table of columns with a named index."""
+    """Return a DataFrame of columns with an index called `name`."""
     pandas = library("pandas")
     return pandas.DataFrame(dict(columns), index=pandas.Index(index, name=name))

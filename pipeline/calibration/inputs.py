@@ -94,7 +94,7 @@ def sensor_of(paths: Sequence[Path], config: SimulationConfig, wanted: SensorNam
     """
     for path in paths:
         if not path.exists():
-            raise InputError("no such folder or file", where=str(path), remedy="check the path")
+            raise InputError("there is no such folder or file", where=str(path), remedy="check the path")
         if (path / FILE).is_file():
             return _matching_sensor(read_measurement(path).sensor, wanted, path)
         if (path / RUN_FILE).is_file():

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pipeline.change.difference import difference, raster_grid, surface_raster
 from pipeline.config.simulation import SimulationConfig
 from pipeline.registration.register import register_to
-from pipeline.run.acquisition import look, reconstruct
-from pipeline.run.registered import reference_and_target
+from pipeline.run.acquisition import acquire, reconstruct
+from pipeline.run.reference import reference_and_target
 from pipeline.run.site import SensorSite
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
@@ -67,4 +67,4 @@ def noise_map(
 
 def _surface(config: SimulationConfig, site: SensorSite, caster: RayCaster, random: KeyedRandom) -> TriangleMesh:
     """Observe the wall and reconstruct its surface."""
-    return reconstruct(config, look(config, site, caster, random))
+    return reconstruct(config, acquire(config, site, caster, random))

@@ -16,8 +16,8 @@ from pipeline.calibration.calibrate import CalibrationResult, GreedyComparison
 from pipeline.calibration.parameters import ORIENTATION
 from pipeline.change.difference import statistics
 from pipeline.formats.files.atomic import write_text
-from pipeline.report.figures import DIFFERENCE_LABEL, DPI, FAMILY, difference_figure, dress, plain_numbers, png_bytes
-from pipeline.report.page import p_value_in_words, percent, template, true_minus
+from pipeline.report.figures import DIFFERENCE_LABEL, DPI, FAMILY, difference_figure, label_axes, plain_numbers, png_bytes
+from pipeline.report.page import p_value_in_words, percent, template, with_minus_sign
 from pipeline.report.plain_text import powers_of_ten
 from scene.geometry.mesh import FloatArray
 
@@ -239,7 +239,7 @@ def _matrix(names: list[str], values: FloatArray) -> list[list[str]]:
 
 
 def _signed(value: float) -> str:
-    return ("+" if value >= 0 else "") + true_minus(value, 2)
+    return ("+" if value >= 0 else "") + with_minus_sign(value, 2)
 
 
 def _epochs(result: CalibrationResult) -> _Table:
@@ -250,13 +250,13 @@ def _epochs(result: CalibrationResult) -> _Table:
         size, tail = each.size, each.tails
         lengths = (size.median, size.standard_deviation, size.rmse, size.nmad)
         rows.append(
-            [each.name, *(true_minus(1e3 * value, 1) for value in lengths), true_minus(tail.skewness, 2),
-             true_minus(tail.excess_kurtosis, 1),
+            [each.name, *(with_minus_sign(1e3 * value, 1) for value in lengths), with_minus_sign(tail.skewness, 2),
+             with_minus_sign(tail.excess_kurtosis, 1),
              p_value_in_words(p), f"{each.independent:,.0f}", each.model.summary()]
         )  # fmt: skip
     sizes = [each.size for each in result.epochs]
     mean = (np.mean([getattr(one, name) for one in sizes]) for name in ("median", "standard_deviation", "rmse", "nmad"))
-    rows.append(["mean", *(true_minus(1e3 * value, 1) for value in mean), *[""] * 5])
+    rows.append(["mean", *(with_minus_sign(1e3 * value, 1) for value in mean), *[""] * 5])
     trends = [
         f"{name} {_signed(1e3 * found.per_epoch_m)} mm per epoch (p: {p_value_in_words(found.p_value)})"
         for name, found in (("median", result.median_trend), ("StD", result.std_trend))
@@ -309,7 +309,7 @@ def _size_and_variogram(result: CalibrationResult) -> bytes:
     left.set_yscale("log")
     powers_of_ten(left.yaxis)
     left.set_ylim(1e-5 / sigma)
-    dress(left, "difference less its median, mm", "density, 1/mm")
+    label_axes(left, "difference less its median, mm", "density, 1/mm")
     left.legend(frameon=False, fontsize=9)
     lags = [name for name in result.statistics if name.startswith("variogram.")]
     place = [result.statistics.index(name) for name in lags]
@@ -327,7 +327,7 @@ def _size_and_variogram(result: CalibrationResult) -> bytes:
     right.set_xscale("log")
     plain_numbers(right.xaxis)
     right.set_ylim(0)
-    dress(right, "distance, m", "root of the semivariance, mm")
+    label_axes(right, "distance, m", "root of the semivariance, mm")
     right.legend(frameon=False, fontsize=9)
     return png_bytes(figure)
 
@@ -341,7 +341,7 @@ def _statistics(result: CalibrationResult) -> bytes:
     axes.barh(place, 2 * (np.exp(2 * scatter) - 1), left=1 - (np.exp(2 * scatter) - 1), color=_SIMULATED, alpha=0.25, height=0.8)
     axes.plot(np.exp(result.observed - expected), place, "o", color=_MEASURED, markersize=4)
     axes.axvline(1, color="0.3", linewidth=0.8)
-    dress(axes, "measured over expected", "")
+    label_axes(axes, "measured over expected", "")
     axes.set_yticks(place, [_in_words(name) for name in result.statistics], fontsize=8)
     return png_bytes(figure)
 
@@ -364,6 +364,6 @@ def _over_time(result: CalibrationResult) -> bytes:
         axes.bar(np.arange(len(values)), values, color=_MEASURED)
         axes.axhline(float(np.mean(values)), color=_SIMULATED)
         axes.axhline(0, color="0.3", linewidth=0.8)
-        dress(axes, "", label)
+        label_axes(axes, "", label)
         axes.set_xticks(np.arange(len(values)), [each.name for each in result.epochs], rotation=45, ha="right", fontsize=8)
     return png_bytes(figure)

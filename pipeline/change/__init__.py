@@ -1,5 +1,4 @@
 """Compute change: difference rasters, M3C2 distances, tiles, annotations of carved blocks.
 
-Registration comes before (`pipeline/registration`), detection after (`pipeline/detection`).
-Start with `difference.py`.
+Registration comes before (`pipeline/registration`), detection after (`pipeline/detection`). Start with `difference.py`.
 """

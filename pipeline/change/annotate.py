@@ -1,7 +1,6 @@
-"""COCO annotations of the blocks in difference maps or their tiles.
+"""Make COCO annotations of the blocks in difference maps or their tiles.
 
-The masks come from the epoch's raster of labels, which travelled with the vertices through noise, meshing and ICP: they lie where
-the *reconstructed* niche lies.
+The masks come from the epoch's raster of labels, displaced like the map itself: they lie where the *reconstructed* niche lies.
 """
 
 from __future__ import annotations
@@ -18,30 +17,41 @@ from scene.common.config import Config
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import IntArray
 
-STANDS_OUT, HARDLY_SHOWS = 4.0, 2.0
-"""Signal-to-noise ratios (matched_filter.py) above which a block can be found among the noise of a tile, and below which nothing
-shows where it is."""
+DETECTABLE_SNR, INVISIBLE_SNR = 4.0, 2.0
+"""Signal-to-noise ratios (matched_filter.py) from which a block can be found in the noise of a tile, and below which it cannot be
+seen at all."""
 BLOCK_CATEGORY = {"id": 1, "name": "block", "supercategory": "rockfall"}
+"""The only category, in COCO's format."""
 
 
 class AnnotationConfig(Config):
     """Which blocks are annotated."""
 
-    minimum_area_px: int = Field(4, ge=1, description="blocks that show on fewer pixels of an image are left out")
+    minimum_area_px: int = Field(4, ge=1, description="blocks that cover fewer pixels of an image are left out")
     ignore_below: float = Field(
-        HARDLY_SHOWS,
+        INVISIBLE_SNR,
         ge=0,
-        description="data sets: blocks with a smaller matched-filter signal-to-noise ratio get `ignore: 1`, and training leaves "
-        "them out of the loss; they count in evaluations",
+        description="data sets: blocks with a smaller matched-filter signal-to-noise ratio get `ignore: 1`; training leaves "
+        "them out of the loss, but evaluations count them",
     )
 
 
 @dataclass(frozen=True)
 class LabelledImage:
-    """An image of the data set: its file, the label (h, w) of each of its pixels, and its place.
+    """An image of the data set.
 
-    file_name: relative to the annotations' folder; block: int32, WALL or the id in blocks.json; row, column: the image's top-left
-    pixel in the difference map (0, 0 for a whole map).
+    Attributes
+    ----------
+    file_name : str
+        Path relative to the annotations' folder.
+    block : (h, w) int32 array
+        Label of each pixel: the block's label in blocks.json, or WALL.
+    grid : Grid
+        Position of the image on the wall.
+    epoch : int
+        Number of the epoch.
+    row, column : int
+        Top-left pixel of the image in the difference map; 0, 0 for a whole map.
     """
 
     file_name: str
@@ -53,10 +63,19 @@ class LabelledImage:
 
 
 def coco(images: Iterable[LabelledImage], config: AnnotationConfig, info: dict[str, Any] | None = None) -> dict[str, Any]:
-    """The data set as COCO holds it (JSON types only); image and annotation ids count from 1.
+    """Make the data set in COCO's format, with JSON types only. Ids of images and annotations count from 1.
 
-    info: COCO's free description. Beyond COCO's own keys, an image has `epoch`, `row`, `column` and its grid (`x_min_m`,
-    `y_max_m`, `gsd_m`, wall frame), an annotation the `block` it shows.
+    Beyond COCO's own keys, an image has `epoch`, `row`, `column` and its grid (`x_min_m`, `y_max_m`, `gsd_m`, wall frame), and
+    an annotation has the `block` that it shows.
+
+    Parameters
+    ----------
+    images : iterable of LabelledImage
+        The images.
+    config : AnnotationConfig
+        Which blocks are annotated.
+    info : dict, optional
+        Further entries of COCO's `info`.
     """
     described: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
@@ -74,7 +93,7 @@ def coco(images: Iterable[LabelledImage], config: AnnotationConfig, info: dict[s
 
 
 def merge(data_sets: Iterable[dict[str, Any]], info: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Several data sets of `coco` as one, with ids that count from 1 throughout."""
+    """Merge several data sets of `coco` into one, with ids that count from 1 throughout."""
     result = coco([], AnnotationConfig(), info)
     for data_set in data_sets:
         before = len(result["images"])
@@ -86,7 +105,7 @@ def merge(data_sets: Iterable[dict[str, Any]], info: dict[str, Any] | None = Non
 
 
 def block_annotations(block: IntArray, config: AnnotationConfig) -> Iterator[dict[str, Any]]:
-    """One annotation, without ids, per block that shows on enough pixels of the raster of labels (h, w), by rising label."""
+    """Yield one annotation, without ids, for each block that covers enough pixels of the labels (h, w), in ascending order."""
     from scipy import ndimage
 
     for label, box in enumerate(ndimage.find_objects(block), start=1):
@@ -108,18 +127,26 @@ def block_annotations(block: IntArray, config: AnnotationConfig) -> Iterator[dic
 
 
 def run_length_encoding(crop: NDArray[np.bool_], row: int, column: int, shape: tuple[int, ...]) -> dict[str, Any]:
-    """COCO's compressed run lengths, down the columns of a frame (h, w), of a mask given by a crop of it.
+    """Encode a mask, given by a crop of the frame, as COCO's compressed run lengths down the columns of the frame.
 
-    crop: (n, m) bool whose top-left pixel is (row, column) of the frame. The same as encoding the whole frame, in the time
-    that the crop takes.
+    The result equals that of encoding the whole frame but takes only the time for the crop.
+
+    Parameters
+    ----------
+    crop : (n, m) bool array
+        The mask in its bounding box.
+    row, column : int
+        Position of the crop's top-left pixel in the frame.
+    shape : (int, int)
+        Height and width of the frame.
     """
     from pycocotools import mask as coco_mask
 
     height, width = shape
-    columns = np.pad(crop.T, ((0, 0), (1, 1)))  # a zero at both ends of each column, so that every run ends in it
+    columns = np.pad(crop.T, ((0, 0), (1, 1)))  # zeros at both ends of each column, so that every run ends within it
     place, step = np.nonzero(columns[:, 1:] != columns[:, :-1])
     changes = (place + column) * height + step + row
-    joined = np.flatnonzero(changes[1:] == changes[:-1])  # a run that goes on at the top of the next column
+    joined = np.flatnonzero(changes[1:] == changes[:-1])  # runs that continue at the top of the next column
     changes = np.delete(changes, np.concatenate([joined, joined + 1]))
     counts = np.diff(changes, prepend=0, append=height * width)
     counts = counts[:-1] if counts[-1] == 0 else counts
@@ -128,6 +155,7 @@ def run_length_encoding(crop: NDArray[np.bool_], row: int, column: int, shape: t
 
 
 def _describe(image: LabelledImage, image_id: int) -> dict[str, Any]:
+    """Describe an image in COCO's format."""
     height, width = image.block.shape
     return {
         "id": image_id,

@@ -1,4 +1,4 @@
-"""Areas of a wall, as configs draw them."""
+"""Define areas of a wall, boxes or polygons, as given in configs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ Box = tuple[float, float, float, float]
 Vertex = tuple[float, float]
 
 
-def _drawn(area: Any) -> Any:
+def _check_shape(area: Any) -> Any:
+    """Refuse anything that is neither a box nor a polygon."""
     try:
         shape = np.array(area, dtype=np.float64).shape
     except (TypeError, ValueError):
@@ -25,12 +26,12 @@ def _drawn(area: Any) -> Any:
     return area
 
 
-Area = Annotated[Box | Annotated[tuple[Vertex, ...], Field(min_length=3)], BeforeValidator(_drawn)]
+Area = Annotated[Box | Annotated[tuple[Vertex, ...], Field(min_length=3)], BeforeValidator(_check_shape)]
 """A box (x0, y0, x1, y1) or the vertices of a polygon, wall frame, m."""
 
 
 def in_areas(areas: Iterable[Area], x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
-    """Whether places x, y (of any one shape, wall frame, m) lie in one of the areas."""
+    """Return whether positions x, y (any shape, wall frame, m) lie in one of the areas."""
     found = np.zeros(np.shape(x), dtype=bool)
     for area in areas:
         corners = np.array(area, dtype=np.float64)
@@ -38,12 +39,12 @@ def in_areas(areas: Iterable[Area], x: FloatArray, y: FloatArray) -> NDArray[np.
             x0, y0, x1, y1 = corners
             found |= (x >= x0) & (x <= x1) & (y >= y0) & (y <= y1)
         else:
-            found |= _inside(corners, x, y)
+            found |= _in_polygon(corners, x, y)
     return found
 
 
-def _inside(corners: FloatArray, x: FloatArray, y: FloatArray) -> Any:
-    """By the even-odd rule: how many sides a ray to the right crosses."""
+def _in_polygon(corners: FloatArray, x: FloatArray, y: FloatArray) -> Any:
+    """Return whether positions lie in a polygon, by the even-odd rule: how many sides a ray to the right crosses."""
     found = np.zeros(np.shape(x), dtype=bool)
     for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         crosses = (y0 > y) != (y1 > y)

@@ -1,4 +1,4 @@
-"""Rasters of surfaces over the wall's plane, their differences, and the statistics of those."""
+"""Rasterise surfaces over the wall's plane, subtract them, and compute statistics of the difference."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from scene.ray_casting.raycast import RayCaster
 from scene.ray_casting.upload import on_device
 
 _BYTES_PER_PIXEL = 64
-"""What reference, epoch, difference, labels and the copies of statistics and pictures take at their peak."""
+"""Peak memory per pixel: reference, epoch, difference, labels, and copies for statistics and pictures."""
 _MOST_PIXELS = 2**32 - 1
 """Dr.Jit numbers the elements of an array with 32 bits."""
 
@@ -28,16 +28,22 @@ _MOST_PIXELS = 2**32 - 1
 class DifferenceConfig(Config):
     """How surfaces are compared."""
 
-    gsd_m: float = Field(0.02, gt=0, description="side of a pixel of the difference map")
+    gsd_m: float = Field(0.02, gt=0, description="side of a pixel of the difference map [m]")
 
 
 @dataclass(frozen=True)
 class SurfaceRaster:
     """A surface seen from the sensors' side along the wall's normal.
 
-    grid: where its pixels lie; heights: (h, w) float32, m, z of the highest surface at each pixel's centre, NaN where there is
-    none; block: (h, w) int32, the label of the face that is seen there, of a surface that knows only those of its vertices that
-    of the nearest vertex; WALL where there is none.
+    Attributes
+    ----------
+    grid : Grid
+        Position of the pixels.
+    heights : (h, w) float32 array
+        z of the highest surface at each pixel centre, m; NaN where there is none.
+    block : (h, w) int32 array
+        Block label of the face seen there (of the nearest vertex, for a surface with labels only at its vertices); WALL where
+        there is none.
     """
 
     grid: Grid
@@ -46,9 +52,9 @@ class SurfaceRaster:
 
 
 def raster_grid(bounds: FloatArray, config: DifferenceConfig) -> Grid:
-    """The pixels inside the reference surface's bounding box ((2, 3), wall frame, m).
+    """Return the grid of all pixels inside the reference surface's bounding box (2, 3), wall frame, m.
 
-    Raises InputError where the GSD is larger than the surface or so fine that the rasters would not fit the free memory.
+    Raises InputError if a pixel would be larger than the surface, or if the rasters would not fit into the free memory.
     """
     width, height = (float(extent) for extent in (bounds[1] - bounds[0])[:2])
     available = psutil.virtual_memory().available
@@ -69,13 +75,15 @@ def raster_grid(bounds: FloatArray, config: DifferenceConfig) -> Grid:
 
 
 def surface_raster(mesh: TriangleMesh, grid: Grid) -> SurfaceRaster:
-    """Look at `mesh` (wall frame) along -z at every pixel centre of `grid`; labels: its `face_block`, else `vertex_block`."""
-    dr.flush_malloc_cache()  # what the observation took: a surface of millions of triangles is the peak of an epoch's memory
+    """Rasterise `mesh` (wall frame) by looking along -z at every pixel centre of `grid`. Labels are its `face_block`, else
+    `vertex_block`.
+    """
+    dr.flush_malloc_cache()  # frees the observation's memory: rasterising the surface is the peak of an epoch
     return cast_raster(RayCaster(mesh), grid)
 
 
 def cast_raster(caster: RayCaster, grid: Grid) -> SurfaceRaster:
-    """The same as `surface_raster`, of a mesh already prepared for ray casting."""
+    """Do the same as `surface_raster` for a mesh that is already prepared for ray casting."""
     hits, point = caster.look_down(grid)
     z = mi.Float32(dr.select(hits.valid, point.z, np.nan))
     if caster.mesh.face_block is not None:
@@ -89,7 +97,9 @@ def cast_raster(caster: RayCaster, grid: Grid) -> SurfaceRaster:
 
 
 def difference(reference: SurfaceRaster, epoch: SurfaceRaster) -> NDArray[np.float32]:
-    """(h, w) reference minus epoch in z, m: positive where rock is missing, negative where it was added, NaN without data."""
+    """Return reference minus epoch in z, (h, w), m: positive where rock is missing, negative where it was added, NaN without
+    data.
+    """
     if reference.grid != epoch.grid:
         raise InputError(f"{epoch.grid} is not the reference's {reference.grid}", where="difference")
     return reference.heights - epoch.heights
@@ -97,7 +107,7 @@ def difference(reference: SurfaceRaster, epoch: SurfaceRaster) -> NDArray[np.flo
 
 @dataclass(frozen=True)
 class DifferenceStatistics:
-    """Statistics of `count` differences, m; NaN where there are none. rmse is about zero, nmad = 1.4826 median(|d - median|)."""
+    """Statistics of `count` differences, m; NaN if there are none. rmse is about zero, nmad = 1.4826 median(|d - median|)."""
 
     count: int
     median: float
@@ -107,19 +117,19 @@ class DifferenceStatistics:
     nmad: float
 
     def to_dict(self) -> dict[str, float | int | None]:
-        """As JSON holds it: the lengths' keys end in _m, NaN is null."""
+        """Return the values for JSON: keys of lengths end in _m, NaN becomes null."""
         lengths = {f"{name}_m": value for name, value in dataclasses.asdict(self).items() if name != "count"}
         return {"count": self.count} | {name: None if np.isnan(value) else value for name, value in lengths.items()}
 
     def summary(self) -> str:
-        """One line in millimetres."""
+        """Describe the statistics on one line, in millimetres."""
         values = (self.median, self.standard_deviation, self.rmse, self.nmad)
         median, deviation, rmse, nmad = (f"{value * 1e3:.1f} mm" for value in values)
         return f"median {median}, StD {deviation}, RMSE {rmse}, NMAD {nmad} ({self.count:,} pixels)"
 
 
 def statistics(values: NDArray[np.floating]) -> DifferenceStatistics:
-    """The statistics of the values (any shape, m) that are not NaN."""
+    """Compute the statistics of all values (any shape, m) that are not NaN."""
     values = values[~np.isnan(values)]
     if values.size == 0:
         return DifferenceStatistics(0, *[float("nan")] * 5)
@@ -137,18 +147,18 @@ def statistics(values: NDArray[np.floating]) -> DifferenceStatistics:
 
 @dataclass(frozen=True)
 class BlockStatistics:
-    """The statistics of a difference map inside the niches of the blocks and outside of them."""
+    """Statistics of a difference map inside the niches of the blocks and outside of them."""
 
     inside: DifferenceStatistics
     outside: DifferenceStatistics
 
 
 def block_statistics(values: NDArray[np.floating], block: IntArray) -> BlockStatistics:
-    """Statistics of a difference map (h, w), m, by the epoch's labels (h, w)."""
+    """Compute the statistics of a difference map (h, w), m, inside and outside the blocks by the epoch's labels (h, w)."""
     return BlockStatistics(statistics(values[block != WALL]), statistics(values[block == WALL]))
 
 
 def _rounded_up(value: float) -> float:
-    """`value` rounded up to two significant digits."""
+    """Round `value` up to two significant digits."""
     unit = 10.0 ** (np.floor(np.log10(value)) - 1)
     return float(np.ceil(value / unit) * unit)

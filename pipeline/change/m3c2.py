@@ -1,17 +1,15 @@
-"""M3C2 distances between two epochs' points, beside the raster differences: for those who compare clouds instead of rasters.
+"""Compute M3C2 distances between two epochs' points, for users who compare clouds instead of rasters.
 
-At each core point, lying on the reference surface with the normal n, the points of both epochs within a cylinder of radius d/2
-along n are averaged, and the distance of the averages along n is the change (Lague, Brodu and Leroux 2013); the level of
-detection at 95 % is
+At each core point on the reference surface, with normal n, the points of both epochs within a cylinder of radius d/2 along n are
+averaged. The distance of the averages along n is the change (Lague, Brodu and Leroux 2013). The level of detection at 95 % is
 
     LoD = 1.96 (sqrt(s_1^2 / n_1 + s_2^2 / n_2) + registration error),       equation 1 there, as py4dgeo computes it,
 
 with the standard deviations s along n and the numbers n of points in the cylinder. The sign is the difference map's: missing rock
-is positive. Core points are pixel centres of the difference map, so that labels and annotations are shared.
+is positive. Core points are pixel centres of the difference map, so that labels and annotations can be shared.
 
-Limits: s also holds the wall's roughness within the cylinder, so LoD is too large on rough rock; it takes points as independent,
-so it is too small where noise is alike over more than a cylinder. Scales here are radii, as py4dgeo's; CloudCompare's are
-diameters.
+Limits: s includes the wall's roughness within the cylinder, so LoD is too large on rough rock. Points count as independent, so it
+is too small where noise is correlated over more than a cylinder. Scales are radii, as in py4dgeo; CloudCompare's are diameters.
 """
 
 from __future__ import annotations
@@ -32,28 +30,39 @@ from scene.geometry.grid import Grid
 from scene.geometry.mesh import WALL, FloatArray, IntArray
 
 _LEAST_POINTS = 2
-"""In a cylinder of each epoch: fewer have no standard deviation."""
+"""Fewest points of each epoch in a cylinder; fewer have no standard deviation."""
 
 
 class M3c2Config(Config):
     """M3C2 by py4dgeo (extra `m3c2`)."""
 
-    core_step_px: int = Field(5, ge=1, description="core points: every so many pixels of the difference map, both ways")
-    normal_radius_m: float = Field(0.25, gt=0, description="radius of the neighbourhood that normals are fitted in")
+    core_step_px: int = Field(5, ge=1, description="distance between core points, in pixels of the difference map")
+    normal_radius_m: float = Field(0.25, gt=0, description="radius of the neighbourhood in which normals are fitted")
     cylinder_radius_m: float = Field(0.08, gt=0, description="radius of the cylinder whose points are averaged (half of d)")
     maximum_distance_m: float = Field(2.0, gt=0, description="half length of the cylinder; deeper changes are not found")
     direction: Literal["normal", "wall"] = Field(
-        "normal", description="along the reference's own normals, or all along the wall's normal, as the difference map"
+        "normal",
+        description="direction of distances: the reference's own normals, or the wall's, as in the difference map",
     )
-    registration_error_m: float = Field(0.0, ge=0, description="of the level of detection: what the registration adds")
+    registration_error_m: float = Field(0.0, ge=0, description="registration error that is added in the level of detection")
 
 
 @dataclass(frozen=True)
 class M3c2Map:
     """M3C2 distances at core points, as rasters over the wall's plane.
 
-    grid: one pixel a core point; distance, level: (h, w) float32, m, NaN without enough points; block: (h, w) the labels of the
-    difference map there; points: (n, 3) the core points, wall frame, m; place: (n,) their pixels, row by row.
+    Attributes
+    ----------
+    grid : Grid
+        One pixel per core point.
+    distance, level : (h, w) float32 arrays
+        Distance and its level of detection, m; NaN without enough points.
+    block : (h, w) array
+        Labels of the difference map at the core points.
+    points : (n, 3) array
+        The core points, wall frame, m.
+    place : (n,) array
+        Their pixels, numbered row by row.
     """
 
     grid: Grid
@@ -65,12 +74,12 @@ class M3c2Map:
 
     @property
     def significant(self) -> NDArray[np.bool_]:
-        """(h, w) where the change exceeds its level of detection."""
+        """(h, w) True where the change exceeds its level of detection."""
         with np.errstate(invalid="ignore"):
             return np.abs(self.distance) > self.level
 
     def summary(self) -> dict[str, float | int | None]:
-        """Core points with a distance, how many are significant, and the median level of detection, m, as JSON holds it."""
+        """Return, for JSON: core points with a distance, how many are significant, and the median level of detection, m."""
         known = ~np.isnan(self.level)
         return {
             "core_points": int(np.count_nonzero(~np.isnan(self.distance))),
@@ -80,16 +89,29 @@ class M3c2Map:
 
 
 def core_grid(grid: Grid, step: int) -> tuple[Grid, slice]:
-    """The grid of core points and the rows and columns of `grid` whose pixels they take: the middle one of every `step`."""
+    """Return the grid of core points, and a slice that selects the middle one of every `step` rows or columns of `grid`."""
     width, height = (max(size // step, 1) for size in (grid.width, grid.height))
     return replace(grid, gsd=grid.gsd * step, width=width, height=height), slice(step // 2, None, step)
 
 
 def m3c2(reference: FloatArray, epoch: FloatArray, raster: SurfaceRaster, block: IntArray, config: M3c2Config) -> M3c2Map:
-    """Distances from the reference's points to the epoch's, (n, 3) and (m, 3), wall frame, m, both registered.
+    """Compute distances from the reference's points to the epoch's. The result does not depend on the number of threads.
 
-    raster: of the reference, whose pixels are the core points; block: (h, w) the epoch's labels at them. The same for any number
-    of threads. Raises InputError where py4dgeo is not installed and where the map is smaller than a step.
+    Parameters
+    ----------
+    reference, epoch : (n, 3) and (m, 3) arrays
+        Registered points, wall frame, m.
+    raster : SurfaceRaster
+        Raster of the reference; its pixels give the core points.
+    block : (h, w) array
+        The epoch's labels at these pixels.
+    config : M3c2Config
+        Radii and limits.
+
+    Raises
+    ------
+    InputError
+        If py4dgeo is not installed or the map is smaller than a step.
     """
     grid, every = core_grid(raster.grid, config.core_step_px)
     heights, labels = (full[every, every][: grid.height, : grid.width] for full in (raster.heights, block))
@@ -97,7 +119,7 @@ def m3c2(reference: FloatArray, epoch: FloatArray, raster: SurfaceRaster, block:
         raise InputError("leaves no core point in the difference map", where="m3c2.core_step_px", remedy="lower it")
     place = np.flatnonzero(np.isfinite(heights))
     row, column = np.divmod(place, grid.width)
-    offset = (config.core_step_px // 2 + 0.5) * raster.grid.gsd  # of the pixel that is taken, from its cell's corner
+    offset = (config.core_step_px // 2 + 0.5) * raster.grid.gsd  # of the selected pixel's centre from its cell's corner
     x, y = grid.x_min + column * grid.gsd + offset, grid.y_max - row * grid.gsd - offset
     core = np.stack([x, y, heights.ravel()[place].astype(np.float64)], axis=1)
     distance, level = np.full((2, grid.height * grid.width), np.nan, dtype=np.float32)
@@ -110,7 +132,7 @@ def m3c2(reference: FloatArray, epoch: FloatArray, raster: SurfaceRaster, block:
 def _distances(
     reference: FloatArray, epoch: FloatArray, core: FloatArray, config: M3c2Config
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(n,) distances, missing rock positive, and levels of detection, m, by py4dgeo; NaN with too few points."""
+    """Return distances (n,), missing rock positive, and levels of detection, m, by py4dgeo; NaN with too few points."""
     py4dgeo = _py4dgeo()
     up = np.array([0.0, 0.0, 1.0])
     algorithm = py4dgeo.M3C2(
@@ -130,6 +152,7 @@ def _distances(
 
 
 def _py4dgeo() -> Any:
+    """Import py4dgeo. Raises InputError if it is not installed."""
     try:
         import py4dgeo
     except ImportError as error:

@@ -1,16 +1,18 @@
-"""How well a niche stands out from a map's noise: the signal-to-noise ratio of a filter matched to its shape.
+"""Compute how well a niche stands out from a map's noise: the signal-to-noise ratio of a filter matched to its shape.
 
-The filter correlates the map with the change t(p) that really happened. In stationary noise n with the power spectrum
-S(k) = <|N(k)|^2> its output is sum t^2 in the mean and scatters by the root of t' C t, so
+The filter correlates the map with the true change t(p). In stationary noise with covariance C and power spectrum
+S(k) = <|N(k)|^2>, the mean of its output is sum t^2 and its variance t' C t, so
 
     rho = sum_k |T(k)|^2 / sqrt(sum_k |T(k)|^2 S(k)),    in white noise of standard deviation s:  rho^2 = sum_p t(p)^2 / s^2
 
-which is the best linear test in white noise (Turin 1960, "An introduction to matched filters"). Whitening would gain more on
-paper: it would look for sharp rims at frequencies where a map interpolated from coarse samples has no noise, but no niche
-either. S is estimated outside of the blocks (Welch 1967: overlapping windows under a Hann taper).
-Where samples are coarse the map shows less of a niche than really happened, and where a surface has finer triangles inside
-niches than outside, the noise in them has a finer grain. As the truth is known, both are seen in what the filter finds, and the
-ratios of a map are corrected for them (`_correction`). Limits: a detector does not know place and shape, so it finds fewer.
+which is the best linear test in white noise (Turin 1960, "An introduction to matched filters"). Whitening would increase the
+ratio only formally: it would use sharp rims at frequencies where a map interpolated from coarse samples contains neither noise
+nor niche. S is estimated outside the blocks (Welch 1967: overlapping windows with a Hann taper).
+
+Where samples are coarse, the map shows less of a niche than the true change. Where a surface has finer triangles inside niches
+than outside, the noise in them has a finer grain. As the truth is known, both can be measured in the filter's output, and the
+ratios of a map are corrected for them (`_correction`). Limits: a detector does not know position and shape, so it finds fewer
+blocks.
 """
 
 from __future__ import annotations
@@ -26,17 +28,29 @@ from scene.geometry.mesh import WALL, FloatArray, IntArray
 from scene.ray_casting.raycast import RayCaster
 
 _SIDES = (64, 128, 256)
+"""Sides of the windows on which spectra are estimated, px."""
 _LEAST_BLOCKS = 20
+"""Fewest blocks from which a correction is estimated."""
 _LEAST_FREE = 0.5
-"""Share of a window outside of blocks and with data from which it counts."""
+"""Smallest share of a window outside of blocks and with data for which the window is used."""
 
 
 def signal_to_noise(
     difference: NDArray[np.float32], block: IntArray, change: NDArray[np.float32], count: int
 ) -> NDArray[np.float64]:
-    """(count,) rho of each block in a difference map (h, w), m; NaN where it cannot be told, 0 of a block that does not show.
+    """Compute rho (count,) of each block in a difference map; NaN if it cannot be determined, 0 for a block that is not in the
+    map.
 
-    block: (h, w) labels; change: (h, w) what the wall really lost at each pixel, m.
+    Parameters
+    ----------
+    difference : (h, w) array
+        Difference map, m.
+    block : (h, w) array
+        Block labels.
+    change : (h, w) array
+        True loss of the wall at each pixel, m.
+    count : int
+        Number of blocks.
     """
     from scipy import ndimage
 
@@ -56,10 +70,11 @@ def signal_to_noise(
 
 
 def _correction(share: NDArray[np.float64], ratio: NDArray[np.float64]) -> float:
-    """By what the ratios of one map are to be multiplied, from what the filter found of each change: share a = sum t d / sum t^2.
+    """Return the factor by which the ratios of one map are multiplied.
 
-    The median of a tells how much of a change the map shows, the scatter of (a - median) rho, 1 where the spectrum is right, how
-    noise inside niches differs from that outside. 1 where few blocks tell.
+    It is estimated from the share a = sum t d / sum t^2 of each change that the filter finds. The median of a tells how much
+    of a change the map shows. The robust standard deviation of (a - median) rho is 1 if the spectrum is right; it tells how
+    the noise inside niches differs from that outside. With few blocks the factor is 1.
     """
     known = np.isfinite(share) & np.isfinite(ratio) & (ratio > 0)
     if known.sum() < _LEAST_BLOCKS:
@@ -70,14 +85,14 @@ def _correction(share: NDArray[np.float64], ratio: NDArray[np.float64]) -> float
 
 
 class _Spectra:
-    """The noise's spectra on windows of some sides, each made when it is first asked for."""
+    """The noise's spectra on windows of several sizes, each estimated when it is first needed."""
 
     def __init__(self, noise: NDArray[np.float32]) -> None:
         self._noise = noise
         self._known: dict[int, FloatArray | None] = {}
 
     def of(self, least: int) -> FloatArray | None:
-        """The spectrum of the smallest windows of `least` px or more, else of the largest that there is."""
+        """Return the spectrum of the smallest windows of at least `least` px, else of the largest that there are."""
         enough = next((number for number, side in enumerate(_SIDES) if side >= least), len(_SIDES) - 1)
         for side in (*_SIDES[enough:], *reversed(_SIDES[:enough])):
             if side not in self._known:
@@ -88,7 +103,10 @@ class _Spectra:
 
 
 def noise_spectrum(noise: NDArray[np.float32], side: int) -> FloatArray | None:
-    """(side, side) mean |N(k)|^2, m2, of windows of `side` px of a map (h, w) of noise, NaN where it is not; None without any."""
+    """Estimate the mean |N(k)|^2 (side, side), m2, on windows of `side` px of a map (h, w) of noise, which is NaN elsewhere.
+
+    Returns None if no window has enough data.
+    """
     from scipy import ndimage
 
     taper, middle = _taper(side), np.nanmedian(noise) if np.isfinite(noise).any() else 0.0
@@ -101,16 +119,25 @@ def noise_spectrum(noise: NDArray[np.float32], side: int) -> FloatArray | None:
         weight += float(np.sum(taper**2 * free))
     if weight == 0 or not total.any():
         return None
-    spectrum = ndimage.uniform_filter(total * side**2 / weight, 3, mode="wrap")  # few windows scatter: neighbours are alike
+    spectrum = ndimage.uniform_filter(total * side**2 / weight, 3, mode="wrap")  # smooth over neighbours, as few windows scatter
     return np.asarray(spectrum)
 
 
 def true_change(
     wall: RayCaster, carved: RayCaster, block: IntArray, grid: Grid, shift_m: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """(h, w) what the wall really lost at the pixels with a label, m, 0 elsewhere, NaN where there is no wall.
+    """Return the true loss (h, w) of the wall at the pixels with a label, m; 0 elsewhere, NaN where there is no wall.
 
-    wall, carved: before and after; shift_m: (h, w, 2) by which the map is displaced, in x and y.
+    Parameters
+    ----------
+    wall, carved : RayCaster
+        The wall before and after.
+    block : (h, w) array
+        Block labels of the map.
+    grid : Grid
+        Its pixels.
+    shift_m : (h, w, 2) array
+        Displacement of the map in x and y, m.
     """
     row, column = np.nonzero(block != WALL)
     result = np.zeros(grid.shape, dtype=np.float32)
@@ -124,7 +151,9 @@ def true_change(
 
 
 def _ratio(template: FloatArray, spectrum: FloatArray) -> float:
-    """rho of a template; one that is larger than the spectrum's window is seen in coarser pixels, their noise taken as white."""
+    """Return rho of a template. A template larger than the spectrum's window is averaged to coarser pixels, whose noise counts as
+    white.
+    """
     side = len(spectrum)
     step = -(-max(template.shape) // side)
     if step > 1:
@@ -136,6 +165,7 @@ def _ratio(template: FloatArray, spectrum: FloatArray) -> float:
 
 
 def _windows(noise: NDArray[np.float32], side: int) -> Iterator[NDArray[np.float32]]:
+    """Yield windows that overlap by half."""
     height, width = noise.shape
     for row in range(0, height - side + 1, side // 2):
         for column in range(0, width - side + 1, side // 2):
@@ -144,5 +174,6 @@ def _windows(noise: NDArray[np.float32], side: int) -> Iterator[NDArray[np.float
 
 @lru_cache
 def _taper(side: int) -> FloatArray:
+    """Return a Hann taper (side, side)."""
     window = np.hanning(side + 1)[:-1]
     return np.outer(window, window)

@@ -1,4 +1,4 @@
-"""Statistics that a few gross errors do not disturb."""
+"""Provide statistics that are insensitive to outliers."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 _NMAD_FACTOR = 1.4826
-"""Median absolute deviation to standard deviation, for normal errors."""
+"""Ratio of standard deviation to median absolute deviation for normal errors."""
 
 
 def nmad(values: NDArray[np.floating], centre: float | np.floating | None = None) -> float:
-    """1.4826 median(|v - centre|), the standard deviation of normal errors, in the values' unit (Hoehle and Hoehle 2009).
+    """Compute 1.4826 median(|v - centre|), which equals the standard deviation for normal errors (Hoehle and Hoehle 2009).
 
-    values: any shape, NaN left out; centre: their median by default. NaN where there are no values.
+    values: any shape; NaN is ignored. centre: their median by default. Returns NaN if there are no values.
     """
     missing = np.isnan(values)
     known = values[~missing] if missing.any() else values

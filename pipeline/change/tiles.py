@@ -1,4 +1,4 @@
-"""Square tiles of a raster, for networks that take small images."""
+"""Cut a raster into square tiles, for networks that take small images."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from scene.geometry.grid import Grid
 from scene.geometry.mesh import WALL, IntArray
 
 MOST_TILES = 100_000
+"""Most tiles of one raster."""
 
 
 class TileConfig(Config):
-    """How a raster is cut."""
+    """How a raster is cut into tiles."""
 
     size_px: int = Field(512, ge=8, le=65_536, description="side of a tile")
     overlap_px: int = Field(0, ge=0, description="pixels that neighbouring tiles share; less than size_px")
@@ -35,8 +36,18 @@ class TileConfig(Config):
 class Tile:
     """A square of a raster; pixels beyond the raster's edge are NaN and WALL.
 
-    row, column: its top-left pixel in the raster; grid: its place on the wall; values: (size, size) float32; block: (size, size)
-    int32; valid_share: the share of its pixels that have data.
+    Attributes
+    ----------
+    row, column : int
+        Top-left pixel in the raster.
+    grid : Grid
+        Position on the wall.
+    values : (size, size) float32 array
+        Values of the raster.
+    block : (size, size) int32 array
+        Block labels.
+    valid_share : float
+        Share of its pixels that have data.
     """
 
     row: int
@@ -48,26 +59,39 @@ class Tile:
 
     @property
     def name(self) -> str:
-        """Its place as a word for file names, unique within the raster: r00512_c01024."""
+        """Its position as a word for file names, unique within the raster: r00512_c01024."""
         return f"r{self.row:05d}_c{self.column:05d}"
 
 
 def tiles(values: NDArray[np.float32], block: IntArray, grid: Grid, config: TileConfig) -> Iterator[Tile]:
-    """Cut a raster (h, w) with its labels (h, w) row by row, leaving out tiles with too few data.
+    """Cut a raster row by row into tiles, leaving out those with too few data.
 
-    Every pixel falls into a tile; the last row and column of tiles reach beyond the raster and are filled with NaN, so that all
-    tiles are of one size and, without overlap, no pixel is in two of them. Raises InputError where the shapes differ, and for
-    more than MOST_TILES.
+    Every pixel belongs to a tile. The last row and column of tiles extend beyond the raster and are filled with NaN, so that
+    all tiles have the same size and, without overlap, no pixel is in two of them.
+
+    Parameters
+    ----------
+    values, block : (h, w) arrays
+        The raster and its labels.
+    grid : Grid
+        Its pixels.
+    config : TileConfig
+        Size and overlap of the tiles.
+
+    Raises
+    ------
+    InputError
+        If the shapes differ, or for more than MOST_TILES.
     """
     if not values.shape == block.shape == grid.shape:
         raise InputError(f"raster {values.shape}, labels {block.shape} and grid {grid.shape} differ in shape", where="tiles")
     size = config.size_px
-    count = len(starts_of_tiles(grid.height, config)) * len(starts_of_tiles(grid.width, config))
+    count = len(tile_starts(grid.height, config)) * len(tile_starts(grid.width, config))
     if count > MOST_TILES:
         problem = f"{count:,} tiles of a map of {grid.width} x {grid.height} px"
         raise InputError(problem, where="tiles", allowed=f"up to {MOST_TILES:,}", remedy="raise size_px or lower overlap_px")
-    for row in starts_of_tiles(grid.height, config):
-        for column in starts_of_tiles(grid.width, config):
+    for row in tile_starts(grid.height, config):
+        for column in tile_starts(grid.width, config):
             window = np.s_[row : row + size, column : column + size]
             valid_share = np.count_nonzero(~np.isnan(values[window])) / size**2
             if valid_share >= config.minimum_valid_share:
@@ -78,6 +102,6 @@ def tiles(values: NDArray[np.float32], block: IntArray, grid: Grid, config: Tile
                 yield Tile(row, column, place, cut, labels, valid_share)
 
 
-def starts_of_tiles(length: int, config: TileConfig) -> range:
-    """The first pixels of the tiles along a side of `length` pixels: no tile lies wholly within the one before it."""
+def tile_starts(length: int, config: TileConfig) -> range:
+    """Return the first pixels of the tiles along a side of `length` pixels. No tile lies entirely within the one before it."""
     return range(0, max(length - config.overlap_px, 1), config.size_px - config.overlap_px)

@@ -1,5 +1,4 @@
-"""Parse the command line and call the API: one thin module a command.
+"""Parse the command line and call the program: one thin module per command.
 
-No module here computes anything; results come from the other folders of `pipeline`.
-Start with `main.py`.
+No module here computes results; those come from the other folders of `pipeline`. Start with `main.py`.
 """

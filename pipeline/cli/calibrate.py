@@ -1,11 +1,11 @@
-"""`scarpsim calibrate`: the noise of measured epochs, and the noise parameters that make the simulation give the like."""
+"""`scarpsim calibrate`: measure the noise of real epochs and fit the noise parameters of the simulation to it."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from pipeline.cli.answer import Answer, recorded
+from pipeline.cli.command_output import CommandOutput, record_document
 from pipeline.cli.parser import add_output_options, at_least, one_of
 
 SUMMARY = "measure the noise of real epochs and fit the simulation's noise to it"
@@ -15,27 +15,33 @@ EXAMPLE = """  scarpsim calibrate my_measurement --out calibration
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
         "measured",
         type=Path,
         nargs="+",
         metavar="MEASUREMENT|MAPS",
-        help="a folder with measurement.yaml, a folder of difference maps (a run's too), or difference maps (GeoTIFF)",
+        help="a folder with measurement.yaml, a folder of difference maps (also a run), or difference maps (GeoTIFF)",
     )
-    parser.add_argument("--config", type=Path, metavar="FILE", help="the site (default: the run's own, else demo.yaml)")
     parser.add_argument(
-        "--sensor", type=one_of("stereo", "tls"), metavar="stereo|tls", help="what measured (default: as the inputs say)"
+        "--config", type=Path, metavar="FILE", help="config of the site (default: the run's, otherwise demo.yaml)"
+    )
+    parser.add_argument(
+        "--sensor", type=one_of("stereo", "tls"), metavar="stereo|tls", help="sensor that measured (default: as the inputs say)"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: a new one under runs/)")
     parser.add_argument("--seed", type=at_least(0), metavar="N", help="seed of the simulations (default: the config's)")
     parser.add_argument(
         "--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE", help="override a key of the config, as a.b=c"
     )
-    parser.add_argument("--no-greedy", action="store_true", help="leave out the thesis's search, which is run for comparison")
+    parser.add_argument(
+        "--no-greedy", action="store_true", help="skip the greedy search of the thesis, which is only for comparison"
+    )
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Fit the noise and write the report."""
     from pipeline.calibration.calibrate import calibrate
     from pipeline.calibration.inputs import config_of, sensor_of
     from pipeline.calibration.report import summary
@@ -55,4 +61,4 @@ def run(arguments: argparse.Namespace) -> Answer:
         result = calibrate(config, sensor, arguments.measured, progress, with_greedy=not arguments.no_greedy)
         with progress.stage("report"):
             report = write(out, config, result, arguments.measured)
-    return Answer(f"{summary(result)}\nreport: {report}", recorded(report, RECORD_FILE))
+    return CommandOutput(f"{summary(result)}\nreport: {report}", record_document(report, RECORD_FILE))

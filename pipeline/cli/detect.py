@@ -6,7 +6,7 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from pipeline.cli.answer import Answer
+from pipeline.cli.command_output import CommandOutput
 from pipeline.cli.parser import add_output_options
 
 SUMMARY = "find rockfalls in difference maps: masks, events, pictures"
@@ -16,10 +16,11 @@ EXAMPLE = """  scarpsim detect default runs/my_run --out found
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
         "model",
         metavar="MODEL",
-        help="'default' (comes with scarpsim), 'baseline' (threshold, no network), or a trained detector's folder",
+        help="'default' (network that comes with scarpsim), 'baseline' (threshold, no network), or folder of a trained detector",
     )
     parser.add_argument(
         "inputs",
@@ -34,18 +35,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         action="append",
         metavar="P",
-        help="lowest score, may be given several times (default: 0.9 0.95 0.99)",
+        help="smallest score to accept; may be given several times (default: 0.9 0.95 0.99)",
     )
     parser.add_argument(
         "--unmirrored",
         action="store_true",
-        help="look at maps as they are, not at their mirror images too: 'default' is three to four times as fast, and finds less",
+        help="do not also search mirror images of the maps; with 'default' three to four times as fast, but finds less",
     )
-    parser.add_argument("--no-pictures", action="store_true", help="neither overlays nor rasters of masks")
+    parser.add_argument("--no-pictures", action="store_true", help="write neither overlays nor mask rasters")
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Find the blocks and write masks, tables and pictures."""
     from pipeline.cli.train import load_keras
     from pipeline.detection.products.run import BASELINE, CONFIDENCES, detect, sorted_confidences
     from pipeline.formats.files.atomic import check_place, new_folder
@@ -58,7 +60,7 @@ def run(arguments: argparse.Namespace) -> Answer:
         from pipeline.detection.inference.weights import check_detector
         from pipeline.detection.products.run import detector_folder, find_inputs
 
-        check_detector(detector_folder(arguments.model))  # a mistake there, or in the inputs, should not wait for TensorFlow
+        check_detector(detector_folder(arguments.model))  # report mistakes before TensorFlow takes its time to load
         find_inputs(arguments.inputs)
         load_keras(quiet=arguments.quiet)
     with shown_progress(quiet=arguments.quiet) as progress:
@@ -79,4 +81,4 @@ def run(arguments: argparse.Namespace) -> Answer:
         "volume_m3": volume,
         "events": [asdict(item) for item in found],
     }
-    return Answer(f"{told}\nresults: {out}", lambda: document)
+    return CommandOutput(f"{told}\nresults: {out}", lambda: document)

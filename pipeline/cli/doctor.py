@@ -1,4 +1,7 @@
-"""`scarpsim doctor`: what is there, what is missing and how to get it. It must not crash whatever is missing."""
+"""`scarpsim doctor`: say what is installed, what is missing and how to get it.
+
+The command must not crash, whatever is missing.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.cli import system_libraries
-from pipeline.cli.answer import Answer
+from pipeline.cli.command_output import CommandOutput
 from pipeline.cli.parser import add_output_options
 from scene.common.errors import InputError
 from scene.common.extras import how_to_install
@@ -24,12 +27,12 @@ from scene.common.extras import how_to_install
 if TYPE_CHECKING:
     from packaging.requirements import Requirement
 
-SUMMARY = "say what is installed, what is missing and how to get it"
+SUMMARY = "list what is installed, what is missing and how to get it"
 EXAMPLE = """  scarpsim doctor
   scarpsim doctor --json"""
-_SETUP = "run `make setup` in the checkout, or install scarpsim again"
+_INSTALL_AGAIN = "run `make setup` in the checkout, or install scarpsim again"
 _MEMORY_GIB, _DISK_GIB = 2.0, 1.0
-"""What the demo needs, with room to spare."""
+"""Free memory and disk space that the demo needs, with a margin."""
 EXTRAS = {
     "colmap": ("surfaces by COLMAP from depth maps", "0.1 GB"),
     "dataset": ("data sets by several workers", "30 MB"),
@@ -39,9 +42,9 @@ EXTRAS = {
     "notebook": ("xarray, GeoPandas, PyVista: the types of the Python interface", "0.9 GB"),
     "poisson": ("Poisson surfaces, by Open3D", "1.0 GB"),
 }
-"""What each extra is for, and what it takes on the disk with what it needs beyond the program's set, November 2026."""
+"""Purpose of each extra, and the disk space of its packages beyond those of the program (November 2026)."""
 _NEEDS_LIBRARIES = {"poisson": "open3d"}
-"""The package whose presence says that an extra's system libraries are wanted."""
+"""Package of an extra; if it is installed, the extra's system libraries are examined too."""
 _IMPORTS = {
     "laspy": "laspy",
     "manifold3d": "manifold3d",
@@ -50,12 +53,24 @@ _IMPORTS = {
     "pycocotools": "pycocotools.mask",
     "pyyaml": "yaml",
 }
-"""The module to load for a distribution that goes by another name, or whose compiled part is not loaded with the package."""
+"""Module to import for a package whose module has another name or whose compiled part is a submodule."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing looked at. `ok` is None where there is nothing to be wrong about; `remedy` says how to get what is missing."""
+    """Result of examining one thing.
+
+    Attributes
+    ----------
+    name : str
+        What was examined.
+    ok : bool or None
+        Whether it is as it should be; None if it is only information.
+    found : str
+        What was found.
+    remedy : str
+        How to get what is missing, or empty.
+    """
 
     name: str
     ok: bool | None
@@ -64,50 +79,57 @@ class Finding:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Examine the installation and list what was found."""
     findings = examine()
     ready = all(finding.ok is not False for finding in findings)
-    end = "\nready: `simulate` can run here" if ready else "\nnot ready: mend what is marked PROBLEM"
+    end = "\nready: `simulate` can run here" if ready else "\nnot ready: fix what is marked PROBLEM"
     document = {"ready": ready, "findings": [asdict(finding) for finding in findings]}
-    return Answer("\n".join([*map(_line, findings), end]), lambda: document, 0 if ready else 1)
+    return CommandOutput("\n".join([*map(_format_finding, findings), end]), lambda: document, 0 if ready else 1)
 
 
 def examine() -> list[Finding]:
-    """Every finding; a probe that fails is itself a finding."""
+    """Return all findings; a probe that fails is reported as a finding."""
     probes: tuple[Callable[[], Iterator[Finding]], ...] = (_python, _packages, _extras, _libraries, _backend, _machine, _caches)
-    return [finding for probe in probes for finding in _guarded(probe)]
+    return [finding for probe in probes for finding in _run_probe(probe)]
 
 
-def _guarded(probe: Callable[[], Iterator[Finding]]) -> list[Finding]:
+def _run_probe(probe: Callable[[], Iterator[Finding]]) -> list[Finding]:
+    """Return the findings of a probe, with an exception as a further finding."""
     found: list[Finding] = []
     try:
         found.extend(probe())
     except InputError as error:
         found.append(Finding(probe.__name__.strip("_"), False, str(error)))
-    except Exception as error:  # whatever it is, it is what this command is there to tell
-        found.append(Finding(probe.__name__.strip("_"), False, _brief(error), _SETUP))
+    except Exception as error:  # the command reports every failure
+        found.append(Finding(probe.__name__.strip("_"), False, _first_line(error), _INSTALL_AGAIN))
     return found
 
 
-def _line(finding: Finding) -> str:
+def _format_finding(finding: Finding) -> str:
+    """Return a finding as one line of the table."""
     mark = {True: "ok", False: "PROBLEM", None: "-"}[finding.ok]
     return f"{mark:<8}{finding.name:<32}{finding.found}" + (f"; {finding.remedy}" if finding.remedy else "")
 
 
-def _brief(error: BaseException) -> str:
+def _first_line(error: BaseException) -> str:
+    """Return the type and the first line of an error."""
     return f"{type(error).__name__}: {error}".partition("\n")[0]
 
 
 def _python() -> Iterator[Finding]:
+    """Examine the versions of Python and scarpsim."""
     right = (3, 11) <= sys.version_info < (3, 14)
     yield Finding("Python", right, platform.python_version(), "" if right else "install Python 3.11 to 3.13")
     yield Finding("scarpsim", True, f"{metadata.version('scarpsim')} in {Path(__file__).parents[2]}")
 
 
 def _packages() -> Iterator[Finding]:
+    """Examine the packages that the program requires."""
     from packaging.requirements import Requirement
 
     for requirement in map(Requirement, metadata.requires("scarpsim") or []):
@@ -117,7 +139,7 @@ def _packages() -> Iterator[Finding]:
 
 
 def _extras() -> Iterator[Finding]:
-    """Which of the extras are there; what is not installed is no problem."""
+    """Examine which extras are installed. A missing extra is not a problem."""
     from packaging.requirements import Requirement
 
     wanted = [Requirement(text) for text in metadata.requires("scarpsim") or []]
@@ -125,11 +147,12 @@ def _extras() -> Iterator[Finding]:
         marked = [each for each in wanted if each.marker and "extra" in str(each.marker)]
         names = [each.name for each in marked if each.marker and each.marker.evaluate({"extra": extra})]
         absent = [name for name in names if not _is_installed(name)]
-        found = f"{purpose}; " + (f"not installed: {', '.join(absent)}, {size} with what they need" if absent else "installed")
+        found = f"{purpose}; " + (f"not installed: {', '.join(absent)}, {size} with dependencies" if absent else "installed")
         yield Finding(f"extra {extra}", None, found, how_to_install(extra) if absent else "")
 
 
 def _is_installed(name: str) -> bool:
+    """Return whether a package is installed."""
     try:
         metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -138,46 +161,49 @@ def _is_installed(name: str) -> bool:
 
 
 def _megabytes(distribution: metadata.Distribution) -> float:
-    """What a distribution takes on the disk, by its own record."""
+    """Return the disk space of a package, MB, from its list of files."""
     return sum(file.size or 0 for file in distribution.files or ()) / 1e6
 
 
 def _package(requirement: Requirement) -> Finding:
-    """Whether a distribution is there, loads, and has a version that fits."""
+    """Examine whether a package is installed, can be imported, and has a suitable version."""
     name, wanted = requirement.name, requirement.specifier
     try:
         version = metadata.version(name)
         importlib.import_module(_IMPORTS.get(name, name))
     except metadata.PackageNotFoundError:
-        return Finding(name, False, f"not installed, wanted {wanted}", _SETUP)
-    except Exception as error:  # compiled packages fail in many ways, each worth reading
-        return Finding(name, False, f"{version} does not load: {_brief(error)}", "see the system libraries below")
+        return Finding(name, False, f"not installed, needs {wanted}", _INSTALL_AGAIN)
+    except Exception as error:  # compiled packages fail in many ways
+        return Finding(name, False, f"{version} does not load: {_first_line(error)}", "see the system libraries below")
     fits = version in wanted
     found = f"{version}, {_megabytes(metadata.distribution(name)):.0f} MB"
-    return Finding(name, fits, found, "" if fits else f"wanted {wanted}; {_SETUP}")
+    return Finding(name, fits, found, "" if fits else f"needs {wanted}; {_INSTALL_AGAIN}")
 
 
 def _libraries() -> Iterator[Finding]:
+    """Examine the system libraries of the program and of the installed extras, except LLVM."""
     extras = [extra for extra, package in _NEEDS_LIBRARIES.items() if _is_installed(package)]
     missing = system_libraries.missing(extras)
     for library in system_libraries.LIBRARIES:
-        if library.extra in ("", *extras) and library.soname != system_libraries.LLVM:  # asked of Dr.Jit itself below
+        if library.extra in ("", *extras) and library.soname != system_libraries.LLVM:  # `_backend` asks Dr.Jit for it
             absent = library in missing
             yield Finding(library.soname, not absent, f"for {library.needed_by}", _apt_line(missing) if absent else "")
 
 
 def _apt_line(libraries: list[system_libraries.SystemLibrary]) -> str:
+    """Return the command that installs system libraries."""
     return f"apt-get install -y --no-install-recommends {' '.join(system_libraries.packages(libraries))}"
 
 
 def _backend() -> Iterator[Finding]:
+    """Examine the GPU and LLVM, one of which the ray tracer needs."""
     import drjit as dr
 
     cuda, llvm = dr.has_backend(dr.JitBackend.CUDA), dr.has_backend(dr.JitBackend.LLVM)
     yield Finding("CUDA device", None, _gpu_name() if cuda else "none; the CPU is used")
     if llvm:
         yield Finding("LLVM backend", True, "usable")
-    else:  # of no importance where there is a GPU
+    else:  # only information if there is a GPU
         remedy = _apt_line([library for library in system_libraries.LIBRARIES if library.soname == system_libraries.LLVM])
         yield Finding("LLVM backend", None if cuda else False, "no usable libLLVM", remedy)
     from scene.common.backend import VARIANT
@@ -186,6 +212,7 @@ def _backend() -> Iterator[Finding]:
 
 
 def _gpu_name() -> str:
+    """Return the name and memory of the GPU as nvidia-smi reports them."""
     try:
         query = ["nvidia-smi", "--query-gpu=name,memory.total", "--format=csv,noheader"]
         return subprocess.run(query, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
@@ -194,6 +221,7 @@ def _gpu_name() -> str:
 
 
 def _machine() -> Iterator[Finding]:
+    """Examine the processors, free memory and disk space."""
     import psutil
 
     threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
@@ -208,6 +236,7 @@ def _machine() -> Iterator[Finding]:
 
 
 def _caches() -> Iterator[Finding]:
+    """Examine the cache of compiled kernels."""
     folder = Path(os.environ.get("DRJIT_CACHE_DIR") or Path.home() / ".drjit")
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) if folder.is_dir() else 0
     yield Finding("compiled kernels", None, f"{size / 2**20:.0f} MiB in {folder}; may be deleted at any time")

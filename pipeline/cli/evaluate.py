@@ -1,4 +1,4 @@
-"""`scarpsim evaluate`: how good detections are."""
+"""`scarpsim evaluate`: score detections against the true blocks."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.cli.answer import Answer
+from pipeline.cli.command_output import CommandOutput
 from pipeline.cli.parser import add_output_options, one_of
 
 if TYPE_CHECKING:
@@ -18,24 +18,25 @@ EXAMPLE = """  scarpsim evaluate my_dataset/test/annotations.json found/detectio
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("truth", type=Path, metavar="TRUTH", help="COCO annotations, or a folder that holds annotations.json")
+    """Declare the command's arguments."""
+    parser.add_argument("truth", type=Path, metavar="TRUTH", help="COCO annotations, or a folder with annotations.json")
     parser.add_argument("predictions", type=Path, metavar="PREDICTIONS", help="COCO detections with scores")
     parser.add_argument(
-        "--by", action="append", default=[], metavar="KEY", help="a table for each value of this key of the images"
+        "--by", action="append", default=[], metavar="KEY", help="also score separately for each value of this key of the images"
     )
     parser.add_argument(
         "--iou",
         type=one_of("both", "segm", "bbox"),
         default="both",
         metavar="both|segm|bbox",
-        help="overlap of masks (segm), of boxes, or tables of both (default)",
+        help="match by overlap of masks (segm), of boxes (bbox), or both in separate tables (default)",
     )
     parser.add_argument(
         "--confidence",
         type=float,
         action="append",
         metavar="P",
-        help="lowest score that counts, may be given several times (default: 0.9 0.95 0.99)",
+        help="smallest score that counts; may be given several times (default: 0.9 0.95 0.99)",
     )
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder for scores.json, scores.csv and reliability.png (default: only print)"
@@ -43,7 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Score the detections and print the tables."""
     from pipeline.detection.products.run import CONFIDENCES, sorted_confidences
     from pipeline.detection.products.score_files import as_text, assess, write
     from pipeline.formats.files.atomic import check_place
@@ -56,4 +58,4 @@ def run(arguments: argparse.Namespace) -> Answer:
     if arguments.out:
         write(assessment, arguments.out)
     place = f"\nscores: {arguments.out}" if arguments.out else ""
-    return Answer(as_text(assessment) + place, assessment.to_dict)
+    return CommandOutput(as_text(assessment) + place, assessment.to_dict)

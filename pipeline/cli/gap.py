@@ -1,4 +1,6 @@
-"""`scarpsim gap`: where simulation and measurement disagree, what explains it, and the model with that in it."""
+"""`scarpsim gap`: find where simulation and measurement disagree, name the effects that explain it, and write the improved
+model.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +8,12 @@ import argparse
 from contextlib import ExitStack
 from pathlib import Path
 
-from pipeline.cli.answer import Answer, recorded
-from pipeline.cli.measurement import add_source_arguments, built
+from pipeline.cli.command_output import CommandOutput, record_document
+from pipeline.cli.measurement import add_source_arguments, build_measurement_folder
 from pipeline.cli.parser import add_output_options, at_least, between, one_of
 from scene.common.errors import InputError
 
-SUMMARY = "find where a measurement and the model disagree, name the effect, add it, show the gap shrink"
+SUMMARY = "find where a measurement and the model disagree, name the effects, add them, measure the gap again"
 EXAMPLE = """  scarpsim gap my_measurement --out diagnosis
   scarpsim gap scan.laz --reference wall.ply --scanner riegl_vz400i --out diagnosis
   scarpsim gap cloud.ply --reference wall.ply --photographs --out diagnosis
@@ -19,22 +21,27 @@ EXAMPLE = """  scarpsim gap my_measurement --out diagnosis
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
         "measurement",
         nargs="+",
         type=Path,
         metavar="MEASUREMENT",
         help="folder with measurement.yaml, or raw scans with --reference and --scanner; with --identifiability also the config "
-        "of a simulation",
+        "of a simulation instead",
     )
     add_source_arguments(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: a new one under runs/)")
-    parser.add_argument("--seed", type=at_least(0), default=1, metavar="N", help="seed of the null distributions (default: 1)")
     parser.add_argument(
-        "--identifiability", action="store_true", help="only say what this geometry can tell apart; looks at no residual"
+        "--seed", type=at_least(0), default=1, metavar="N", help="seed of the simulated null distributions (default: 1)"
     )
     parser.add_argument(
-        "--sensor", type=one_of("stereo", "tls"), metavar="stereo|tls", help="with --identifiability: of a config's sensors"
+        "--identifiability",
+        action="store_true",
+        help="only say which effects this geometry can tell apart, without using residuals",
+    )
+    parser.add_argument(
+        "--sensor", type=one_of("stereo", "tls"), metavar="stereo|tls", help="with --identifiability: sensor of the config"
     )
     parser.add_argument(
         "--set",
@@ -42,19 +49,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         dest="overrides",
         metavar="KEY=VALUE",
-        help="a threshold of the diagnosis, as mean.class_margin=4 (gap.json lists them under decisions); with --identifiability "
-        "a key of the config",
+        help="change a threshold of the diagnosis, as mean.class_margin=4 (gap.json lists them under decisions); with "
+        "--identifiability override a key of the config",
     )
     parser.add_argument(
         "--reference-error",
         type=between(0.0, 100.0),
         metavar="M",
-        help="with --identifiability: error of the known surface, correlated over 3 m (default: 0.001 tls, 0.005 stereo)",
+        help="with --identifiability: standard error of the reference surface, m, correlated over 3 m (default: 0.001 tls, 0.005 "
+        "stereo)",
     )
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Diagnose a measurement, or with --identifiability only its geometry."""
     from pipeline.formats.files.atomic import check_place, new_folder
 
     out = arguments.out or new_folder(Path("runs"), "gap")
@@ -63,27 +72,28 @@ def run(arguments: argparse.Namespace) -> Answer:
 
 
 def _measurement_folder(arguments: argparse.Namespace, out: Path) -> Path:
-    """The folder to read; of raw scans it is built first, under the one of the results."""
+    """Return the folder to read; if raw scans are given, build it first in the folder of the results."""
     given: list[Path] = arguments.measurement
     if len(given) == 1 and (given[0].is_dir() or given[0].suffix in ("", ".yaml", ".yml")) and not arguments.reference:
         return given[0]
     if not arguments.reference:
         remedy = (
             "add --reference (a mesh, a cloud, or half) and --scanner, or --photographs for a cloud from photographs without "
-            "cameras; or name the folder of a measurement"
+            "cameras; or give the folder of a measurement"
         )
-        raise InputError("is a raw file, without what it is to be compared with", where=str(given[0]), remedy=remedy)
-    return built(arguments, given, out / "measurement").folder
+        raise InputError("is a raw file, and no reference is given to compare it with", where=str(given[0]), remedy=remedy)
+    return build_measurement_folder(arguments, given, out / "measurement").folder
 
 
-def _diagnosis(arguments: argparse.Namespace, out: Path) -> Answer:
+def _diagnosis(arguments: argparse.Namespace, out: Path) -> CommandOutput:
+    """Diagnose a measurement and write the report."""
     from pipeline.formats.measurements.measurement import read_measurement
-    from pipeline.gap.decisions import read_decisions
     from pipeline.gap.naming.workflow import STEPS, diagnose
-    from pipeline.gap.report.report import summary, write
+    from pipeline.gap.report.report import summarise, write_report
+    from pipeline.gap.thresholds import read_thresholds
     from pipeline.report.progress import shown_progress
 
-    decisions = read_decisions(arguments.overrides)
+    thresholds = read_thresholds(arguments.overrides)
     weights = {**STEPS, "report": 2.0}
     steps = iter(weights)
     with shown_progress(quiet=arguments.quiet) as progress, ExitStack() as stage:
@@ -95,20 +105,21 @@ def _diagnosis(arguments: argparse.Namespace, out: Path) -> Answer:
         progress.plan(weights)
         begin_next()
         measurement = read_measurement(_measurement_folder(arguments, out))
-        found = diagnose(measurement, arguments.seed, begin_next, decisions)
-        report = write(out, found, measurement)
-    return Answer(f"{summary(found)}\nreport: {report}", recorded(report, "gap.json"))
+        found = diagnose(measurement, arguments.seed, begin_next, thresholds)
+        report = write_report(out, found, measurement)
+    return CommandOutput(f"{summarise(found)}\nreport: {report}", record_document(report, "gap.json"))
 
 
-def _identifiability(arguments: argparse.Namespace, out: Path) -> Answer:
-    from pipeline.gap.report.identifiability_report import in_words, write_identifiability
+def _identifiability(arguments: argparse.Namespace, out: Path) -> CommandOutput:
+    """Report which effects the geometry of a measurement or config can tell apart."""
+    from pipeline.gap.report.identifiability_report import summarise, write_identifiability
     from pipeline.gap.survey.identifiability import format_table, identifiability
     from pipeline.gap.survey.load_surveys import load_surveys
 
     if len(arguments.measurement) > 1:
-        raise InputError(f"got {len(arguments.measurement)} names", where="--identifiability", allowed="one")
+        raise InputError(f"got {len(arguments.measurement)} inputs", where="--identifiability", allowed="one")
     wanted = load_surveys(arguments.measurement[0], arguments.overrides, arguments.sensor)
     found = [identifiability(survey, arguments.reference_error) for survey in wanted]
     report = write_identifiability(out, found)
-    told = "\n\n".join(f"{in_words(each)}\n{format_table(each)}" for each in found)
-    return Answer(f"{told}\nreport: {report}", recorded(report, "identifiability.json"))
+    told = "\n\n".join(f"{summarise(each)}\n{format_table(each)}" for each in found)
+    return CommandOutput(f"{told}\nreport: {report}", record_document(report, "identifiability.json"))

@@ -1,51 +1,66 @@
-"""`scarpsim icp-study`: which settings of the registration suit a run."""
+"""`scarpsim icp-study`: find the registration settings that suit a run."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from pipeline.cli.answer import Answer, recorded
+from pipeline.cli.command_output import CommandOutput, record_document
 from pipeline.cli.parser import add_output_options, at_least, one_of
 from scene.common.errors import InputError
 
-SUMMARY = "find the settings of ICP that suit a run, against the true transform"
+SUMMARY = "find the ICP settings that recover a run's true transform best"
 EXAMPLE = """  scarpsim icp-study runs/my_site
   scarpsim icp-study my_site.yaml --sensor stereo --epochs 2 --offset-m 0.05 --out study"""
 
 MOST_EPOCHS, MOST_REPEATS = 99, 99
-"""More epochs and draws say nothing new of a setting; each is some forty registrations."""
+"""Limits of the study's size. Each epoch and repeat takes about forty registrations, and more add no information."""
 MOST_OFFSET_M = 100.0
-"""More than any epoch is off that somebody set up with a map in hand, and than ICP could take."""
+"""Largest offset, m. It exceeds the error of any real set-up, and ICP could not correct more."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
-        "source", type=Path, metavar="RUN|CONFIG", help="folder of a run, or a config file or bundled site to simulate"
+        "source",
+        type=Path,
+        metavar="RUN|CONFIG",
+        help="folder of a run, or a config file or bundled site, which is simulated first",
     )
-    parser.add_argument("--sensor", type=one_of("stereo", "tls"), metavar="stereo|tls", help="of a config (default: its first)")
+    parser.add_argument(
+        "--sensor", type=one_of("stereo", "tls"), metavar="stereo|tls", help="sensor of the config (default: the first)"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: a new one under runs/)")
     parser.add_argument(
-        "--epochs", type=at_least(1, at_most=MOST_EPOCHS), default=1, metavar="N", help="epochs to register (default: 1)"
+        "--epochs",
+        type=at_least(1, at_most=MOST_EPOCHS),
+        default=1,
+        metavar="N",
+        help="number of epochs to register (default: 1)",
     )
     parser.add_argument(
         "--repeats",
         type=at_least(1, at_most=MOST_REPEATS),
         default=3,
         metavar="N",
-        help="random subsets for each ratio (default: 3)",
+        help="number of random subsets per sampling ratio (default: 3)",
     )
     parser.add_argument(
-        "--offset-m", type=float, default=0.03, metavar="M", help="put each epoch off by a known motion first (default: 0.03)"
+        "--offset-m",
+        type=float,
+        default=0.03,
+        metavar="M",
+        help="first displace each epoch by a known motion of this size, m (default: 0.03)",
     )
     parser.add_argument("--seed", type=at_least(0), metavar="N", help="seed of all random numbers (default: the config's)")
     parser.add_argument(
-        "--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE", help="override a key of a config, as a.b=c"
+        "--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE", help="override a key of the config, as a.b=c"
     )
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Run the study and write the report."""
     from pipeline.config.bundled import config_path
     from pipeline.config.simulation import load_config
     from pipeline.formats.files.atomic import empty_folder, new_folder
@@ -68,4 +83,4 @@ def run(arguments: argparse.Namespace) -> Answer:
         settings = {"offset_m": arguments.offset_m, "repeats": arguments.repeats}
         found = study(sensor, surfaces, config.icp or IcpConfig(), KeyedRandom(config.seed), **settings, progress=progress)
     report = write_icp_study(out, found)
-    return Answer(f"{summary(found)}\nreport: {report}", recorded(report, "icp_study.json"))
+    return CommandOutput(f"{summary(found)}\nreport: {report}", record_document(report, "icp_study.json"))

@@ -1,4 +1,4 @@
-"""`scarpsim init`: write a short config to start from, all further keys in its comments."""
+"""`scarpsim init`: write a short config to start from, with all further keys as comments."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.cli.answer import Answer
+from pipeline.cli.command_output import CommandOutput
 from pipeline.cli.parser import add_output_options
 from scene.common.errors import InputError
 
-SUMMARY = "write a short config to start from, with every further key in a comment"
+SUMMARY = "write a short config to start from, with all further keys as comments"
 EXAMPLE = """  scarpsim init --site glendale --scanner riegl_vz400i --out my_site.yaml
   simulate --sensor tls --config my_site.yaml
   scarpsim init --mesh wall.ply --cameras cameras.xml --out my_site.yaml
@@ -19,26 +19,34 @@ EXAMPLE = """  scarpsim init --site glendale --scanner riegl_vz400i --out my_sit
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument("--site", metavar="NAME", help="start from a bundled site, such as glendale (default: the demo)")
-    words = "with the wall of this mesh file, or of several that make up the scene, in survey coordinates"
+    words = "take the wall from this mesh file, or from the several that make up the scene, in survey coordinates"
     parser.add_argument("--mesh", type=Path, metavar="FILE", nargs="+", help=words)
     parser.add_argument(
-        "--cameras", type=Path, metavar="FILE", help="with the pair of this file: Metashape, COLMAP or cameras.yaml"
+        "--cameras", type=Path, metavar="FILE", help="take the camera pair from this file: Metashape, COLMAP or cameras.yaml"
     )
-    parser.add_argument("--scanner", metavar="NAME", help="with this scanner, such as riegl_vz400i, its noise and its beam")
-    parser.add_argument("--dataset", metavar="NAME", help="the config of a data set instead, such as small")
-    parser.add_argument("--out", type=Path, default=Path("scarpsim.yaml"), metavar="FILE", help="default: %(default)s")
+    parser.add_argument("--scanner", metavar="NAME", help="take scanner, noise and beam from this preset, such as riegl_vz400i")
+    parser.add_argument("--dataset", metavar="NAME", help="write the config of a data set instead, such as small")
+    parser.add_argument(
+        "--out", type=Path, default=Path("scarpsim.yaml"), metavar="FILE", help="config to write (default: %(default)s)"
+    )
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Write the config and its JSON schema."""
     out = arguments.out
     if arguments.dataset and (arguments.site or arguments.scanner or arguments.mesh or arguments.cameras):
-        raise InputError("stands beside --site or --scanner", where="--dataset", remedy="a data set's walls name their sites")
+        raise InputError(
+            "cannot be combined with --site, --scanner, --mesh or --cameras",
+            where="--dataset",
+            remedy="leave it out, or name the sites of the walls in the data set's config",
+        )
     kind = "dataset" if arguments.dataset else "simulation"
-    meshes = [_beside(out, path) for path in arguments.mesh or ()]
-    cameras = _beside(out, arguments.cameras) if arguments.cameras else ""
-    made = _dataset(arguments.dataset) if arguments.dataset else ""
+    meshes = [_relative_to_config(out, path) for path in arguments.mesh or ()]
+    cameras = _relative_to_config(out, arguments.cameras) if arguments.cameras else ""
+    made = _data_set_text(arguments.dataset) if arguments.dataset else ""
     text = made or simulation_text(arguments.site, arguments.scanner, meshes, cameras)
     from pipeline.cli.json_schema import schema_line, schema_name, schema_text
     from pipeline.formats.files.atomic import write_text
@@ -50,22 +58,34 @@ def run(arguments: argparse.Namespace) -> Answer:
     except FileExistsError:
         raise InputError("exists already", where=str(out), remedy="choose another name with --out") from None
     except (FileNotFoundError, NotADirectoryError):
-        raise InputError("there is no such folder", where=str(out.parent), remedy="make it first") from None
+        raise InputError("there is no such folder", where=str(out.parent), remedy="create it first") from None
     write_text(schema, schema_text(kind))
     command = f"scarpsim dataset {out} --out my_set" if arguments.dataset else f"simulate --sensor tls --config {out}"
     told = f"wrote {out} and, for editors, {schema}; run it with: {command}"
-    return Answer(told, lambda: {"file": str(out), "schema": str(schema), "command": command})
+    return CommandOutput(told, lambda: {"file": str(out), "schema": str(schema), "command": command})
 
 
-def _beside(out: Path, path: Path) -> str:
-    """The path of an input as the config in `out` names it: relative to its folder. Raises InputError where there is none."""
+def _relative_to_config(out: Path, path: Path) -> str:
+    """Return the path of an input relative to the folder of the config `out`. Raises InputError if the file does not exist."""
     if not path.exists():
         raise InputError("there is no such file", where=str(path), remedy="check the path")
     return os.path.relpath(path.resolve(), out.parent.resolve())
 
 
 def simulation_text(site: str | None, scanner: str | None, meshes: Sequence[str] = (), cameras: str = "") -> str:
-    """Return a config that starts from a bundled site, with another scanner, wall (one file or several) or cameras (file)."""
+    """Return the text of a config that starts from a bundled site.
+
+    Parameters
+    ----------
+    site : str or None
+        Name of the bundled site. None: the demo.
+    scanner : str or None
+        Scanner preset to use instead of the site's scanner.
+    meshes : sequence of str
+        Mesh files of the wall to use instead of the site's.
+    cameras : str
+        File of the camera pair to use instead of the site's, or empty.
+    """
     from pipeline.config.bundled import bundled_config
     from pipeline.config.commented import commented_yaml
     from pipeline.config.simulation import SimulationConfig
@@ -81,7 +101,8 @@ def simulation_text(site: str | None, scanner: str | None, meshes: Sequence[str]
     return commented_yaml(parse(SimulationConfig, values, str(source)), values)
 
 
-def _dataset(name: str) -> str:
+def _data_set_text(name: str) -> str:
+    """Return the text of a bundled data set's config."""
     from pipeline.config.bundled import bundled_config
 
     return bundled_config("datasets", name).read_text(encoding="utf-8")

@@ -1,37 +1,39 @@
-"""`scarpsim inspect`: what a planned set-up promises, before anything is simulated."""
+"""`scarpsim inspect`: predict what a planned set-up achieves, before anything is simulated."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from pipeline.cli.answer import Answer, recorded
+from pipeline.cli.command_output import CommandOutput, record_document
 from pipeline.cli.parser import add_output_options, at_least, one_of
 
-SUMMARY = "map what a planned set-up promises: precision, spacing, blind spots, smallest block"
+SUMMARY = "map what a planned set-up achieves: precision, spacing, blind spots, smallest block"
 EXAMPLE = """  scarpsim inspect my_site.yaml
   scarpsim inspect my_site.yaml --sensor tls --set station.distance_m=100 --set planning.block_size_m=[0.2] --out plans/100m"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
         "config",
         type=Path,
         metavar="CONFIG",
-        help="config file, as `scarpsim init` writes it, or a bundled site, such as glendale",
+        help="config file as `scarpsim init` writes it, or a bundled site, such as glendale",
     )
     parser.add_argument(
-        "--sensor", type=one_of("stereo", "tls"), metavar="stereo|tls", help="the one to inspect (default: those of the config)"
+        "--sensor", type=one_of("stereo", "tls"), metavar="stereo|tls", help="sensor to inspect (default: all of the config)"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for maps and report (default: a new one under runs/)")
-    parser.add_argument("--seed", type=at_least(0), metavar="N", help="seed of a wall made by rule (default: the config's)")
+    parser.add_argument("--seed", type=at_least(0), metavar="N", help="seed of a procedural wall (default: the config's)")
     parser.add_argument(
         "--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE", help="override a key of the config, as a.b=c"
     )
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Compute the maps of the set-up and write the report."""
     from pipeline.config.bundled import config_path
     from pipeline.config.simulation import load_config
     from pipeline.formats.files.atomic import empty_folder, new_folder
@@ -47,4 +49,6 @@ def run(arguments: argparse.Namespace) -> Answer:
         plans = inspect(config, sensors, progress)
         with progress.stage("report"):
             report = write_plans(out, config, plans)
-    return Answer("\n\n".join([*(summary(plan) for plan in plans), f"report: {report}"]), recorded(report, PLAN_FILE))
+    return CommandOutput(
+        "\n\n".join([*(summary(plan) for plan in plans), f"report: {report}"]), record_document(report, PLAN_FILE)
+    )

@@ -1,4 +1,4 @@
-"""Ctrl-C that is always heard: the first ends the command in order, a second at once, whatever native code is doing then."""
+"""Handle Ctrl-C: the first one ends the command in an orderly way, the second one at once, even inside native code."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 INTERRUPTED = 130
+"""Exit status of an interrupted command."""
 
 
 @contextmanager
-def second_interrupt_ends(kept: Callable[[], str]) -> Iterator[None]:
-    """In the block a second SIGINT ends the process with 130 and the words of `kept`.
+def exit_on_second_interrupt(kept: Callable[[], str]) -> Iterator[None]:
+    """Within the block, end the process with status 130 at the second SIGINT and print what `kept` returns.
 
-    Python hears signals between two of its own instructions only, so that native code that waits for memory or for a thread which
-    could not be started hears none. Here the number of each signal goes through a socket, written by the kernel's handler, to a
-    thread of its own. Does nothing outside of the main thread, where Python allows no such thing.
+    Python handles signals only between two of its own instructions, so native code that waits for memory or a thread cannot be
+    interrupted. Here the kernel's signal handler writes each signal's number to a socket, and a separate thread reads it.
+    Outside the main thread, where Python allows no signal handling, this does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,4 +1,4 @@
-"""JSON schemas of the config files, for editors: completion, descriptions, and mistakes marked while one types."""
+"""Make JSON schemas of the config files, with which editors complete keys, show descriptions and mark mistakes."""
 
 from __future__ import annotations
 
@@ -22,40 +22,40 @@ KINDS: dict[str, type[BaseModel]] = {
     "model": RootModel[SensorModel],
     "measurement": MeasurementConfig,
 }
-"""What a file of each kind holds once it is read; `_written` adds the short forms that a file may have."""
+"""The model of each kind of file after reading; `_with_short_forms` adds the short forms that a file may use."""
 _DRAFT = "https://json-schema.org/draft/2020-12/schema"
 _NUMBER, _NAME = {"type": "number"}, {"type": "string"}
-_NUMBERS_ALONE = ("DrawnParameter", "Constant")
-"""Sections for which a plain number may stand."""
+_NUMBER_ALLOWED = ("DrawnParameter", "Constant")
+"""Models that a file may give as a plain number."""
 
 
 def json_schema(kind: str) -> dict[str, Any]:
-    """The JSON schema (draft 2020-12) of one kind of file; raises InputError for an unknown kind."""
+    """Return the JSON schema (draft 2020-12) of one kind of file; raise InputError for an unknown kind."""
     if kind not in KINDS:
         raise InputError(f"there is no schema '{kind}'", allowed=", ".join(KINDS), remedy=nearest(kind, KINDS))
     found = KINDS[kind].model_json_schema()
-    return {"$schema": _DRAFT, **_written(found), "title": f"scarpsim: {kind}"}
+    return {"$schema": _DRAFT, **_with_short_forms(found), "title": f"scarpsim: {kind}"}
 
 
 def schema_text(kind: str) -> str:
-    """The schema as JSON."""
+    """Return the schema of one kind of file as JSON text."""
     return json.dumps(json_schema(kind), indent=1) + "\n"
 
 
 def schema_name(kind: str) -> str:
-    """The name of the schema's file beside a config."""
+    """Return the file name of the schema that `scarpsim init` writes next to a config."""
     return f"scarpsim.{kind}.schema.json"
 
 
 def schema_line(kind: str) -> str:
-    """The comment by which editors with a YAML language server find the schema beside the file that it stands in."""
+    """Return the YAML comment that tells editors where the schema is."""
     return f"# yaml-language-server: $schema={schema_name(kind)}\n"
 
 
-def _written(schema: dict[str, Any]) -> dict[str, Any]:
-    """The schema with the short forms that the reading of a file resolves: names of presets, models and sites, plain numbers."""
+def _with_short_forms(schema: dict[str, Any]) -> dict[str, Any]:
+    """Add to a schema the short forms that the reader resolves: names of presets, models and sites, and plain numbers."""
     known = schema.get("$defs", {})
-    for name in _NUMBERS_ALONE:
+    for name in _NUMBER_ALLOWED:
         if name in known:
             known[name] = {"anyOf": [known[name], _NUMBER]}
     simulations = [part for part in (schema, known.get("SimulationConfig")) if part and "rockfall" in part.get("properties", {})]
@@ -72,13 +72,14 @@ def _written(schema: dict[str, Any]) -> dict[str, Any]:
 
 
 def _site() -> dict[str, Any]:
-    """A wall of a data set, told by the site that it is on."""
+    """Return the schema of a data set's wall that is given by its site."""
     overrides = {"type": "array", "items": _NAME, "description": "key=value, as --set takes them"}
     site = _NAME | {"description": "a bundled site's name or a config file"}
     return {"type": "object", "properties": {"site": site, "set": overrides}, "required": ["site"], "additionalProperties": False}
 
 
 def _add_names(sections: dict[str, Any], known: dict[str, Any]) -> None:
+    """Allow names of models, cameras and scanners in the sections of a simulation's schema."""
     models, cameras = sections["sensor"], sections["cameras"]
     one = models["items"]
     sections["sensor"] = {key: value for key, value in models.items() if key not in ("items", "type")}

@@ -1,6 +1,6 @@
-"""The console scripts `scarpsim` and `simulate`: they find the command, and turn every error into a message and an exit code.
+"""Run the console scripts `scarpsim` and `simulate`: find the command and turn errors into a message and an exit status.
 
-Nothing heavy is imported here or at the top of a command's file, so that `--help` is instant.
+To keep `--help` fast, neither this module nor the top level of a command's module imports anything heavy.
 """
 
 from __future__ import annotations
@@ -38,13 +38,14 @@ from pipeline.cli import (
     view,
 )
 from pipeline.cli import simulate as simulate_command
-from pipeline.cli.answer import Answer, as_json
-from pipeline.cli.interrupt import INTERRUPTED, second_interrupt_ends
+from pipeline.cli.command_output import CommandOutput, as_json
+from pipeline.cli.interrupt import INTERRUPTED, exit_on_second_interrupt
 from pipeline.cli.parser import Parser
 from scene.common.errors import InputError, OutsideError, nearest, one_line
 
 DONE, FAILED, WRONG_INPUT = 0, 1, 2
-_BAD_PLACES = {
+"""Exit statuses."""
+_REMEDIES = {
     errno.ENOSPC: "make room, or choose another folder with --out",
     errno.EDQUOT: "make room, or choose another folder with --out",
     errno.EACCES: "check the permissions, or choose another folder with --out",
@@ -53,19 +54,19 @@ _BAD_PLACES = {
     errno.ELOOP: "give the file or folder itself",
     errno.ENOTDIR: "give a path that leads through folders",
 }
-"""What a person can do about an operating system's error, by its number."""
+"""What the user can do about an error of the operating system, by its number."""
 
 
 class Command(Protocol):
-    """A command's module: what its help says, its arguments, and what it does."""
+    """Interface of a command's module: a summary and an example for the help, the arguments, and the action."""
 
     SUMMARY: str
     EXAMPLE: str
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None: ...
 
-    def run(self, arguments: argparse.Namespace) -> Answer:
-        """Carry the command out. It may set `arguments.kept`, what an interrupt leaves usable."""
+    def run(self, arguments: argparse.Namespace) -> CommandOutput:
+        """Run the command and return what it prints. It may set `arguments.kept`, which says what an interrupt leaves usable."""
         ...
 
 
@@ -93,11 +94,13 @@ COMMANDS: dict[str, Command] = {
 
 
 def main(argv: list[str] | None = None) -> int:
-    """`scarpsim COMMAND ...`; returns the exit code."""
+    """Run `scarpsim COMMAND ...` and return the exit status. `argv`: the words after `scarpsim`; default: those of the
+    process.
+    """
     words = sys.argv[1:] if argv is None else argv
     name = words[0] if words else ""
     if name in COMMANDS:
-        return _carry_out(f"scarpsim {name}", COMMANDS[name], words[1:])
+        return _run_command(f"scarpsim {name}", COMMANDS[name], words[1:])
     if name in ("-h", "--help", ""):
         print(_overview())
         return DONE if name else WRONG_INPUT
@@ -105,15 +108,16 @@ def main(argv: list[str] | None = None) -> int:
         print(f"scarpsim {metadata.version('scarpsim')}")
         return DONE
     hint = nearest(name, [*COMMANDS, "--help", "--version"]) or f"allowed: {', '.join(COMMANDS)}"
-    return _complain(f"scarpsim: there is no command '{name}'; {hint}", WRONG_INPUT)
+    return _print_error(f"scarpsim: there is no command '{name}'; {hint}", WRONG_INPUT)
 
 
 def simulate(argv: list[str] | None = None) -> int:
-    """`simulate ...`, the same as `scarpsim simulate ...`."""
-    return _carry_out("simulate", simulate_command, sys.argv[1:] if argv is None else argv)
+    """Run `simulate ...`, which is the same as `scarpsim simulate ...`, and return the exit status."""
+    return _run_command("simulate", simulate_command, sys.argv[1:] if argv is None else argv)
 
 
 def _overview() -> str:
+    """Return the text of `scarpsim --help`."""
     lines = "\n".join(f"  {name:<12}{command.SUMMARY}" for name, command in COMMANDS.items())
     return f"""usage: scarpsim COMMAND ...
 
@@ -122,68 +126,71 @@ Simulates what a stereo pair and a laser scanner measure on a rock wall.
 commands:
 {lines}
 
-`scarpsim COMMAND --help` explains one.
+`scarpsim COMMAND --help` explains a command.
 
 example:
 {simulate_command.EXAMPLE}
 
-exit status: 0 done; 2 the input or the config is wrong (one message says what, where, what is allowed, how to mend it);
-1 anything else, also `doctor` and `dataset verify --report-only` that found something; 130 interrupted"""
+exit status: 0 done; 2 the input or the config is wrong (one message says what is wrong, where, what is allowed and what to do);
+1 any other failure, also if `doctor` or `dataset verify --report-only` found a problem; 130 interrupted"""
 
 
 def command_parser(prog: str, command: Command) -> Parser:
-    """The parser of one command, as its help shows it."""
+    """Return the parser of one command. `prog`: how the help calls the command."""
     parser = Parser(prog, command.SUMMARY, command.EXAMPLE)
     command.add_arguments(parser)
     parser.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
     return parser
 
 
-def _carry_out(prog: str, command: Command, words: list[str]) -> int:
-    """Run one command and print its answer; with --json one document on stdout, of an error too, and all else on stderr."""
+def _run_command(prog: str, command: Command, words: list[str]) -> int:
+    """Run one command, print what it returns, and return the exit status.
+
+    With --json, stdout gets exactly one document, also for an error, and everything else goes to stderr.
+    """
     arguments = argparse.Namespace(debug="--debug" in words, kept="")
-    _take_any_character()
+    _escape_unprintable_characters()
     as_document = "--json" in words
     try:
         parser = command_parser(prog, command)
         arguments = parser.parse(words)
         _check_current_folder()
         as_document = getattr(arguments, "json", False)
-        ended = second_interrupt_ends(lambda: arguments.kept or "nothing is kept")
+        ended = exit_on_second_interrupt(lambda: arguments.kept or "no results were kept")
         with redirect_stdout(sys.stderr) if as_document else nullcontext(), ended:
             answer = command.run(arguments)
             text = as_json(answer.document()) if as_document else answer.text
         print(text)
         return answer.code
-    except SystemExit as stop:  # argparse, after --help
+    except SystemExit as stop:  # raised by argparse after --help
         return int(stop.code or DONE)
-    except BrokenPipeError:  # the reader of our output went away, as `head` does
+    except BrokenPipeError:  # the reader of our output ended, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except (Exception, KeyboardInterrupt) as error:
-        message, code = _explained(error, arguments)
+        message, code = _message_and_exit_code(error, arguments)
         if as_document:
             print(as_json({"error": message, "exit_status": code}))
-        return _complain(message, code)
+        return _print_error(message, code)
 
 
 def _check_current_folder() -> None:
-    """Raise InputError where the current folder was removed: libraries in C abort there."""
+    """Raise InputError if the current folder was deleted, because C libraries abort there."""
     try:
         Path.cwd()
     except FileNotFoundError:
-        raise InputError("the current folder is not there any more", remedy="cd to one that is") from None
+        raise InputError("the current folder no longer exists", remedy="cd to another folder") from None
 
 
-def _take_any_character() -> None:
-    """Print what stdout's encoding lacks, or is no character, as an escape: a file's name can hold any bytes."""
+def _escape_unprintable_characters() -> None:
+    """Print characters that the terminal's encoding lacks as escapes, because file names may contain any bytes."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
 
 
-def _explained(error: BaseException, arguments: argparse.Namespace) -> tuple[str, int]:
-    """The message and the exit code of an error; the only place where errors become exit codes."""
+def _message_and_exit_code(error: BaseException, arguments: argparse.Namespace) -> tuple[str, int]:
+    """Return the message and the exit status of an error. Only here do errors become exit statuses."""
     if isinstance(error, InputError):
         return str(error), WRONG_INPUT
     if isinstance(error, OutsideError):
@@ -193,25 +200,26 @@ def _explained(error: BaseException, arguments: argparse.Namespace) -> tuple[str
         return f"interrupted; {kept}" if kept else "interrupted", INTERRUPTED
     if isinstance(error, ImportError):
         return f"a library does not load ({error}); `scarpsim doctor` says what is missing", FAILED
-    if isinstance(error, OSError) and error.errno in _BAD_PLACES:
+    if isinstance(error, OSError) and error.errno in _REMEDIES:
         where = one_line(str(error.filename or "output"))
-        return f"{where}: {error.strerror}; {_BAD_PLACES[error.errno]}", WRONG_INPUT
+        return f"{where}: {error.strerror}; {_REMEDIES[error.errno]}", WRONG_INPUT
     if (
         isinstance(error, MemoryError) or type(error).__name__ == "ResourceExhaustedError"
     ):  # TensorFlow's, which is not loaded here
-        problem = one_line(str(error)) or "no more is given"
-        return f"needs more memory than there is ({problem}); take larger pixels or steps, or less at a time", WRONG_INPUT
+        problem = one_line(str(error)) or "the system refused more"
+        return f"not enough memory ({problem}); use larger pixels or steps, or less data at a time", WRONG_INPUT
     return _unexpected(error, show=arguments.debug), FAILED
 
 
-def _complain(message: str, code: int) -> int:
-    with suppress(OSError):  # nobody reads it, or no room is left
+def _print_error(message: str, code: int) -> int:
+    """Print an error message on stderr and return the exit status `code`."""
+    with suppress(OSError):  # nobody reads stderr, or the disk is full
         print(f"error: {message}", file=sys.stderr, flush=True)
     return code
 
 
 def _unexpected(error: BaseException, *, show: bool) -> str:
-    """A fault of the program's own in one line; its traceback on stderr where --debug asks for it, or else in a file."""
+    """Return an internal error in one line; its traceback goes to stderr with --debug, otherwise to a file."""
     text = "".join(traceback.format_exception(error))
     summary = " ".join(f"{type(error).__name__}: {error}".split())
     if show:
@@ -223,4 +231,4 @@ def _unexpected(error: BaseException, *, show: bool) -> str:
         where = f"the traceback is in {file.name}"
     except OSError:
         where = "run it again with --debug to see the traceback"
-    return f"unexpected fault of the program, {summary}; {where}"
+    return f"internal error, {summary}; {where}"

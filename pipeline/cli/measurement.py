@@ -1,4 +1,4 @@
-"""`scarpsim measurement`: the folder that `gap` takes, out of raw scans and a surface to compare them with."""
+"""`scarpsim measurement`: build the folder that `gap` reads from raw scans and a reference surface."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.cli.answer import Answer
+from pipeline.cli.command_output import CommandOutput
 from pipeline.cli.parser import add_output_options, at_least, one_of
 from scene.common.errors import InputError
 from scene.common.lengths import METRES
 
 if TYPE_CHECKING:
-    from pipeline.measurement.folder import Understood
+    from pipeline.measurement.folder import Interpretation
     from pipeline.measurement.request import Request
 
 FARTHEST_M = 1e8
-"""No coordinate system of a survey reaches farther."""
-SUMMARY = "build the folder that gap takes out of raw scans and a reference; say what was understood"
+"""Largest coordinate, m; no coordinate system of a survey exceeds it."""
+SUMMARY = "build the folder that gap reads from raw scans and a reference, and say how they were interpreted"
 EXAMPLE = """  scarpsim measurement scan.e57 --reference wall.ply --scanner riegl_vz400i --out my_measurement
   scarpsim measurement cloud.laz --cameras cameras.xml --reference scan.laz --out my_measurement
   scarpsim measurement cloud.ply --reference wall.ply --photographs --out my_measurement
@@ -26,8 +26,13 @@ EXAMPLE = """  scarpsim measurement scan.e57 --reference wall.ply --scanner rieg
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
-        "scans", nargs="+", type=Path, metavar="SCAN", help="raw scan: las, laz, e57, ply, ptx, pts, xyz, csv; several: epochs"
+        "scans",
+        nargs="+",
+        type=Path,
+        metavar="SCAN",
+        help="raw scan: las, laz, e57, ply, ptx, pts, xyz, csv; several scans are epochs",
     )
     add_source_arguments(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="new folder of the measurement")
@@ -35,54 +40,60 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_source_arguments(parser: argparse.ArgumentParser) -> None:
-    """What a raw scan needs beside itself; `gap` takes the same."""
+    """Declare the arguments that describe raw scans; `gap` has the same."""
     parser.add_argument(
         "--reference",
         metavar="FILE|half",
-        help="the surface as known: a mesh, a cloud, another epoch, a DEM; half: of the scan itself",
+        help="the known surface: a mesh, a cloud, another epoch or a DEM; half: one half of the scan itself",
     )
-    parser.add_argument("--scanner", metavar="PRESET", help="what is believed about the scanner, such as riegl_vz400i, or a file")
-    parser.add_argument("--model", type=Path, metavar="FILE", help="a model.yaml instead of --scanner")
+    parser.add_argument("--scanner", metavar="PRESET", help="preset or file of the scanner, such as riegl_vz400i")
+    parser.add_argument("--model", type=Path, metavar="FILE", help="sensor model (model.yaml) instead of --scanner")
     parser.add_argument(
         "--position",
-        type=numbers(3),
+        type=comma_separated_numbers(3),
         metavar="X,Y,Z",
-        help="where the scanner stood, m, in the points' frame, if no header says; with --photographs any place before the wall",
+        help="position of the scanner in the points' frame, m, if no header gives it; with --photographs any point in front of "
+        "the wall",
     )
     parser.add_argument(
         "--unit",
         type=one_of(*METRES),
         metavar="|".join(METRES),
-        help="of the scan (default: as the file states, m where it states none); us-ft: US survey foot",
+        help="unit of the scan (default: as the file states, otherwise m); us-ft: US survey foot",
     )
     parser.add_argument(
-        "--reference-unit", type=one_of(*METRES), metavar="|".join(METRES), help="of the reference (default: as for --unit)"
+        "--reference-unit", type=one_of(*METRES), metavar="|".join(METRES), help="unit of the reference (default: as for --unit)"
     )
     parser.add_argument(
-        "--columns", type=words, default=[], metavar="x,y,z,...", help="of a text file; - for one that is left out"
+        "--columns",
+        type=comma_separated_words,
+        default=[],
+        metavar="x,y,z,...",
+        help="columns of a text file; - for a column to ignore",
     )
     parser.add_argument(
         "--cameras",
         type=Path,
         metavar="FILE",
-        help="the points are from photographs: cameras.yaml, Metashape XML or .psx, COLMAP",
+        help="cameras of points from photographs: cameras.yaml, Metashape XML or .psx, COLMAP",
     )
     parser.add_argument(
         "--photographs",
         action="store_true",
-        help="the points, mesh or DEM are from photographs whose cameras are not at hand: only the surface is compared",
+        help="the points, mesh or DEM are from photographs without known cameras; only the surface is compared",
     )
-    parser.add_argument("--pair", type=pair, metavar="LEFT,RIGHT", help="which two cameras of a project")
-    parser.add_argument("--scan", type=at_least(1), metavar="N", help="take one scan of a file that holds several")
+    parser.add_argument("--pair", type=pair, metavar="LEFT,RIGHT", help="labels of the two cameras in a project")
+    parser.add_argument("--scan", type=at_least(1), metavar="N", help="number of the scan to read from a file with several")
 
 
-def run(arguments: argparse.Namespace) -> Answer:
-    found = built(arguments, arguments.scans, arguments.out)
-    return Answer(f"{found.summary()}\npicture: {found.folder / 'understood.png'}", found.to_dict)
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Build the measurement folder and say how the inputs were interpreted."""
+    found = build_measurement_folder(arguments, arguments.scans, arguments.out)
+    return CommandOutput(f"{found.summary()}\npicture: {found.folder / 'understood.png'}", found.to_dict)
 
 
-def built(arguments: argparse.Namespace, scans: list[Path], out: Path) -> Understood:
-    """Build the folder that the arguments ask for."""
+def build_measurement_folder(arguments: argparse.Namespace, scans: list[Path], out: Path) -> Interpretation:
+    """Build the measurement folder `out` from raw scans as the arguments say, and return how they were interpreted."""
     from pipeline.formats.files.atomic import empty_folder
     from pipeline.measurement.build import build, build_stereo
     from pipeline.measurement.surface import build_surface
@@ -90,17 +101,18 @@ def built(arguments: argparse.Namespace, scans: list[Path], out: Path) -> Unders
     empty_folder(out)
     request = _request(arguments, scans)
     if arguments.cameras and arguments.photographs:
-        raise InputError("is for a cloud whose cameras are not at hand", where="--photographs", remedy="leave it out")
+        raise InputError("cannot be combined with --cameras", where="--photographs", remedy="leave one of them out")
     if arguments.photographs:
         return build_surface(request, out)
     return build_stereo(request, arguments.cameras, arguments.pair, out) if arguments.cameras else build(request, out)
 
 
 def _request(arguments: argparse.Namespace, scans: list[Path]) -> Request:
+    """Collect the arguments that describe raw scans."""
     from pipeline.measurement.request import Request
 
     if arguments.reference is None:
-        remedy = "name a mesh, a cloud or another epoch, or say half"
+        remedy = "give a mesh, a cloud, another epoch, or half"
         raise InputError("is missing", where="--reference", remedy=remedy)
     return Request(
         scans,
@@ -115,21 +127,21 @@ def _request(arguments: argparse.Namespace, scans: list[Path]) -> Request:
     )
 
 
-def words(text: str) -> list[str]:
-    """An argument's type: words between commas."""
+def comma_separated_words(text: str) -> list[str]:
+    """Convert an argument: words separated by commas, in lower case."""
     return [word.strip().lower() for word in text.split(",")]
 
 
 def pair(text: str) -> tuple[str, str]:
-    """An argument's type: two labels."""
+    """Convert an argument: the labels of two cameras, separated by a comma."""
     labels = [label.strip() for label in text.split(",")]
     if len(labels) != 2 or not all(labels):
-        raise argparse.ArgumentTypeError(f"got '{text}'; allowed: two cameras' labels with a comma between")
+        raise argparse.ArgumentTypeError(f"got '{text}'; allowed: the labels of two cameras, separated by a comma")
     return labels[0], labels[1]
 
 
-def numbers(count: int) -> Callable[[str], Any]:
-    """An argument's type: so many coordinates between commas."""
+def comma_separated_numbers(count: int) -> Callable[[str], Any]:
+    """Return an argument's converter: `count` coordinates, separated by commas."""
 
     def check(text: str) -> tuple[float, ...]:
         try:
@@ -137,7 +149,7 @@ def numbers(count: int) -> Callable[[str], Any]:
         except ValueError:
             found = ()
         if len(found) != count or not all(abs(value) <= FARTHEST_M for value in found):
-            raise argparse.ArgumentTypeError(f"got '{text}'; allowed: {count} numbers between commas, up to {FARTHEST_M:g}")
+            raise argparse.ArgumentTypeError(f"got '{text}'; allowed: {count} numbers separated by commas, up to {FARTHEST_M:g}")
         return found
 
     return check

@@ -1,4 +1,4 @@
-"""`scarpsim monitor`: what fell between real epochs."""
+"""`scarpsim monitor`: find what fell between real epochs."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.cli.answer import Answer, recorded
-from pipeline.cli.measurement import numbers, words
+from pipeline.cli.command_output import CommandOutput, record_document
+from pipeline.cli.measurement import comma_separated_numbers, comma_separated_words
 from pipeline.cli.parser import add_output_options, at_least, between, one_of
 from scene.common.errors import InputError
 from scene.common.lengths import METRES
 
 if TYPE_CHECKING:
-    from pipeline.monitor.options import MonitorOptions
+    from pipeline.monitoring.options import MonitorOptions
 
 SUMMARY = "compare real epochs of a wall: registered maps, level of detection, a list of what fell"
 EXAMPLE = """  scarpsim monitor march.laz april.laz --out april
@@ -22,6 +22,7 @@ EXAMPLE = """  scarpsim monitor march.laz april.laz --out april
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
         "epochs",
         nargs="+",
@@ -33,26 +34,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--reference", type=Path, metavar="FILE", help="compare with this instead of the first epoch")
     parser.add_argument(
         "--position",
-        type=numbers(3),
+        type=comma_separated_numbers(3),
         metavar="X,Y,Z",
-        help="where the sensor stood, or any place before the wall, in the points' coordinates, m, if no header says",
+        help="position of the sensor, or any point in front of the wall, in the points' coordinates, m, if no header gives it",
     )
     parser.add_argument(
-        "--direction", type=numbers(3), metavar="X,Y,Z", help="measure change along it, towards the sensor (default: mean plane)"
+        "--direction",
+        type=comma_separated_numbers(3),
+        metavar="X,Y,Z",
+        help="measure change along it, towards the sensor (default: mean plane)",
     )
-    parser.add_argument("--scanner", metavar="PRESET", help="say what level of detection this scanner promises, too")
-    parser.add_argument("--model", type=Path, metavar="FILE", help="a model.yaml instead of --scanner")
+    parser.add_argument("--scanner", metavar="PRESET", help="also predict the level of detection of this scanner")
+    parser.add_argument("--model", type=Path, metavar="FILE", help="sensor model (model.yaml) instead of --scanner")
     parser.add_argument("--photographs", action="store_true", help="the epochs are from photographs")
     parser.add_argument("--stable", type=Path, metavar="FILE", help="stable rock: YAML list of boxes or polygons, wall frame, m")
-    parser.add_argument("--times", type=words, default=[], metavar="T,T,...", help="time of each epoch, ISO 8601")
+    parser.add_argument("--times", type=comma_separated_words, default=[], metavar="T,T,...", help="time of each epoch, ISO 8601")
     parser.add_argument(
-        "--gsd", type=between(1e-4, 100.0), metavar="M", help="side of a pixel, m (default: by the points' density)"
+        "--gsd", type=between(1e-4, 100.0), metavar="M", help="side of a pixel, m (default: from the points' density)"
     )
     parser.add_argument(
-        "--unit", type=one_of(*METRES), metavar="|".join(METRES), help="of the epochs (default: as the files state, else m)"
+        "--unit",
+        type=one_of(*METRES),
+        metavar="|".join(METRES),
+        help="unit of the epochs (default: as the files state, otherwise m)",
     )
     parser.add_argument(
-        "--columns", type=words, default=[], metavar="x,y,z,...", help="of a text file; - for one that is left out"
+        "--columns",
+        type=comma_separated_words,
+        default=[],
+        metavar="x,y,z,...",
+        help="columns of a text file; - for a column to ignore",
     )
     parser.add_argument(
         "--detector",
@@ -60,18 +71,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="default|baseline|none|FOLDER",
         help="find events with a detector instead of the level of detection (default: none)",
     )
-    parser.add_argument("--workers", type=at_least(1), default=1, metavar="N", help="processes (default: 1)")
-    parser.add_argument("--follow", type=Path, metavar="FOLDER", help="go on with each new file in a folder, until interrupted")
-    parser.add_argument("--resume", action="store_true", help="go on with an interrupted monitoring in --out")
+    parser.add_argument("--workers", type=at_least(1), default=1, metavar="N", help="number of processes (default: 1)")
+    parser.add_argument(
+        "--follow", type=Path, metavar="FOLDER", help="also process each new file in this folder, until interrupted"
+    )
+    parser.add_argument("--resume", action="store_true", help="continue an interrupted monitoring in --out")
     parser.add_argument("--write-site", type=Path, metavar="FILE", help="write a config that simulates this site")
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
-    from pipeline.monitor.follow import follow
-    from pipeline.monitor.report import headline
-    from pipeline.monitor.run import monitor_paths
-    from pipeline.monitor.write_site import write_site
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Compare the epochs and write maps, events and report."""
+    from pipeline.monitoring.follow import follow
+    from pipeline.monitoring.report import headline
+    from pipeline.monitoring.run import monitor_paths
+    from pipeline.monitoring.write_site import write_site
     from pipeline.report.progress import shown_progress
 
     options = _options(arguments)
@@ -87,16 +101,17 @@ def run(arguments: argparse.Namespace) -> Answer:
         write_site(result, arguments.write_site)
         lines.append(f"a config of this site: {arguments.write_site}")
     report = arguments.out / "report.html"
-    return Answer("\n".join([*lines, f"report: {report}"]), recorded(report, "monitor.json"))
+    return CommandOutput("\n".join([*lines, f"report: {report}"]), record_document(report, "monitor.json"))
 
 
 def _options(arguments: argparse.Namespace) -> MonitorOptions:
+    """Collect the options of the comparison from the arguments."""
     import numpy as np
 
-    from pipeline.monitor.options import MonitorOptions, read_areas
+    from pipeline.monitoring.options import MonitorOptions, read_areas
 
     if arguments.scanner and arguments.model:
-        raise InputError("goes without --model: both say what the scanner does", where="--scanner", remedy="give one of them")
+        raise InputError("cannot be combined with --model", where="--scanner", remedy="give one of them")
     return MonitorOptions(
         position=None if arguments.position is None else np.array(arguments.position),
         direction=None if arguments.direction is None else np.array(arguments.direction),

@@ -1,4 +1,4 @@
-"""The argument parser of every command: mistakes become InputErrors with the nearest right word."""
+"""Parse the arguments of every command; mistakes become InputErrors that suggest the nearest correct word."""
 
 from __future__ import annotations
 
@@ -11,11 +11,15 @@ from typing import NoReturn
 from scene.common.errors import InputError, nearest
 
 _NEGATIVE_NUMBERS = re.compile(r"^-\.?\d[\d.,eE+-]*$")
-"""A negative number, or several with commas between, is a value and no option: --position -3.5,20,1."""
+"""Matches arguments that are values, not options: a negative number or several separated by commas, as in --position
+-3.5,20,1.
+"""
 
 
 class Parser(argparse.ArgumentParser):
-    """argparse with exact flags, an example at the end of the help, and InputErrors instead of exits."""
+    """Argument parser that requires complete option names, shows an example in its help, and raises InputError instead of
+    exiting.
+    """
 
     def __init__(self, prog: str, description: str, example: str) -> None:
         super().__init__(
@@ -28,7 +32,7 @@ class Parser(argparse.ArgumentParser):
         self._negative_number_matcher = _NEGATIVE_NUMBERS
 
     def parse(self, words: list[str]) -> argparse.Namespace:
-        """Parse the words after the command's name; a misspelt flag is named before the one that is then missing."""
+        """Parse the words after the command's name. An unknown option is reported before a missing one."""
         flags = [flag for action in self._actions for flag in action.option_strings]
         for word in words:
             flag = word.partition("=")[0]
@@ -36,7 +40,7 @@ class Parser(argparse.ArgumentParser):
                 raise InputError(f"unknown option '{flag}'", where=self.prog, remedy=nearest(flag, flags) or self._see_help)
             if word == "" or (flag.startswith("--") and word == f"{flag}="):
                 problem = f"{flag} is empty" if flag else "an argument is empty"
-                raise InputError(problem, where=self.prog, remedy="check the variable that it was to come from")
+                raise InputError(problem, where=self.prog, remedy="check the shell variable that should contain it")
         arguments, unknown = self.parse_known_args(words)
         if unknown:
             raise InputError(f"unexpected argument '{unknown[0]}'", where=self.prog, remedy=self._see_help)
@@ -47,17 +51,18 @@ class Parser(argparse.ArgumentParser):
         return f"see {self.prog} --help"
 
     def error(self, message: str) -> NoReturn:
+        """Raise argparse's message as an InputError."""
         raise InputError(message, where=self.prog, remedy=self._see_help)
 
 
 def add_output_options(parser: argparse.ArgumentParser) -> None:
-    """--quiet and --json, the same for every command that computes something."""
-    parser.add_argument("--quiet", action="store_true", help="no progress")
-    parser.add_argument("--json", action="store_true", help="print one JSON document instead of text; words go to stderr")
+    """Add --quiet and --json, which every computing command has."""
+    parser.add_argument("--quiet", action="store_true", help="show no progress")
+    parser.add_argument("--json", action="store_true", help="print one JSON document on stdout; text goes to stderr")
 
 
 def one_of(*allowed: str) -> Callable[[str], str]:
-    """An argument's type: one of the words `allowed`."""
+    """Return an argument's converter that accepts only the words `allowed`."""
 
     def check(text: str) -> str:
         if text in allowed:
@@ -70,7 +75,7 @@ def one_of(*allowed: str) -> Callable[[str], str]:
 
 
 def between(low: float, high: float) -> Callable[[str], float]:
-    """An argument's type: a number within two limits, which are allowed too."""
+    """Return an argument's converter that accepts numbers from `low` to `high`, both included."""
 
     def check(text: str) -> float:
         try:
@@ -85,7 +90,7 @@ def between(low: float, high: float) -> Callable[[str], float]:
 
 
 def at_least(smallest: int, *, at_most: int | None = None) -> Callable[[str], int]:
-    """An argument's type: a whole number not below `smallest` and not above `at_most`."""
+    """Return an argument's converter that accepts whole numbers from `smallest` to `at_most`."""
     allowed = f"a whole number from {smallest}" + ("" if at_most is None else f" to {at_most}")
 
     def check(text: str) -> int:

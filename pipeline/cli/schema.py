@@ -1,10 +1,10 @@
-"""`scarpsim schema`: the JSON schema of a config file, for editors."""
+"""`scarpsim schema`: print the JSON schema of a config file, for editors."""
 
 from __future__ import annotations
 
 import argparse
 
-from pipeline.cli.answer import Answer
+from pipeline.cli.command_output import CommandOutput
 from pipeline.cli.parser import one_of
 
 SUMMARY = "print the JSON schema of a config file, for editors"
@@ -14,17 +14,19 @@ _KINDS = ("simulation", "dataset", "detector", "scanner", "model", "measurement"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
         "kind",
         type=one_of(*_KINDS),
         nargs="?",
         default="simulation",
         metavar="KIND",
-        help=f"{', '.join(_KINDS)} (default: first)",
+        help=f"{', '.join(_KINDS)} (default: simulation)",
     )
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Return the JSON schema."""
     from pipeline.cli.json_schema import schema_text
 
-    return Answer(schema_text(arguments.kind).rstrip("\n"))
+    return CommandOutput(schema_text(arguments.kind).rstrip("\n"))

@@ -1,4 +1,4 @@
-"""`scarpsim simulate`: observe a wall before and after rocks fall."""
+"""`scarpsim simulate`: observe a wall before and after rockfall."""
 
 from __future__ import annotations
 
@@ -6,39 +6,44 @@ import argparse
 import os
 from pathlib import Path
 
-from pipeline.cli.answer import Answer, recorded
+from pipeline.cli.command_output import CommandOutput, record_document
 from pipeline.cli.parser import add_output_options, at_least, one_of
 from scene.common.errors import InputError
 
-SUMMARY = "observe a rock wall before and after rocks fall, and map the differences"
+SUMMARY = "simulate how a sensor observes a rock wall before and after rockfall, and map the differences"
 EXAMPLE = """  simulate --sensor tls
   simulate --sensor stereo --config my_site.yaml --seed 7 --set rockfall.count=200 --out runs/my_site"""
-_POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""The variables by which the numerical libraries learn how many threads they may use."""
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Environment variables that set the number of threads of the numerical libraries."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
-        "--sensor", required=True, type=one_of("stereo", "tls"), metavar="stereo|tls", help="what observes the wall"
+        "--sensor", required=True, type=one_of("stereo", "tls"), metavar="stereo|tls", help="sensor that observes the wall"
     )
     parser.add_argument(
-        "--config", type=Path, metavar="FILE", help="config file, or a bundled site (default: the bundled demo.yaml)"
+        "--config", type=Path, metavar="FILE", help="config file or bundled site (default: the bundled demo.yaml)"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: a new one under runs/)")
     parser.add_argument("--seed", type=at_least(0), metavar="N", help="seed of all random numbers (default: the config's)")
     parser.add_argument(
         "--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE", help="override a key of the config, as a.b=c"
     )
-    parser.add_argument("--resume", action="store_true", help="go on with the interrupted run in the folder --out")
+    parser.add_argument("--resume", action="store_true", help="continue the interrupted run in the folder --out")
     parser.add_argument(
-        "--threads", type=at_least(1, at_most=1024), metavar="N", help="threads to use (default: all; the results are the same)"
+        "--threads",
+        type=at_least(1, at_most=1024),
+        metavar="N",
+        help="number of threads (default: all); it does not change the results",
     )
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Run or resume the simulation and write the report."""
     if arguments.resume and not arguments.out:
-        raise InputError("needs the folder to go on with", where="--resume", remedy="add --out DIR")
+        raise InputError("needs the folder of the run to continue", where="--resume", remedy="add --out DIR")
     if arguments.threads:
         _use_threads(arguments.threads)
     from pipeline.config.bundled import bundled_config, config_path
@@ -50,14 +55,15 @@ def run(arguments: argparse.Namespace) -> Answer:
     out = arguments.out or new_folder(Path("runs"), arguments.sensor)
     path = config_path("sites", arguments.config) if arguments.config else bundled_config("", "demo")
     config = load_config(path, arguments.overrides, arguments.sensor, arguments.seed)
-    arguments.kept = f"what was finished is in {out} and usable; go on with --resume --out {out}"
+    arguments.kept = f"finished epochs are in {out} and usable; continue with --resume --out {out}"
     with shown_progress(quiet=arguments.quiet) as progress:
         summary = pipeline_run.simulate(config, arguments.sensor, out, resume=arguments.resume, progress=progress)
-    return Answer(f"report: {summary.report}", recorded(summary.report, "run.json"))
+    return CommandOutput(f"report: {summary.report}", record_document(summary.report, "run.json"))
 
 
 def _use_threads(count: int) -> None:
-    for variable in _POOLS:  # read when the libraries are loaded, so before the imports
+    """Limit the number of threads of all numerical libraries."""
+    for variable in _THREAD_VARIABLES:  # the libraries read them when they are imported
         os.environ[variable] = str(count)
     import cv2
 

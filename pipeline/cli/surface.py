@@ -1,11 +1,11 @@
-"""`scarpsim surface`: a point cloud becomes a wall."""
+"""`scarpsim surface`: mesh a point cloud, for use as a wall or as a reference."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from pipeline.cli.answer import Answer
+from pipeline.cli.command_output import CommandOutput
 from pipeline.cli.parser import add_output_options, between, one_of
 from scene.common.errors import InputError
 from scene.common.lengths import METRES
@@ -16,42 +16,50 @@ EXAMPLE = """  scarpsim surface scan.laz --seen-from 345180.0 6389420.0 121.6 --
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("cloud", type=Path, metavar="CLOUD", help="points: .laz .las .ply .e57 .xyz")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the mesh, .ply, in the points' coordinates, m")
+    """Declare the command's arguments."""
+    parser.add_argument("cloud", type=Path, metavar="CLOUD", help="points (.laz .las .ply .e57 .xyz)")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="FILE", help="mesh to write (.ply), in the points' coordinates, m"
+    )
     parser.add_argument(
         "--seen-from",
         type=between(-1e8, 1e8),
         nargs=3,
         required=True,
         metavar=("X", "Y", "Z"),
-        help="where a sensor stood, in the points' coordinates [m]: the surface looks there",
+        help="position of a sensor in the points' coordinates, m; the surface faces it",
     )
     parser.add_argument(
         "--unit",
         type=one_of(*METRES),
         metavar="|".join(METRES),
-        help="of the points (default: as the file states, else m); the mesh is in m",
+        help="unit of the points (default: as the file states, otherwise m); the mesh is in m",
     )
     parser.add_argument(
         "--method",
         choices=("triangulation", "poisson"),
         default="triangulation",
-        help="triangulation: through the points as the sensor sees them (default); poisson: for points from several sides",
+        help="triangulation: connect the points as the sensor sees them (default); poisson: for points from several sides",
     )
     parser.add_argument(
         "--trim",
         type=between(0.1, 1000.0),
         default=3.0,
         metavar="N",
-        help="poisson: how far it reaches, in point spacings (default: 3)",
+        help="poisson: largest distance of the surface from a point, in point spacings (default: 3)",
     )
     parser.add_argument(
-        "--depth", type=int, choices=range(4, 17), metavar="N", help="poisson: of the octree, 4 to 16 (default: as the points)"
+        "--depth",
+        type=int,
+        choices=range(4, 17),
+        metavar="N",
+        help="poisson: depth of the octree, 4 to 16 (default: from the points' density)",
     )
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Mesh the point cloud and write the PLY file."""
     out = arguments.out
     if out.suffix.lower() != ".ply":
         raise InputError(f"got '{out.suffix}'", where="--out", allowed=".ply")
@@ -69,7 +77,9 @@ def run(arguments: argparse.Namespace) -> Answer:
     mesh = surface.mesh
     write_ply(out, mesh)
     counts = {"points": len(cloud.points), "vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
-    told = f"{counts['points']:,} points, {counts['triangles']:,} triangles: {out}; a config of it: scarpsim init --mesh {out}"
+    told = (
+        f"{counts['points']:,} points, {counts['triangles']:,} triangles: {out}; make a config with: scarpsim init --mesh {out}"
+    )
     notes = [*(f"{arguments.cloud.name}: {note}" for note in cloud.notes), *surface.notes]
     told = "\n".join([*(f"note: {note}" for note in notes), told])
-    return Answer(told, lambda: {"file": str(out), **counts, "notes": notes})
+    return CommandOutput(told, lambda: {"file": str(out), **counts, "notes": notes})

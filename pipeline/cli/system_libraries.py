@@ -1,7 +1,7 @@
-"""The system libraries that PyPI's packages do not bring along, and which of them this machine lacks.
+"""List the system libraries that the packages from PyPI do not contain, and which of them this machine lacks.
 
-Standard library only: `tools/setup.sh` runs this file before any package is there, with the extras that it installs as arguments;
-`scarpsim doctor` imports it.
+This file uses only the standard library. `tools/setup.sh` runs it before any package is installed, with the extras to install
+as arguments; `scarpsim doctor` imports it.
 """
 
 from __future__ import annotations
@@ -18,13 +18,24 @@ from pathlib import Path
 
 LLVM = "libLLVM"
 _LLVM_RELEASES = range(22, 13, -1)
-"""LLVM releases for Dr.Jit 1.5, the ones to prefer first; tried: 22, 19, 16, 15."""
+"""LLVM releases that Dr.Jit 1.5 works with, preferred ones first. Tested: 22, 19, 16, 15."""
 
 
 @dataclass(frozen=True)
 class SystemLibrary:
-    """A shared library: what the loader looks for, Debian's and Ubuntu's package, and who needs it; extra: the extra of that,
-    without which nobody does."""
+    """A shared library that must be installed with the system's package manager.
+
+    Attributes
+    ----------
+    soname : str
+        Name that the loader looks for.
+    package : str
+        Package of Debian and Ubuntu.
+    needed_by : str
+        Python packages that need it.
+    extra : str
+        Extra that installs those packages; empty if the program always needs them.
+    """
 
     soname: str
     package: str
@@ -33,7 +44,7 @@ class SystemLibrary:
 
     @property
     def present(self) -> bool:
-        """Whether the loader finds it (for LLVM: whether Dr.Jit would)."""
+        """Whether the loader finds the library; for LLVM, whether Dr.Jit would find it."""
         return _llvm_path() is not None if self.soname == LLVM else _loads(self.soname)
 
 
@@ -48,19 +59,21 @@ LIBRARIES = (
     SystemLibrary("libEGL.so.1", "libegl1", "Open3D", "poisson"),
     SystemLibrary(LLVM, "libllvm", "Dr.Jit on the CPU"),
 )
+"""All system libraries of the program and its extras."""
 
 
 def missing(extras: Sequence[str] = ()) -> list[SystemLibrary]:
-    """The libraries that this machine lacks for the program and some of its extras."""
+    """Return the libraries that this machine lacks for the program and the given extras."""
     return [library for library in LIBRARIES if library.extra in ("", *extras) and not library.present]
 
 
 def packages(libraries: list[SystemLibrary]) -> list[str]:
-    """The packages to install for `libraries`; LLVM's has its release in the name, so apt is asked which there are."""
+    """Return the Debian packages of `libraries`. LLVM's package name contains its release, so apt is asked which exist."""
     return [_llvm_package() if library.soname == LLVM else library.package for library in libraries]
 
 
 def _loads(name: str) -> bool:
+    """Return whether the loader can load a library."""
     try:
         ctypes.CDLL(name)
     except OSError:
@@ -69,14 +82,14 @@ def _loads(name: str) -> bool:
 
 
 def _llvm_path() -> str | None:
-    """Where Dr.Jit will find LLVM: its own variable, the loader's path, Debian's folders."""
+    """Return where Dr.Jit finds LLVM: in its own environment variable, on the loader's path, or in Debian's folders."""
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
     found = sorted(map(str, Path("/usr/lib").glob("*-linux-gnu/libLLVM*.so.*")))
     return next((path for path in ([named] if named else ["libLLVM.so", *found]) if _loads(path)), None)
 
 
 def _llvm_package() -> str:
-    """The best LLVM package that apt knows; a usual name where there is no apt to ask."""
+    """Return the best LLVM package that apt knows, or a common name if apt is not available."""
     known: set[str] = set()
     if shutil.which("apt-cache"):
         listing = subprocess.run(["apt-cache", "pkgnames", "libllvm"], capture_output=True, text=True, check=False).stdout

@@ -1,4 +1,4 @@
-"""`scarpsim train`: teach a detector on a data set of difference maps."""
+"""`scarpsim train`: train a rockfall detector on a data set of difference maps."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from pipeline.cli.answer import Answer
+from pipeline.cli.command_output import CommandOutput
 from pipeline.cli.parser import add_output_options, at_least
 from scene.common.errors import InputError
 
@@ -16,24 +16,31 @@ EXAMPLE = """  scarpsim train my_dataset --out my_detector
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
     parser.add_argument(
-        "data_set", type=Path, metavar="DATASET", help="folder with train/ and val/, as scarpsim dataset makes it"
+        "data_set", type=Path, metavar="DATASET", help="folder with train/ and val/, as scarpsim dataset makes them"
     )
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder for the detector, its checkpoints and curves"
+        "--out", type=Path, required=True, metavar="DIR", help="folder for the detector, its checkpoints and training curves"
     )
     parser.add_argument(
-        "--config", type=Path, metavar="FILE", help="network and training (default: the bundled detectors/light.yaml)"
+        "--config", type=Path, metavar="FILE", help="config of network and training (default: the bundled detectors/light.yaml)"
     )
     parser.add_argument(
         "--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE", help="override a key of the config, as a.b=c"
     )
-    parser.add_argument("--seed", type=at_least(0), metavar="N", help="seed of weights, order and flips (default: the config's)")
-    parser.add_argument("--resume", action="store_true", help="go on with the interrupted training in the folder --out")
+    parser.add_argument(
+        "--seed",
+        type=at_least(0),
+        metavar="N",
+        help="seed of the initial weights, the order and the flips of tiles (default: the config's)",
+    )
+    parser.add_argument("--resume", action="store_true", help="continue the interrupted training in the folder --out")
     add_output_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> Answer:
+def run(arguments: argparse.Namespace) -> CommandOutput:
+    """Train the detector or continue its training."""
     from pipeline.config.bundled import bundled_config, config_path
     from pipeline.detection.inference.weights import check_detector
     from pipeline.detection.network.config import load_train_config
@@ -46,44 +53,44 @@ def run(arguments: argparse.Namespace) -> Answer:
         check_place(arguments.out)
         _check_training(arguments.out)
     else:
-        empty_folder(arguments.out, "add --resume to go on with a training in it, or choose another --out")
+        empty_folder(arguments.out, "add --resume to continue a training in it, or choose another --out")
     overrides = [*arguments.overrides, *([f"training.seed={arguments.seed}"] if arguments.seed is not None else [])]
     path = config_path("detectors", arguments.config) if arguments.config else bundled_config("detectors", "light")
     config = load_train_config(path, overrides)
     for split in ("train", "val"):
-        CocoFolder(arguments.data_set / split).check_images()  # a mistake there should not wait for TensorFlow
+        CocoFolder(arguments.data_set / split).check_images()  # report mistakes before TensorFlow takes its time to load
     if config.training.start is not None:
         check_detector(detector_folder(config.training.start))
     load_keras(quiet=arguments.quiet)
     from pipeline.detection.training.training import train
 
-    arguments.kept = f"what was learned is in {arguments.out}; go on with --resume"
+    arguments.kept = f"the last checkpoint is in {arguments.out}; continue with --resume"
     with shown_progress(quiet=arguments.quiet) as progress:
         history = train(arguments.data_set, config, arguments.out, resume=arguments.resume, progress=progress)
     best, model = min(history.total), arguments.out / "best"
     count = len(history.total)
     told = f"{count} epoch{'s' if count > 1 else ''}, validation loss {history.total[-1]:.4f}, best {best:.4f}: {model}"
     document = {"folder": str(arguments.out), "model": str(model), "epochs": count}
-    return Answer(told, lambda: document | {"validation_loss": history.total[-1], "best_validation_loss": best})
+    return CommandOutput(told, lambda: document | {"validation_loss": history.total[-1], "best_validation_loss": best})
 
 
 def _check_training(out: Path) -> None:
-    """Raise InputError where a folder holds nothing of a training, or something else in the place of its folders."""
+    """Raise InputError if a folder contains no training, or other things in the place of its folders."""
     from pipeline.detection.network.config import BEST, CHECKPOINT, CURVES, EVENTS
     from pipeline.formats.files.own_folders import require_own_folder
 
     if not any((out / name).exists() for name in (CHECKPOINT, BEST, EVENTS, CURVES)):
-        remedy = "begin it without --resume, in a new folder"
-        raise InputError("there is no training", where=f"--resume, --out {out}", remedy=remedy)
+        remedy = "start a training without --resume, in a new folder"
+        raise InputError("there is no training to continue", where=f"--resume, --out {out}", remedy=remedy)
     for name in (CHECKPOINT, BEST, EVENTS):
         require_own_folder(out / name)
 
 
 def load_keras(*, quiet: bool) -> None:
-    """Import Keras and its backend, and say before that this is what takes so long."""
+    """Import Keras and its backend, after a message that this takes time."""
     from pipeline.detection.network.keras_backend import check_installed, import_keras
 
     backend = check_installed()
     if not quiet:
-        print(f"loading {backend}, ten seconds and more", file=sys.stderr, flush=True)
+        print(f"loading {backend}, which takes ten seconds or more", file=sys.stderr, flush=True)
     import_keras()

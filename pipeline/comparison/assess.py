@@ -29,10 +29,10 @@ from pipeline.noise.statistics import (
     DensityHistogram,
     Normality,
     TailFigures,
-    binned,
     histogram,
     normality,
     quantile_edges,
+    statistics_by_bin,
     tails,
     without_outliers,
 )
@@ -321,7 +321,7 @@ def _by_covariates(stable: Raster, trial: Trial, seen: SensorObservations) -> di
 
     def against(covariate: NDArray[np.floating], edges: FloatArray | None = None) -> list[Bin]:
         thinned = covariate[::step, ::step]
-        return binned(part, np.broadcast_to(thinned, part.shape), quantile_edges(thinned) if edges is None else edges)
+        return statistics_by_bin(part, np.broadcast_to(thinned, part.shape), quantile_edges(thinned) if edges is None else edges)
 
     edge_bins = np.array([*_EDGE_STEPS_PX, np.inf]) * trial.grid.gsd
     incidence = np.radians([0, 10, 20, 30, 40, 50, 60, 70, 80, 90])

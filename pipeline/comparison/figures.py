@@ -20,9 +20,9 @@ from pipeline.report.figures import (
     NO_DATA,
     SCALE_SIGMAS,
     SEQUENTIAL,
-    bar_place,
-    dress,
-    dress_map,
+    colour_bar_position,
+    label_axes,
+    label_map_axes,
     mean_pooled,
     plain_numbers,
     png_bytes,
@@ -68,7 +68,7 @@ def side_by_side(panels: Sequence[MapPanel], limit_m: float, label: str, *, sign
     rows = -(-len(panels) // columns)
     aspect = max(panel.grid.height / panel.grid.width for panel in panels)
     height = rows * (_WIDTH_IN / columns * aspect + 0.5) + 0.4
-    place, room = bar_place(height)
+    place, room = colour_bar_position(height)
     figure = Figure(figsize=(_WIDTH_IN, height + room), dpi=DPI, layout="constrained")
     grid = np.atleast_1d(figure.subplots(rows, columns)).ravel()
     for axes in grid[len(panels) :]:
@@ -83,7 +83,7 @@ def side_by_side(panels: Sequence[MapPanel], limit_m: float, label: str, *, sign
             inside = panel.block[:: pooling(panel.grid), :: pooling(panel.grid)] != 0
             axes.contour(inside, levels=[0.5], colors="black", linewidths=0.5, origin="upper", extent=extent)
         axes.set_title(panel.title, fontsize=10, loc="left")
-        dress_map(axes, extent[0], extent[2])
+        label_map_axes(axes, extent[0], extent[2])
     bar = figure.colorbar(image, ax=grid.tolist(), pad=0.01, extend="both" if signed else "max", **place)
     bar.ax.tick_params(labelsize=8)
     bar.set_label(label, fontsize=9)
@@ -108,10 +108,10 @@ def noise_figure(noises: Mapping[str, MapNoise]) -> bytes:
     logarithmic.set_yscale("log")
     powers_of_ten(logarithmic.yaxis)
     logarithmic.set_ylim(bottom=1e-5)
-    dress(linear, DIFFERENCE_LABEL, "density, 1/mm")
-    dress(logarithmic, DIFFERENCE_LABEL, "density, 1/mm")
+    label_axes(linear, DIFFERENCE_LABEL, "density, 1/mm")
+    label_axes(logarithmic, DIFFERENCE_LABEL, "density, 1/mm")
     _metric(correlation, both=True)
-    dress(correlation, "distance, m", "semivariance, mm²")
+    label_axes(correlation, "distance, m", "semivariance, mm²")
     _grid_and_legend(figure, [linear, logarithmic, correlation])
     return png_bytes(figure)
 
@@ -130,7 +130,7 @@ def covariate_figure(found: Sequence[SensorAssessment]) -> bytes:
             )
         if key == "edge_m":
             _metric(axes)
-        dress(axes, label, "NMAD, mm")
+        label_axes(axes, label, "NMAD, mm")
     panels[0].set_ylim(bottom=0)
     _grid_and_legend(figure, list(panels))
     return png_bytes(figure)
@@ -157,10 +157,10 @@ def detection_figure(found: Sequence[SensorAssessment]) -> bytes:
     for axes, label in ((by_size, _SIZE_LABEL), (by_depth, "mean depth of the niche, m")):
         axes.axhline(95, color="0.3", linewidth=0.8, linestyle=":")
         axes.set_ylim(-3, 103)
-        dress(axes, label, "blocks seen, %")
+        label_axes(axes, label, "blocks seen, %")
     volume.axhline(0, color="0.3", linewidth=0.8, linestyle=":")
     volume.set_ylim(-100, 100)
-    dress(volume, _SIZE_LABEL, "volume error, %: median, NMAD")
+    label_axes(volume, _SIZE_LABEL, "volume error, %: median, NMAD")
     volume.sharex(by_size)  # is empty if fewer than half of the blocks of every size are detected
     for axes in (by_size, by_depth):
         _metric(axes)
@@ -179,7 +179,7 @@ def table_figure(found: Sequence[SensorAssessment]) -> bytes:
         image = axes.pcolormesh(size, depth, 100 * detection.table.T, cmap=SEQUENTIAL, vmin=0, vmax=100)
         _metric(axes, both=True)
         axes.set_title(each.name, fontsize=10, loc="left")
-        dress(axes, _SIZE_LABEL, "mean depth of the niche, m")
+        label_axes(axes, _SIZE_LABEL, "mean depth of the niche, m")
     bar = figure.colorbar(image, ax=row.tolist(), pad=0.01)
     bar.ax.tick_params(labelsize=8)
     bar.set_label("blocks seen, %", fontsize=9)

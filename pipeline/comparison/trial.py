@@ -20,9 +20,9 @@ from pipeline.comparison.covariates import UntouchedWall, range_and_incidence, u
 from pipeline.comparison.sensor_setups import SensorSetup
 from pipeline.registration.register import register_to
 from pipeline.report.progress import Progress
-from pipeline.run.acquisition import Look, look, reconstruct
-from pipeline.run.epoch import as_observed
-from pipeline.run.registered import reference_and_target, reference_sensor
+from pipeline.run.acquisition import Acquisition, acquire, reconstruct
+from pipeline.run.epoch import with_wetness
+from pipeline.run.reference import reference_and_target, reference_sensor
 from pipeline.run.site import SensorSite, prepare_site
 from scene.blocks.block import RockfallConfig, place_blocks
 from scene.blocks.carve import block_records, carve
@@ -87,7 +87,7 @@ class SensorObservations:
     points: tuple[int, ...]
     seconds: tuple[float, ...]
     registration_rms_m: tuple[float, ...]
-    reference: Look
+    reference: Acquisition
     range_m: Raster
     incidence_rad: Raster
     visible: NDArray[np.bool_]
@@ -138,7 +138,7 @@ def compare(
     with progress.stage("wall"):
         sites = [prepare_site(each.config, each.sensor, random) for each in sensors]
         _check_one_frame(sensors, sites)
-        caster = RayCaster(as_observed(config, sites[0].mesh))
+        caster = RayCaster(with_wetness(config, sites[0].mesh))
         grid = raster_grid(sites[0].mesh.bounds, config.difference)
         untouched, wall = cast_raster(caster, grid), untouched_wall(caster, grid)
     runs = []
@@ -151,7 +151,7 @@ def compare(
         with progress.stage(f"epoch {number}: carve"):
             blocks = place_blocks(rockfall, sites[0].mesh, keyed.child("blocks"), caster)
             carved = carve(sites[0].mesh, blocks)
-            after = RayCaster(as_observed(config, carved.mesh))
+            after = RayCaster(with_wetness(config, carved.mesh))
             truths.append(
                 _true_epoch(number, block_records(blocks, carved.removed_volume_m3), untouched, cast_raster(after, grid))
             )
@@ -216,7 +216,7 @@ class _SensorRun:
         self.setup, self.site, self.config = setup, site, setup.config
         for where, viewpoint in site.viewpoints.items():
             check_in_front(caster, viewpoint, f"{setup.name}: {where}")
-        self.first = look(self.config, reference_sensor(self.config, site), caster, random.child("epoch", 0, "observe"))
+        self.first = acquire(self.config, reference_sensor(self.config, site), caster, random.child("epoch", 0, "observe"))
         keyed = random.child("epoch", 0, "register")
         surface, self.target = reference_and_target(self.config, reconstruct(self.config, self.first), caster.mesh, keyed)
         self.raster = surface_raster(surface, grid)
@@ -228,7 +228,7 @@ class _SensorRun:
     def observe(self, after: RayCaster, keyed: KeyedRandom) -> None:
         """Observe, reconstruct, register and subtract one epoch, as `pipeline.run.epoch` does."""
         began = time.perf_counter()
-        seen = look(self.config, self.site, after, keyed.child("observe"))
+        seen = acquire(self.config, self.site, after, keyed.child("observe"))
         surface = reconstruct(self.config, seen)
         if self.config.icp is not None and self.target is not None:
             found = register_to(self.target, surface.vertices, self.config.icp, keyed.child("register"))
@@ -256,6 +256,6 @@ class _SensorRun:
         )
 
 
-def _count(seen: Look) -> int:
+def _count(seen: Acquisition) -> int:
     """Count the points of an observation, further returns included."""
     return sum(int(each.valid.sum()) + (0 if each.further is None else len(each.further.cell)) for each in seen.observations)

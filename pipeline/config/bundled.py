@@ -1,4 +1,4 @@
-"""The config files that come with the program: `configs/` of a checkout, `pipeline/configs/` of an installed wheel."""
+"""Find the config files that come with the program: `configs/` in a checkout, `pipeline/configs/` in an installed wheel."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from scene.common.errors import InputError, nearest
 from scene.common.plug_ins import load_plug_ins
 
 PLUG_INS = {"scanners": "scarpsim.scanners", "noise": "scarpsim.noise", "sites": "scarpsim.sites"}
-"""The groups of entry points by which other packages name configs of a kind, each the path of a YAML file."""
+"""Groups of entry points by which other packages add configs of a kind, each the path of a YAML file."""
 _PLACES = (Path(__file__).parents[1] / "configs", Path(__file__).parents[2] / "configs")
 
 
 def configs_folder() -> Path:
-    """The folder of the bundled configs; raises InputError where the installation lacks it."""
+    """Return the folder of the bundled configs. Raises InputError if the installation lacks it."""
     for place in _PLACES:
         if place.is_dir():
             return place
@@ -21,7 +21,7 @@ def configs_folder() -> Path:
 
 
 def named_configs(kind: str) -> dict[str, Path]:
-    """The files of a kind's configs by name: those that come with the program, and those of other packages (PLUG_INS)."""
+    """Return the config files of a kind by name: those that come with the program and those of other packages (PLUG_INS)."""
     own = {path.stem: path for path in sorted((configs_folder() / kind).glob("*.yaml"))}
     if kind not in PLUG_INS:
         return own
@@ -31,9 +31,10 @@ def named_configs(kind: str) -> dict[str, Path]:
 
 
 def bundled_config(kind: str, name: str) -> Path:
-    """The file of the bundled config `name` of a `kind` (a subfolder, such as "sites"; "" for the top, as of demo.yaml).
+    """Return the file of the bundled config `name` of a `kind` (a subfolder such as "sites"; "" for the top level, such as
+    demo.yaml).
 
-    Raises InputError with the nearest name where there is none of that name.
+    Raises InputError, with the most similar name, if there is none.
     """
     named = named_configs(kind)
     if name in named:
@@ -45,10 +46,11 @@ def bundled_config(kind: str, name: str) -> Path:
 
 
 def config_path(kind: str, given: Path) -> Path:
-    """`given` itself or, where nothing is there, the bundled config that it names: `glendale`, or by its path in a checkout,
-    `configs/sites/glendale.yaml`, which an installed wheel has elsewhere.
+    """Return `given` itself or, if no such file exists, the bundled config that it names.
 
-    Raises InputError with the nearest name where a bare word is neither a file nor a bundled config of `kind`.
+    A bundled config is named by a word (`glendale`), or by its path in a checkout (`configs/sites/glendale.yaml`), which is
+    elsewhere in an installed wheel. Raises InputError, with the most similar name, if a bare word is neither a file nor a
+    bundled config of `kind`.
     """
     if given.exists():
         return given

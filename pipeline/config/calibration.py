@@ -1,4 +1,4 @@
-"""What a calibration is told beside the site: where nothing moved, what is fitted, how much is simulated."""
+"""Define the settings of a calibration: stable areas, fitted parameters, amount of simulation."""
 
 from __future__ import annotations
 
@@ -23,4 +23,4 @@ class CalibrationConfig(Config):
     windows: int = Field(24, ge=6, le=400, description="square windows in which measured and simulated maps are compared")
     window_px: int = Field(64, ge=16, le=1024, description="side of a window, pixels of the difference map")
     simulations: int = Field(160, ge=60, le=100_000, description="simulated sets of epochs in the last round of the search")
-    confidence: float = Field(0.95, gt=0.5, lt=1, description="of the intervals")
+    confidence: float = Field(0.95, gt=0.5, lt=1, description="confidence level of the intervals")

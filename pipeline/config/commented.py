@@ -1,6 +1,6 @@
-"""A config as YAML that shows every key: those of a file of one's own live, all others as comments with their defaults.
+"""Write a config as YAML that shows every key: those that a file sets are active, all others are comments with their defaults.
 
-A line `#key: value` is a key that can be had by taking the `#` away; what is to be read begins with `# `.
+A line `#key: value` becomes active when the `#` is removed; explanations begin with `# `.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from scene.common.yaml_text import yaml_line
 _WIDTH = 120
 _INDENT = "  "
 _SMALL = 2
-"""A section of no more keys, inside another and all default, takes one line."""
+"""A section with at most so many keys, inside another one and all default, takes one line."""
 _ABSENT: Any = object()
+"""Marks a key that the file does not set."""
 _HOW_TO = "# A key after `#` has the value that is shown; take the `#` away, and that of the section it is in, to change it."
 _UNITS = {
     "m": "m",
@@ -37,22 +38,23 @@ _UNITS = {
     "hz": "Hz",
     "ppm": "ppm",
 }
-"""The units that a key's last part stands for."""
+"""Units by the last part of a key."""
 _BOUNDS = {"ge": "from {}", "gt": "above {}", "le": "up to {}", "lt": "below {}", "min_length": "at least {} entries"}
+"""Words for the limits of a value."""
 
 
 def commented_yaml(config: BaseModel, own: Mapping[str, Any]) -> str:
-    """The config as YAML that loads into the same config, each key with what it is, its unit and its bounds.
+    """Write the config as YAML that loads into the same config, each key with its meaning, unit and limits.
 
-    own: the keys and values, as in a file, that `config` was made of; they are live, the others are comments that stay right
-    when their `#` is taken away.
+    own: the keys and values, as in a file, from which `config` was made. They are active; the others are comments that remain
+    valid when their `#` is removed.
     """
     title = _first_line(type(config))
     return "\n".join([f"# {title}" if title else "", _HOW_TO, "", *_section(config, own, 0)]).strip("\n") + "\n"
 
 
 def _section(config: BaseModel, own: Mapping[str, Any], depth: int) -> Iterator[str]:
-    """The section's lines; short forms in `own`, keys that the config resolves to others, come first."""
+    """Yield the lines of a section. Short forms in `own` (keys that the config replaces by others) come first."""
     fields = type(config).model_fields
     for name in own:
         if name not in fields:
@@ -64,7 +66,7 @@ def _section(config: BaseModel, own: Mapping[str, Any], depth: int) -> Iterator[
 
 
 def _entry(name: str, value: Any, own: Any, depth: int, words: str = "") -> Iterator[str]:
-    """A key with its value. own: what the file has for it, `_ABSENT`: nothing, so that the key is a comment."""
+    """Yield the lines of a key with its value. own: what the file has for it, or `_ABSENT`, which makes it a comment."""
     live = own is not _ABSENT and own not in ({}, [], ())
     start = f"{_INDENT * depth}{'' if live else '#'}"
     if isinstance(value, BaseModel) and not _in_one_line(value, own, depth):
@@ -79,7 +81,7 @@ def _entry(name: str, value: Any, own: Any, depth: int, words: str = "") -> Iter
 
 
 def _items(sections: Sequence[BaseModel], own: Any, depth: int) -> Iterator[str]:
-    """A list of sections, those beyond the file's own as comments."""
+    """Yield the lines of a list of sections; those that the file does not have are comments."""
     listed = [own] if isinstance(own, Mapping) else own
     for number, section in enumerate(sections):
         live = number < len(listed)
@@ -88,13 +90,13 @@ def _items(sections: Sequence[BaseModel], own: Any, depth: int) -> Iterator[str]
 
 
 def _in_one_line(section: BaseModel, own: Any, depth: int) -> bool:
-    """Whether a section is written as it stands in the file (a number, a name), or is too small to be spread out."""
+    """Return whether a section is written as in the file (a number, a name), or is small enough for one line."""
     fields = type(section).model_fields
     return not fields or (depth > 0 and len(fields) <= _SMALL if own is _ABSENT else not isinstance(own, Mapping))
 
 
 def _explained(line: str, words: str, depth: int) -> Iterator[str]:
-    """A line with its comment behind it, or above it where that gets too long."""
+    """Yield a line with its comment behind it, or above it if that is too long."""
     whole = f"{line}  # {words}"
     if words and len(whole) > _WIDTH:
         start = f"{_INDENT * depth}# "
@@ -103,7 +105,7 @@ def _explained(line: str, words: str, depth: int) -> Iterator[str]:
 
 
 def _plain(value: Any) -> Any:
-    """The value in YAML's own types."""
+    """Convert a value to YAML's own types."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")
     if isinstance(value, Enum):
@@ -116,6 +118,7 @@ def _plain(value: Any) -> Any:
 
 
 def _comment(name: str, field: FieldInfo, value: Any) -> str:
+    """Return the comment of a key: meaning, unit, limits, choices and default."""
     told = _description(field, value)
     parts = [told, "" if _has_unit(told, name) else _UNITS.get(_ending(name), ""), _bounds(field), _choices(field.annotation)]
     default = field.default
@@ -125,32 +128,34 @@ def _comment(name: str, field: FieldInfo, value: Any) -> str:
 
 
 def _ending(name: str) -> str:
-    """The key's last part, where the unit stands."""
+    """Return the last part of a key, which states the unit."""
     return name.rpartition("_")[2] if "_" in name else ""
 
 
 def _has_unit(description: str, name: str) -> bool:
-    """Whether a description says the unit of its key itself."""
+    """Return whether a description states the unit of its key."""
     return _ending(name) in re.findall(r"[\w']+", description) or description.endswith("]")
 
 
 def _description(field: FieldInfo, value: Any) -> str:
-    """What the field says of itself, else what its section does."""
+    """Return the description of a field, or else that of its section."""
     told = field.description or (_first_line(type(value)) if isinstance(value, BaseModel) else "")
     return told.rstrip(".")
 
 
 def _first_line(section: type[BaseModel]) -> str:
+    """Return the first line of a section's docstring."""
     return (section.__doc__ or "").strip().partition("\n")[0]
 
 
 def _bounds(field: FieldInfo) -> str:
+    """Return the limits of a value in words."""
     found = [form.format(getattr(item, key)) for item in field.metadata for key, form in _BOUNDS.items() if hasattr(item, key)]
     return " ".join(found)
 
 
 def _choices(annotation: Any) -> str:
-    """The words that a Literal or an enumeration allows, or the kinds of sections that a union does."""
+    """Return the words that a Literal or an enumeration allows, or the kinds of sections of a union."""
     if get_origin(annotation) is Literal:
         words = [str(word) for word in get_args(annotation)]
         return f"one of {', '.join(words)}" if len(words) > 1 else ""
@@ -161,7 +166,7 @@ def _choices(annotation: Any) -> str:
 
 
 def _sections(annotation: Any) -> Iterator[type[BaseModel]]:
-    """The config models that an annotation allows, in its order."""
+    """Yield the config models that an annotation allows, in its order."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for inner in get_args(annotation):
@@ -169,7 +174,7 @@ def _sections(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def _kind(section: type[BaseModel]) -> str:
-    """The word by which a section of a union is told, its only field with one allowed word; "" where there is none."""
+    """Return the word that distinguishes a section within a union (its only field with one allowed word), or ""."""
     for name, field in section.model_fields.items():
         if get_origin(field.annotation) is Literal and len(get_args(field.annotation)) == 1:
             return f"{name}={get_args(field.annotation)[0]}"

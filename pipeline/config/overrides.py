@@ -1,4 +1,4 @@
-"""`--set a.b=c`: single values of a config, given on the command line."""
+"""Apply `--set a.b=c`: single values of a config, given on the command line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scene.common.yaml_text import parse_yaml
 
 @dataclass(frozen=True)
 class Override:
-    """A value for a place of a config. path: keys, and indices into lists counted from 0; text: as it was given."""
+    """A value for one key of a config. path: keys, and list indices from 0; text: as it was given."""
 
     path: tuple[str, ...]
     value: Any
@@ -23,10 +23,10 @@ class Override:
 
 
 def read_override(text: str) -> Override:
-    """The override that `key.path=value` stands for.
+    """Parse `key.path=value`.
 
     The value is read as YAML: a number, true or false, null, a text, or a collection such as [1, 2] or {a: 1}. Raises
-    InputError where the text is malformed.
+    InputError if the text is malformed.
     """
     key, equals, value = text.partition("=")
     path = tuple(part.strip() for part in key.split("."))
@@ -45,10 +45,10 @@ def read_override(text: str) -> Override:
 
 
 def apply_overrides(values: dict[str, Any], overrides: Sequence[str | Override]) -> dict[str, Any]:
-    """A copy of the config `values` with each override, `key.path=value`, put into its place, in the order given.
+    """Return a copy of the config `values` with each override (`key.path=value`) applied, in the given order.
 
-    Sections that are not there yet are made; whether a key exists is for the config model to say. Raises InputError where an
-    override is malformed or leads through a plain value or past a list's end.
+    Missing sections are created; whether a key exists is checked by the config model. Raises InputError if an override is
+    malformed, or leads through a plain value or beyond the end of a list.
     """
     result = deepcopy(values)
     for given in overrides:
@@ -58,22 +58,23 @@ def apply_overrides(values: dict[str, Any], overrides: Sequence[str | Override])
 
 
 def _put(root: dict[str, Any], path: tuple[str, ...], value: Any, where: str) -> None:
+    """Set one value, and create missing sections."""
     container: Any = root
     for depth, part in enumerate(path[:-1]):
         place = _place(container, part, ".".join(path[:depth]), where)
         if isinstance(container, dict) and container.get(place) is None:
-            container[place] = {}  # an absent or empty section
+            container[place] = {}  # a missing or empty section
         container = container[place]
     container[_place(container, path[-1], ".".join(path[:-1]), where)] = value
 
 
 def _place(container: Any, part: str, name: str, where: str) -> str | int:
-    """`part` as the key or index into `container`, which stands in the config under `name`."""
+    """Return `part` as key or index into `container`, which the config has under `name`."""
     if isinstance(container, dict):
         return part
     if not isinstance(container, list):
         raise InputError(f"'{name}' is {container!r} and has no '{part}' in it", where=where)
     if not (part.isdecimal() and int(part) < len(container)):
         allowed = f"0 to {len(container) - 1}" if container else f"none, the list is empty; set it as a whole: {name}=[...]"
-        raise InputError(f"'{part}' is no index of the list '{name}'", where=where, allowed=allowed)
+        raise InputError(f"'{part}' is not an index of the list '{name}'", where=where, allowed=allowed)
     return int(part)

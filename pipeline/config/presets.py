@@ -1,7 +1,7 @@
-"""Scanner presets and sensor models as files: those in configs/scanners and configs/noise by name, a user's own by path.
+"""Read scanner presets and sensor models: those in configs/scanners and configs/noise by name, a user's own by path.
 
-Which of a preset and a key wins: of those named together, in one file or on one command line, the key, a deliberate refinement
-of the preset; otherwise what is named later, so a preset of `--set` before the keys of the file.
+If a preset and a key are named together, in one file or on one command line, the key wins, because it refines the preset.
+Otherwise the later one wins: a preset of `--set` replaces the keys of the file.
 """
 
 from __future__ import annotations
@@ -19,26 +19,28 @@ from sensors.laser.presets import ScannerPreset
 
 
 def is_path(name: str) -> bool:
-    """Whether a preset or model is named by a file instead of by a bundled one's name."""
+    """Return whether a preset or model is named by a file instead of by a bundled name."""
     return name.endswith((".yaml", ".yml")) or "/" in name or "\\" in name
 
 
 def read_preset(name: str) -> ScannerPreset:
-    """The preset of a bundled name such as `riegl_vz400i`, or out of a YAML file.
+    """Read the preset with a bundled name such as `riegl_vz400i`, or from a YAML file.
 
-    Raises InputError for an unknown name, with the nearest one, and for whatever is wrong in the file.
+    Raises InputError for an unknown name, with the most similar one, and for mistakes in the file.
     """
     path = Path(name) if is_path(name) else bundled_config("scanners", name)
     return parse(ScannerPreset, load_yaml(path), str(path))
 
 
 def model_file(name: str) -> Path:
-    """The file of a sensor model: a bundled name such as `glendale_high`, or a YAML file itself."""
+    """Return the file of a sensor model: of a bundled name such as `glendale_high`, or a YAML file itself."""
     return Path(name) if is_path(name) else bundled_config("noise", name)
 
 
-def spelled_out(overrides: Sequence[str | Override]) -> list[Override]:
-    """The overrides, with `scanner=NAME` as `scanner.preset=NAME`: another instrument keeps the pattern that is scanned."""
+def expand_shorthand(overrides: Sequence[str | Override]) -> list[Override]:
+    """Return the overrides with `scanner=NAME` as `scanner.preset=NAME`, so that another instrument keeps the pattern that is
+    scanned.
+    """
     found = [read_override(each) if isinstance(each, str) else each for each in overrides]
     return [
         replace(each, path=("scanner", "preset")) if each.path == ("scanner",) and isinstance(each.value, str) else each
@@ -46,11 +48,12 @@ def spelled_out(overrides: Sequence[str | Override]) -> list[Override]:
     ]
 
 
-def without_what_a_preset_sets(values: dict[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
-    """A file's values, ready for overrides (`spelled_out`): where these name a preset, what it sets goes out of the file's.
+def without_keys_of_preset(values: dict[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
+    """Prepare a file's values for overrides (`expand_shorthand`): if these name a preset, remove from the file what the preset
+    sets.
 
-    So the preset wins over the file: the keys of `scanner` that it knows go, and a laser scanner's model gives way to the
-    preset's, in its place. What the file says beyond that stays. Keys among the overrides are put in afterwards and win.
+    The preset so replaces the keys of `scanner` that it knows, and the model of a laser scanner, in its place. Everything else
+    in the file stays. Keys among the overrides are applied afterwards and win.
     """
     values = _with_section(values)
     later = apply_overrides({}, [each for each in overrides if each.path[0] == "scanner"]).get("scanner")
@@ -65,10 +68,10 @@ def without_what_a_preset_sets(values: dict[str, Any], overrides: Sequence[Overr
 
 
 def with_preset(values: dict[str, Any]) -> dict[str, Any]:
-    """A config's values with the preset that its `scanner` names written out.
+    """Return a config's values with the preset that its `scanner` names written out.
 
-    `scanner` is a preset's name or file, or a section with the key `preset`, whose other keys go before the preset's. The
-    preset's sensor model is added where the config has no laser scanner's model of its own.
+    `scanner` is a preset's name or file, or a section with the key `preset`, whose other keys replace the preset's. The
+    preset's sensor model is added if the config has no laser scanner's model of its own.
     """
     values = _with_section(values)
     own = values.get("scanner")
@@ -82,20 +85,22 @@ def with_preset(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _with_section(values: dict[str, Any]) -> dict[str, Any]:
-    """The values with a scanner that is only named, `scanner: NAME`, as a section: keys can then stand beside the preset."""
+    """Return the values with `scanner: NAME` as a section, so that keys can be added beside the preset."""
     scanner = values.get("scanner")
     return {**values, "scanner": {"preset": scanner}} if isinstance(scanner, str) else values
 
 
 def _in_place(sensor: Any, preset: ScannerPreset) -> Any:
-    """The `sensor` section with the preset's model instead of a laser scanner's; without one as it is."""
+    """Return the `sensor` section with the preset's model in place of a laser scanner's."""
     if isinstance(sensor, list | tuple):
         return [_in_place(model, preset) for model in sensor]
     return preset.model().model_dump(mode="json") if _kind(sensor) == "tls" else sensor
 
 
 def _with_model(sensor: Any, preset: ScannerPreset) -> Any:
-    """The `sensor` section with the preset's model in it, unless it has a laser scanner's already (or is no section at all)."""
+    """Return the `sensor` section with the preset's model added, unless it already has a laser scanner's (or is not a
+    section).
+    """
     models = [sensor] if isinstance(sensor, dict) else sensor or ()
     if not isinstance(models, list | tuple) or any(_kind(model) == "tls" for model in models):
         return sensor
@@ -103,4 +108,5 @@ def _with_model(sensor: Any, preset: ScannerPreset) -> Any:
 
 
 def _kind(model: Any) -> Any:
+    """Return which sensor a model is of."""
     return model.get("sensor") if isinstance(model, dict) else getattr(model, "sensor", None)

@@ -1,4 +1,4 @@
-"""The config of a simulation: the model of all its sections, and how files and overrides become one."""
+"""Define the config of a simulation: the model of all its sections, and how files and overrides are combined."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pipeline.change.tiles import TileConfig
 from pipeline.config.bundled import bundled_config
 from pipeline.config.calibration import CalibrationConfig
 from pipeline.config.overrides import Override, apply_overrides
-from pipeline.config.presets import is_path, model_file, spelled_out, with_preset, without_what_a_preset_sets
+from pipeline.config.presets import expand_shorthand, is_path, model_file, with_preset, without_keys_of_preset
 from pipeline.formats.cameras.camera_files import oriented_files, read_oriented, stereo_pair
 from pipeline.formats.cameras.cameras import PairConfig, cameras_yaml_files, read_cameras_yaml
 from pipeline.precision.detectability import PlanningConfig
@@ -45,25 +45,24 @@ SensorName = Literal["stereo", "tls"]
 
 
 class CamerasFile(Config):
-    """A stereo pair out of a file: the project's cameras.yaml, Metashape's camera XML or COLMAP's text model."""
+    """A stereo pair from a file: the project's cameras.yaml, Metashape's camera XML or COLMAP's text model."""
 
     file: Path = Field(description="cameras.yaml, a Metashape camera XML or project (.psx), or the folder of a COLMAP text model")
-    left: str | None = Field(
-        None, description="label or image name of the left camera; none: of the only pair, told by where they stand"
-    )
+    left: str | None = Field(None, description="label or image name of the left camera; none: the only pair, sorted by position")
     right: str | None = Field(None, description="label or image name of the right camera")
 
     def pair(self) -> CameraPair:
-        """The cameras, world frame."""
+        """Read the cameras, world frame."""
         found = read_oriented(self.file)
         return read_cameras_yaml(self.file) if found is None else stereo_pair(found, self.left, self.right, str(self.file))
 
     def files(self) -> list[Path]:
-        """Those that `pair` reads."""
+        """Return the files that `pair` reads."""
         return cameras_yaml_files(self.file) if read_oriented(self.file) is None else oriented_files(self.file)
 
 
 def _camera_kind(values: Any) -> str:
+    """Tell which kind of `cameras` section this is."""
     if isinstance(values, CamerasFile) or (isinstance(values, dict) and "file" in values):
         return "in a file"
     return "pair" if isinstance(values, PairConfig) or (isinstance(values, dict) and "left" in values) else "rig"
@@ -83,6 +82,7 @@ StationChoice = Annotated[
 
 
 def _model_kind(values: Any) -> str:
+    """Tell which sensor a model is of."""
     return str(values.get("sensor") if isinstance(values, dict) else getattr(values, "sensor", None))
 
 
@@ -90,17 +90,17 @@ SensorModel = Annotated[Annotated[StereoModel, Tag("stereo")] | Annotated[TlsMod
 
 
 class ProductsConfig(Config):
-    """What is written beyond the raster products."""
+    """What is written in addition to the raster products."""
 
     truth_channels: bool = Field(True, description="the true range or depth of each point, as extra dimensions of points.laz")
-    world: bool | None = Field(None, description="points and surface in the wall's own coordinates too; none: for imported walls")
+    world: bool | None = Field(None, description="points and surface in world coordinates too; none: only for imported walls")
     surface: bool = Field(True, description="the reconstructed surface of each epoch, surface.ply (`view`, `icp-study` need it)")
-    truth: bool = Field(True, description="the wall as it really is, truth.ply (`view`, `icp-study` need it)")
+    truth: bool = Field(True, description="the true wall, truth.ply (`view`, `icp-study` need it)")
     crs: str | None = Field(
-        None, description="coordinate system of the wall's own coordinates, such as EPSG:28356: stated in points_world.laz"
+        None, description="coordinate system of the world coordinates, such as EPSG:28356, for points_world.laz"
     )
     formats: tuple[Literal["copc", "ply", "xyz", "e57", "pcd"], ...] = Field(
-        (), description="points in these formats too, beside points.laz"
+        (), description="formats of the points in addition to points.laz"
     )
     block_meshes: bool = Field(
         False, description="four meshes of each block: wall difference, intersection, niche, removed block"
@@ -112,11 +112,11 @@ class SimulationConfig(Config):
     """A simulation of one wall, observed before and after rocks fall."""
 
     seed: int = Field(1, ge=0, lt=2**63, description="seed of all random numbers")
-    epochs: int = Field(1, ge=1, le=9999, description="epochs after the reference, each with rockfalls of its own")
+    epochs: int = Field(1, ge=1, le=9999, description="number of epochs after the reference, each with its own rockfalls")
     wall: WallConfig = Field(
-        ProceduralWall(), description="made by rule in the style of a site, or a mesh of your own: `mesh: FILE` and no `style`"
+        ProceduralWall(), description="generated in the style of a site, or a mesh of your own: `mesh: FILE` and no `style`"
     )
-    frame: FrameConfig = Field(FrameConfig(), description="the wall's own frame, in which maps are drawn")
+    frame: FrameConfig = Field(FrameConfig(), description="the wall frame, in which maps are made")
     rockfall: RockfallConfig = RockfallConfig()
     wetness: WetnessConfig | None = Field(None, description="wet patches of the rock, in every epoch; none: dry")
     sensor: tuple[SensorModel, ...] = Field((), description="sensor models (noise and effects), at most one of each sensor")
@@ -128,11 +128,11 @@ class SimulationConfig(Config):
     matcher: Literal["simulated", "sgbm"] = Field(
         "simulated",
         description="stereo: disparities by ray tracing plus noise (simulated), or photographs rendered and matched (sgbm), "
-        "whose errors are their own: the model's parallax and regularization noise then play no part",
+        "which have their own errors: the model's parallax and regularization noise is then not used",
     )
     illumination: IlluminationConfig = Field(IlluminationConfig(), description="light on the rock (matcher: sgbm)")
     texture: TextureConfig = Field(TextureConfig(), description="texture of the rock (matcher: sgbm)")
-    exposure: ExposureConfig = Field(ExposureConfig(), description="from light to grey values (matcher: sgbm)")
+    exposure: ExposureConfig = Field(ExposureConfig(), description="how light becomes grey values (matcher: sgbm)")
     matching: MatchingConfig = Field(MatchingConfig(), description="the real matcher (matcher: sgbm)")
     scanner: ScannerConfig = Field(
         ScannerConfig(),
@@ -140,27 +140,27 @@ class SimulationConfig(Config):
     )
     station: StationChoice = Field(
         StationConfig(),
-        description="where the laser scanner stands; of several stations a list, whose first the others are joined to",
+        description="where the laser scanner stands; for several stations a list, which are registered to the first",
     )
     stations: StationsConfig = StationsConfig()
     reconstruction: Reconstruction = Field(
         "direct",
-        description="surface from the sensor's own grid (direct); stereo: of the wall's own vertices, each with the disparity "
-        "that the pair finds (vertices), or by COLMAP from both depth maps (colmap)",
+        description="how the surface is made: from the sensor's own grid (direct); for stereo also from the wall's own vertices, "
+        "measured by the pair (vertices), or by COLMAP from both depth maps (colmap)",
     )
     surface: SurfaceConfig = SurfaceConfig()
     fusion: FusionConfig = FusionConfig()
-    icp: IcpConfig | None = Field(IcpConfig(), description="registration of each epoch to the reference; none: left out")
+    icp: IcpConfig | None = Field(IcpConfig(), description="registration of each epoch to the reference; none: no registration")
     noisy_reference: bool = Field(
-        True, description="whether the reference epoch has the sensor's noise too; effects it has in any case"
+        True, description="whether the reference epoch has the sensor's noise too; it has the effects in any case"
     )
     icp_target: Literal["reference", "true_wall"] = Field(
         "reference",
-        description="what ICP registers to: the reconstructed reference, or the wall as it really is (thesis 3.6), to which the "
-        "reference is then registered as well",
+        description="what ICP registers to: the reconstructed reference, or the true wall (thesis 3.6), to which the reference "
+        "is then registered as well",
     )
     difference: DifferenceConfig = DifferenceConfig()
-    m3c2: M3c2Config | None = Field(None, description="M3C2 distances beside the difference maps; none: left out")
+    m3c2: M3c2Config | None = Field(None, description="M3C2 distances in addition to the difference maps; none: not computed")
     annotation: AnnotationConfig = AnnotationConfig()
     tiles: TileConfig | None = Field(None, description="cut the difference maps into tiles; none: whole maps")
     products: ProductsConfig = ProductsConfig()
@@ -170,11 +170,13 @@ class SimulationConfig(Config):
     @model_validator(mode="before")
     @classmethod
     def _with_preset(cls, values: Any) -> Any:
+        """Write out the preset that `scanner` names."""
         return with_preset(values) if isinstance(values, dict) else values
 
     @field_validator("sensor", mode="before")
     @classmethod
     def _listed(cls, value: Any) -> Any:
+        """Accept a single sensor model as a list of one."""
         models = [value] if isinstance(value, dict) else value
         for model in models if isinstance(models, list) else []:
             name = model.get("sensor") if isinstance(model, dict) else None
@@ -185,11 +187,13 @@ class SimulationConfig(Config):
     @field_validator("cameras", mode="before")
     @classmethod
     def _from_path(cls, value: Any) -> Any:
+        """Accept a path as the `cameras` section."""
         return {"file": value} if isinstance(value, str) else value
 
     @field_validator("sensor")
     @classmethod
     def _one_of_each(cls, models: tuple[StereoModel | TlsModel, ...]) -> tuple[StereoModel | TlsModel, ...]:
+        """Refuse two models of the same sensor."""
         if len({model.sensor for model in models}) < len(models):
             raise ValueError("holds two models of one sensor")
         return models
@@ -197,43 +201,62 @@ class SimulationConfig(Config):
     @field_validator("station")
     @classmethod
     def _apart(cls, stations: StationConfig | tuple[StationConfig, ...]) -> StationConfig | tuple[StationConfig, ...]:
-        """All stations scan with the config's one scanner, and its maps gain nothing from the same scan again (NMAD of 1, 2, 8
-        and 32 scans from one place: 3.20, 3.24, 3.22, 3.20 mm), so that a station given twice is a slip."""
+        """Refuse a station given twice.
+
+        All stations use the config's one scanner, and repeating the same scan does not improve its maps (NMAD of 1, 2, 8 and
+        32 scans from one place: 3.20, 3.24, 3.22, 3.20 mm), so this must be a mistake.
+        """
         if isinstance(stations, tuple) and len(set(stations)) < len(stations):
             raise ValueError(
-                "holds the same station twice, which changes no map; a set-up that is repeated with its errors stands a "
-                "millimetre away, and another scanner in a config of its own (scarpsim compare)"
+                "holds the same station twice, which changes no map; to repeat a set-up with its errors, move it by a "
+                "millimetre; for another scanner, use another config (scarpsim compare)"
             )
         return stations
 
     def sensor_names(self) -> tuple[SensorName, ...]:
-        """The sensors that the config has a model of; both where it has none, as then all is default."""
+        """Return the sensors of which the config has a model; both if it has none, as both are then default."""
         return tuple(model.sensor for model in self.sensor) or ("stereo", "tls")
 
     def stereo_model(self) -> StereoModel:
+        """Return the model of the stereo pair."""
         return next((model for model in self.sensor if isinstance(model, StereoModel)), StereoModel())
 
     def tls_model(self) -> TlsModel:
+        """Return the model of the laser scanner."""
         return next((model for model in self.sensor if isinstance(model, TlsModel)), TlsModel())
 
-    def stations_of_the_scanner(self) -> tuple[StationConfig, ...]:
-        """The laser scanner's stations, one or several."""
+    def station_configs(self) -> tuple[StationConfig, ...]:
+        """Return the laser scanner's stations, one or several."""
         return (self.station,) if isinstance(self.station, StationConfig) else self.station
 
     def camera_pair(self, target: Target) -> CameraPair:
-        """The nominal pair, world frame; a rig is placed in front of `target`."""
+        """Return the nominal pair, world frame; a rig is placed in front of `target`."""
         return self.cameras.place(target) if isinstance(self.cameras, RigConfig) else self.cameras.pair()
 
 
 def load_config(path: Path, overrides: Sequence[str | Override], sensor: SensorName | None, seed: int | None) -> SimulationConfig:
-    """Read a config file, apply `--set` overrides and the seed.
+    """Read a config file and apply `--set` overrides and the seed.
 
-    Paths in the file are relative to its folder, those of overrides to the working folder; both become absolute.
+    Paths in the file are relative to its folder, those of overrides to the working folder; both become absolute. The run.json
+    of a finished run is also a config, which repeats that run to the byte. So is a single sensor model (model.yaml,
+    model_after.yaml: its `sensor` is a word); everything else is then as in the demo. A preset among the overrides replaces
+    what the file says about the instrument (pipeline/config/presets.py).
 
-    The run.json of a finished run is a config too: that run again, to the byte. So is a bare sensor model (model.yaml,
-    model_after.yaml: its `sensor` is a word); all else is the demo's. A preset among the overrides goes before what the file
-    says of the instrument (pipeline/config/presets.py). Raises InputError for whatever is wrong, and where the config's only
-    models are of another sensor than `sensor` (None: any).
+    Parameters
+    ----------
+    path : Path
+        The file.
+    overrides : sequence of str or Override
+        Values to change, `key.path=value`.
+    sensor : str or None
+        The sensor that is used; None for any.
+    seed : int or None
+        Seed that replaces the config's.
+
+    Raises
+    ------
+    InputError
+        If anything is wrong, or if the config only has models of another sensor than `sensor`.
     """
     values = load_yaml(path)
     if values is None:
@@ -244,7 +267,7 @@ def load_config(path: Path, overrides: Sequence[str | Override], sensor: SensorN
 def resolved(
     values: Any, overrides: Sequence[str | Override], sensor: SensorName | None, seed: int | None, path: Path
 ) -> SimulationConfig:
-    """`load_config` of values that are read already; path: of the file that they come from, or as which they are named."""
+    """Do the same as `load_config` for values that have already been read; `path` is their file, or names them."""
     own: dict[str, Any] = {}
     values = {} if values is None else values
     if not isinstance(values, dict):
@@ -253,8 +276,8 @@ def resolved(
         values = values["config"]
     if isinstance(values.get("sensor"), str) and values["sensor"] in ("stereo", "tls"):
         values, own = load_yaml(bundled_config("", "demo")), {"sensor": [values]}
-    later = spelled_out(overrides)
-    values = without_what_a_preset_sets(_with_paths(values, path.parent), later) | own
+    later = expand_shorthand(overrides)
+    values = without_keys_of_preset(_with_paths(values, path.parent), later) | own
     values = _with_paths(apply_overrides(values, later), Path.cwd())
     if isinstance(values.get("sensor"), str):
         values["sensor"] = load_yaml(model_file(values["sensor"]))
@@ -271,13 +294,13 @@ def resolved(
 
 
 def _with_paths(values: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """The values with the paths in them made absolute, relative to `folder`."""
+    """Return the values with all paths made absolute, relative to `folder`."""
 
     def absolute(path: Any) -> Any:
         if isinstance(path, list):
             return [absolute(each) for each in path]
-        is_one = isinstance(path, str) and "\0" not in path  # whoever reads the others says what they are
-        return os.path.realpath(folder / path) if is_one else path  # Path.resolve raises at a loop of links
+        is_one = isinstance(path, str) and "\0" not in path  # other values are refused when they are read
+        return os.path.realpath(folder / path) if is_one else path  # Path.resolve raises for a loop of links
 
     result = dict(values)
     for section, key in (("wall", "mesh"), ("cameras", "file")):

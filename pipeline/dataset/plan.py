@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from pipeline.change.tiles import TileConfig, starts_of_tiles
+from pipeline.change.tiles import TileConfig, tile_starts
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.dataset.config import DatasetConfig
 from scene.blocks.block import MOST_BLOCKS
@@ -158,7 +158,7 @@ def tile_region(split: Split, share: float, grid: Grid, config: TileConfig) -> T
         If the wall has too few columns to divide.
     """
     step = config.size_px - config.overlap_px
-    columns = len(starts_of_tiles(grid.width, config))
+    columns = len(tile_starts(grid.width, config))
     if split == "test" or share == 0:
         return TileRegion(0, float("inf"))
     kept = round(share * columns)
@@ -207,6 +207,6 @@ def check_tiles_filled(split: Split, where: TileRegion, grid: Grid, config: Tile
 def _most_filled(where: TileRegion, grid: Grid, config: TileConfig) -> float:
     """Return the largest share of a tile in a region that the wall covers; 0 if no tile fits."""
     size = config.size_px
-    starts = (column for column in starts_of_tiles(grid.width, config) if where.holds(column, size))
+    starts = (column for column in tile_starts(grid.width, config) if where.holds(column, size))
     width = max((min(size, grid.width - column) for column in starts), default=0)
     return width * min(size, grid.height) / size**2

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.change.annotate import STANDS_OUT
+from pipeline.change.annotate import DETECTABLE_SNR
 
 SIZE_EDGES_M = np.geomspace(0.04, 6.0, 81)
 """Bin edges of the histogram of block sizes, m."""
@@ -87,7 +87,7 @@ class SetStatistics:
         cell.annotations += len(annotations)
         ratios = [ratio for each in annotations if (ratio := each.get("signal_to_noise")) is not None]
         cell.with_ratio += len(ratios)
-        cell.stand_out += sum(ratio > STANDS_OUT for ratio in ratios)
+        cell.stand_out += sum(ratio > DETECTABLE_SNR for ratio in ratios)
         cell.filled += sum(each["area"] / (each["bbox"][2] * each["bbox"][3]) for each in annotations)
         noise = record["outside_blocks"]["standard_deviation_m"]
         if noise is not None:

@@ -1,4 +1,4 @@
-"""A run's folder as it is exported: its files, and what fell."""
+"""Read a run's folder for export: its files, and the blocks that fell."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from scene.common.errors import InputError
 
 
 class ExportedRun(RunFiles):
-    """A run's folder. Raises InputError where it holds no finished epoch."""
+    """A run's folder. Raises InputError if it contains no finished epoch."""
 
     @cached_property
     def record(self) -> dict[str, Any]:
-        """run.json."""
+        """Contents of run.json."""
         found = super().record
         if len(found["epochs"]) < 2:
             raise InputError("holds no finished epoch", where=str(self.folder), remedy=RESUME)
@@ -28,12 +28,12 @@ class ExportedRun(RunFiles):
         return len(self.record["epochs"]) - 1
 
     def limit_m(self, number: int) -> float:
-        """Where the colours of an epoch's map end in the report."""
+        """Return the limit of the colour scale of an epoch's map, as in the report, m."""
         statistics = self.record["epochs"][number].get("statistics")
         if not statistics:
             raise InputError(f"has no statistics of epoch {number}", where=str(self.folder / RUN_FILE), remedy=RESUME)
         return float(SCALE_SIGMAS * statistics["sigma_m"])
 
     def blocks(self, number: int) -> list[dict[str, Any]]:
-        """What fell in an epoch, the largest first."""
+        """Return the records of the blocks that fell in an epoch, the largest first."""
         return sorted(self.record["epochs"][number]["blocks"], key=lambda block: -block["volume_m3"])

@@ -1,4 +1,4 @@
-"""A data set's folder as it is exported."""
+"""Read a data set's folder for export."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scene.common.errors import InputError
 
 
 def splits_of(folder: Path) -> dict[str, Tiles]:
-    """The tiles of each split that a set has; raises InputError where the folder holds none."""
+    """Return the tiles of each split in a data set's folder. Raises InputError if there is none."""
     splits = [split for split in SPLITS if (folder / split / "annotations.json").is_file()]
     if not splits:
         raise InputError("holds no split of a data set", where=str(folder), allowed=f"a folder with {', '.join(SPLITS)}")

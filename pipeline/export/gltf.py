@@ -1,4 +1,4 @@
-"""A run's wall and the niches of its blocks as glTF, for slides and web pages."""
+"""Export a run's wall and the niches of its blocks as glTF, for slides and web pages."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ from scene.geometry.mesh import WALL, TriangleMesh, compact_vertices
 
 
 def save_gltf(run: ExportedRun, number: int, path: Path) -> None:
-    """Write the measured surface as .glb: the wall, and the niche of each block as a part of its own (`block_12`), all coloured
-    by the difference as the report's map is, grey without data. Raises InputError where the run wrote no surface."""
+    """Write the measured surface of epoch `number` as .glb.
+
+    The wall and the niche of each block (`block_12`) are separate parts, coloured by the difference as in the report, grey
+    without data. Raises InputError if the run wrote no surface.
+    """
     surface, (values, grid) = run.surface(number), run.difference(number)
     colours = colours_of(difference_at(surface.vertices, values, grid), run.limit_m(number))
     label = np.full(len(surface.faces), WALL) if surface.face_block is None else surface.face_block

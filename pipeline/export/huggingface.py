@@ -1,4 +1,6 @@
-"""A data set for Hugging Face's `datasets`: Parquet files of tiles with their blocks, as `load_dataset` and the Hub read them."""
+"""Export a data set for Hugging Face's `datasets`: Parquet files of tiles with their blocks, as `load_dataset` and the Hub read
+them.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +19,12 @@ from scene.common.errors import InputError
 from scene.common.extras import how_to_install
 
 _TILES_A_FILE = 256
+"""Tiles per Parquet file."""
 _NAMES = {"train": "train", "val": "validation", "test": "test"}
-"""Splits by the names that the Hub has for them."""
+"""The Hub's names of the splits."""
 _TEXTS, _NUMBERS = ("sensor", "wall", "noise", "size_class"), ("gsd_m", "x_min_m", "y_max_m", "noise_sigma_m")
 _OF_A_BLOCK = ("area", "volume_m3", "depth_m", "signal_to_noise")
+"""Properties of a block that are exported as numbers."""
 _CARD = """---
 pretty_name: {name}
 task_categories: [object-detection, image-segmentation]
@@ -45,11 +49,12 @@ Simulated difference maps of rock walls with annotated rockfalls, made by scarps
   `depth_m` and `signal_to_noise` in the map, `ignore`: 1 where the block is below the noise.
 - `x_min_m`, `y_max_m`, `gsd_m`: the tile's place on the wall; `noise_sigma_m`: spread of its epoch's map outside the blocks.
 """
+"""Text of README.md, the data set's card."""
 
 
 @dataclass(frozen=True)
 class HuggingFaceSet:
-    """What was written. images, blocks: by split, as the Hub names them."""
+    """What was written: the folder, and the number of images and of blocks by split, with the Hub's names."""
 
     folder: Path
     images: dict[str, int]
@@ -57,10 +62,10 @@ class HuggingFaceSet:
 
 
 def save_huggingface(folder: Path, out: Path, progress: Progress) -> HuggingFaceSet:
-    """Write the splits of a set: data/SPLIT-00000-of-00002.parquet ... of 256 tiles each, and README.md.
+    """Write the splits of a data set: README.md, and data/SPLIT-00000-of-00002.parquet ... with 256 tiles each.
 
-    The tiles are the set's own TIFF files, byte for byte. Raises InputError where the folder holds no split, and where `datasets`
-    (the extra `huggingface`) is not installed.
+    The tiles are the data set's own TIFF files, byte for byte. Raises InputError if the folder contains no split, or if
+    `datasets` (the extra `huggingface`) is not installed.
     """
     library, sets = _library(), splits_of(folder)
     blocks: dict[str, int] = {}
@@ -75,6 +80,7 @@ def save_huggingface(folder: Path, out: Path, progress: Progress) -> HuggingFace
 
 
 def _library() -> Any:
+    """Import `datasets`. Raises InputError if it is not installed."""
     try:
         import datasets
     except ImportError as error:
@@ -88,7 +94,7 @@ def _library() -> Any:
 
 @contextmanager
 def _without_bars(library: Any) -> Iterator[None]:
-    """Progress is told here; the library's own bars come back afterwards."""
+    """Switch off the library's own progress bars inside the `with` block."""
     shown = not library.are_progress_bars_disabled()
     library.disable_progress_bars()
     try:
@@ -99,7 +105,7 @@ def _without_bars(library: Any) -> Iterator[None]:
 
 
 def _write(library: Any, stem: Path, tiles: Tiles) -> int:
-    """Write a split's files; returns how many blocks they hold."""
+    """Write a split's files; return the number of blocks in them."""
     features, files, blocks = _features(library), -(-len(tiles) // _TILES_A_FILE), 0
     for number in range(files):
         some = range(number * _TILES_A_FILE, min((number + 1) * _TILES_A_FILE, len(tiles)))
@@ -111,6 +117,7 @@ def _write(library: Any, stem: Path, tiles: Tiles) -> int:
 
 
 def _features(library: Any) -> Any:
+    """Return the types of the columns."""
     whole, number, text = (library.Value(kind) for kind in ("int64", "float64", "string"))
     objects = {
         "id": whole,
@@ -125,6 +132,7 @@ def _features(library: Any) -> Any:
 
 
 def _row(tiles: Tiles, sample: Sample) -> dict[str, Any]:
+    """Return the row of one tile."""
     record, blocks = sample.record, sample.annotations
     name = record["file_name"]
     objects: dict[str, list[Any]] = {
@@ -145,11 +153,11 @@ def _row(tiles: Tiles, sample: Sample) -> dict[str, Any]:
 
 
 def summary(made: HuggingFaceSet) -> str:
-    """What was written, in lines."""
+    """Describe what was written, in lines."""
     lines = [f"{split}: {images:,} images, {made.blocks[split]:,} blocks" for split, images in made.images.items()]
     return "\n".join([*lines, f"load it with datasets.load_dataset({str(made.folder)!r})"])
 
 
 def to_dict(made: HuggingFaceSet) -> dict[str, Any]:
-    """As --json prints it."""
+    """Return what was written, for --json."""
     return {"folder": str(made.folder), "images": made.images, "blocks": made.blocks}

@@ -1,4 +1,4 @@
-"""A list of a result folder's files with checksums, as a Data Package (datapackage.org), which archives and catalogues read."""
+"""List a result folder's files with checksums as a Data Package (datapackage.org), which archives and catalogues read."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ _MEDIA = {
     ".laz": "application/vnd.laszip", ".csv": "text/csv", ".yaml": "application/yaml", ".md": "text/markdown",
     ".ply": "model/ply", ".txt": "text/plain", ".qml": "application/xml",
 }  # fmt: skip
+"""Media types by suffix."""
 
 
 def package(folder: Path) -> dict[str, Any]:
-    """The package of all files in a folder but hidden ones and itself, by path: size, bytes, and SHA-256.
+    """Describe all files in a folder (except hidden ones and the package itself) by path, size and SHA-256.
 
-    Raises InputError where there is nothing to list, and for a link to what lies outside: it would not come along.
+    Raises InputError if there is nothing to list, or for a link to a file outside the folder, which would be missing in a
+    copy.
     """
     if not folder.is_dir():
         raise InputError("there is no such folder", where=str(folder), remedy="give the folder that a command filled")
@@ -30,7 +32,7 @@ def package(folder: Path) -> dict[str, Any]:
     for path in found:
         if path.is_symlink() and not path.resolve().is_relative_to(folder.resolve()):
             problem = f"is a link out of the folder, to {path.resolve()}"
-            raise InputError(problem, where=str(path), remedy="put what it points to in its place, or take it away")
+            raise InputError(problem, where=str(path), remedy="replace it by the file that it points to, or remove it")
     files = [path for path in found if path.is_file()]
     if not files:
         raise InputError("holds no file", where=str(folder), remedy="give the folder that a command filled")
@@ -38,22 +40,24 @@ def package(folder: Path) -> dict[str, Any]:
 
 
 def save_package(folder: Path, path: Path) -> int:
-    """Write the package; returns how many files it lists."""
+    """Write the package; return the number of files that it lists."""
     made = package(folder)
     write_json(path, made)
     return len(made["resources"])
 
 
 def _is_listed(path: Path) -> bool:
+    """Return whether a file belongs into the package."""
     return path.name != PACKAGE_FILE and not any(part.startswith(".") for part in path.parts)
 
 
 def _resource(folder: Path, path: Path) -> dict[str, Any]:
+    """Describe one file."""
     name = path.relative_to(folder).as_posix()
     known = {"mediatype": _MEDIA[path.suffix]} if path.suffix in _MEDIA else {}
     return {"name": _slug(name), "path": name, **known, "bytes": path.stat().st_size, "hash": f"sha256:{sha256(path)}"}
 
 
 def _slug(name: str) -> str:
-    """A name of small letters, digits, dots, hyphens and underscores."""
+    """Convert a name to lower-case letters, digits, dots, hyphens and underscores."""
     return re.sub(r"[^a-z0-9._-]+", "-", name.lower()).strip("-") or "result"

@@ -1,4 +1,4 @@
-"""A wall as a camera in front of it sees it: pictures for slides and frames of animations, ray traced on this machine."""
+"""Render a wall as a camera in front of it sees it, for slides and frames of animations."""
 
 from __future__ import annotations
 
@@ -15,26 +15,42 @@ from scene.geometry.mesh import FloatArray, TriangleMesh
 from scene.ray_casting.raycast import RayCaster
 
 _FROM = np.array([-0.42, -0.12, 1.0])
-"""Towards the camera, wall frame: from the left, a little from below."""
+"""Direction towards the camera, wall frame: from the left, slightly from below."""
 _LIGHT = np.array([-0.45, 0.55, 0.7])
+"""Direction towards the light, wall frame."""
 _HALF_VIEW = np.tan(np.radians(16.0))
-"""Half of the field of view across; a long lens keeps the wall's lines straight."""
+"""Tangent of half the horizontal field of view; a long lens keeps the wall's lines straight."""
 _MARGIN = 1.04
+"""Width of the picture relative to what it shows."""
 _TALLEST = 3.0
-"""Height over width of a picture: a column of points would take gigabytes."""
+"""Largest ratio of height to width: a picture of a vertical line of points would take gigabytes."""
 _LEAST_SHARE = 1e-3
-"""Of the places' depth that their width has to have, and of the camera's distance the least before any of them."""
+"""Smallest extent across the line of sight, as a share of that along it, and smallest distance of the camera from any place."""
 _OVERSAMPLED = 2
+"""Rays per pixel along a row or a column."""
 _PLACES = 200_000
-"""That the picture is made to hold, at least where there are more."""
+"""If there are more places than this, the camera is fitted to a subsample of about this size."""
 _ROCK = np.array([0.80, 0.77, 0.73])
 _DARKEST = 0.25
+"""Brightness of surfaces that face away from the light."""
 Image = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class PerspectiveView:
-    """A camera. position: (3,) m, wall frame; axes: (3, 3) right, down, forward as rows; width, height: px; focal_px."""
+    """A camera for pictures.
+
+    Attributes
+    ----------
+    position : (3,) array
+        Perspective centre, wall frame, m.
+    axes : (3, 3) array
+        Rows are right, down and forward.
+    width, height : int
+        Size of the picture, px.
+    focal_px : float
+        Principal distance, px.
+    """
 
     position: FloatArray
     axes: FloatArray
@@ -44,9 +60,10 @@ class PerspectiveView:
 
     @classmethod
     def on(cls, places: FloatArray, width: int = 1280) -> PerspectiveView:
-        """The camera that has all of `places`, (n, 3) m, in its picture of `width` px, at most _TALLEST times as high.
+        """Place the camera so that all `places` (n, 3), m, are in its picture of `width` px, which is at most _TALLEST times as
+        high.
 
-        Raises InputError for places that are one point or lie on one line of sight.
+        Raises InputError if the places are one point or lie on one line of sight.
         """
         forward = -_FROM / np.linalg.norm(_FROM)
         right = np.cross(forward, [0.0, 1.0, 0.0])
@@ -65,14 +82,14 @@ class PerspectiveView:
         return cls(middle @ axes - distance * forward, axes, width, max(height, 2), focal_px)
 
     def rays(self, times: int) -> FloatArray:
-        """(h * times * w * times, 3) directions through the pixels' parts, row by row."""
+        """Return directions (h * times * w * times, 3) through `times` x `times` parts of each pixel, row by row."""
         columns, rows = np.meshgrid(*((np.arange(size * times) + 0.5) / times for size in (self.width, self.height)))
         right, down = columns - self.width / 2, rows - self.height / 2
         own = np.stack([right, down, np.full_like(right, self.focal_px)], axis=-1).reshape(-1, 3) / self.focal_px
         return np.asarray(own @ self.axes)
 
     def project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(n, 2) column and row of points (n, 3), px from the top-left corner, and (n,) how far ahead they are, m."""
+        """Return column and row (n, 2) of points (n, 3), px from the top-left corner, and their depth (n,), m."""
         own = (points - self.position) @ self.axes.T
         ahead = own[:, 2]
         place = own[:, :2] / ahead[:, None] * self.focal_px + np.array([self.width, self.height]) / 2
@@ -82,9 +99,20 @@ class PerspectiveView:
 def draw_wall(
     view: PerspectiveView, mesh: TriangleMesh, difference: NDArray[np.floating] | None, grid: Grid | None, limit_m: float
 ) -> Image:
-    """(h, w, 3) the mesh (wall frame) lit from the upper left, on white.
+    """Render the mesh (wall frame), lit from the upper left, on white, as (h, w, 3).
 
-    difference: (h, w) of `grid`, m, or None for bare rock: red where rock is missing, colours end at +-`limit_m`, grey: no data.
+    Parameters
+    ----------
+    view : PerspectiveView
+        The camera.
+    mesh : TriangleMesh
+        The wall.
+    difference : (h, w) array or None
+        Difference map, m, that gives the colours (red where rock is missing, grey without data); None for bare rock.
+    grid : Grid or None
+        Grid of the map.
+    limit_m : float
+        Difference at which the colour scale ends, m.
     """
     caster, rays = RayCaster(mesh), view.rays(_OVERSAMPLED)
     distance, face = caster.cast(view.position, rays)
@@ -102,7 +130,7 @@ def draw_wall(
 
 
 def difference_at(places: FloatArray, difference: NDArray[np.floating], grid: Grid) -> NDArray[np.floating]:
-    """(n,) the map's value at places (n, 2 or 3), m; NaN outside of it."""
+    """Return the map's value (n,) at places (n, 2 or 3), m; NaN outside the map."""
     columns, rows = np.floor(grid.columns(places[:, 0])).astype(int), np.floor(grid.rows(places[:, 1])).astype(int)
     inside = (columns >= 0) & (columns < grid.width) & (rows >= 0) & (rows < grid.height)
     values = np.full(len(places), np.nan)
@@ -111,9 +139,10 @@ def difference_at(places: FloatArray, difference: NDArray[np.floating], grid: Gr
 
 
 def colours_of(values: NDArray[np.floating], limit_m: float) -> NDArray[np.uint8]:
-    """(n, 4) RGBA of differences, m, as the reports' maps have them."""
+    """Return the RGBA colours (n, 4) of differences, m, as in the reports' maps."""
     return np.asarray(COLOURS.with_extremes(bad=NO_DATA)((values / limit_m + 1) / 2, bytes=True))
 
 
 def _colours(places: FloatArray, difference: NDArray[np.floating], grid: Grid, limit_m: float) -> FloatArray:
+    """Return the colours (n, 3) of places."""
     return np.asarray(colours_of(difference_at(places, difference, grid), limit_m)[:, :3] / 255.0)

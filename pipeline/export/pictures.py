@@ -1,4 +1,4 @@
-"""A run's wall in perspective: an epoch as a picture, all epochs and the scan as animations."""
+"""Export a run's wall in perspective: an epoch as a picture, all epochs and the scan as animations."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ _EPOCH_MS, _SCAN_MS, _LAST_MS = 1200, 80, 2500
 _SCAN_FRAMES, _SCAN_POINTS = 48, 400_000
 _ANIMATED_PX, _COLOURS_OF_GIF = 900, 96
 _LONGEST_SCAN_S = 1e6
-"""Eleven days: no scan takes longer."""
+"""Longest plausible duration of a scan: eleven days."""
 _NIGHT, _BEAM = 26, np.array([255, 150, 30], dtype=np.uint8)
 
 
 def save_picture(run: ExportedRun, number: int, path: Path, width: int = 1280) -> None:
-    """Write an epoch's wall as PNG, coloured by the difference, its largest blocks numbered as in the report."""
+    """Write an epoch's wall as PNG, coloured by the difference, with its largest blocks numbered as in the report."""
     reference = run.surface(0)
     view = PerspectiveView.on(reference.vertices, width)
     drawn = _reference_picture(reference, view, run.limit_m(1)) if number == 0 else _epoch_picture(run, number, view)
@@ -45,7 +45,7 @@ def save_picture(run: ExportedRun, number: int, path: Path, width: int = 1280) -
 
 
 def save_epochs(run: ExportedRun, path: Path, progress: Progress) -> None:
-    """Write the epochs, the reference first, as an animated GIF on one scale of colours."""
+    """Write the epochs, the reference first, as an animated GIF with one colour scale."""
     numbers = range(1, run.last + 1)
     limit = max(run.limit_m(number) for number in numbers)
     with progress.stage("reference"):
@@ -59,9 +59,10 @@ def save_epochs(run: ExportedRun, path: Path, progress: Progress) -> None:
 
 
 def save_scan(run: ExportedRun, number: int, path: Path) -> None:
-    """Write how an epoch's points came in, line by line, as an animated GIF, coloured by how far they stand out.
+    """Write an animated GIF that shows how an epoch's points are recorded, line by line, coloured by their distance from the wall
+    plane.
 
-    Raises InputError for a run of a stereo pair, which has all of its points at once.
+    Raises InputError for a run of a stereo pair, which records all its points at once.
     """
     if run.record["sensor"] != "tls":
         raise InputError("is of a stereo pair", where=str(run.folder), allowed="a run of a laser scanner")
@@ -69,7 +70,7 @@ def save_scan(run: ExportedRun, number: int, path: Path) -> None:
     count, clock = len(cloud.points), np.zeros(len(cloud.points)) if cloud.gps_time is None else cloud.gps_time
     if not np.isfinite(clock).all() or np.ptp(clock) > _LONGEST_SCAN_S:
         allowed = f"numbers of seconds over at most {_LONGEST_SCAN_S:g} s"
-        raise InputError(f"the points of epoch {number} have other times", where=str(run.folder), allowed=allowed)
+        raise InputError(f"the points of epoch {number} have no valid times", where=str(run.folder), allowed=allowed)
     order = np.argsort(clock, kind="stable")[:: max(1, count // _SCAN_POINTS)]
     places, time = cloud.points[order], clock[order]
     view = PerspectiveView.on(places, _ANIMATED_PX)
@@ -84,7 +85,7 @@ def save_scan(run: ExportedRun, number: int, path: Path) -> None:
 
 
 def _cloud_pixels(view: PerspectiveView, places: FloatArray, start: int, end: int) -> Pixels:
-    """(h, w, 3) the points up to `end`, nearer ones over farther ones; those from `start` on as the beam lights them."""
+    """Draw the points up to `end` (h, w, 3), nearer ones over farther ones; those from `start` on have the colour of the beam."""
     low, high = np.quantile(places[:, 2], [0.02, 0.98])
     shown = places[:end]
     at, ahead = view.project(shown)
@@ -99,11 +100,12 @@ def _cloud_pixels(view: PerspectiveView, places: FloatArray, start: int, end: in
 
 
 def _reference_picture(surface: TriangleMesh, view: PerspectiveView, limit: float) -> Image.Image:
+    """Draw the reference."""
     return _framed(draw_wall(view, surface, None, None, limit), "Reference: before rocks fall", limit)
 
 
 def _epoch_picture(run: ExportedRun, number: int, view: PerspectiveView, limit: float | None = None) -> Image.Image:
-    """limit: where the colours end, m; none: where those of the epoch's own map do."""
+    """Draw an epoch. limit: where the colour scale ends, m; by default that of the epoch's own map."""
     limit = run.limit_m(number) if limit is None else limit
     values, grid = run.difference(number)
     blocks = run.blocks(number)
@@ -115,7 +117,7 @@ def _epoch_picture(run: ExportedRun, number: int, view: PerspectiveView, limit: 
 
 
 def _framed(pixels: Pixels, title: str, limit: float | None, numbers: dict[int, FloatArray] | None = None) -> Image.Image:
-    """The pixels with a title above and, with a limit in m, the scale of colours beneath."""
+    """Add a title above the pixels and, with a limit in m, the colour scale beneath."""
     height, width, _ = pixels.shape
     bar = 0 if limit is None else _BAR_PX
     whole = height + _TITLE_PX + bar
@@ -140,13 +142,14 @@ def _framed(pixels: Pixels, title: str, limit: float | None, numbers: dict[int, 
 
 
 def _png(picture: Image.Image) -> bytes:
+    """Return a picture as PNG with a palette."""
     buffer = io.BytesIO()
     picture.quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
     return buffer.getvalue()
 
 
 def _write_gif(path: Path, frames: Sequence[Image.Image], milliseconds: list[int]) -> None:
-    """One palette for all frames, so that what stays looks the same throughout."""
+    """Write an animated GIF with one palette for all frames, so that what does not move keeps its colour."""
     sample = Image.new("RGB", (frames[0].width, sum(frame.height for frame in (frames[0], frames[-1]))))
     sample.paste(frames[0], (0, 0))
     sample.paste(frames[-1], (0, frames[0].height))
@@ -157,5 +160,6 @@ def _write_gif(path: Path, frames: Sequence[Image.Image], milliseconds: list[int
 
 
 def _on_palette(frames: Sequence[Image.Image], palette: Image.Image) -> Iterator[Image.Image]:
+    """Convert frames to the palette."""
     for frame in frames:
         yield frame.quantize(palette=palette, dither=Image.Dither.NONE)

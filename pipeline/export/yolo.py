@@ -1,4 +1,4 @@
-"""A data set in the form that YOLO programs train on: 8-bit pictures, a text file of outlines each, data.yaml."""
+"""Export a data set in the form on which YOLO programs train: 8-bit pictures, a text file of outlines for each, data.yaml."""
 
 from __future__ import annotations
 
@@ -20,14 +20,26 @@ from pipeline.report.progress import Progress
 from scene.common.errors import InputError
 
 _ZERO, _STEPS = 128, 127
+"""Grey value of no change, and grey values from there to the limit."""
 _FINER = 4
-"""Parts of a pixel in which outlines run around masks: they lie an eighth of a pixel inside of them."""
+"""Subdivisions of a pixel on which outlines are traced; they lie an eighth of a pixel inside the mask."""
 _SIGMAS = 6.0
+"""Default limit of the grey values, in standard deviations of the noise."""
 
 
 @dataclass(frozen=True)
 class YoloSet:
-    """What was written. limit_m: the difference at the ends of the grey values; images, blocks: by split."""
+    """What was written.
+
+    Attributes
+    ----------
+    folder : Path
+        The folder.
+    limit_m : float
+        Difference at the ends of the grey scale, m.
+    images, blocks : dict
+        Number of images and of blocks by split.
+    """
 
     folder: Path
     limit_m: float
@@ -36,14 +48,27 @@ class YoloSet:
 
 
 def save_yolo(folder: Path, out: Path, limit_m: float | None, progress: Progress) -> YoloSet:
-    """Write the splits of a set as Ultralytics' YOLO reads them: images/SPLIT/*.png, labels/SPLIT/*.txt, data.yaml.
+    """Write the splits of a data set as Ultralytics' YOLO reads them: images/SPLIT/*.png, labels/SPLIT/*.txt, data.yaml.
 
-    Grey values: 128 + 127 * difference / limit_m, cut off at 1 and 255, 0 without data; limit_m: none: six times the median
-    noise of the set's images. A label's line is class 0 and the outline of a block, in shares of width and height; detectors
-    make its box of it. Raises InputError where the folder holds no split.
+    Grey values are 128 + 127 * difference / limit_m, clipped to 1 and 255, and 0 without data. A line of a label file is class
+    0 and the outline of a block, as shares of width and height; detectors derive its box.
+
+    Parameters
+    ----------
+    folder, out : Path
+        The data set, and where to write.
+    limit_m : float or None
+        Difference at the ends of the grey scale, m; None: six times the median noise of the images.
+    progress : Progress
+        Is told the stages.
+
+    Raises
+    ------
+    InputError
+        If the folder contains no split, or no noise from which to take the limit.
     """
     sets = splits_of(folder)
-    limit = limit_m or _usual_limit(sets, folder)
+    limit = limit_m or _default_limit(sets, folder)
     blocks: dict[str, int] = {}
     with filling(out) as into:
         for split, tiles in sets.items():
@@ -55,18 +80,21 @@ def save_yolo(folder: Path, out: Path, limit_m: float | None, progress: Progress
     return YoloSet(out, limit, {split: len(tiles) for split, tiles in sets.items()}, blocks)
 
 
-def _usual_limit(sets: dict[str, Tiles], folder: Path) -> float:
+def _default_limit(sets: dict[str, Tiles], folder: Path) -> float:
+    """Return the default limit of the grey scale. Raises InputError if no image states its noise."""
     said: list[Any] = [record.get("noise_sigma_m") for tiles in sets.values() for record in tiles.records]
     noise = [value for value in said if type(value) in (int, float) and 0 < value < math.inf]
     if not noise:
         raise InputError(
-            "says nothing of its images' noise", where=str(folder), remedy="give the grey values' end with --limit-m"
+            "none of its images states its noise, which sets the limit of the grey scale",
+            where=str(folder),
+            remedy="set that limit with --limit-m",
         )
     return _SIGMAS * float(np.median(noise))
 
 
 def _write(out: Path, split: str, sample: Sample, limit: float) -> int:
-    """Write a tile's picture and labels; returns how many blocks it shows."""
+    """Write a tile's picture and labels; return the number of blocks in it."""
     name = Path(sample.record["file_name"]).with_suffix("").as_posix().replace("/", "_")
     _, encoded = cv2.imencode(".png", grey_values(sample.image, sample.valid, limit))
     write_bytes(out / "images" / split / f"{name}.png", encoded.tobytes())
@@ -76,13 +104,15 @@ def _write(out: Path, split: str, sample: Sample, limit: float) -> int:
 
 
 def grey_values(image: NDArray[np.float32], valid: NDArray[np.bool_], limit_m: float) -> NDArray[np.uint8]:
-    """(h, w) a difference map, m, in 8 bits: 128 is no change, 0 no data."""
+    """Convert a difference map (h, w), m, to 8 bits: 128 is no change, 0 no data."""
     grey = np.clip(np.round(_ZERO + _STEPS * image / limit_m), 1, 255)
     return np.where(valid, grey, 0).astype(np.uint8)
 
 
 def outline(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """(k, 2) x and y, px from the top-left corner, around a mask (h, w); parts are joined by lines there and back."""
+    """Return the outline (k, 2) of a mask (h, w) as x, y, px from the top-left corner; separate parts are joined by lines there
+    and back.
+    """
     fine = np.kron(mask.astype(np.uint8), np.ones((_FINER, _FINER), np.uint8))
     found, _ = cv2.findContours(fine, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     parts = [(part.reshape(-1, 2) + 0.5) / _FINER for part in found]
@@ -95,7 +125,7 @@ def outline(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 
 def _joined(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """One outline that goes round the second where it comes nearest to it."""
+    """Join two outlines at their nearest points."""
     apart = np.linalg.norm(first[:, None] - second[None], axis=2)
     here, there = (int(place) for place in np.unravel_index(np.argmin(apart), apart.shape))
     around = np.roll(second, -there, axis=0)
@@ -103,21 +133,23 @@ def _joined(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[
 
 
 def _line(points: NDArray[np.float64], shape: tuple[int, ...]) -> str:
+    """Return the line of a label file."""
     shares = points / np.array([shape[1], shape[0]])
     return f"0 {' '.join(f'{value:.6f}' for value in shares.ravel())}\n"
 
 
 def summary(made: YoloSet) -> str:
-    """What was written, in lines."""
+    """Describe what was written, in lines."""
     return "\n".join(_sentences(made))
 
 
 def _sentences(made: YoloSet) -> Iterator[str]:
+    """Yield the lines of the summary."""
     for split, images in made.images.items():
         yield f"{split}: {images:,} images, {made.blocks[split]:,} blocks"
     yield f"grey values end at {1e3 * made.limit_m:.3g} mm; train with {made.folder / 'data.yaml'}"
 
 
 def to_dict(made: YoloSet) -> dict[str, Any]:
-    """As --json prints it."""
+    """Return what was written, for --json."""
     return {"folder": str(made.folder), "limit_m": made.limit_m, "images": made.images, "blocks": made.blocks}

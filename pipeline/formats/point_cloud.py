@@ -1,4 +1,4 @@
-"""A point cloud as files hold it."""
+"""The point cloud that all readers return and all writers take."""
 
 from __future__ import annotations
 
@@ -12,17 +12,23 @@ from pipeline.formats.units import AxisUnits
 from scene.geometry.mesh import FloatArray
 
 SCAN = "scan"
-"""Channel of points: the number of the scan, of several."""
+"""Channel with the number of the scan that a point belongs to."""
 _COUNTERS = ("epoch", SCAN)
+"""Channels that number the files of a joined cloud."""
 
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points with what was recorded or is known of each.
+    """Points with the values recorded for each.
 
-    points: (n, 3) float64, m, in the file's own frame; intensity: (n,) relative received power; gps_time: (n,) float64, s;
-    extra: named (n,) channels, such as `true_range_m` or `pixel_x`, in the file's order; notes: what the reader left out,
-    converted or guessed; stated_units: of the points as yet, where the file states one and they are not in metres already.
+    Attributes
+    ----------
+    points : (n, 3) float64, m, in the file's own frame.
+    intensity : (n,) relative received power.
+    gps_time : (n,) float64, s.
+    extra : (n,) channels by name, such as `true_range_m` or `pixel_x`, in the file's order.
+    notes : What the reader left out, converted or guessed.
+    stated_units : Unit of the points that the file states, if they are not yet in metres.
     """
 
     points: FloatArray
@@ -33,7 +39,7 @@ class PointCloud:
     stated_units: AxisUnits | None = None
 
     def part(self, rows: NDArray[Any]) -> PointCloud:
-        """Some of the points, by a mask or indices."""
+        """Return some of the points, by a mask or indices."""
         return replace(
             self,
             points=self.points[rows],
@@ -43,12 +49,15 @@ class PointCloud:
         )
 
     def noted(self, *notes: str) -> PointCloud:
-        """The cloud with further notes."""
+        """Return the cloud with further notes."""
         return replace(self, notes=(*self.notes, *notes))
 
 
 def joined(clouds: list[PointCloud], counted: str) -> PointCloud:
-    """One cloud of all files, with the channels that all have; a channel `counted` counts the files, whatever a file calls so."""
+    """Join the clouds of several files, with the channels that all have.
+
+    The channel named `counted` gives the number of the file; a channel of that name in the files is replaced.
+    """
     if len(clouds) == 1:
         return replace(clouds[0], extra={name: values for name, values in clouds[0].extra.items() if name not in _COUNTERS})
     shared = set.intersection(*(set(cloud.extra) for cloud in clouds))

@@ -1,4 +1,4 @@
-"""Units that files state: in their coordinate system, in the names of their columns; and those of the command line."""
+"""Units of length that files state, in their coordinate system or in column names, and those of the command line."""
 
 from __future__ import annotations
 
@@ -14,21 +14,24 @@ from scene.common.lengths import METRES, US_FOOT_M
 from scene.geometry.mesh import FloatArray
 
 _ALIKE = 1e-8
-"""Two factors this near to each other are one unit: files state the US survey foot with 9 to 15 digits."""
+"""Relative difference up to which two factors are the same unit: files state the US survey foot with 9 to 15 digits."""
 _NAMES = {1.0: "m", 0.01: "cm", 0.001: "mm", 0.3048: "ft (international foot)", US_FOOT_M: "us-ft (US survey foot)"}
+"""Name of each unit, by its length in metres."""
 _PROJECT = "project the points to a coordinate system in metres, such as UTM, and export them again"
 
 
 @dataclass(frozen=True)
 class AxisUnits:
-    """The unit of the coordinates as a file states it. metres: of one unit along x, y and z; source: where the file says so."""
+    """Unit of the coordinates, as a file states it. metres: length of one unit along x, y and z; source: where the file states
+    it.
+    """
 
     metres: tuple[float, float, float]
     source: str
 
     @property
     def name(self) -> str:
-        """The unit in words; of axes with different units one after the other."""
+        """The unit in words; if the axes differ, one after the other."""
         names = [unit_name(each) for each in self.metres]
         if len(set(names)) == 1:
             return names[0]
@@ -36,50 +39,53 @@ class AxisUnits:
 
     @property
     def in_metres(self) -> bool:
+        """Whether all axes are in metres."""
         return all(same_unit(each, 1.0) for each in self.metres)
 
     def factors(self) -> FloatArray:
-        """(3,) metres of one unit."""
+        """Return the (3,) lengths of one unit, m."""
         return np.array(self.metres)
 
 
 def unit_name(metres: float) -> str:
-    """A unit of so many metres in words."""
+    """Return the name of a unit of this length, m."""
     return next((name for known, name in _NAMES.items() if same_unit(metres, known)), f"units of {metres:.12g} m")
 
 
 def same_unit(metres: float, other: float) -> bool:
-    """Whether two units, each in metres, are the same but for the digits in which they are written."""
+    """Whether two units, m, are the same except for the digits in which they are written."""
     return math.isclose(metres, other, rel_tol=_ALIKE)
 
 
 def agreed_units(stated: AxisUnits | None, given: str | None, where: str, option: str = "--unit") -> AxisUnits:
-    """The unit of a file's coordinates by what the file states and by what the user gives; metres where nobody says.
+    """Decide the unit of a file's coordinates from what the file states and what the user gives; metres if neither says.
 
     Parameters
     ----------
-    stated : what the file says of itself, None where it says nothing
-    given : a key of METRES, None where the user says nothing
-    where : what errors call the file
-    option : by which the user gives it
+    stated : The file's statement; None: it states nothing.
+    given : A key of METRES; None: the user gives nothing.
+    where : Name of the file, for errors.
+    option : Command-line option that gives the unit.
 
     Raises
     ------
     InputError
-        Where the two contradict each other.
+        If the two contradict each other.
     """
     if stated is None:
         return AxisUnits((METRES[given or "m"],) * 3, option)
     if given is None or all(same_unit(each, METRES[given]) for each in stated.metres):
         return stated
     raise InputError(
-        f"states its unit, {stated.name}, in {stated.source}, and {option} says {unit_name(METRES[given])}", where=where,
-        remedy=f"leave {option} out if the file is right, else export it with the right coordinate system or names",
+        f"states its unit, {stated.name}, in {stated.source}, but {option} says {unit_name(METRES[given])}", where=where,
+        remedy=f"leave out {option} if the file is right, else export it with the right coordinate system or names",
     )  # fmt: skip
 
 
 def understood_crs(text: str) -> Any:
-    """The coordinate system (a pyproj.CRS) of WKT or a code such as EPSG:2260; None for a text that PROJ does not understand."""
+    """Return the coordinate system (a pyproj.CRS) of WKT or a code such as EPSG:2260; None if PROJ does not understand
+    the text.
+    """
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
@@ -90,33 +96,34 @@ def understood_crs(text: str) -> Any:
 
 
 def not_understood(text: str, where: str) -> str:
-    """A note on a coordinate system that PROJ does not understand, whose coordinates are taken for metres.
+    """Return a note on a coordinate system that PROJ does not understand, so that its coordinates are read as metres.
 
-    Raises InputError where its text has a word for another unit.
+    Raises InputError if its text contains the name of another unit.
     """
     problem = f"states a coordinate system that is not understood: '{text:.60}'"
     if word := re.search(r"foot|feet|yard|\bft\b|us-ft", text, re.IGNORECASE):
         remedy = "export the file with its EPSG code or valid WKT"
-        raise InputError(f"{problem}, in which stands '{word[0]}'", where=where, remedy=remedy)
-    return f"the file {problem}; its coordinates are taken for metres"
+        raise InputError(f"{problem}, and names the unit '{word[0]}'", where=where, remedy=remedy)
+    return f"the file {problem}; its coordinates are read as metres"
 
 
 def units_of_crs(crs: Any, where: str) -> AxisUnits | None:
-    """The unit of projected coordinates in a coordinate system; None where it states none.
+    """Return the unit of projected coordinates in a coordinate system.
 
     Parameters
     ----------
-    crs : a pyproj.CRS
-    where : what errors call the file
+    crs : A pyproj.CRS.
+    where : Name of the file, for errors.
 
     Returns
     -------
-    AxisUnits of easting, northing and height. Without a vertical system heights have the unit of the plane.
+    Units of easting, northing and height; None if the system states none. Without a vertical system, heights have the unit of the
+    plane.
 
     Raises
     ------
     InputError
-        For coordinates in degrees, coordinates from the Earth's centre, and units that are no length.
+        If coordinates are in degrees or geocentric, or a unit is not a length.
     """
     plane, *further = [_plain(each) for each in (crs.sub_crs_list if crs.is_compound else [_plain(crs)])]
     if plane.is_geographic:
@@ -135,7 +142,9 @@ def units_of_crs(crs: Any, where: str) -> AxisUnits | None:
 
 
 def metres_of_epsg_unit(code: int) -> float | None:
-    """Metres of a unit of length by its EPSG code, such as 9003 of the US survey foot; None for one that is none."""
+    """Return the length, m, of a unit by its EPSG code, such as 9003 of the US survey foot; None if the code is not a unit of
+    length.
+    """
     from pyproj.database import get_units_map
 
     units = get_units_map(auth_name="EPSG", category="linear", allow_deprecated=True).values()
@@ -144,12 +153,12 @@ def metres_of_epsg_unit(code: int) -> float | None:
 
 
 def _plain(crs: Any) -> Any:
-    """A coordinate system without the transformation to another datum that may be bound to it."""
+    """Return a coordinate system without a transformation to another datum that may be bound to it."""
     return crs.source_crs if crs.is_bound else crs
 
 
 def _metres(axis: Any, name: str, where: str) -> float:
-    """Metres of one unit of a CRS's axis; of local systems PROJ gives the unit's name and no factor."""
+    """Return the length, m, of one unit of an axis; PROJ gives only the unit's name for local systems."""
     factor = axis.unit_conversion_factor
     if not factor:
         factor = metres_of_word(axis.unit_name)
@@ -160,7 +169,7 @@ def _metres(axis: Any, name: str, where: str) -> float:
 
 
 def _exact(metres: float) -> float:
-    """A factor with few digits as the exact one of its unit."""
+    """Replace a factor with few digits by the exact one of its unit."""
     return next((known for known in _NAMES if same_unit(metres, known)), metres)
 
 
@@ -172,8 +181,9 @@ _WORDS = {
     "usfoot": US_FOOT_M, "usfeet": US_FOOT_M, "surveyfoot": US_FOOT_M, "surveyfeet": US_FOOT_M, "footus": US_FOOT_M,
     "in": 0.0254, "inch": 0.0254, "yd": 0.9144, "yard": 0.9144,
 }  # fmt: skip
+"""Length of each unit, m, by the words for it, in lower case without spaces and punctuation."""
 
 
 def metres_of_word(word: str) -> float | None:
-    """Metres of a unit of length as people write it; None for another word."""
+    """Return the length of a unit, m, by the word for it; None for an unknown word."""
     return _WORDS.get(re.sub(r"[\s._-]+", "", word.lower()))

@@ -1,5 +1,4 @@
-"""Show how ICP's result depends on its subsample ratio and its outlier threshold (`scarpsim icp-study`).
+"""Study how ICP's result depends on its subsample ratio and its outlier threshold (`scarpsim icp-study`).
 
-The ICP itself is in `pipeline/registration`.
-Start with `study.py`.
+The ICP itself is in `pipeline/registration`. Start with `study.py`.
 """

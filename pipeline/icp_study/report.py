@@ -1,4 +1,4 @@
-"""The folder that `scarpsim icp-study` fills: icp_study.json, icp_study.csv, two pictures and report.html."""
+"""Make the folder of `scarpsim icp-study`: icp_study.json, icp_study.csv, two pictures and report.html."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from pipeline.comparison.report import write_csv
 from pipeline.formats.files.atomic import filling, write_bytes, write_json, write_text
 from pipeline.icp_study.study import IcpStudy, Parameter, Recommendation, StudyRow
-from pipeline.report.figures import DPI, FAMILY, dress, plain_numbers, png_bytes
+from pipeline.report.figures import DPI, FAMILY, label_axes, plain_numbers, png_bytes
 from pipeline.report.page import millimetres, template
 from pipeline.report.provenance import versions
 
@@ -21,30 +21,33 @@ _TITLES: dict[Parameter, str] = {
     "subsample_ratio": "share of the points left out",
     "outlier_distance_threshold": "outlier threshold, m",
 }
+"""Axis labels."""
 _LEAST_KEPT = 5e-4
+"""Smallest share of points on the axis of subsample ratios."""
 
 
 def write_icp_study(out: Path, study: IcpStudy) -> Path:
-    """Write everything; returns the report's path. The folder appears when all of it is there."""
+    """Write everything; return the report's path. The folder appears when everything has been written."""
     with filling(out) as folder:
         _write(folder, study)
     return out / "report.html"
 
 
 def _write(out: Path, study: IcpStudy) -> None:
+    """Write everything into the folder."""
     write_json(out / "icp_study.json", {**study.to_dict(), "versions": versions()})
     write_csv(out / "icp_study.csv", [row.to_dict() for row in study.rows])
     pictures = {f"{name}.png": study_figure(study, name) for name in _TITLES}
     for name, png in pictures.items():
         write_bytes(out / name, png)
     page = template("icp_study/report.html.jinja").render(
-        study=study, answers=[in_words(each) for each in study.recommended], pictures=pictures
+        study=study, answers=[recommendation_sentence(each) for each in study.recommended], pictures=pictures
     )
     write_text(out / "report.html", page)
 
 
-def in_words(found: Recommendation) -> str:
-    """A recommendation as a sentence."""
+def recommendation_sentence(found: Recommendation) -> str:
+    """State a recommendation as a sentence."""
     low, high = found.good
     error = f"{millimetres(found.normal_error_m, 2)} of error along the surface's normal remains"
     if found.parameter == "subsample_ratio":
@@ -55,8 +58,8 @@ def in_words(found: Recommendation) -> str:
 
 
 def summary(study: IcpStudy) -> str:
-    """What people want to know, as lines of text."""
-    lines = [in_words(each) for each in study.recommended]
+    """State the main results, as lines of text."""
+    lines = [recommendation_sentence(each) for each in study.recommended]
     for number, error in study.applied.items():
         if error is not None:
             lines.append(
@@ -67,7 +70,9 @@ def summary(study: IcpStudy) -> str:
 
 
 def study_figure(study: IcpStudy, parameter: Parameter) -> bytes:
-    """RMS of the fit, error of the pose and share of inliers against a parameter: lines are medians, dots registrations."""
+    """Draw RMS of the fit, error of the pose and share of inliers against a parameter: lines are medians, dots single
+    registrations.
+    """
     rows = [row for row in study.rows if row.parameter == parameter]
     figure = Figure(figsize=(13.0, 4.2), dpi=DPI, layout="constrained")
     panels = figure.subplots(1, 3)
@@ -82,7 +87,7 @@ def study_figure(study: IcpStudy, parameter: Parameter) -> bytes:
         best = next((each for each in study.recommended if each.parameter == parameter), None)
         if best is not None:
             axes.axvline(_place(parameter, best.value), color="0.3", linewidth=0.8, linestyle="--", label="recommended")
-        dress(axes, _TITLES[parameter], label)
+        label_axes(axes, _TITLES[parameter], label)
         axes.grid(color="0.9", linewidth=0.6)
         _scale(axes, parameter, rows)
     panels[1].set_yscale("log")
@@ -92,6 +97,7 @@ def study_figure(study: IcpStudy, parameter: Parameter) -> bytes:
 
 
 def _curve(axes: Axes, rows: Sequence[StudyRow], field: str, factor: float, colour: str, label: str) -> None:
+    """Draw the median and the single registrations of one variant."""
     values = sorted({row.value for row in rows})
     place = [_place(rows[0].parameter, value) for value in values]
     median = [factor * float(np.median([getattr(row, field) for row in rows if row.value == value])) for value in values]
@@ -101,11 +107,12 @@ def _curve(axes: Axes, rows: Sequence[StudyRow], field: str, factor: float, colo
 
 
 def _place(parameter: Parameter, value: float) -> float:
-    """Where a value stands on its axis: ratios by the share that is kept, on a logarithmic axis."""
+    """Return the position of a value on its axis: for ratios the share that is kept, on a logarithmic axis."""
     return max(1 - value, _LEAST_KEPT) if parameter == "subsample_ratio" else value
 
 
 def _scale(axes: Axes, parameter: Parameter, rows: Sequence[StudyRow]) -> None:
+    """Set the scale of the parameter's axis."""
     if parameter == "outlier_distance_threshold":
         return
     axes.set_xscale("log")

@@ -1,12 +1,14 @@
-"""Which settings of ICP suit a run: the two sensitivity studies of the thesis (3.6), with the true transform beside the RMS.
+"""Study which settings of ICP suit a run: the two sensitivity studies of the thesis (3.6), with the true transform beside the
+RMS.
 
-The true transform of an epoch is known in a simulation. T(s) is the rigid motion that brings what a sensor measured, s, onto the
-wall as it really was then, by point-to-plane fit over all points; the epoch has to be moved by T(reference)^-1 T(epoch) to lie on
-the reference. An epoch is first put off by a known motion D of `offset_m`, as epochs come that nobody has aligned, so that the
-transform to be found is M = T(reference)^-1 T(epoch) D^-1. What a found transform F does wrong is F M^-1: at each point x of the
-reference an error F M^-1 x - x, whose part along the surface's normal is what a difference map shows.
+The true transform of an epoch is known in a simulation. T(s) is the rigid motion that brings what a sensor measured, s, onto
+the true wall of that epoch, by a point-to-plane fit over all points. To lie on the reference, the epoch has to be moved by
+T(reference)^-1 T(epoch). An epoch is first displaced by a known motion D of size `offset_m`, as if nobody had aligned it, so
+that the transform to be found is M = T(reference)^-1 T(epoch) D^-1. The error of a found transform F is F M^-1: at each point
+x of the reference F M^-1 x - x. Its component along the surface's normal is what a difference map shows.
 
-RMS of the inliers alone cannot choose the outlier threshold: it grows with the threshold whatever the pose. The error can.
+The RMS of the inliers alone cannot select the outlier threshold, because it grows with the threshold whatever the pose. The
+error can.
 """
 
 from __future__ import annotations
@@ -41,16 +43,30 @@ RATIOS = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
 _THRESHOLDS = np.geomspace(0.5, 12.0, 13)
 """Outlier thresholds, in NMADs of the residuals at the true pose."""
 _SAMPLE, _FIT_SAMPLE = 20_000, 200_000
-"""Points for the error and for the RMS."""
+"""Number of points from which the error and the RMS are computed."""
 _TOLERANCE, _LEAST_TOLERANCE_M = 1.1, 1e-4
-"""A setting is as good as the best where its error is at most 10 % or 0.1 mm larger."""
+"""A setting is as good as the best if its error is at most 10 % or 0.1 mm larger."""
 _TO_TRUTH = IcpConfig(outlier_distance_threshold=0.2, threshold=0.0, delta_threshold=1e-7, max_iteration=60)
+"""Settings with which the true transform is found."""
 
 
 @dataclass(frozen=True)
 class StudyEpoch:
-    """An epoch to be registered. points: (n, 3), wall frame, m, put off by the offset; true: what brings them to the reference;
-    applied: what the run applied, for points that were not put off; true_applied: what it should have."""
+    """An epoch to be registered.
+
+    Attributes
+    ----------
+    number : int
+        Number of the epoch.
+    points : (n, 3) array
+        Displaced points, wall frame, m.
+    true : RigidTransform
+        Brings them to the reference.
+    applied : RigidTransform or None
+        What the run applied to the points before they were displaced.
+    true_applied : RigidTransform
+        What it should have applied.
+    """
 
     number: int
     points: FloatArray
@@ -61,8 +77,15 @@ class StudyEpoch:
 
 @dataclass(frozen=True)
 class PoseError:
-    """What a transform does wrong over the reference's points: RMS along the normals and in all, m; at their middle, translation
-    (3,), m, and rotation vector (3,), rad."""
+    """Error of a transform over the reference's points.
+
+    Attributes
+    ----------
+    normal_m, displacement_m : float
+        RMS along the normals, and of the whole displacement, m.
+    translation_m, rotation_rad : (3,) tuples
+        Translation at the points' centroid, m, and rotation vector, rad.
+    """
 
     normal_m: float
     displacement_m: float
@@ -70,7 +93,7 @@ class PoseError:
     rotation_rad: tuple[float, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it."""
+        """Return the values for JSON."""
         return dataclasses.asdict(self)
 
 
@@ -78,9 +101,24 @@ class PoseError:
 class StudyRow:
     """One registration.
 
-    gradual: whether the outlier threshold came down to its value over the iterations, as the config says, or held from the first;
-    rms_m, inlier_share: residuals of all points, not only the subset, within the threshold; the error's fields as in PoseError;
-    None where ICP found too few pairs.
+    Attributes
+    ----------
+    parameter, value
+        The parameter that is studied, and its value.
+    gradual : bool
+        Whether the outlier threshold decreased to its value over the iterations, as the config says, or was constant.
+    epoch, repeat : int
+        Number of the epoch and of the repetition.
+    rms_m, inlier_share
+        Residuals of all points, not only the subsample, within the threshold, m, and share of these points.
+    normal_error_m, displacement_m
+        As in PoseError.
+    iterations, seconds
+        Iterations and duration of the registration.
+
+    Notes
+    -----
+    Results are None if ICP found too few pairs.
     """
 
     parameter: Parameter
@@ -96,13 +134,13 @@ class StudyRow:
     seconds: float
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON and CSV hold it."""
+        """Return the values for JSON and CSV."""
         return dataclasses.asdict(self)
 
 
 @dataclass(frozen=True)
 class Recommendation:
-    """A setting, the range of values that are as good, and the error that they leave, m."""
+    """A recommended setting, the range of values that are as good, and the remaining error, m."""
 
     parameter: Parameter
     value: float
@@ -110,15 +148,30 @@ class Recommendation:
     normal_error_m: float
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it."""
+        """Return the values for JSON."""
         return dataclasses.asdict(self)
 
 
 @dataclass(frozen=True)
 class IcpStudy:
-    """The rows, what they recommend, and how far each run's own transform is from the true one (None without ICP).
+    """The result of a study.
 
-    sigma_m: NMAD of the residuals along the normals at the true pose; offset_m: by which epochs were put off.
+    Attributes
+    ----------
+    sensor : str
+        "stereo" or "tls".
+    config : IcpConfig
+        The other settings.
+    offset_m : float
+        Size of the epochs' displacement, m.
+    sigma_m : float
+        NMAD of the residuals along the normals at the true pose, m.
+    rows : list of StudyRow
+        All registrations.
+    recommended : list of Recommendation
+        The recommended settings.
+    applied : dict
+        Error of the run's own transform of each epoch; None without ICP.
     """
 
     sensor: str
@@ -130,7 +183,7 @@ class IcpStudy:
     applied: dict[int, PoseError | None]
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it."""
+        """Return the values for JSON."""
         return {
             "schema": 1,
             "sensor": self.sensor,
@@ -144,8 +197,8 @@ class IcpStudy:
 
 
 @dataclass(frozen=True)
-class Surfaces:
-    """What a sensor measured of an epoch and the wall as it really was, wall frame; applied: the run's transform, if any."""
+class EpochSurfaces:
+    """What a sensor measured of an epoch, and the true wall, wall frame; applied: the run's transform, if any."""
 
     number: int
     measured: TriangleMesh
@@ -153,8 +206,8 @@ class Surfaces:
     applied: RigidTransform | None = None
 
 
-def surfaces_of_run(folder: Path, epochs: int) -> tuple[SimulationConfig, str, list[Surfaces]]:
-    """Config, sensor, reference and the first `epochs` epochs of a run. Raises InputError where it has no record of so many."""
+def surfaces_of_run(folder: Path, epochs: int) -> tuple[SimulationConfig, str, list[EpochSurfaces]]:
+    """Read config, sensor, reference and the first `epochs` epochs of a run. Raises InputError if it has fewer epochs."""
     path = folder / RUN_FILE
     if not path.exists():
         raise InputError(f"holds no {RUN_FILE}", where=str(folder), remedy="name a run's folder or a config file")
@@ -169,35 +222,35 @@ def surfaces_of_run(folder: Path, epochs: int) -> tuple[SimulationConfig, str, l
     found = []
     for number, applied in records[: epochs + 1]:
         epoch = epoch_folder(folder, number)
-        found.append(Surfaces(number, read_surface(epoch / "surface.ply"), read_surface(epoch / "truth.ply"), applied))
+        found.append(EpochSurfaces(number, read_surface(epoch / "surface.ply"), read_surface(epoch / "truth.ply"), applied))
     return config, sensor, found
 
 
 def _applied(record: dict[str, Any]) -> RigidTransform | None:
-    """The transform of an epoch's record in run.json, None without ICP."""
+    """Return the transform in an epoch's record in run.json; None without ICP."""
     registered = record.get("registration")
     if not registered:
         return None
     return RigidTransform(np.array(registered["rotation"], float), np.array(registered["translation_m"], float))
 
 
-def simulated_surfaces(config: SimulationConfig, sensor: SensorName, epochs: int, progress: Progress) -> list[Surfaces]:
-    """Observe the reference and so many epochs of a config, as `simulate` does; nothing is written."""
+def simulated_surfaces(config: SimulationConfig, sensor: SensorName, epochs: int, progress: Progress) -> list[EpochSurfaces]:
+    """Simulate the reference and some epochs of a config, as `simulate` does, without writing anything."""
     random = KeyedRandom(config.seed)
     with progress.stage("wall"):
         site = prepare_site(config, sensor, random)
     reference = observe_reference(config, site, random, progress)
-    found = [Surfaces(0, reference.surface, reference.caster.mesh)]
+    found = [EpochSurfaces(0, reference.surface, reference.caster.mesh)]
     for number in range(1, epochs + 1):
         epoch = observe_epoch(config, site, reference, number, random, progress)
         applied = None if epoch.registration is None else epoch.registration.transform
-        found.append(Surfaces(number, epoch.surface, epoch.carved.mesh, applied))
+        found.append(EpochSurfaces(number, epoch.surface, epoch.carved.mesh, applied))
     return found
 
 
 def study(
     sensor: str,
-    surfaces: Sequence[Surfaces],
+    surfaces: Sequence[EpochSurfaces],
     config: IcpConfig,
     random: KeyedRandom,
     *,
@@ -205,9 +258,24 @@ def study(
     repeats: int = 3,
     progress: Progress | None = None,
 ) -> IcpStudy:
-    """Register every epoch to the reference (the first of `surfaces`) with each setting, and say which is best.
+    """Register every epoch to the reference (the first of `surfaces`) with each setting, and recommend the best.
 
-    config: all other parameters; repeats: draws of the subset for each ratio; offset_m: how far epochs are put off, 0 for not.
+    Parameters
+    ----------
+    sensor : str
+        "stereo" or "tls".
+    surfaces : sequence of EpochSurfaces
+        The reference and the epochs.
+    config : IcpConfig
+        All other settings.
+    random : KeyedRandom
+        Source of subsamples and displacements.
+    offset_m : float
+        Size of the epochs' displacement, m; 0 for none.
+    repeats : int
+        Number of subsamples drawn for each ratio.
+    progress : Progress, optional
+        Is told the stages.
     """
     progress = progress or Progress()
     progress.plan({"truth": 2.0, "subsample ratio": float(len(RATIOS) * repeats), "outlier threshold": 2.0 * len(_THRESHOLDS)})
@@ -216,9 +284,9 @@ def study(
         normals = reference.vertex_normals()
         target = ReferenceSurface.build(reference.vertices, normals)
         to_truth = true_pose(surfaces[0], random)
-        epochs = [_put_off(each, to_truth, offset_m, random.child("study", each.number)) for each in surfaces[1:]]
+        epochs = [_displaced(each, to_truth, offset_m, random.child("study", each.number)) for each in surfaces[1:]]
         sigma = _residual_nmad(target, epochs[0])
-    judge = _Judge(target, reference.vertices, normals, config)
+    judge = _PoseEvaluator(target, reference.vertices, normals, config)
     with progress.stage("subsample ratio"):
         cases = [(ratio, epoch, repeat) for epoch in epochs for ratio in RATIOS for repeat in range(repeats if ratio else 1)]
         rows = [_ratio_row(judge, ratio, epoch, repeat, random) for ratio, epoch, repeat in _counted(cases, progress)]
@@ -230,13 +298,15 @@ def study(
             _threshold_row(judge, threshold, epoch, gradual, random) for threshold, epoch, gradual in _counted(held, progress)
         ]
     applied = {each.number: None if each.applied is None else judge.error(each.applied, each.true_applied) for each in epochs}
-    found = [best for name in ("subsample_ratio", "outlier_distance_threshold") if (best := recommended(rows, name)) is not None]
+    found = [best for name in ("subsample_ratio", "outlier_distance_threshold") if (best := recommend(rows, name)) is not None]
     return IcpStudy(sensor, config, offset_m, sigma, rows, found, applied)
 
 
-def true_pose(surface: Surfaces, random: KeyedRandom) -> RigidTransform:
-    """The rigid motion that brings what was measured onto the wall as it was: point to plane, all points, to the true triangles'
-    vertices and centroids."""
+def true_pose(surface: EpochSurfaces, random: KeyedRandom) -> RigidTransform:
+    """Find the rigid motion that brings what was measured onto the true wall.
+
+    All points are fitted, point to plane, to the vertices and centroids of the true triangles.
+    """
     truth = surface.truth
     corners = truth.corners()
     across = area_normals(corners)
@@ -248,11 +318,12 @@ def true_pose(surface: Surfaces, random: KeyedRandom) -> RigidTransform:
     return register_to(target, surface.measured.vertices, _TO_TRUTH, random.child("truth", surface.number)).transform
 
 
-def recommended(rows: Iterable[StudyRow], parameter: Parameter) -> Recommendation | None:
-    """The setting to take, by the largest error over epochs and repeats; None where registrations failed at every value.
+def recommend(rows: Iterable[StudyRow], parameter: Parameter) -> Recommendation | None:
+    """Recommend a setting by the largest error over epochs and repetitions; None if all registrations failed.
 
-    Of the subsample ratios the largest up to which all are as good as taking all points: the fewest points. Of the outlier
-    thresholds, with the gradual start, the one in the middle (of the logarithms) of the good range about the best.
+    For the subsample ratio, this is the largest one up to which all are as good as using all points, which needs the fewest
+    points. For the outlier threshold (with gradual decrease) it is the middle, in the logarithm, of the good range around the
+    best.
     """
     chosen = [row for row in rows if row.parameter == parameter and row.gradual]
     values = sorted({row.value for row in chosen})
@@ -274,8 +345,8 @@ def recommended(rows: Iterable[StudyRow], parameter: Parameter) -> Recommendatio
     return Recommendation(parameter, value, (good[0], good[-1]), errors[value])
 
 
-class _Judge:
-    """Runs registrations to one reference and measures what they do wrong."""
+class _PoseEvaluator:
+    """Runs registrations to one reference and measures their errors."""
 
     def __init__(self, target: ReferenceSurface, points: FloatArray, normals: FloatArray, config: IcpConfig) -> None:
         self.target, self.config = target, config
@@ -283,6 +354,7 @@ class _Judge:
         self.points, self.normals, self.middle = points[::step], normals[::step], points.mean(axis=0)
 
     def error(self, found: RigidTransform, true: RigidTransform) -> PoseError:
+        """Measure the error of a transform."""
         wrong = found.after(true.inverse())
         moved = wrong.apply(self.points) - self.points
         along = np.einsum("ni,ni->n", moved, self.normals)
@@ -305,10 +377,11 @@ class _Judge:
         gradual: bool,
         repeat: int,
     ) -> StudyRow:
+        """Register an epoch with one setting and measure the result."""
         began = time.perf_counter()
         try:
             found = register_to(self.target, epoch.points, config, random)
-        except InputError:  # fewer than six pairs, or points: this setting does not work here
+        except InputError:  # fewer than six pairs or points: this setting fails
             return StudyRow(
                 parameter, value, gradual, epoch.number, repeat, None, None, None, None, None, time.perf_counter() - began
             )
@@ -330,21 +403,25 @@ class _Judge:
         )
 
 
-def _ratio_row(judge: _Judge, ratio: float, epoch: StudyEpoch, repeat: int, random: KeyedRandom) -> StudyRow:
+def _ratio_row(judge: _PoseEvaluator, ratio: float, epoch: StudyEpoch, repeat: int, random: KeyedRandom) -> StudyRow:
+    """Register an epoch with a subsample ratio."""
     config = judge.config.model_copy(update={"subsample_points": ratio > 0, "subsample_ratio": ratio})
     keyed = random.child("ratio", epoch.number, repeat)
     return judge.row("subsample_ratio", ratio, config, epoch, keyed, gradual=True, repeat=repeat)
 
 
-def _threshold_row(judge: _Judge, threshold: float, epoch: StudyEpoch, gradual: bool, random: KeyedRandom) -> StudyRow:
+def _threshold_row(judge: _PoseEvaluator, threshold: float, epoch: StudyEpoch, gradual: bool, random: KeyedRandom) -> StudyRow:
+    """Register an epoch with an outlier threshold."""
     changed: dict[str, Any] = {"outlier_distance_threshold": threshold, "remove_outlier": True}
     config = judge.config.model_copy(update=changed if gradual else changed | {"outlier_threshold_decay_iteration": 1})
     keyed = random.child("threshold", epoch.number)
     return judge.row("outlier_distance_threshold", threshold, config, epoch, keyed, gradual=gradual, repeat=0)
 
 
-def _put_off(surface: Surfaces, reference_to_truth: RigidTransform, offset_m: float, random: KeyedRandom) -> StudyEpoch:
-    """The epoch moved by a random rigid motion: a shift of `offset_m`, and a turn that moves the cloud's edge by as much."""
+def _displaced(surface: EpochSurfaces, reference_to_truth: RigidTransform, offset_m: float, random: KeyedRandom) -> StudyEpoch:
+    """Displace the epoch by a random rigid motion: a shift of `offset_m`, and a rotation that moves the cloud's edge by as
+    much.
+    """
     points = surface.measured.vertices
     true = reference_to_truth.inverse().after(true_pose(surface, random))
     shift, axis = (direction / np.linalg.norm(direction) for direction in random.generator().standard_normal((2, 3)))
@@ -356,7 +433,7 @@ def _put_off(surface: Surfaces, reference_to_truth: RigidTransform, offset_m: fl
 
 
 def _residual_nmad(target: ReferenceSurface, epoch: StudyEpoch) -> float:
-    """NMAD of the residuals along the normals at the true pose, m."""
+    """Return the NMAD of the residuals along the normals at the true pose, m."""
     step = max(len(epoch.points) // _SAMPLE, 1)
     local = epoch.true.apply(epoch.points[::step]) - target.origin
     _, nearest = target.tree.query(local)
@@ -366,11 +443,12 @@ def _residual_nmad(target: ReferenceSurface, epoch: StudyEpoch) -> float:
 
 
 def _worst_error(rows: Sequence[StudyRow]) -> float:
-    """Largest error along the normals, m; a registration that failed counts as infinite."""
+    """Return the largest error along the normals, m; a failed registration counts as infinite."""
     return max(np.inf if row.normal_error_m is None else row.normal_error_m for row in rows)
 
 
 def _counted(cases: Sequence[Any], progress: Progress) -> Iterable[Any]:
+    """Yield the cases and report the progress."""
     for number, case in enumerate(cases):
         progress.advance(number / len(cases))
         yield case

@@ -1,5 +1,4 @@
-"""Build a measurement folder from raw scans, photographs and a reference (`scarpsim measurement`).
+"""Build a measurement folder from raw scans or photogrammetric clouds and a reference (`scarpsim measurement`).
 
-Reading such a folder is the work of `pipeline/formats/measurements`.
-Start with `build.py`.
+Reading such a folder is the task of `pipeline/formats/measurements`. Start with `build.py`.
 """

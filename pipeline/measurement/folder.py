@@ -1,4 +1,4 @@
-"""The files of a measurement's folder, written together and read back as `gap` will read them."""
+"""Write the files of a measurement folder, and check that `gap` can read them."""
 
 from __future__ import annotations
 
@@ -22,34 +22,47 @@ from scene.geometry.mesh import FloatArray, TriangleMesh
 from sensors.cameras.camera import CameraPair
 from sensors.models.sensor_model import StereoModel, TlsModel
 
-UNDERSTOOD = "understood.json"
+INTERPRETATION_FILE = "understood.json"
 
 
 @dataclass(frozen=True)
-class Understood:
-    """How files were understood: lines of words by what they are about, and the command that comes next."""
+class Interpretation:
+    """How raw files were interpreted: lines of text by subject, in a folder that the next command uses."""
 
     folder: Path
     about: dict[str, tuple[str, ...]]
 
     @property
     def next_command(self) -> str:
+        """The command that analyses the folder."""
         return f"scarpsim gap {self.folder} --out {self.folder}_gap"
 
     def summary(self) -> str:
-        """The words for people, a line each."""
+        """Return the text for users, one line for each statement."""
         lines = [f"{name}: {line}" for name, words in self.about.items() for line in words]
         return "\n".join([*lines, f"next: {self.next_command}"])
 
     def to_dict(self) -> dict[str, Any]:
+        """Return the content as `understood.json` holds it."""
         words = {name: list(lines) for name, lines in self.about.items()}
         return {"schema": 1, "folder": str(self.folder), **words, "next": self.next_command}
 
 
 @dataclass(frozen=True)
-class Content:
-    """What goes into a folder. clouds: an epoch each, world frame, m; keys: of measurement.yaml beside files and notes; eye:
-    position (3,) and rotation (3, 3) to the world of what looks at the wall."""
+class MeasurementContent:
+    """What a measurement folder contains.
+
+    Attributes
+    ----------
+    sensor : "tls" or "stereo".
+    clouds : One for each epoch, world frame, m.
+    reference : Reference surface, world frame, m.
+    model : Sensor model.
+    eye : Position (3,), m, and rotation (3, 3) to the world of the sensor, or of a place to look from.
+    title : Title of the picture.
+    cameras : The stereo pair; None if there is none or it is unknown.
+    keys : Further keys of measurement.yaml.
+    """
 
     sensor: str
     clouds: Sequence[PointCloud]
@@ -61,8 +74,20 @@ class Content:
     keys: Mapping[str, Any] = field(default_factory=dict)
 
 
-def write(out: Path, content: Content, found: Understood) -> None:
-    """Fill `out` and try what is in it; it stays away where points and reference do not meet (InputError)."""
+def write(out: Path, content: MeasurementContent, found: Interpretation) -> None:
+    """Write the folder and check that it can be used.
+
+    Parameters
+    ----------
+    out : Folder to write; it appears only if the check succeeds.
+    content : What it contains.
+    found : How the files were interpreted.
+
+    Raises
+    ------
+    InputError
+        If points and reference do not overlap.
+    """
     with filling(out) as folder:
         names = [f"scan_{number}.laz" for number in range(len(content.clouds))]
         for name, cloud in zip(names, content.clouds, strict=True):
@@ -82,18 +107,20 @@ def write(out: Path, content: Content, found: Understood) -> None:
         _write_yaml(folder / FILE, values | {"model": "model.yaml", "notes": limits})
         _write_yaml(folder / "model.yaml", content.model.model_dump(mode="json"), found.about["model"])
         write_text(folder / "understood.txt", found.summary() + "\n")
-        write_json(folder / UNDERSTOOD, found.to_dict())
+        write_json(folder / INTERPRETATION_FILE, found.to_dict())
         seen = np.concatenate([cloud.points for cloud in content.clouds])
         write_bytes(folder / "understood.png", _picture(content, seen))
-        _try(folder, out)
+        _check_readable(folder, out)
 
 
-def _picture(content: Content, points: FloatArray) -> bytes:
+def _picture(content: MeasurementContent, points: FloatArray) -> bytes:
+    """Draw the picture of the set-up."""
     sensor = content.sensor == "tls" or content.cameras is not None
     return picture(points, content.reference, *content.eye, content.title, sensor=sensor)
 
 
 def _write_points(path: Path, cloud: PointCloud) -> None:
+    """Write a cloud as LAZ, with the exact intensity as an extra channel."""
     extra = dict(cloud.extra)
     if cloud.intensity is not None:
         extra[EXACT_INTENSITY] = np.asarray(cloud.intensity, dtype=np.float32)
@@ -101,12 +128,13 @@ def _write_points(path: Path, cloud: PointCloud) -> None:
 
 
 def _write_yaml(path: Path, values: Mapping[str, Any], comments: Sequence[str] = ()) -> None:
+    """Write keys and values as YAML after comment lines."""
     lines = [*(f"# {line}" for line in comments), *(f"{key}: {yaml_line(value)}" for key, value in values.items())]
     write_text(path, "\n".join(lines) + "\n")
 
 
-def _try(folder: Path, out: Path) -> None:
-    """Raise InputError, with the folder's later name, where `gap` could not use the folder."""
+def _check_readable(folder: Path, out: Path) -> None:
+    """Raise InputError, with the folder's final name, if `gap` could not use it."""
     try:
         read_measurement(folder).check_near(FILE)
     except InputError as error:

@@ -1,14 +1,14 @@
-"""Where a scan was taken from, by the geometry of its own lines.
+"""Find where a scan was taken from, by the geometry of its scan lines.
 
-About the true origin the angles of recorded points lie on the scanner's grid (recorded directions are nominal, whatever the beam
-did). About an origin that is off by dp they depart from it: for a point at range R with unit vectors e_a, e_z towards rising
-azimuth and zenith angle
+Seen from the true origin, the angles of recorded points lie on the scanner's grid, because recorded directions are nominal. Seen
+from an origin that is off by dp they deviate from it. For a point at range R with unit vectors e_a, e_z in the directions of
+rising azimuth and zenith angle z,
 
     R sin z da = -e_a . dp        R dz = -e_z . dp
 
-Least squares over all points, with what the pattern leaves open as further unknowns (its start and step, of a tilted scan the
-axis and the shape and start of its lines), give dp and its covariance. A first guess without any pattern comes from points in the
-order in which they were taken: those of one line lie in a plane through the scanner, and the planes of many lines meet there.
+Least squares over all points gives dp and its covariance. Further unknowns are what the pattern leaves open: its start and step,
+and for a tilted scan its axis and the shape and start of its lines. An initial value without a known pattern comes from points in
+the order of measurement: the points of one line lie in a plane through the scanner, and the planes of many lines meet there.
 """
 
 from __future__ import annotations
@@ -24,20 +24,31 @@ from scene.geometry.mesh import FloatArray, IntArray
 from sensors.signal_chain.polar import polar_axes
 
 _SAMPLE = 60_000
+"""Number of points used for the least squares."""
 _TURNS = 6
+"""Largest number of iterations."""
 _OFF_GRID = 0.2
-"""Share of a step: a pattern whose angles scatter more about it is none."""
+"""Scatter of the angles, as a share of the step, above which the points do not lie on a pattern."""
 _SHORTEST_LINE, _LONGEST_STEP = 25, 8.0
-"""Points of a piece of a line, and the step between its points, in median ones."""
+"""Smallest number of points in a piece of a line, and largest step between them, in median steps."""
 _RELIEF = 4.0
-"""A piece of a line shows its plane where it is so many times wider across the line than out of the plane."""
+"""A piece of a line determines its plane if it is this much wider across the line than out of the plane."""
 _HEIGHTS = 41
+"""Number of heights tried in each pass."""
 _GROUPS = 24
+"""Number of groups of neighbouring lines for the covariance."""
 
 
 @dataclass(frozen=True)
 class Origin:
-    """position: (3,) m, in the points' frame; sigma_m: (3,) its standard deviation; geometry: the pattern seen from there."""
+    """Origin of a scan.
+
+    Attributes
+    ----------
+    position : (3,) m, in the points' frame.
+    sigma_m : (3,) its standard deviation, m.
+    geometry : The scan pattern seen from there.
+    """
 
     position: FloatArray
     sigma_m: FloatArray
@@ -45,7 +56,7 @@ class Origin:
 
 
 def pattern_from(points: FloatArray, position: FloatArray, rotation: FloatArray) -> ScanGeometry | None:
-    """The pattern of points (n, 3) seen from a place, None where they lie on none from there."""
+    """Return the scan pattern of points (n, 3) seen from a position; None if they lie on no pattern."""
     try:
         found = recover_pattern(points, position, rotation)
     except InputError:
@@ -54,8 +65,16 @@ def pattern_from(points: FloatArray, position: FloatArray, rotation: FloatArray)
     return found if good else None
 
 
-def refined(points: FloatArray, position: FloatArray, rotation: FloatArray, geometry: ScanGeometry) -> Origin:
-    """The origin near `position` about which the points' angles lie best on their pattern."""
+def refine_origin(points: FloatArray, position: FloatArray, rotation: FloatArray, geometry: ScanGeometry) -> Origin:
+    """Improve an origin by least squares.
+
+    Parameters
+    ----------
+    points : (n, 3) points, m.
+    position : (3,) initial origin, m.
+    rotation : (3, 3) scanner to the points' frame.
+    geometry : The pattern seen from the initial origin.
+    """
     for _ in range(_TURNS):
         step, sigma = _step(geometry, rotation)
         if np.all(np.abs(step) <= 0.5 * sigma):
@@ -68,24 +87,25 @@ def refined(points: FloatArray, position: FloatArray, rotation: FloatArray, geom
 
 
 def _scatter(geometry: ScanGeometry) -> float:
+    """Return the RMS deviation of the angles from the pattern, rad."""
     return float(np.hypot(geometry.azimuth_rms, geometry.zenith_rms))
 
 
 def _step(geometry: ScanGeometry, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(3,) step of the origin towards the best one and (3,) its standard deviation, points' frame, m."""
+    """Return the (3,) correction of the origin and its (3,) standard deviation, points' frame, m."""
     rows = np.arange(0, len(geometry.range_m), max(len(geometry.range_m) // _SAMPLE, 1))
     rows = rows[geometry.range_m[rows] >= np.median(geometry.range_m) / 2]
     azimuth, zenith, distance = geometry.azimuth[rows], geometry.zenith[rows], geometry.range_m[rows]
     _, along_azimuth, along_zenith = polar_axes(azimuth, zenith)
     level = distance * np.sin(zenith)
-    across, down = _open(geometry, rows)
+    across, down = _pattern_unknowns(geometry, rows)
     design = [-along_azimuth / level[:, None], -along_zenith / distance[:, None]]
     residual = [azimuth - geometry.lines.start - geometry.lines.step * geometry.line[rows], _zenith_residual(geometry, rows)]
     if not geometry.synchronous:
         lean = np.stack([np.cos(azimuth) / np.tan(zenith), np.sin(azimuth) / np.tan(zenith)], axis=1)
         design[0] = np.concatenate([design[0], lean], axis=1)
         design[1] = np.concatenate([design[1], np.stack([-np.sin(azimuth), np.cos(azimuth)], axis=1)], axis=1)
-    parts = [_without(open_, weight, *pair) for open_, weight, pair in zip(
+    parts = [_project_out(open_, weight, *pair) for open_, weight, pair in zip(
         (across, down), (level, distance), zip(design, residual, strict=True), strict=True)]  # fmt: skip
     matrix = np.concatenate([part[0] for part in parts])
     value = np.concatenate([part[1] for part in parts])
@@ -99,19 +119,32 @@ def _step(geometry: ScanGeometry, rotation: FloatArray) -> tuple[FloatArray, Flo
 
 
 def _covariance(matrix: FloatArray, left: FloatArray, line: IntArray, inverse: FloatArray) -> FloatArray:
-    """Of a least-squares solution whose residuals (n,) go together within groups of neighbouring lines (the sandwich form)."""
+    """Return the covariance of a least-squares solution whose residuals are correlated within groups of neighbouring lines.
+
+    It is the sandwich estimator.
+
+    Parameters
+    ----------
+    matrix : (n, k) design matrix.
+    left : (n,) residuals.
+    line : (n,) line of each.
+    inverse : (k, k) inverse of the normal matrix.
+    """
     group = (line.astype(np.int64) - line.min()) * _GROUPS // (int(np.ptp(line)) + 1)
     score = np.stack([np.bincount(group, column * left, minlength=_GROUPS) for column in matrix.T], axis=1)
     return inverse @ (score.T @ score) @ inverse * (_GROUPS / (_GROUPS - 1))
 
 
 def _zenith_residual(geometry: ScanGeometry, rows: NDArray[np.int64]) -> FloatArray:
-    """(k,) zenith angle less the grid's; of lines that begin anywhere each with its own start (taken out in `_open`)."""
+    """Return the (k,) zenith angles minus the grid's; `_pattern_unknowns` has the starts of lines that begin anywhere."""
     return geometry.zenith[rows] - geometry.pulses.start - geometry.pulses.step * geometry.pulse[rows]
 
 
-def _open(geometry: ScanGeometry, rows: NDArray[np.int64]) -> tuple[list[FloatArray], list[FloatArray]]:
-    """What the pattern leaves open of azimuth and of zenith: columns (k,); a line's own start is given as its number."""
+def _pattern_unknowns(geometry: ScanGeometry, rows: NDArray[np.int64]) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Return the design columns (k,) of the pattern's unknowns in azimuth and in zenith angle.
+
+    The first of the zenith angle's columns is the number of the line if each line has its own start.
+    """
     line, pulse, zenith = (each[rows].astype(float) for each in (geometry.line, geometry.pulse, geometry.zenith))
     one = np.ones_like(line)
     if geometry.synchronous:
@@ -119,13 +152,21 @@ def _open(geometry: ScanGeometry, rows: NDArray[np.int64]) -> tuple[list[FloatAr
     return [one, line, zenith - np.pi / 2, 1 / np.sin(zenith), 1 / np.tan(zenith)], [line, pulse]
 
 
-def _without(
+def _project_out(
     columns: list[FloatArray], weight: FloatArray, design: FloatArray, value: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """The weighted design and residual without what the open columns explain."""
+    """Project the unknowns of the pattern out of the weighted design and residuals.
+
+    Parameters
+    ----------
+    columns : (k,) each, from `_pattern_unknowns`.
+    weight : (k,) weights.
+    design : (k, p) design matrix.
+    value : (k,) residuals.
+    """
     first, values = columns[0], np.concatenate([design, value[:, None]], axis=1)
     open_ = np.stack(columns[1:], axis=1)
-    if np.ptp(first) > 0:  # a start for each line: take the lines' weighted means out of everything
+    if np.ptp(first) > 0:  # each line has its own start: subtract the lines' weighted means
         number = np.unique(first, return_inverse=True)[1]
         total = np.bincount(number, weight**2)
         for block in (values, open_):
@@ -140,14 +181,14 @@ def _without(
     return values[:, :-1], values[:, -1]
 
 
-# --- a first guess from the order of the points
+# --- initial value from the order of the points
 
 
-def from_order(points: FloatArray) -> Origin | None:
-    """The origin of points (n, 3), m, that stand in the order in which they were taken; None where their lines do not tell it.
+def origin_from_point_order(points: FloatArray) -> Origin | None:
+    """Find the origin of points (n, 3), m, that are in the order of measurement; None if their lines do not determine it.
 
-    The planes of vertical lines meet in the scanner's axis; the height on it is where the zenith angles of a line are equally
-    spaced. The scanner is taken to stand upright in the points' frame, to some degrees.
+    The planes of vertical lines meet in the scanner's axis. The height on the axis is where the zenith angles of a line are
+    equally spaced. The scanner is assumed to be upright in the points' frame to some degrees.
     """
     centre = points.mean(axis=0)
     pieces = _pieces(points - centre)
@@ -157,22 +198,33 @@ def from_order(points: FloatArray) -> Origin | None:
     place, axis, free = _meeting(*planes)
     if free:
         place = place + _height(points - centre, pieces, place, axis) * axis
-    return near(points, centre + place, np.eye(3))
+    return origin_near(points, centre + place, np.eye(3))
 
 
-def near(points: FloatArray, position: FloatArray, rotation: FloatArray) -> Origin | None:
-    """The origin of points (n, 3), m, near a place; None where they lie on no pattern seen from there."""
+def origin_near(points: FloatArray, position: FloatArray, rotation: FloatArray) -> Origin | None:
+    """Find the origin of points near a position.
+
+    Parameters
+    ----------
+    points : (n, 3) points, m.
+    position : (3,) approximate origin, m.
+    rotation : (3, 3) scanner to the points' frame.
+
+    Returns
+    -------
+    The origin; None if the points lie on no pattern seen from the position.
+    """
     some = points[:: max(len(points) // _SAMPLE, 1)] if len(points) > 3 * _SAMPLE else points
     seen = pattern_from(some, position, rotation)
     if seen is None:
         return None
-    found = refined(some, position, rotation, seen)
+    found = refine_origin(some, position, rotation, seen)
     whole = found.geometry if some is points else pattern_from(points, found.position, rotation)
     return None if whole is None else Origin(found.position, found.sigma_m, whole)
 
 
 def _pieces(points: FloatArray) -> list[NDArray[np.int64]]:
-    """Indices of the points of each piece of a line: without a step back or a wide one."""
+    """Return the indices of the points in each piece of a line, which has no step back and no wide step."""
     step = np.diff(points, axis=0)
     length = np.linalg.norm(step, axis=1)
     typical = np.median(length[length > 0]) if (length > 0).any() else 1.0
@@ -184,7 +236,7 @@ def _pieces(points: FloatArray) -> list[NDArray[np.int64]]:
 
 
 def _planes(points: FloatArray, pieces: list[NDArray[np.int64]]) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Normals (k, 3), middles (k, 3) and angular errors (k,) of the planes of pieces of lines; None for fewer than 8."""
+    """Return normals (k, 3), centres (k, 3) and angular errors (k,) of the planes of line pieces; None for fewer than 8."""
     found = []
     for rows in pieces:
         middle = points[rows].mean(axis=0)
@@ -194,12 +246,12 @@ def _planes(points: FloatArray, pieces: list[NDArray[np.int64]]) -> tuple[FloatA
     if len(found) < 8:
         return None
     normals, middles, width, out = (np.array(each) for each in zip(*found, strict=True))
-    out = np.maximum(out, np.median(out)) + 1e-12  # rounding can put a line into a plane of its own
+    out = np.maximum(out, np.median(out)) + 1e-12  # rounding can make a line exactly plane
     return normals, middles, out / width
 
 
 def _height(points: FloatArray, pieces: list[NDArray[np.int64]], place: FloatArray, axis: FloatArray) -> float:
-    """How far along the axis from `place` the steps of a line are most equal as angles, m."""
+    """Return the distance along the axis from `place` at which the angular steps of the lines are most equal, m."""
     rows = np.concatenate(pieces)
     same = np.diff(np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])) == 0
     upright = axis if axis[2] >= 0 else -axis
@@ -222,7 +274,12 @@ def _height(points: FloatArray, pieces: list[NDArray[np.int64]], place: FloatArr
 
 
 def _meeting(normals: FloatArray, middles: FloatArray, errors: FloatArray) -> tuple[FloatArray, FloatArray, bool]:
-    """Where planes meet, robustly: a point, the direction in which it is known worst, and whether it is open in that one."""
+    """Intersect planes robustly.
+
+    Returns
+    -------
+    The point of intersection, the direction in which it is least certain, and whether it is undetermined in that direction.
+    """
     offset = np.einsum("ni,ni->n", normals, middles)
     place, weight = np.zeros(3), 1 / errors**2
     for _ in range(20):

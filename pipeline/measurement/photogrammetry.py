@@ -1,4 +1,4 @@
-"""A cloud from photographs whose cameras are known: pixels and disparities follow by projection, so only the pair is needed."""
+"""Read the stereo pair of a photogrammetric cloud; pixels and disparities of the points follow by projection."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from sensors.cameras.camera import Camera, CameraPair
 
 
 def read_pair(path: Path, labels: tuple[str, str] | None) -> CameraPair:
-    """The pair out of cameras.yaml, a Metashape XML or a COLMAP text model, world frame; labels: which two of a project.
+    """Read the stereo pair from cameras.yaml, a Metashape file or a COLMAP text model, world frame.
 
-    Raises InputError where the file does not tell a pair.
+    labels names the left and right camera of a project. Raises InputError if the file does not determine a pair.
     """
     if not path.exists():
         raise InputError("there is no such file", where=str(path), allowed="cameras.yaml, Metashape XML or .psx, a COLMAP folder")
@@ -26,27 +26,27 @@ def read_pair(path: Path, labels: tuple[str, str] | None) -> CameraPair:
         return read_cameras_yaml(path)
     if labels is None and len(found.cameras) != 2:
         raise InputError(
-            f"holds {len(found.cameras)} aligned cameras, a pair is two", where=str(path),
+            f"the file has {len(found.cameras)} aligned cameras, but a pair has two", where=str(path),
             allowed=", ".join(sorted(found.cameras)[:20]), remedy="name them: --pair LEFT,RIGHT",
         )  # fmt: skip
     left, right = labels or (None, None)
     return stereo_pair(found, left, right, str(path))
 
 
-def looking(camera: Camera) -> FloatArray:
-    """(3, 3) a frame at the camera to the world: x forward, y left, z up in the picture, for angles about its middle."""
+def viewing_rotation(camera: Camera) -> FloatArray:
+    """Return the (3, 3) rotation from a frame at the camera to the world: x forward, y left, z up in the picture."""
     right, down, forward = camera.rotation.T
     return np.stack([forward, -right, -down], axis=1)
 
 
-def seen_by(pair: CameraPair, points: FloatArray, where: str) -> tuple[str, ...]:
-    """Words on how much of a cloud (n, 3), m, the pair sees. Raises InputError where that is next to nothing."""
+def describe_view(pair: CameraPair, points: FloatArray, where: str) -> tuple[str, ...]:
+    """Describe how much of a cloud (n, 3), m, the pair sees; raise InputError if it sees almost nothing."""
     both = check_seen(pair, points, where)
     left = pair.left
     middle = float(np.median((points - left.position) @ left.rotation[:, 2]))
     tenth = 1e3 * middle**2 / (left.f_px * pair.base_m) * 0.1
     return (
         f"cameras {left.width} x {left.height} px, f {left.f_px:.1f} px, base {pair.base_m:.4g} m, depth {middle:.4g} m (median)",
-        f"0.1 px of disparity are {tenth:.3g} mm of depth",
-        f"both see {100 * both:.3g} % of the points; pixels and disparities are found by projection",
+        f"0.1 px of disparity is {tenth:.3g} mm of depth",
+        f"both see {100 * both:.3g} % of the points; pixels and disparities are computed by projection",
     )

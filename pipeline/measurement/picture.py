@@ -1,4 +1,4 @@
-"""What was understood of raw files, as a picture: the set-up from above, and the scan as the scanner sees it."""
+"""Draw how raw files were interpreted: the set-up from above, and the scan as seen from the scanner."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import numpy as np
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
-from pipeline.report.figures import FAMILY, SEQUENTIAL, dress, png_bytes
+from pipeline.report.figures import FAMILY, SEQUENTIAL, label_axes, png_bytes
 from scene.geometry.mesh import FloatArray, TriangleMesh
 from sensors.signal_chain.polar import polar
 
 _DOTS = 15_000
+"""Number of points drawn."""
 
 
 def picture(
@@ -22,9 +23,16 @@ def picture(
     *,
     sensor: bool = True,
 ) -> bytes:
-    """PNG of points (n, 3) and the reference, both m in one frame, with the scanner (position, rotation to that frame).
+    """Draw points and reference from above and from the sensor, as PNG.
 
-    sensor: whether there is one at that place; else it is only a place to look from.
+    Parameters
+    ----------
+    points : (n, 3) points, m.
+    mesh : Reference in the same frame.
+    position : (3,) position of the sensor, m.
+    rotation : (3, 3) sensor to that frame.
+    title : Title.
+    sensor : Whether a sensor is at that position; otherwise it is only a place to look from.
     """
     figure = Figure(figsize=(11.0, 5.0), layout="constrained")
     above, seen = figure.subplots(1, 2)
@@ -38,25 +46,25 @@ def picture(
         _fan(above, few, here)
     above.set_aspect("equal", adjustable="datalim")
     shift = "" if not origin.any() else f" less {origin[0]:,.0f}", f" less {origin[1]:,.0f}" if origin.any() else ""
-    dress(above, f"x{shift[0]}, m", f"y{shift[1]}, m")
+    label_axes(above, f"x{shift[0]}, m", f"y{shift[1]}, m")
     above.set_title("from above")
     for handle in above.legend(loc="best", fontsize=8).legend_handles:
         if isinstance(handle, PathCollection):
-            handle.set_sizes([16])  # the dots themselves are too small to tell their colours
+            handle.set_sizes([16])  # the dots are too small to show their colours
     distance, azimuth, zenith = polar(np.einsum("ij,ni->nj", rotation, few - here))
     middle = float(np.angle(np.mean(np.exp(1j * azimuth))))
     azimuth = middle + np.angle(np.exp(1j * (azimuth - middle)))
     dots = seen.scatter(np.degrees(azimuth), np.degrees(zenith), c=distance, s=0.8, cmap=SEQUENTIAL, linewidths=0)
     seen.invert_yaxis()
-    dress(seen, "azimuth, degrees", "zenith angle, degrees")
-    seen.set_title("as the sensor sees it" if sensor else "seen from before the wall")
+    label_axes(seen, "azimuth, degrees", "zenith angle, degrees")
+    seen.set_title("as the sensor sees it" if sensor else "seen from in front of the wall")
     figure.colorbar(dots, ax=seen, label="range, m" if sensor else "distance from there, m")
     figure.suptitle(title)
     return png_bytes(figure)
 
 
 def _fan(axes: object, points: FloatArray, here: FloatArray) -> None:
-    """The edges of the window from above, unless it is a full circle."""
+    """Draw the edges of the field of view from above, unless it is a full circle."""
     angle = np.sort(np.arctan2(points[:, 1] - here[1], points[:, 0] - here[0]))
     gaps = np.diff(angle, append=angle[0] + 2 * np.pi)
     widest = int(np.argmax(gaps))

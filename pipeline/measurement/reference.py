@@ -1,4 +1,4 @@
-"""The surface that a scan is compared with: a mesh, a cloud that is meshed here, or one half of the scan itself."""
+"""Make the reference surface that a scan is compared with: from a mesh, a cloud, an elevation model, or one half of the scan."""
 
 from __future__ import annotations
 
@@ -25,19 +25,27 @@ from scene.walls.imported import read_mesh
 HALF = "half"
 DEMS = (".tif", ".tiff")
 _MUCH_FINER = 0.6
-"""Pulses that lie so much closer along a line than lines do are halved instead of the lines."""
+"""If the step of pulses along a line is less than this share of the step of lines, pulses are halved instead of lines."""
 _FEWEST_CHORDS = 100
+"""Smallest number of chords for an estimate of noise."""
 _TWICE_AS_LONG, _LEAST_NOISE = 16.0, 0.1
-"""Times the variance of smooth relief about chords that are twice as long, and share of a variance that is noise in any case."""
+"""Variance of smooth relief about chords that are twice as long, over that about the shorter ones; smallest share of noise in a
+variance.
+"""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """The surface as known, points' frame, m, with the standard error of its vertices along the rays (0: taken as exact) and what
-    is to be said of it.
+    """Reference surface of a measurement, points' frame, m.
 
-    rows: (k,) the points of the scan that are compared with it, None for all; of_points: made of a cloud, so that its triangles
-    lean by noise and relief between points.
+    Attributes
+    ----------
+    mesh : The surface.
+    error_m : Standard error of its vertices along the rays, m; 0 if it is taken as exact.
+    words : Description of the surface.
+    limits : What a comparison with it cannot show.
+    rows : (k,) points of the scan that are compared with it; None: all.
+    of_points : Whether it is made of a cloud, so that noise and relief tilt its triangles.
     """
 
     mesh: TriangleMesh
@@ -49,26 +57,39 @@ class Reference:
 
 
 def is_cloud(path: Path) -> bool:
-    """Whether a file holds points without triangles."""
+    """Whether a file contains points without triangles."""
     if path.suffix.lower() != ".ply":
         return path.suffix.lower() in SUFFIXES
     faces = read_elements(path).get("face")
     return faces is None or not faces or not len(next(iter(faces.values())))
 
 
-def from_file(
+def reference_from_file(
     path: Path, unit: str | None, position: FloatArray, rotation: FloatArray, seen_from: str = "from the scanner"
 ) -> Reference:
-    """A reference out of a file, seen from `position` (3,) m with `rotation` (3, 3), `seen_from` in words; InputError where it
-    cannot be used."""
+    """Read a reference from a file.
+
+    Parameters
+    ----------
+    path : A mesh, a cloud or an elevation model.
+    unit : Unit of its coordinates; None: as the file states, or metres.
+    position : (3,) place from which a cloud is meshed, m.
+    rotation : (3, 3) that place's frame to the points' frame.
+    seen_from : That place in words.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be used.
+    """
     if not path.is_file():
         raise InputError("there is no such file", where=str(path), allowed=f"a mesh, a cloud, a DEM, or the word {HALF}")
     if path.suffix.lower() in DEMS:
-        return from_dem(path, unit, "--reference-unit")
+        return reference_from_dem(path, unit, "--reference-unit")
     if not is_cloud(path):
         mesh, notes = read_mesh(path, unit or "m")
         words = (f"mesh {path.name}: {len(mesh.faces):,} triangles, taken as exact", *notes)
-        limit = "an error of the mesh (its noise, chords across curved rock, cut edges) looks like one of the sensor"
+        limit = "an error of the mesh (noise, chords across curved rock, cut edges) looks like an error of the sensor"
         return Reference(mesh, 0.0, words, (limit,))
     scans = read_scans(path, unit, option="--reference-unit")
     points = np.concatenate([scan.cloud.points for scan in scans])
@@ -76,22 +97,31 @@ def from_file(
     said = f"cloud {path.name}: {len(points):,} points, meshed as seen {seen_from}, {len(surface.mesh.faces):,} triangles"
     words = tuple(dict.fromkeys(f"cloud {path.name}: {word}" for scan in scans for word in scan.cloud.notes))
     limits = (
-        "the reference is a measurement itself: errors that both share (same scanner, same place) cannot be seen, and rock that "
-        "moved between the two is told from errors only where it has edges",
+        "the reference is a measurement itself: errors that both share (same scanner, same place) are invisible, and rock that "
+        "moved between the two differs from an error only at its edges",
     )
-    return Reference(surface.mesh, surface.error_m, (said, *words, _of_noise(surface)), limits, of_points=True)
+    return Reference(surface.mesh, surface.error_m, (said, *words, _noise_in_words(surface)), limits, of_points=True)
 
 
-def from_dem(path: Path, unit: str | None = None, option: str = "--unit") -> Reference:
-    """Make a surface of a raster of heights: a vertex at the centre of each pixel, two triangles between four that have data.
+def reference_from_dem(path: Path, unit: str | None = None, option: str = "--unit") -> Reference:
+    """Make a surface of an elevation model: a vertex at the centre of each pixel, and two triangles between four pixels with
+    data.
 
-    unit: what the user says of coordinates and heights by `option`, None where the file's own word holds, metres where it has
-    none. Raises InputError where the two contradict each other, and where the raster holds no heights or no place.
+    Parameters
+    ----------
+    path : GeoTIFF of heights.
+    unit : Unit of coordinates and heights; None: as the file states, or metres.
+    option : Command-line option that gives the unit, for errors.
+
+    Raises
+    ------
+    InputError
+        If `unit` contradicts the file, or the raster has no heights or no place.
     """
     raster = read_raster(path)
     heights, place = raster.values, raster.place
     if place.grid is None:
-        raise InputError("has no place: pixel scale and one tie point are needed", where=str(path), remedy="export a GeoTIFF")
+        raise InputError("the raster has no pixel scale and tie point", where=str(path), remedy="export a GeoTIFF")
     level, upright = place.linear_m, place.vertical_m
     stated = None if level is None else AxisUnits((level, level, upright or level), "its GeoTIFF keys")
     units, notes = agreed_units(stated, unit, str(path), option), list(raster.notes)
@@ -102,40 +132,42 @@ def from_dem(path: Path, unit: str | None = None, option: str = "--unit") -> Ref
     grid = place.grid
     known = np.isfinite(heights)
     if not known.any() or min(heights.shape) < 2:
-        raise InputError("holds no heights", where=str(path), remedy="export the elevation model again")
+        raise InputError("the raster has no heights", where=str(path), remedy="export the elevation model again")
     mesh = mesh_of_raster(heights.astype(np.float64), grid)
     if not len(mesh.faces):
-        raise InputError("has no four neighbouring pixels with heights", where=str(path), remedy="export a whole elevation model")
+        raise InputError("no four neighbouring pixels have heights", where=str(path), remedy="export a whole elevation model")
     mesh = mesh.with_vertices(mesh.vertices * np.array([metres, metres, up]))
     words = f"elevation model {path.name}: {int(known.sum()):,} heights every {grid.gsd * metres:.3g} m, taken as exact"
     limit = (
         "an elevation model has one height at each place: overhangs are missing, and steep faces are chords between pixels, "
-        "whose error looks like one of the sensor"
+        "whose error looks like an error of the sensor"
     )
     return Reference(mesh, 0.0, (words, *notes), (limit,))
 
 
-def half_of(scan: RawScan, station: Station) -> Reference:
-    """Every other line (or pulse, where these are much finer) as the surface, with the rest to be compared with it."""
+def reference_from_half(scan: RawScan, station: Station) -> Reference:
+    """Mesh every second line of a scan (or pulse, if these are much denser) as the reference for its other half."""
     even, what = _halves(scan, station)
     surface = triangulate_seen_points(scan.cloud.points[even], station.position, station.rotation, scan.name)
     said = f"half of the scan itself ({what}): {int(even.sum()):,} points, {len(surface.mesh.faces):,} triangles"
     limits = (
-        "both halves are of one scan: nothing that changes slowly over the wall can be seen (offset, scale, index, eccentricity, "
-        "incidence, cyclic error), only noise, tails, and what differs from one line or pulse to the next",
+        "both halves are of one scan: errors that vary slowly over the wall are invisible (offset, scale, index, eccentricity, "
+        "incidence, cyclic error); only noise, outliers and differences between lines or pulses show",
     )
     noise = None if station.geometry is None else _noise_along_lines(station.geometry, even)
     if noise is None or surface.smoothed:
-        return Reference(surface.mesh, surface.error_m, (said, _of_noise(surface)), limits, np.flatnonzero(~even), of_points=True)
-    told = f"along its lines points scatter by {1e3 * noise:.2g} mm, which is carried as their error"
+        return Reference(
+            surface.mesh, surface.error_m, (said, _noise_in_words(surface)), limits, np.flatnonzero(~even), of_points=True
+        )
+    told = f"along its lines points scatter by {1e3 * noise:.2g} mm, which is used as their error"
     return Reference(surface.mesh, noise, (said, told), limits, np.flatnonzero(~even), of_points=True)
 
 
 def _noise_along_lines(geometry: ScanGeometry, rows: NDArray[np.bool_]) -> float | None:
-    """Robust standard deviation of a range, m, about the chord of its neighbours in a line; None without any.
+    """Estimate the standard deviation of a range, m, from chords between its neighbours in a line; None with too few chords.
 
-    Chords twice as long are as noisy, and four times as far from relief that is smooth over them: what they scatter more is taken
-    off. Relief that is rougher counts as noise, steps of depth do not.
+    Chords twice as long have the same noise but four times the deviation from smooth relief; the additional scatter is
+    subtracted. Rougher relief counts as noise; depth steps do not.
     """
     line, pulse, distance = geometry.line[rows], geometry.pulse[rows], geometry.range_m[rows]
     order = np.lexsort((pulse, line))
@@ -150,9 +182,19 @@ def _noise_along_lines(geometry: ScanGeometry, rows: NDArray[np.bool_]) -> float
 def _variance_about_chords(
     line: NDArray[Any], pulse: NDArray[Any], distance: FloatArray, lag: int, step_rad: float
 ) -> float | None:
-    """Of a range, m2, in lines in order, about the chord of those `lag` places before and after it; None where there are few.
+    """Return the robust variance of a range, m^2, about the chord between the points `lag` places before and after it in a line.
 
-    Neighbours at r1 and r3, an angle t to either side, put the one between them at 2 r1 r3 cos t / (r1 + r3).
+    Neighbours at r1 and r3, an angle t to either side, put the point between them at 2 r1 r3 cos t / (r1 + r3).
+
+    Parameters
+    ----------
+    line, pulse, distance : (n,) line, pulse and range, m, of points sorted by line and pulse.
+    lag : Distance of the neighbours, in points.
+    step_rad : Angle between pulses, rad.
+
+    Returns
+    -------
+    The variance; None if there are few chords.
     """
     first, middle, last = (slice(start, len(line) - 2 * lag + start) for start in (0, lag, 2 * lag))
     before, after = pulse[middle] - pulse[first], pulse[last] - pulse[middle]
@@ -163,17 +205,19 @@ def _variance_about_chords(
 
 
 def _halves(scan: RawScan, station: Station) -> tuple[NDArray[np.bool_], str]:
+    """Return the mask of the reference's half, and its description."""
     geometry = station.geometry
     if geometry is None:
-        return np.arange(len(scan.cloud.points)) % 2 == 0, "every second point of the file, as no lines were found"
+        return np.arange(len(scan.cloud.points)) % 2 == 0, "every second point of the file, because no lines were found"
     if geometry.pulses.step < _MUCH_FINER * geometry.lines.step:
-        return geometry.pulse % 2 == 0, "every second pulse of each line, which lie closer than lines do"
+        return geometry.pulse % 2 == 0, "every second pulse of each line, as pulses are denser than lines"
     return geometry.line % 2 == 0, "every second line"
 
 
-def _of_noise(surface: SeenSurface) -> str:
-    smoothed = ", vertices averaged with their neighbours as the coordinates are rounded" if surface.smoothed else ""
+def _noise_in_words(surface: SeenSurface) -> str:
+    """Describe the error of a surface made of points."""
+    smoothed = ", vertices averaged with their neighbours because the coordinates are rounded" if surface.smoothed else ""
     return (
         f"its points scatter by {1e3 * surface.roughness_m:.2g} mm about their neighbours, {1e3 * surface.spacing_m:.2g} mm away "
-        f"(noise and relief){smoothed}: {1e3 * surface.error_m:.2g} mm are carried as the error of each"
+        f"(noise and relief){smoothed}: {1e3 * surface.error_m:.2g} mm is used as the error of each"
     )

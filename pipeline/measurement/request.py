@@ -1,4 +1,4 @@
-"""What is asked for of raw files."""
+"""The user's request for a measurement folder."""
 
 from __future__ import annotations
 
@@ -9,10 +9,19 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for. scans: files, each an epoch; reference: a file, or `half`; scanner: a preset's name or file, or model: a
-    file model.yaml; position: (3,) m; unit, reference_unit: of the files' coordinates, None: as each file states, metres where it
-    states none; columns: of text files; number: which scan
-    of a file of several, from 1."""
+    """The raw files of a measurement and what the user says of them.
+
+    Attributes
+    ----------
+    scans : Files, one for each epoch.
+    reference : A file, or "half" for one half of the scan.
+    scanner : Name or file of a scanner preset.
+    model : File of a sensor model, instead of a preset.
+    position : (3,) position of the scanner, m.
+    unit, reference_unit : Units of the files' coordinates; None: as each file states, or metres.
+    columns : Names of a text file's columns.
+    number : Which scan of a file with several, from 1.
+    """
 
     scans: Sequence[Path]
     reference: str

@@ -1,5 +1,4 @@
-"""Raw scans of any format as this room takes them: points in metres in the files' frame, poses where a header holds them, and
-words on what was guessed."""
+"""Read raw scans of any format: points in metres in the file's frame, the scanner's pose if the header has it, and notes."""
 
 from __future__ import annotations
 
@@ -18,16 +17,25 @@ from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 
 _OF_GRID = {"row", "column", "line", "scan", "pixel_x", "pixel_y"}
+"""Channels of the scan's grid."""
 _OF_RETURNS = {"return_number", "number_of_returns", "return_index", "return_count"}
-"""Channels that a measurement is made of, beside intensity and time."""
+"""Channels of returns. A measurement uses these, those of the grid, intensity and time."""
 _FEWEST = 100
-"""Points below which nothing can be said of a scan."""
+"""Smallest number of points in a scan."""
 
 
 @dataclass(frozen=True)
 class RawScan:
-    """One scan. cloud: finite points, m, in the file's frame (intensity from 0 up); position: (3,) m, rotation: (3, 3), scanner
-    to the file's frame, None where the file does not say; words: what was guessed or changed."""
+    """One scan of a file.
+
+    Attributes
+    ----------
+    name : Name of the scan.
+    cloud : Points with finite coordinates, m, in the file's frame; intensity from 0 up.
+    position : (3,) position of the scanner, m; None if the file does not state it.
+    rotation : (3, 3) scanner to the file's frame; None if the file does not state it.
+    words : What was assumed or changed.
+    """
 
     name: str
     cloud: PointCloud
@@ -36,12 +44,12 @@ class RawScan:
     words: tuple[str, ...] = ()
 
     def part(self, rows: NDArray[Any]) -> RawScan:
-        """The scan with some of its points."""
+        """Return the scan with some of its points."""
         return replace(self, cloud=part_of(self.cloud, rows))
 
 
 def part_of(cloud: PointCloud, rows: NDArray[Any]) -> PointCloud:
-    """Some points (indices, or a mask) of a cloud."""
+    """Return some points (indices or a mask) of a cloud with all their channels."""
     return PointCloud(
         cloud.points[rows],
         None if cloud.intensity is None else cloud.intensity[rows],
@@ -55,15 +63,15 @@ def read_scans(path: Path, unit: str | None = None, columns: Sequence[str] = (),
 
     Parameters
     ----------
-    path : of any format that `read_placed_scans` reads
-    unit : of the file's coordinates; None: as the file states, metres where it states none
-    columns : names of a text file's columns
-    option : by which the user gives the unit, for errors
+    path : File of any format that `read_placed_scans` reads.
+    unit : Unit of the coordinates; None: as the file states, or metres.
+    columns : Names of a text file's columns.
+    option : Command-line option that gives the unit, for errors.
 
     Raises
     ------
     InputError
-        For a format that is not known, whatever is wrong in the file, and a scan without points to speak of.
+        If the format is unknown, the file is wrong, or a scan has almost no points.
     """
     scans = read_placed_scans(path, unit, columns, option)
     raw = (RawScan(scan.name, scan.cloud, scan.position, scan.rotation, scan.cloud.notes) for scan in scans)
@@ -71,17 +79,17 @@ def read_scans(path: Path, unit: str | None = None, columns: Sequence[str] = (),
 
 
 def _checked(scan: RawScan, where: str) -> RawScan:
-    """The scan without points that are no numbers, and with an intensity that is a power."""
+    """Remove points that are not finite, and convert the intensity to a power."""
     cloud = finite(scan.cloud, where)
     words = list(scan.words)
     if (lost := len(scan.cloud.points) - len(cloud.points)) > 0:
-        words.append(f"{lost:,} points that are no numbers are left out")
+        words.append(f"{lost:,} points with coordinates that are not numbers are left out")
     if len(cloud.points) < _FEWEST:
         raise InputError(
-            f"holds {len(cloud.points)} points", where=where, allowed=f"{_FEWEST} and more", remedy="give a whole scan"
+            f"the scan has {len(cloud.points)} points", where=where, allowed=f"{_FEWEST} or more", remedy="use a whole scan"
         )
     if unused := sorted(set(cloud.extra) - _OF_GRID - _OF_RETURNS):
-        words.append(f"the file also holds {', '.join(unused)}, which {'is' if len(unused) == 1 else 'are'} not used")
+        words.append(f"the file also has {', '.join(unused)}, which {'is' if len(unused) == 1 else 'are'} not used")
     if cloud.intensity is not None:
         power, said = _power(np.asarray(cloud.intensity, dtype=np.float64))
         cloud = replace(cloud, intensity=power)
@@ -90,12 +98,14 @@ def _checked(scan: RawScan, where: str) -> RawScan:
 
 
 def _power(intensity: FloatArray) -> tuple[FloatArray | None, list[str]]:
-    """Intensity as it may stand for received power: decibels as 10^(dB / 10), numbers with an offset from their least."""
+    """Convert intensity to a received power, with notes: decibels as 10^(dB / 10), other negative numbers by subtracting their
+    minimum.
+    """
     low, high = float(intensity.min()), float(intensity.max())
     if low == high:
-        return None, ["the intensity is the same everywhere and left out"]
+        return None, ["the intensity is constant and left out"]
     if low >= 0:
-        return intensity, ["intensity is taken as it stands: the maker's numbers need not be proportional to received power"]
+        return intensity, ["intensity is used unchanged; the manufacturer's numbers need not be proportional to received power"]
     if low > -60 and high < 60:
-        return 10 ** (intensity / 10), ["the intensity has values below 0 and was taken for decibels: 10^(dB / 10)"]
-    return intensity - low, [f"the intensity has values below 0: its least, {low:g}, was taken for no power"]
+        return 10 ** (intensity / 10), ["the intensity has values below 0 and was read as decibels: 10^(dB / 10)"]
+    return intensity - low, [f"the intensity has values below 0; its minimum, {low:g}, was read as zero power"]

@@ -1,4 +1,4 @@
-"""Where the scanner of a raw scan stood and how it scanned: from the file's header, from what was said, or from its lines."""
+"""Find where the scanner of a raw scan stood and its scan pattern: from the file's header, the user, or the scan lines."""
 
 from __future__ import annotations
 
@@ -7,25 +7,32 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.formats.measurements.scan_geometry import ScanGeometry
-from pipeline.measurement.origin import Origin, from_order, near, pattern_from
+from pipeline.measurement.origin import Origin, origin_from_point_order, origin_near, pattern_from
 from pipeline.measurement.scans import RawScan
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray, IntArray
 
 _SURE_M = 0.05
-"""An origin by scan lines is taken instead of a stated one where it is known to this, and differs by more than its error."""
+"""An origin from the scan lines replaces a stated one if its standard deviation is below this, m, and the difference is
+significant.
+"""
 _STATED_M = 0.002
-"""A stated origin is kept where the lines' one is nearer than this: what a survey rounds to."""
+"""A stated origin is kept if the one from the scan lines is nearer than this, m, to which surveys round."""
 _ORIGIN_M = 0.02
-"""Lines that meet so near to the file's origin belong to a file in the scanner's own frame."""
+"""If scan lines meet this near to the file's origin, m, the file is in the scanner's own frame."""
 
 
 @dataclass(frozen=True)
 class Station:
-    """A scanner's place and pattern.
+    """Position and scan pattern of a scanner.
 
-    position: (3,) m; rotation: (3, 3), scanner to the points' frame, orthonormal; sigma_m: (3,) of the position where the scan
-    lines told it; geometry: the pattern that the points lie on, None where they lie on none; words: how it was found.
+    Attributes
+    ----------
+    position : (3,) m.
+    rotation : (3, 3) orthonormal rotation, scanner to the points' frame.
+    sigma_m : (3,) standard deviation of the position, m, if it comes from the scan lines; else None.
+    geometry : Pattern on which the points lie; None if they lie on none.
+    words : How it was found.
     """
 
     position: FloatArray
@@ -36,33 +43,33 @@ class Station:
 
     @property
     def line(self) -> IntArray | None:
-        """(n,) the scan line of each point."""
+        """(n,) scan line of each point; None without a pattern."""
         return None if self.geometry is None else self.geometry.line
 
     @property
     def pattern(self) -> dict[str, list[float]] | None:
-        """As measurement.yaml has it; None without one, and for lines that begin anywhere or are slanted."""
+        """The pattern as measurement.yaml has it; None without one, and if lines are slanted or begin anywhere."""
         return self.geometry.pattern if self.geometry is not None and self.geometry.synchronous else None
 
 
 def find_station(scan: RawScan, position: FloatArray | None = None) -> Station:
-    """The station of a scan; position: (3,) m, as said by the user. Raises InputError where nothing tells it."""
+    """Find the station of a scan; position: (3,) m, as stated by the user. Raises InputError if nothing determines it."""
     points = _in_order(scan)
     if position is not None:
-        return _restored(_stated(points, position, np.eye(3), "as given by --position"), scan)
+        return _in_file_order(_stated_station(points, position, np.eye(3), "as given by --position"), scan)
     if scan.position is not None and scan.rotation is not None:
-        return _restored(_stated(points, scan.position, scan.rotation, "of the header"), scan)
-    return _restored(_found(points, scan.name), scan)
+        return _in_file_order(_stated_station(points, scan.position, scan.rotation, "of the header"), scan)
+    return _in_file_order(_unstated_station(points, scan.name), scan)
 
 
 def _in_order(scan: RawScan) -> FloatArray:
-    """Points in the order in which they were taken, as far as the file says."""
+    """Return the points in the order of measurement, as far as the file has times."""
     time = scan.cloud.gps_time
     return scan.cloud.points if time is None else scan.cloud.points[np.argsort(time, kind="stable")]
 
 
-def _restored(station: Station, scan: RawScan) -> Station:
-    """The station with a pattern whose points are in the file's order again."""
+def _in_file_order(station: Station, scan: RawScan) -> Station:
+    """Return the station with the columns of its pattern in the file's order."""
     time, geometry = scan.cloud.gps_time, station.geometry
     if time is None or geometry is None:
         return station
@@ -73,15 +80,22 @@ def _restored(station: Station, scan: RawScan) -> Station:
     return Station(station.position, station.rotation, station.sigma_m, ScanGeometry(**columns, **others), station.words)
 
 
-def _stated(points: FloatArray, position: FloatArray, rotation: FloatArray, source: str) -> Station:
-    """A station whose place was said, moved where the scan lines know it better."""
-    found = near(points, position, rotation)
-    if found is None or found.sigma_m.max() > _SURE_M:  # from there the pattern is none, or bent
+def _stated_station(points: FloatArray, position: FloatArray, rotation: FloatArray, source: str) -> Station:
+    """Return the station of a stated position, corrected if the scan lines determine it better.
+
+    Parameters
+    ----------
+    points : (n, 3) points in the order of measurement, m.
+    position, rotation : The stated pose.
+    source : Who stated it, in words.
+    """
+    found = origin_near(points, position, rotation)
+    if found is None or found.sigma_m.max() > _SURE_M:  # seen from there, the pattern is missing or distorted
         found = _from_lines(points, position) or found
     if found is None:
         words = (
             f"position {_place(position)} {source}",
-            "from there the points lie on no regular pattern: scan lines and missing returns cannot be told",
+            "seen from there, the points lie on no regular pattern, so scan lines and missing returns are unknown",
         )
         return Station(position, rotation, None, None, words)
     off = found.position - position
@@ -90,39 +104,40 @@ def _stated(points: FloatArray, position: FloatArray, rotation: FloatArray, sour
     kept = pattern_from(points, position, rotation) if not better else None
     if kept is not None:
         return _station(Origin(position, found.sigma_m, kept), rotation, (f"position {_place(position)} {source}",))
-    moved = f"position {_place(found.position)}: the scan lines meet there, {away:.3g} m from the one {source}"
+    moved = f"position {_place(found.position)}, where the scan lines meet, {away:.3g} m from the one {source}"
     return _station(found, rotation, (f"{moved} (± {1e3 * found.sigma_m.max():.2g} mm)",))
 
 
 def _from_lines(points: FloatArray, position: FloatArray) -> Origin | None:
-    """Where the lines of points in their order meet, if well known, and not farther off than the points are."""
-    found = from_order(points)
+    """Return where the scan lines meet, if it is well determined and not farther from `position` than the points are."""
+    found = origin_from_point_order(points)
     if found is None or found.sigma_m.max() > _SURE_M:
         return None
     return found if np.linalg.norm(found.position - position) < np.median(np.linalg.norm(points - position, axis=1)) else None
 
 
-def _found(points: FloatArray, name: str) -> Station:
-    """A station of which nothing was said: at the file's origin, or where the lines meet."""
-    found = near(points, np.zeros(3), np.eye(3)) if np.abs(points).max() < 1e4 else None
+def _unstated_station(points: FloatArray, name: str) -> Station:
+    """Find a station of which nothing was stated: at the file's origin, or where the lines meet."""
+    found = origin_near(points, np.zeros(3), np.eye(3)) if np.abs(points).max() < 1e4 else None
     if found is not None and np.linalg.norm(found.position) < max(_ORIGIN_M, 3 * float(found.sigma_m.max())):
         off = f"the scan lines meet {1e3 * np.linalg.norm(found.position):.2g} mm from it (± {_mm(found)} mm)"
-        word = f"the points lie on a regular pattern seen from the file's origin: the scanner is taken to stand there; {off}"
+        word = f"seen from the file's origin, the points lie on a regular pattern, so the scanner is assumed there; {off}"
         kept = pattern_from(points, np.zeros(3), np.eye(3))
         found = found if kept is None else Origin(np.zeros(3), found.sigma_m, kept)
         return _station(found, np.eye(3), (word,))
-    found = found or from_order(points)
+    found = found or origin_from_point_order(points)
     if found is None:
         raise InputError(
-            "says nowhere where the scanner stood, and its scan lines do not tell", where=name,
-            remedy=f"give --position X,Y,Z (m, in the points' frame), if need be to some metres; {_place(_before(points))} lies "
-            "in front of them, if their wall leans back",
+            "neither the file nor its scan lines say where the scanner stood", where=name,
+            remedy=f"give --position X,Y,Z (m, in the points' frame), to a few metres if need be; "
+            f"{_place(_place_in_front(points))} is in front of them, if the wall leans back",
         )  # fmt: skip
     word = f"position {_place(found.position)} found from the scan lines (± {_mm(found)} mm)"
     return _station(found, np.eye(3), (word,))
 
 
 def _station(found: Origin, rotation: FloatArray, words: tuple[str, ...]) -> Station:
+    """Describe a station found."""
     geometry = found.geometry
     lines, pulses = geometry.lines, geometry.pulses
     pattern = (
@@ -131,14 +146,14 @@ def _station(found: Origin, rotation: FloatArray, words: tuple[str, ...]) -> Sta
     )
     said = [*words, pattern]
     if not geometry.synchronous:
-        said.append("the lines begin anywhere or are slanted: missing returns cannot be told")
+        said.append("the lines begin anywhere or are slanted, so missing returns are unknown")
     if geometry.tilt > 1e-6:
-        said.append(f"the scan's axis leans by {np.degrees(geometry.tilt):.3g} degrees; angles are counted about it")
+        said.append(f"the scan's axis is tilted by {np.degrees(geometry.tilt):.3g} degrees; angles refer to it")
     return Station(found.position, rotation @ geometry.rotation, found.sigma_m, geometry, tuple(said))
 
 
-def _before(points: FloatArray) -> FloatArray:
-    """A place as far before the middle of a wall of points (n, 3) as it is wide, on the side to which its normal looks up."""
+def _place_in_front(points: FloatArray) -> FloatArray:
+    """Return a place as far in front of a wall of points (n, 3) as it is wide, on the side to which its normal points up."""
     centre = points.mean(axis=0)
     few = points[:: max(len(points) // 20_000, 1)] - centre
     normal = np.linalg.eigh(np.einsum("ni,nj->ij", few, few))[1][:, 0]
@@ -148,8 +163,10 @@ def _before(points: FloatArray) -> FloatArray:
 
 
 def _mm(found: Origin) -> str:
+    """Format the standard deviation of an origin."""
     return f"{1e3 * found.sigma_m.max():.2g}"
 
 
 def _place(position: FloatArray) -> str:
+    """Format a position."""
     return "(" + ", ".join(f"{value:.3f}" for value in position) + ")"

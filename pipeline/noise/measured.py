@@ -1,7 +1,7 @@
-"""Real epochs as difference maps over a wall's plane: out of a measurement's points, or GeoTIFFs that exist already.
+"""Read real epochs as difference maps over a wall's plane, from a measurement's points or from existing GeoTIFFs.
 
-Of a point p the difference is z of the reference at p's place in the wall's plane minus p's z; a pixel holds the mean of its
-points' differences, so what is compared is never interpolated between points. Missing rock is positive.
+The difference of a point p is the z of the reference at p's position in the wall's plane minus p's z. A pixel holds the mean
+of its points' differences, so nothing is interpolated between points. Missing rock is positive.
 """
 
 from __future__ import annotations
@@ -32,8 +32,23 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class MeasuredMaps:
-    """Difference maps of real epochs. name: of the folder; maps: (e, h, w) float32, m, NaN without data; stable: (h, w), where
-    nothing has changed, as drawn; None where nobody drew it; points: of each epoch, none for maps out of files."""
+    """Difference maps of real epochs.
+
+    Attributes
+    ----------
+    name : str
+        Name of the folder.
+    grid : Grid
+        Pixels of the maps.
+    maps : (e, h, w) float32 array
+        Differences, m; NaN without data.
+    stable : (h, w) bool array or None
+        Where nothing has changed, if the measurement states it.
+    points : tuple of int
+        Number of points of each epoch; empty for maps from files.
+    registrations : tuple of Registration
+        Of each epoch; empty without registration.
+    """
 
     name: str
     grid: Grid
@@ -44,12 +59,25 @@ class MeasuredMaps:
 
 
 def read_measured(folder: Path, config: DifferenceConfig, icp: IcpConfig | None, random: KeyedRandom) -> MeasuredMaps:
-    """The difference maps of a folder with measurement.yaml, or of one with GeoTIFFs difference_*.tif (all *.tif where none is
-    so called) that share a grid.
+    """Read the difference maps of a folder.
 
-    config: side of the pixels, at least; that of maps out of points is no smaller than the points' spacing, as most pixels would
-    be empty. icp: registration of each epoch's points to the reference, none: they are where they should be. Raises InputError
-    where the folder holds neither.
+    The folder contains measurement.yaml, or GeoTIFFs difference_*.tif (all *.tif if none has such a name) that share a grid.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder.
+    config : DifferenceConfig
+        Smallest side of the pixels. For points it is at least their spacing, because most pixels would be empty otherwise.
+    icp : IcpConfig or None
+        Registration of each epoch's points to the reference; None: they are registered.
+    random : KeyedRandom
+        Source of the registration's subsamples.
+
+    Raises
+    ------
+    InputError
+        If the folder contains neither.
     """
     if (folder / FILE).is_file():
         return _from_points(folder, config, icp, random)
@@ -65,6 +93,7 @@ def read_measured(folder: Path, config: DifferenceConfig, icp: IcpConfig | None,
 
 
 def _from_points(folder: Path, config: DifferenceConfig, icp: IcpConfig | None, random: KeyedRandom) -> MeasuredMaps:
+    """Make the maps from a measurement's points."""
     measurement = read_measurement(folder)
     bounds, epochs = measurement.reference.bounds, measurement.epochs
     clouds = [measurement.cloud.points[epochs == number] for number in np.unique(epochs)]
@@ -81,13 +110,15 @@ def _from_points(folder: Path, config: DifferenceConfig, icp: IcpConfig | None, 
 
 
 def _spacing(points: FloatArray) -> float:
-    """The side of the square that a point has to itself in the wall's plane, m."""
+    """Return the side, m, of the square in the wall's plane that each point has on average."""
     low, high = np.quantile(points[:, :2], [0.01, 0.99], axis=0)
     return float(np.sqrt(np.prod(high - low) / len(points)))
 
 
 def point_differences(reference: RayCaster, points: FloatArray, grid: Grid) -> NDArray[np.float32]:
-    """(h, w) mean over each pixel of reference minus point in z, m; points: (n, 3), wall frame; NaN where there is none."""
+    """Return the mean of reference minus point in z over each pixel, (h, w), m; NaN without points. points: (n, 3), wall
+    frame.
+    """
     top = float(reference.mesh.bounds[1, 2]) + 1.0
     x, y = (on_device(mi.Float64, np.ascontiguousarray(points[:, axis])) for axis in (0, 1))
     hits = reference.intersect(mi.Array3f64(x, y, top), mi.Array3f64(0.0, 0.0, -1.0), coherent=False)
@@ -101,7 +132,7 @@ def point_differences(reference: RayCaster, points: FloatArray, grid: Grid) -> N
 
 
 def area_mask(areas: Iterable[Area], grid: Grid) -> BoolArray:
-    """(h, w) the pixels whose centre lies in one of the areas."""
+    """Return the pixels (h, w) whose centre lies in one of the areas."""
     x = grid.x_min + (np.arange(grid.width) + 0.5) * grid.gsd
     y = grid.y_max - (np.arange(grid.height) + 0.5) * grid.gsd
     return in_areas(areas, *np.meshgrid(x.astype(np.float64), y.astype(np.float64)))

@@ -1,6 +1,6 @@
-"""How differences are distributed: their size, their tails, against a normal distribution, and against what may explain them.
+"""Describe the distribution of differences: tails, normality, and dependence on covariates.
 
-The size (median, StD, RMSE, NMAD) is `pipeline.change.difference.statistics`; here is what it leaves out.
+Location and size (median, StD, RMSE, NMAD) are in `pipeline.change.difference.statistics`.
 """
 
 from __future__ import annotations
@@ -20,19 +20,27 @@ from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 
 NORMAL_BEYOND_3 = 0.0027
-"""Share of a normal distribution that lies more than three sigma from its median."""
+"""Share of a normal distribution more than three sigma from its median."""
 _LEAST_SAMPLE = 20
-"""D'Agostino and Pearson's test holds from about this many values."""
+"""Fewest values for which D'Agostino and Pearson's test is valid."""
 _MOST_SAMPLE = 5000
-"""With more, any departure too small to matter is significant."""
+"""Most values that are tested; with more, irrelevant departures become significant."""
 
 
 @dataclass(frozen=True)
 class TailFigures:
-    """What the tails hold, of n differences, m.
+    """Description of the tails of differences, m.
 
-    quantile_025_m ... quantile_975_m: quantiles at 2.5, 25, 75 and 97.5 %; skewness, excess_kurtosis: 0 for a normal
-    distribution; beyond_3_nmad: share farther than three NMAD from the median (normal: 0.0027); largest_m: largest |difference|.
+    Attributes
+    ----------
+    quantile_025_m, quantile_250_m, quantile_750_m, quantile_975_m : float
+        Quantiles at 2.5, 25, 75 and 97.5 %.
+    skewness, excess_kurtosis : float
+        0 for a normal distribution.
+    beyond_3_nmad : float
+        Share farther than three NMAD from the median (normal: 0.0027).
+    largest_m : float
+        Largest absolute difference.
     """
 
     quantile_025_m: float
@@ -45,12 +53,12 @@ class TailFigures:
     largest_m: float
 
     def to_dict(self) -> dict[str, float | None]:
-        """As JSON holds it: NaN is null."""
+        """Return the values for JSON; NaN becomes null."""
         return {name: None if np.isnan(value) else value for name, value in dataclasses.asdict(self).items()}
 
 
 def tails(values: NDArray[np.floating]) -> TailFigures:
-    """The tails of the values (any shape, m) that are not NaN; all NaN where there are none."""
+    """Describe the tails of the values (any shape, m) that are not NaN; all NaN if there are none."""
     known = values[~np.isnan(values)].astype(np.float64)
     if known.size == 0:
         return TailFigures(*[float("nan")] * 8)
@@ -67,7 +75,7 @@ def tails(values: NDArray[np.floating]) -> TailFigures:
 class Normality:
     """D'Agostino and Pearson's (1973) test of a sample: K2 of skewness and kurtosis, chi-squared with 2 degrees of freedom.
 
-    sample: how many values were drawn; None where there are too few.
+    sample: number of values drawn. The other attributes are None if there are too few.
     """
 
     statistic: float | None
@@ -75,15 +83,22 @@ class Normality:
     sample: int
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it."""
+        """Return the values for JSON."""
         return dataclasses.asdict(self)
 
 
 def normality(values: NDArray[np.floating], effective: float, random: KeyedRandom) -> Normality:
-    """Whether the values (any shape, NaN left out) may be normal.
+    """Test whether values may be normally distributed.
 
-    effective: how many of them are independent, as `variogram.effective_sample_size` gives it: so many, at most 5,000, are drawn
-    at random by `random`, because neighbours are correlated and a test of all pixels rejects every real map.
+    Parameters
+    ----------
+    values : array of any shape
+        NaN is ignored.
+    effective : float
+        Number of independent values (`variogram.effective_sample_size`). At most so many, and at most 5,000, are drawn at
+        random, because neighbours are correlated and a test of all pixels would reject every real map.
+    random : KeyedRandom
+        Source of the draw.
     """
     known = values[~np.isnan(values)]
     size = int(min(effective, known.size, _MOST_SAMPLE))
@@ -96,22 +111,29 @@ def normality(values: NDArray[np.floating], effective: float, random: KeyedRando
 
 @dataclass(frozen=True)
 class Bin:
-    """Differences where a covariate lies in [low, high); `of` are their statistics."""
+    """Statistics of the differences where a covariate lies in [low, high)."""
 
     low: float
     high: float
     of: DifferenceStatistics
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it: an infinite end is null."""
+        """Return the values for JSON; an infinite end becomes null."""
         low, high = (end if np.isfinite(end) else None for end in (self.low, self.high))
         return {"low": low, "high": high, **self.of.to_dict()}
 
 
-def binned(values: NDArray[np.floating], covariate: NDArray[np.floating], edges: Sequence[float] | FloatArray) -> list[Bin]:
-    """Statistics of the values, m, in each bin of a covariate of the same shape; pixels where either is NaN are left out.
+def statistics_by_bin(
+    values: NDArray[np.floating], covariate: NDArray[np.floating], edges: Sequence[float] | FloatArray
+) -> list[Bin]:
+    """Compute statistics of the values, m, in each bin of a covariate; pixels where either is NaN are ignored.
 
-    edges: increasing, one more than bins; the last bin holds its upper edge.
+    Parameters
+    ----------
+    values, covariate : arrays of equal shape
+        Differences, m, and covariate.
+    edges : sequence of float
+        Ascending, one more than bins. The last bin includes its upper edge.
     """
     if values.shape != covariate.shape:
         raise ValueError(f"expected a covariate of shape {values.shape}, got {covariate.shape}")
@@ -126,7 +148,7 @@ def binned(values: NDArray[np.floating], covariate: NDArray[np.floating], edges:
 
 
 def quantile_edges(covariate: NDArray[np.floating], bins: int = 8) -> FloatArray:
-    """Edges of bins that hold equally many of the covariate's values (NaN left out), fewer where many values are alike."""
+    """Return edges of bins with equally many of the covariate's values (NaN ignored); fewer bins if many values are equal."""
     known = covariate[~np.isnan(covariate)]
     if known.size == 0:
         return np.array([0.0, 1.0])
@@ -136,7 +158,7 @@ def quantile_edges(covariate: NDArray[np.floating], bins: int = 8) -> FloatArray
 
 @dataclass(frozen=True)
 class DensityHistogram:
-    """Counts of values in bins of equal width and what a normal distribution of the same median and NMAD would hold there.
+    """Counts in bins of equal width, and the expected counts of a normal distribution with the same median and NMAD.
 
     edges: (k + 1,), m; counts, normal: (k,).
     """
@@ -147,7 +169,7 @@ class DensityHistogram:
 
 
 def histogram(values: NDArray[np.floating], bins: int = 100, half_width_nmads: float = 6.0) -> DensityHistogram:
-    """The histogram of the values (NaN left out) within some NMADs of their median."""
+    """Compute the histogram of the values (NaN ignored) within some NMADs of their median."""
     known = values[~np.isnan(values)]
     size = statistics(known)
     centre, sigma = (size.median, size.nmad or 1e-6) if size.count else (0.0, 1e-3)
@@ -157,6 +179,6 @@ def histogram(values: NDArray[np.floating], bins: int = 100, half_width_nmads: f
 
 
 def without_outliers(values: NDArray[np.floating], nmads: float = 5.0) -> NDArray[np.floating]:
-    """The values with NaN in place of those farther than some NMADs from the median."""
+    """Return the values with NaN in place of those farther than some NMADs from the median."""
     size = statistics(values)
     return np.where(np.abs(values - size.median) <= nmads * size.nmad, values, np.nan)

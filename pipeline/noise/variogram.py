@@ -1,23 +1,23 @@
-"""How far noise is alike: the variogram of a difference map, a model fitted to it, and how many of its pixels are independent.
+"""Estimate the spatial correlation of noise: variogram of a difference map, fitted model, number of independent pixels.
 
-The empirical variogram (Matheron 1962) takes every pair of pixels with data,
+The empirical variogram (Matheron 1962) uses every pair of pixels with data,
 
     gamma(h) = 1 / (2 N(h)) sum (z(x) - z(x + h))^2,
 
 by Fourier transform (Marcotte 1996, "Fast variogram computation with FFT", equation 8), so that no pairs have to be drawn at
-random; then it is averaged over the directions within bins of |h|. The model is a nugget and up to two nested structures,
+random. It is then averaged over directions within bins of |h|. The model is a nugget and up to two nested structures,
 
     gamma(h) = c_0 + sum c_i s(h / a_i),      s: spherical 1.5 t - 0.5 t^3, exponential 1 - exp(-3 t), gaussian 1 - exp(-3 t^2),
 
-where a is the effective range: s(1) = 1 (spherical) or 0.95. Its covariance C(h) = gamma(inf) - gamma(h) gives the standard error
-of a mean over an area of n pixels and the effective sample size (Rolstad et al. 2009; Hugonnet et al. 2022, equations 13 to 18),
+where a is the effective range: s(1) = 1 (spherical) or 0.95. The covariance C(h) = gamma(inf) - gamma(h) gives the standard error
+of the mean of n pixels and the effective sample size (Rolstad et al. 2009; Hugonnet et al. 2022, equations 13 to 18),
 
     Var(mean) = 1/n^2 sum_ij C(h_ij),      n_eff = C(0) / Var(mean),
 
-which are summed exactly over all pairs, by Fourier transform as well.
+which are summed exactly over all pairs, also by Fourier transform.
 
-Where it fails: noise that is longer than the largest lag looks like a constant and is not in the model, so n_eff is then too
-large; a few gross errors dominate squares, so leave them out first (`statistics.without_outliers`) and say so.
+Limits: noise that is correlated beyond the largest lag looks constant and is not in the model, so n_eff is too large. Outliers
+dominate squares, so remove them first (`statistics.without_outliers`) and say so.
 """
 
 from __future__ import annotations
@@ -37,37 +37,50 @@ Direction = Literal["all", "x", "y"]
 Family = Literal["spherical", "exponential", "gaussian"]
 _FAMILIES: tuple[Family, ...] = ("spherical", "exponential", "gaussian")
 _LAGS = 24
+"""Number of bins of distance."""
 _SECTOR = np.tan(np.radians(22.5))
 """Directions within 22.5 degrees of an axis count as along it."""
 _WORTH = 0.8
-"""A further structure has to bring the cost below this share of what it is without."""
+"""A further structure is kept if it reduces the squared misfit below this share."""
 _MODEL_ERROR = 0.03
+"""Relative accuracy to which the model is expected to hold."""
 _GOOD_ENOUGH = 0.01
-"""Relative misfit from which a further structure is not looked for."""
+"""Relative misfit below which no further structure is tried."""
 
 
 @dataclass(frozen=True)
 class Variogram:
-    """An empirical variogram: (k,) mean distance and semivariance of the pairs in each bin, and how many there are."""
+    """An empirical variogram: mean distance and semivariance of the pairs in each bin, and their number, (k,) each."""
 
     lag_m: FloatArray
     semivariance_m2: FloatArray
     pairs: FloatArray
 
     def to_dict(self) -> dict[str, list[float]]:
-        """As JSON holds it."""
+        """Return the values for JSON."""
         return {field.name: getattr(self, field.name).tolist() for field in dataclasses.fields(self)}
 
 
 def variogram(
     values: NDArray[np.floating], gsd_m: float, *, largest_lag_m: float | None = None, direction: Direction = "all"
 ) -> Variogram:
-    """The empirical variogram of a raster (h, w), m, NaN without data, over all its pairs; of several (e, h, w), over the pairs
-    within each.
+    """Compute the empirical variogram of a raster over all its pairs, or of several rasters over the pairs within each.
 
-    largest_lag_m: of the bins, which grow geometrically from one pixel; none: half of the raster's larger side; direction: all,
-    or pairs along x (rows) or y (columns) only, within 22.5 degrees. Raises InputError where there are fewer than two pixels
-    with data or none far enough apart.
+    Parameters
+    ----------
+    values : (h, w) or (e, h, w) array
+        Rasters, m; NaN without data.
+    gsd_m : float
+        Side of a pixel, m.
+    largest_lag_m : float, optional
+        Largest distance; by default half of the raster's larger side. Bins grow geometrically from one pixel.
+    direction : str
+        "all", or only pairs along "x" (rows) or "y" (columns), within 22.5 degrees.
+
+    Raises
+    ------
+    InputError
+        If fewer than two pixels have data, or no two of them lie within the largest lag.
     """
     rasters = values[None] if values.ndim == 2 else values
     if np.isfinite(rasters).sum(axis=(1, 2)).max(initial=0) < 2:
@@ -80,7 +93,7 @@ def variogram(
 
 
 def _by_shift(values: NDArray[np.floating], steps: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
-    """The number of pairs of a raster and the sum of their (z - z')^2 at each shift."""
+    """Return the number of pairs of a raster, and the sum of their (z - z')^2, at each shift."""
     known = np.isfinite(values)
     if not known.any():
         return (np.zeros((steps[0] + 1, 2 * steps[1] + 1)),) * 2
@@ -93,7 +106,9 @@ def _by_shift(values: NDArray[np.floating], steps: tuple[int, ...]) -> tuple[Flo
 
 
 def _shifts(correlation: FloatArray, steps: tuple[int, ...]) -> FloatArray:
-    """(steps_0 + 1, 2 steps_1 + 1) half of the shifts, which the others repeat: rows from 0, columns from -steps_1."""
+    """Return one half of the shifts, (steps_0 + 1, 2 steps_1 + 1), rows from 0 and columns from -steps_1; the other half is
+    symmetric.
+    """
     rows = correlation[: steps[0] + 1]
     return np.concatenate([rows[:, rows.shape[1] - steps[1] :], rows[:, : steps[1] + 1]], axis=1)
 
@@ -101,7 +116,7 @@ def _shifts(correlation: FloatArray, steps: tuple[int, ...]) -> FloatArray:
 def _averaged(
     pairs: FloatArray, squares: FloatArray, steps: tuple[int, ...], gsd_m: float, reach: float, direction: Direction
 ) -> Variogram:
-    """Averages over the bins of distance. squares: sums of (z - z')^2 over each shift's pairs."""
+    """Average over the bins of distance. squares: sums of (z - z')^2 over each shift's pairs."""
     row, column = np.arange(steps[0] + 1)[:, None], np.arange(-steps[1], steps[1] + 1)[None]
     distance: FloatArray = gsd_m * np.hypot(row, column)
     wanted = (pairs > 0.5) & (distance > 0) & (distance <= reach * (1 + 1e-9)) & ~((row == 0) & (column < 0))
@@ -109,7 +124,7 @@ def _averaged(
         along, across = (np.abs(column), row) if direction == "x" else (row, np.abs(column))
         wanted &= across <= _SECTOR * along
     if not wanted.any():
-        raise InputError("no pixels with data are far enough apart", where="variogram", remedy="raise the largest lag")
+        raise InputError(f"no two pixels with data lie within {reach:g} m", where="variogram", remedy="raise the largest lag")
     edges = np.geomspace(0.5, max(reach / gsd_m, 1.0) * (1 + 1e-6), _LAGS + 1) * gsd_m
     number = np.clip(np.searchsorted(edges, distance[wanted], side="right") - 1, 0, _LAGS - 1)
     count = np.bincount(number, pairs[wanted], _LAGS).astype(np.float64)
@@ -120,14 +135,14 @@ def _averaged(
 
 @dataclass(frozen=True)
 class Structure:
-    """A part of a variogram: its family, its sill, m2, and its effective range, m."""
+    """A part of a variogram model: its family, its sill, m2, and its effective range, m."""
 
     family: Family
     sill_m2: float
     range_m: float
 
     def share(self, distance: FloatArray) -> FloatArray:
-        """The share of the sill that is reached at a distance, m."""
+        """Return the share of the sill that is reached at a distance, m."""
         t = np.asarray(distance) / self.range_m
         if self.family == "spherical":
             return np.where(t < 1, 1.5 * t - 0.5 * t**3, 1.0)
@@ -136,7 +151,10 @@ class Structure:
 
 @dataclass(frozen=True)
 class VariogramModel:
-    """A nugget, m2, and nested structures by rising range. relative_misfit: RMS of model over empirical minus one, if fitted."""
+    """A nugget, m2, and nested structures by ascending range.
+
+    relative_misfit: RMS of model over empirical minus one, if fitted.
+    """
 
     nugget_m2: float
     structures: tuple[Structure, ...]
@@ -144,35 +162,36 @@ class VariogramModel:
 
     @property
     def sill_m2(self) -> float:
-        """The variance of a pixel."""
+        """Variance of a pixel, m2."""
         return self.nugget_m2 + sum(part.sill_m2 for part in self.structures)
 
     def semivariance(self, distance: FloatArray) -> FloatArray:
-        """m2 at distances, m; 0 at 0."""
+        """Return the semivariance, m2, at distances, m; 0 at 0."""
         total = self.nugget_m2 + sum(
             (part.sill_m2 * part.share(distance) for part in self.structures), np.zeros(np.shape(distance))
         )
         return np.where(np.asarray(distance) > 0, total, 0.0)
 
     def covariance(self, distance: FloatArray) -> FloatArray:
-        """m2 at distances, m; the nugget shows at 0 only."""
+        """Return the covariance, m2, at distances, m; the nugget only contributes at 0."""
         return self.sill_m2 - self.semivariance(distance)
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it."""
+        """Return the values for JSON."""
         return {**dataclasses.asdict(self), "sill_m2": self.sill_m2}
 
     def summary(self) -> str:
-        """One line in millimetres (standard deviations) and metres (ranges)."""
+        """Describe the model on one line, in millimetres (standard deviations) and metres (ranges)."""
         parts = [f"nugget {np.sqrt(self.nugget_m2) * 1e3:.1f} mm"]
         parts += [f"{part.family} {np.sqrt(part.sill_m2) * 1e3:.1f} mm over {part.range_m:.2g} m" for part in self.structures]
         return ", ".join(parts)
 
 
 def fit_variogram(found: Variogram) -> VariogramModel:
-    """The model that makes the relative misfit of all bins least; a second structure, or a first, only where it is worth it.
+    """Fit the model with the smallest relative misfit over all bins. A first or a second structure is only added if it pays.
 
-    Bins count alike but for those of few pairs: the model is taken to be good to 3 %, n pairs tell a semivariance to sqrt(2 / n).
+    All bins have equal weight except those with few pairs: the model is assumed accurate to 3 %, and n pairs determine a
+    semivariance to sqrt(2 / n).
     """
     if not found.semivariance_m2.max() > 0:
         return VariogramModel(0.0, ())
@@ -187,7 +206,7 @@ def fit_variogram(found: Variogram) -> VariogramModel:
 
 
 def _fitted(found: Variogram, families: tuple[Family, ...]) -> VariogramModel:
-    """The least relative misfit with structures of these families: ranges by search, sills by non-negative least squares."""
+    """Fit structures of given families: ranges by search, sills by non-negative least squares."""
     weight = 1 / np.sqrt(1 + 2 / (np.maximum(found.pairs, 1) * _MODEL_ERROR**2))
     lag, gamma = found.lag_m, np.maximum(found.semivariance_m2, 1e-6 * found.semivariance_m2.max())
 
@@ -216,7 +235,7 @@ def _fitted(found: Variogram, families: tuple[Family, ...]) -> VariogramModel:
 
 
 def variance_of_mean(model: VariogramModel, mask: NDArray[np.bool_], gsd_m: float) -> float:
-    """Variance, m2, of the mean over the pixels of a mask (h, w), over all pairs of them. Raises ValueError for an empty mask."""
+    """Return the variance, m2, of the mean over the pixels of a mask (h, w). Raises ValueError for an empty mask."""
     count = int(np.count_nonzero(mask))
     if count == 0:
         raise ValueError("the mask is empty")
@@ -229,7 +248,9 @@ def variance_of_mean(model: VariogramModel, mask: NDArray[np.bool_], gsd_m: floa
 
 
 def effective_sample_size(model: VariogramModel, mask: NDArray[np.bool_], gsd_m: float) -> float:
-    """How many independent pixels would give the mean over a mask (h, w) the same variance: 1 to the number of its pixels."""
+    """Return how many independent pixels would give the mean over a mask (h, w) the same variance: 1 to the number of its
+    pixels.
+    """
     variance = variance_of_mean(model, mask, gsd_m)
     return (
         float(np.clip(model.sill_m2 / variance, 1.0, np.count_nonzero(mask))) if variance > 0 else float(np.count_nonzero(mask))

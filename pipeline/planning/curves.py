@@ -1,8 +1,7 @@
-"""Detection probability in the middle of the wall, against range, angular step or cell, and angle of incidence.
+"""Compute the detection probability in the middle of the wall against range, angular step or cell, and angle of incidence.
 
-The headline of a plan, the column "middle" of its table and the curves all speak of the same places, and of the median over
-them, so that they cannot contradict one another: the median of the smallest blocks is the size from which on the median
-probability suffices.
+The main statement of a plan, the column "middle" of its table and the curves all refer to the median over the same places, so
+that they are consistent: the median of the smallest blocks is the size from which the median probability suffices.
 """
 
 from __future__ import annotations
@@ -17,17 +16,30 @@ from pipeline.precision.surface import BoolArray, Places, WallRaster
 from scene.geometry.mesh import FloatArray
 
 _MIDDLE_SHARE = 0.1
-"""The middle of the wall are the places within this share of its smaller side from the middle of its extent."""
+"""The middle of the wall consists of the places within this share of its smaller side from the centre of its extent."""
 _MOST_PLACES = 201
+"""Most places that represent the middle."""
 _CURVE_POINTS = 80
+"""Number of points of a curve."""
 _LARGEST_INCIDENCE_RAD = np.radians(85)
+"""Largest angle of incidence of a curve."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Detection probability against one quantity, the median over the places in the middle of the wall, all else as it is there.
+    """Detection probability against one quantity: the median over the places in the middle of the wall, all else being as it is
+    there.
 
-    x: (k,) in the label's unit; at: the set-up's own value, one of x; probability: by the block's side, m, (k,).
+    Attributes
+    ----------
+    label : str
+        The quantity, with its unit.
+    x : (k,) array
+        Its values.
+    at : float
+        The set-up's own value, one of x.
+    probability : dict of (k,) arrays
+        Detection probability, by the side of the block, m.
     """
 
     label: str
@@ -37,8 +49,9 @@ class Curve:
 
 
 def middle_places(raster: WallRaster, seen: BoolArray) -> BoolArray:
-    """Return which of the n places stand for the middle of the wall: those that are seen there, at most some hundred, evenly
-    chosen."""
+    """Select the places (n,) that represent the middle of the wall: those that are seen there, some hundred at most, evenly
+    chosen.
+    """
     points = raster.places.points[:, :2]
     low, high = points.min(axis=0), points.max(axis=0)
     near = np.hypot(*(points - (low + high) / 2).T) <= _MIDDLE_SHARE * (high - low).min()
@@ -50,10 +63,18 @@ def middle_places(raster: WallRaster, seen: BoolArray) -> BoolArray:
 
 @dataclass(frozen=True)
 class Views:
-    """The places in the middle of the wall as the sensor sees them, to be seen from elsewhere.
+    """The places in the middle of the wall as the sensor sees them, which can be moved to other ranges and angles.
 
-    viewpoint: (3,) m; places: k of them; aside: (k, 3) unit vectors across the lines of sight, towards which the normals lean;
-    range_m, incidence_rad: (k,).
+    Attributes
+    ----------
+    viewpoint : (3,) array
+        Position of the sensor, m.
+    places : Places
+        The k places.
+    aside : (k, 3) array
+        Unit vectors across the lines of sight, towards which the normals lean.
+    range_m, incidence_rad : (k,) arrays
+        Range and angle of incidence.
     """
 
     viewpoint: FloatArray
@@ -64,7 +85,10 @@ class Views:
 
     @classmethod
     def of(cls, places: Places, viewpoint: FloatArray, upright: FloatArray) -> Views:
-        """Of some places seen from a viewpoint (3,); upright: (3,) the axis about which a surface turns that is met squarely."""
+        """Describe places as seen from a viewpoint (3,), m.
+
+        upright: (3,) axis about which a surface is rotated that is seen at normal incidence.
+        """
         sight = places.points - viewpoint
         distance = np.linalg.norm(sight, axis=1)
         back = -sight / distance[:, None]
@@ -77,7 +101,7 @@ class Views:
         return cls(viewpoint, places, aside, distance, np.arccos(cosine))
 
     def seen_at(self, ratio: float = 1.0, turn_rad: float = 0.0) -> Places:
-        """Return the places at `ratio` times their range, with their angles of incidence larger by `turn_rad`."""
+        """Return the places at `ratio` times their range, with their angles of incidence increased by `turn_rad`."""
         sight = self.places.points - self.viewpoint
         if turn_rad == 0:
             return replace(self.places, points=self.viewpoint + ratio * sight)
@@ -94,7 +118,7 @@ def probability_curves(
     Parameters
     ----------
     sampling_of : callable
-        Gives the sampling of places and whether the sensor reaches each.
+        Returns the sampling of places, and whether the sensor reaches each.
     views : Views
         The places in the middle of the wall.
     config : PlanningConfig
@@ -105,7 +129,7 @@ def probability_curves(
     Returns
     -------
     list of Curve
-        Three; none where nothing is seen in the middle of the wall.
+        Three curves; none if nothing is seen in the middle of the wall.
     """
     if not len(views.range_m):
         return []
@@ -137,10 +161,10 @@ def probability_curves(
 
 
 def _median(found: tuple[Sampling, BoolArray], size: float, config: PlanningConfig) -> float:
-    """Median probability over places; one that the sensor does not reach counts 0."""
+    """Return the median probability over places. A place that the sensor does not reach counts as 0."""
     return float(np.median(np.where(found[1], detection_probability(found[0], size, config), 0.0)))
 
 
 def _with(x: FloatArray, value: float) -> FloatArray:
-    """The sorted values with one more among them."""
+    """Return the values with one more among them, sorted."""
     return np.unique(np.append(x, value))

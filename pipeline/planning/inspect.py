@@ -1,4 +1,4 @@
-"""The folder that `scarpsim inspect` fills: maps as GeoTIFF, plan.json and report.html."""
+"""Make the folder of `scarpsim inspect`: maps as GeoTIFF, plan.json and report.html."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from scene.common.keyed_random import KeyedRandom
 
 PLAN_FILE, REPORT_FILE = "plan.json", "report.html"
 _WALL_S, _MAPS_S = 2.0, 4.0
-"""Seconds that stages take, for the plan of the progress."""
+"""Approximate duration of the stages, s, for the progress."""
 
 
 def inspect(config: SimulationConfig, sensors: Sequence[SensorName], progress: Progress | None = None) -> list[Plan]:
-    """What each sensor promises on the config's wall; nothing is simulated."""
+    """Predict what each sensor achieves on the config's wall. Nothing is simulated."""
     progress = progress or Progress()
     progress.plan(
         {f"{sensor}: {stage}": seconds for sensor in sensors for stage, seconds in (("wall", _WALL_S), ("maps", _MAPS_S))}
@@ -38,10 +38,10 @@ def inspect(config: SimulationConfig, sensors: Sequence[SensorName], progress: P
 
 
 def write_plans(out: Path, config: SimulationConfig, found: Sequence[Plan]) -> Path:
-    """Write maps, plan.json and report.html; returns the report's path.
+    """Write maps, plan.json and report.html; return the report's path.
 
-    Maps are called <sensor>_<map>.tif, of one of several stations <sensor>_station_<n>_<map>.tif; SI, wall frame.
-    The folder appears when all of it is there. Raises InputError where it is in use.
+    Maps are named <sensor>_<map>.tif, or <sensor>_station_<n>_<map>.tif for one of several stations; SI, wall frame. The
+    folder appears when everything has been written. Raises InputError if it is in use.
     """
     with filling(out) as folder:
         _write(folder, config, found)
@@ -49,6 +49,7 @@ def write_plans(out: Path, config: SimulationConfig, found: Sequence[Plan]) -> P
 
 
 def _write(out: Path, config: SimulationConfig, found: Sequence[Plan]) -> None:
+    """Write everything into the folder."""
     for each in found:
         for plotted in each.maps:
             path = out / f"{each.prefix}_{plotted.name}.tif"

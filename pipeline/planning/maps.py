@@ -1,4 +1,4 @@
-"""The maps and figures of a planned set-up: sensors in front of one wall, before anything is simulated."""
+"""Compute the maps and figures of a planned set-up: sensors in front of a wall, before anything is simulated."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from pipeline.planning.curves import Curve, Views, middle_places, probability_cu
 from pipeline.precision import stereo_geometry as stereo
 from pipeline.precision import tls_geometry as tls
 from pipeline.precision.detectability import (
-    FINDABLE,
+    CLEAR_SNR,
     PlanningConfig,
     Sampling,
     detection_probability,
     smallest_block,
-    smallest_findable,
+    smallest_clear_block,
 )
 from pipeline.precision.surface import BoolArray, Places, WallRaster, seen_from, wall_raster
 from pipeline.run.site import SensorSite
@@ -29,14 +29,21 @@ from sensors.laser.tls import LaserScanner
 from sensors.stereo.stereo_pair import REDUCTION, StereoPair
 
 _FACES = {1: "", 2: "mean of two faces"}
+"""Remark on the number of faces."""
 
 
 @dataclass(frozen=True)
 class PlanMap:
     """One quantity over the wall.
 
-    name: of its file, with the SI unit; title, unit, factor: to show it, unit = factor * SI; values: (n,) of the raster's places,
-    NaN where it has no meaning.
+    Attributes
+    ----------
+    name : str
+        Name of its file, with the SI unit.
+    title, unit, factor
+        How to show it, with unit = factor * SI.
+    values : (n,) array
+        Values at the raster's places, SI; NaN where there is none.
     """
 
     name: str
@@ -47,14 +54,14 @@ class PlanMap:
 
     @property
     def si_unit(self) -> str:
-        """The unit of the values, told by the name's end."""
+        """Unit of the values, as given by the end of the name."""
         return next((unit for unit in ("m", "rad") if self.name.endswith(f"_{unit}")), "1")
 
     def summary(self, middle: BoolArray) -> dict[str, float | None]:
         """Summarise the map: median in the middle of the wall, and median and 5 and 95 % quantiles over all of it, SI.
 
-        middle: (n,) the places in the middle. A place without a value counts as infinite there: no block is large enough for it.
-        None: no value.
+        middle: (n,) the places in the middle. A place without a value counts as infinite there, because no block is large
+        enough for it. None means no value.
         """
         values, centre = self.values[np.isfinite(self.values)], np.nan_to_num(self.values[middle], nan=np.inf)
         there = float(np.median(centre)) if centre.size else np.nan
@@ -69,10 +76,31 @@ class PlanMap:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a sensor promises on a wall. instrument: what it is called; station: its number where a scanner has several, None for
-    the only one and for all together; figures: single numbers, SI, by name; curves: detection probability; ignored: effects of
-    the model that a plan does not count; in_middle: (n,) the places of which headline, table and curves
-    speak where they say "in the middle of the wall"."""
+    """What a sensor achieves on a wall.
+
+    Attributes
+    ----------
+    sensor, instrument : str
+        "stereo" or "tls", and a description.
+    station : int or None
+        Number of the station if a scanner has several; None for the only one and for all together.
+    wall : str
+        Name of the wall.
+    raster : WallRaster
+        The places.
+    maps : list of PlanMap
+        The maps.
+    figures : dict of float
+        Single numbers by name, SI.
+    curves : list of Curve
+        Detection probability.
+    ignored : list of str
+        Effects of the model that a plan does not take into account.
+    config : PlanningConfig
+        Its settings.
+    in_middle : (n,) bool array
+        The places that statements about the middle of the wall refer to.
+    """
 
     sensor: str
     instrument: str
@@ -88,11 +116,11 @@ class Plan:
 
     @property
     def prefix(self) -> str:
-        """What the names of its files begin with."""
+        """Beginning of the names of its files."""
         return self.sensor if self.station is None else f"{self.sensor}_station_{self.station}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything but the maps' pixels, for JSON."""
+        """Return everything except the maps' pixels, for JSON."""
         middle = self.in_middle
         return {
             "sensor": self.sensor,
@@ -116,9 +144,9 @@ class Plan:
 
 
 def plans(config: SimulationConfig, site: SensorSite) -> list[Plan]:
-    """Map what the sensor of `site` promises; of several stations, what they promise together and then one by one.
+    """Compute the plan of the sensor of `site`; for several stations, that of all together and then of each.
 
-    The rock is as wet as the config says. Raises InputError where the sensor, or one of its stations, sees nothing of the wall.
+    The rock is as wet as the config says. Raises InputError if the sensor, or one of its stations, sees nothing of the wall.
     """
     caster = RayCaster(site.mesh if config.wetness is None else config.wetness.with_wet_patches(site.mesh))
     raster = wall_raster(caster, config.planning.gsd_m)
@@ -132,10 +160,11 @@ def plans(config: SimulationConfig, site: SensorSite) -> list[Plan]:
         _tls_plan(site.name, scanner, number, caster, raster, config.planning)
         for number, scanner in enumerate((site.sensor, *site.further_stations), start=1)
     ]
-    return [_together(single), *single]
+    return [_combine_stations(single), *single]
 
 
 def _stereo_plan(wall: str, pair: StereoPair, caster: RayCaster, raster: WallRaster, config: PlanningConfig) -> Plan:
+    """Compute the plan of a stereo pair."""
     places, nominal = raster.places, pair.cameras.in_wall_frame(pair.frame)
     found = stereo.stereo_geometry(pair, places, config.image_sigma_px)
     left = found.in_left & seen_from(caster, places, nominal.left.position)
@@ -186,6 +215,7 @@ def _stereo_plan(wall: str, pair: StereoPair, caster: RayCaster, raster: WallRas
 def _tls_plan(
     wall: str, scanner: LaserScanner, station: int | None, caster: RayCaster, raster: WallRaster, config: PlanningConfig
 ) -> Plan:
+    """Compute the plan of one station of a laser scanner."""
     places = raster.places
     found = tls.tls_geometry(scanner, places)
     in_sight = seen_from(caster, places, scanner.position)
@@ -236,10 +266,10 @@ def _tls_plan(
     return Plan("tls", instrument, station, wall, raster, maps, figures, curves, ignored, config, middle)
 
 
-def _together(single: list[Plan]) -> Plan:
-    """Several stations as one plan: at each place the figures of the station with the best precision along the normal there.
+def _combine_stations(single: list[Plan]) -> Plan:
+    """Combine several stations into one plan: at each place, the values of the station with the best precision along the normal.
 
-    That is the one whose surface the merged surface takes (`pipeline.surface.stations`).
+    The merged surface is taken from the same station (`pipeline.surface.stations`).
     """
     first = single[0]
     seen = np.sum([_values(plan, "views") for plan in single], axis=0)
@@ -258,32 +288,37 @@ def _together(single: list[Plan]) -> Plan:
 
 
 def _values(plan: Plan, name: str) -> FloatArray:
+    """Return the values of a map by its name."""
     return next(found.values for found in plan.maps if found.name == name)
 
 
 def _ignored(names: Any) -> list[str]:
+    """Sort names and remove duplicates."""
     return sorted(set(names))
 
 
 def _require_seen(seen: BoolArray, problem: str, where: str) -> None:
+    """Raise InputError if nothing is seen."""
     if not seen.any():
         raise InputError(problem, where=where, remedy="check positions, rotations and window, and which side faces the wall")
 
 
 def _map(name: str, title: str, values: FloatArray, seen: BoolArray, unit: str = "", factor: float = 1.0) -> PlanMap:
+    """Make a map with values only where the wall is seen."""
     return PlanMap(name, title, np.where(seen, values, np.nan), unit, factor)
 
 
 def _if_any(found: PlanMap) -> list[PlanMap]:
-    """A map in a list, or none where it is zero all over because the model has no such thing."""
+    """Return a list with the map, or an empty one if it is zero everywhere because the model has no such effect."""
     return [found] if np.nanmax(found.values) > 0 else []
 
 
 def _detection_maps(sampling: Sampling, seen: BoolArray, config: PlanningConfig) -> list[PlanMap]:
+    """Compute the maps of the smallest blocks and of the detection probability."""
     title = f"Smallest block seen in {100 * config.probability:g} % of cases"
     maps = [_map("smallest_block_m", title, smallest_block(sampling, config), seen, "cm", 100.0)]
-    findable = f"Smallest block that stands out wherever it is (S/N {FINDABLE:g})"
-    maps.append(_map("smallest_findable_m", findable, smallest_findable(sampling, config), seen, "cm", 100.0))
+    findable = f"Smallest block that stands out anywhere on the wall (S/N {CLEAR_SNR:g})"
+    maps.append(_map("smallest_findable_m", findable, smallest_clear_block(sampling, config), seen, "cm", 100.0))
     for size in config.block_size_m:
         probability = np.where(seen, detection_probability(sampling, size, config), 0.0)
         name, words = f"probability_{size * 1e3:.0f}mm", f"Probability to see a block of {size:g} m"
@@ -292,5 +327,5 @@ def _detection_maps(sampling: Sampling, seen: BoolArray, config: PlanningConfig)
 
 
 def _normal_case(pair: StereoPair, distance: FloatArray, noise: stereo.DisparityNoise) -> float:
-    """sigma_Z = Z^2 / (c B) sigma_p at the median distance, m, as a check by a rule of thumb."""
+    """Return sigma_Z = Z^2 / (c B) sigma_p at the median distance, m, as a check by a rule of thumb."""
     return float(np.median(distance) ** 2 / (rectify(pair.cameras).f * pair.cameras.base_m) * np.hypot(noise.white, noise.smooth))

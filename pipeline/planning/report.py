@@ -1,4 +1,4 @@
-"""A plan's report and its summary in words: what a set-up promises, with a picture of every map."""
+"""Write a plan's report and its summary: what a set-up achieves, with a picture of every map."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import yaml
 
 from pipeline.formats.files.atomic import write_text
 from pipeline.planning.maps import Plan, PlanMap
-from pipeline.precision.detectability import FINDABLE
+from pipeline.precision.detectability import CLEAR_SNR
 from pipeline.report.figures import CurvePanel, curves_figure, map_figure
 from pipeline.report.page import percent, template
 
@@ -32,11 +32,13 @@ _FIGURES: dict[str, tuple[str, str, float]] = {
     "pulses": ("Pulses", "million", 1e-6),
     "seconds_to_scan": ("Time to scan", "s", 1.0),
 }
-"""Title, unit and factor of each of a plan's single figures."""
+"""Title, unit and factor of each single figure of a plan."""
 
 
 @dataclass(frozen=True)
 class _PlanRow:
+    """One map as a row of the table."""
+
     title: str
     unit: str
     values: list[str]
@@ -44,7 +46,7 @@ class _PlanRow:
 
 @dataclass(frozen=True)
 class _Picture:
-    """grey: what the places without a value are; "" where all have one."""
+    """One picture of the page. grey: what places without a value mean; "" if all have one."""
 
     title: str
     png: bytes
@@ -65,7 +67,7 @@ class _Part:
 
 
 def summary(plan: Plan) -> str:
-    """The figures of a plan as aligned lines of text."""
+    """Describe a plan as aligned lines of text."""
     lines = [f"{plan.instrument}, wall {plan.wall}", f"  {answer(plan)}"]
     lines += [f"  {title:<52}{value:>12}" for title, value in _figures(plan)]
     lines.append(f"  {'map':<52}{'middle':>12}{'median':>10}{'5 %':>10}{'95 %':>10}")
@@ -74,7 +76,7 @@ def summary(plan: Plan) -> str:
 
 
 def answer(plan: Plan) -> str:
-    """The sentence that planners ask for: the smallest block that is seen."""
+    """State the main result in words: the smallest block that is seen."""
     share = percent(plan.config.probability, 0)
     middle, least = (_in_the_middle(plan, name) for name in ("smallest_block_m", "smallest_findable_m"))
     name = plan.instrument
@@ -83,17 +85,19 @@ def answer(plan: Plan) -> str:
     points = plan.config.minimum_points
     return (
         f"{name}: at a typical place in the middle of the wall, the fall of a block with sides of {100 * middle:.1f} cm exceeds "
-        f"the level of detection in {share} of cases, a test that needs {points} points in each epoch. The signal-to-noise ratio "
-        f"of a fall is {FINDABLE:g} from sides of {100 * least:.1f} cm on; below, noise elsewhere on the wall looks like a block."
+        f"the level of detection in {share} of cases, a test that needs {points} points in each epoch. "
+        f"The signal-to-noise ratio of a fall is {CLEAR_SNR:g} from sides of {100 * least:.1f} cm on; below, noise elsewhere on "
+        "the wall looks like a block."
     )
 
 
 def _in_the_middle(plan: Plan, name: str) -> float | None:
+    """Return the value of a map in the middle of the wall."""
     return next(found for found in plan.maps if found.name == name).summary(plan.in_middle)["middle"]
 
 
 def write_plan_report(path: Path, plans: Sequence[Plan], config: Mapping[str, Any]) -> None:
-    """Write report.html, whole or not at all; equal arguments give equal bytes."""
+    """Write report.html completely or not at all. Equal arguments give equal bytes."""
     page = template("planning/report.html.jinja").render(
         title=f"{plans[0].wall.replace('_', ' ').capitalize()}: a plan",
         parts=[_part(plan) for plan in plans],
@@ -104,6 +108,7 @@ def write_plan_report(path: Path, plans: Sequence[Plan], config: Mapping[str, An
 
 
 def _part(plan: Plan) -> _Part:
+    """Collect what the page shows of one plan."""
     return _Part(
         instrument=plan.instrument,
         answer=answer(plan),
@@ -116,34 +121,38 @@ def _part(plan: Plan) -> _Part:
 
 
 def _figures(plan: Plan) -> list[tuple[str, str]]:
+    """Return title and value of each single figure."""
     entries = ((*_FIGURES[name], value) for name, value in plan.figures.items())
     return [(title, f"{value * factor:.3g} {unit}") for title, unit, factor, value in entries]
 
 
 def _rows(plan: Plan) -> list[_PlanRow]:
+    """Return the rows of the table of maps."""
     middle = plan.in_middle
     return [_PlanRow(found.title, found.unit, _values(found, found.summary(middle))) for found in plan.maps]
 
 
 def _values(found: PlanMap, figures: Mapping[str, float | None]) -> list[str]:
+    """Format the values of a row."""
     return [_NOTHING if value is None else f"{value * found.factor:.4g}" for value in figures.values()]
 
 
 def map_picture(plan: Plan, found: PlanMap) -> bytes:
-    """PNG of a map in the unit in which people read it."""
+    """Draw a map as PNG in the unit in which it is shown."""
     return map_figure(plan.raster.image(found.values * found.factor), plan.raster.grid, found.unit or "ratio", found.title)
 
 
 def _picture(plan: Plan, found: PlanMap) -> _Picture:
+    """Draw a map for the page."""
     png = map_picture(plan, found)
     none = found.name in ("smallest_block_m", "smallest_findable_m")
-    grey = "not seen, or no block is, however large" if none else "not seen"
+    grey = "not seen, or no block would be, however large" if none else "not seen"
     shown = np.isnan(plan.raster.image(found.values)).any()
     return _Picture(found.title, png, grey if shown else "")
 
 
 def _curves(plan: Plan) -> bytes | None:
-    """The figure of the detection probability's curves; None for several stations together, which have no one range."""
+    """Draw the curves of the detection probability; None for several stations together, which have no single range."""
     if not plan.curves:
         return None
     panels = [

@@ -1,4 +1,6 @@
-"""The detection probability by simulation, the check of the closed form: niches in a flat wall, observed by the real sensors."""
+"""Estimate the detection probability by simulation, to check the closed form: niches in a flat wall, observed by the real
+sensors.
+"""
 
 from __future__ import annotations
 
@@ -22,17 +24,22 @@ from sensors.models.sensor_model import StereoModel, TlsModel
 from sensors.stereo.stereo_pair import StereoPair
 
 _ON_SURFACE_M = 1e-4
+"""Tolerance within which a point lies on a floor, m."""
 
 
 @dataclass(frozen=True)
 class Trials:
-    """k blocks. predicted: (k,) detection probability of each; detected: (k,) whether the simulated points exceeded their LoD."""
+    """Results for k blocks: the predicted detection probability (k,) of each, and whether the simulated change exceeded its LoD
+    (k,).
+    """
 
     predicted: FloatArray
     detected: BoolArray
 
     def score(self) -> float:
-        """Observed minus expected detections over the standard deviation of a sum of independent draws (Poisson binomial)."""
+        """Return observed minus expected detections, divided by the standard deviation of a sum of independent draws (Poisson
+        binomial).
+        """
         variance = (self.predicted * (1 - self.predicted)).sum()
         return float((self.detected.sum() - self.predicted.sum()) / np.sqrt(max(variance, 1e-12)))
 
@@ -46,10 +53,27 @@ def detection_trials(
     count: int = 40,
     apart_m: float = 0.1,
 ) -> Trials:
-    """Carve `count` cubes, half in the rock, `apart_m` from each other, out of the flat wall z = 0 (wall frame), observe before
-    and after with `sensor`, and test each niche's floor as `detectability` says.
+    """Carve cubes, half in the rock, out of a flat wall, observe before and after, and test each niche's floor as `detectability`
+    does.
 
-    A noiseless twin of the sensor tells which cells look at the floor's part that every viewpoint sees.
+    A noiseless copy of the sensor tells which cells see the part of the floor that every viewpoint sees.
+
+    Parameters
+    ----------
+    sensor : LaserScanner or StereoPair
+        The sensor.
+    wall : TriangleMesh
+        The flat wall z = 0, wall frame.
+    side_m : float
+        Side of the cubes, m.
+    config : PlanningConfig
+        The test.
+    random : KeyedRandom
+        Source of random numbers.
+    count : int
+        Number of cubes.
+    apart_m : float
+        Distance between cubes, m.
     """
     blocks = place_blocks(_cubes(side_m, count, apart_m), wall, random.child("blocks"))
     centres = blocks.position_m * [1.0, 1.0, 0.0]
@@ -70,12 +94,14 @@ def detection_trials(
 
 
 def _cubes(side_m: float, count: int, apart_m: float) -> RockfallConfig:
+    """Return the config of the blocks."""
     exact = {"rotation_rad": Gaussian(mean=0.0, sigma=0.0), "irregularity": Gaussian(mean=0.0, sigma=0.0)}
     size = Gaussian(mean=side_m, sigma=0.0)
     return RockfallConfig(count=count, shape="cube", size_m=size, minimum_distance_m=apart_m, safe_zone_offset_m=0.2, **exact)
 
 
 def _quiet(sensor: LaserScanner | StereoPair) -> LaserScanner | StereoPair:
+    """Return the sensor without noise."""
     if isinstance(sensor, LaserScanner):
         return replace(sensor, model=TlsModel.model_validate({"noise": {"range_sigma_m": 0, "angle_sigma_rad": 0}}))
     quiet = StereoModel.model_validate({"noise": {"parallax_sigma_px": 0, "regularization_sigma_px": 0}})
@@ -83,7 +109,7 @@ def _quiet(sensor: LaserScanner | StereoPair) -> LaserScanner | StereoPair:
 
 
 def _visible_floor(sensor: LaserScanner | StereoPair, centres: FloatArray, side_m: float) -> tuple[FloatArray, FloatArray]:
-    """(k, 2) smallest and largest x, y of the part of each floor that all viewpoints see."""
+    """Return smallest and largest x, y (k, 2) of the part of each floor that all viewpoints see."""
     if isinstance(sensor, LaserScanner):
         viewpoints = [sensor.position]
     else:
@@ -96,7 +122,7 @@ def _visible_floor(sensor: LaserScanner | StereoPair, centres: FloatArray, side_
 
 
 def _block_of(truth: FloatArray, depth: float, low: FloatArray, high: FloatArray) -> IntArray:
-    """(n,) the block at whose floor, `depth` below the wall, each cell really looks; -1 for none."""
+    """Return the block (n,) whose floor, `depth` below the wall, each cell really sees; -1 for none."""
     at_depth = np.flatnonzero(np.abs(truth[:, 2] + depth) < _ON_SURFACE_M)
     place = truth[at_depth, :2]
     _, nearest = cKDTree((low + high) / 2).query(place, p=np.inf)
@@ -107,7 +133,7 @@ def _block_of(truth: FloatArray, depth: float, low: FloatArray, high: FloatArray
 
 
 def _statistics(points: FloatArray, block: IntArray, count: int) -> FloatArray:
-    """(3, count) number of points, mean and variance of z of each block."""
+    """Return number of points, mean and variance of z of each block, (3, count)."""
     used = (block >= 0) & ~np.isnan(points[:, 2])
     label, z = block[used], points[used, 2]
     number = np.bincount(label, minlength=count)
@@ -117,7 +143,7 @@ def _statistics(points: FloatArray, block: IntArray, count: int) -> FloatArray:
 
 
 def _exceeding(before: FloatArray, after: FloatArray, config: PlanningConfig) -> BoolArray:
-    """(k,) whether each change exceeds its level of detection (Lague et al. 2013)."""
+    """Return whether each change (k,) exceeds its level of detection (Lague et al. 2013)."""
     number = np.minimum(before[0], after[0])
     error = np.sqrt(before[2] / np.maximum(before[0], 1) + after[2] / np.maximum(after[0], 1))
     limit = config.critical_value * (error + config.registration_sigma_m)

@@ -1,5 +1,4 @@
-"""Predict, from geometry alone, what a sensor achieves at a place of the wall: spacing, precision, smallest detectable block.
+"""Predict what a sensor achieves at a place on the wall from geometry alone: spacing, precision, smallest detectable block.
 
-Maps of it are drawn by `pipeline/planning`.
-Start with `detectability.py`.
+The maps are made by `pipeline/planning`. Start with `detectability.py`.
 """

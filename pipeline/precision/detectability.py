@@ -1,39 +1,38 @@
-"""Which blocks a sensor sees: the probability that the fall of a block exceeds the level of detection.
+"""Compute which blocks a sensor detects: the probability that the fall of a block exceeds the level of detection.
 
-A cube of side s that sat with half of its height in the rock leaves a niche of s x s and of depth h = s/2 (`depth_ratio` says
-otherwise). Two epochs are compared over the floor of the niche, along its normal, with a test as M3C2 makes it (Lague et al.
-2013, eq. 1; in the form py4dgeo computes):
+A cube of side s that was half embedded in the rock leaves a niche of s x s and depth h = s/2 (see `depth_ratio`). The epochs
+are compared over the floor of the niche, along its normal, with the test of M3C2 (Lague et al. 2013, eq. 1; in the form that
+py4dgeo computes):
 
     detected where   D > LoD = z (se^ + reg),   se^ = sqrt(s1^2/n1 + s2^2/n2),   z = 1.96
 
-1  Points. The sensor's rays meet the surface in a lattice with steps a and b, so that a patch of w_a x w_b holds N = N_a N_b
-   points, N_a = floor(w_a/a) or one more; the latter with probability frac(w_a/a), for a place that owes nothing to the lattice.
-   The mean is w_a w_b / (a b): for a laser scanner s^2 cos i / spacing^2. On the floor the lattice lies shifted by h t_a
-   (t: tangents below) against the block's face, a share delta = frac(h t_a/a) of a step, so with rho = frac(w_a/a) both epochs
-   have the line more with probability max(0, rho - delta) + max(0, rho + delta - 1). Fewer than `minimum_points` in an epoch
-   make no test.
+1  Points. The sensor's rays meet the surface in a lattice with steps a and b, so that a patch of w_a x w_b contains N = N_a N_b
+   points. N_a is floor(w_a/a), or one more with probability frac(w_a/a), for a place at random relative to the lattice. The mean
+   is w_a w_b / (a b): for a laser scanner s^2 cos i / spacing^2. On the floor the lattice is shifted by h t_a (t: tangents below)
+   against the block's face, a share delta = frac(h t_a/a) of a step. With rho = frac(w_a/a), both epochs have the additional line
+   with probability max(0, rho - delta) + max(0, rho + delta - 1). With fewer than `minimum_points` in an epoch there is no test.
 2  Shadow. Seen along a direction with the tangents t_a, t_b against the normal, the niche's rim hides h t_a and h t_b of its
-   floor; several viewpoints hide on both sides: w_a = s - h (max(0, t_a...) - min(0, t_a...)). Both epochs are compared over what
-   is left.
-3  Noise. A point's error along the normal has a white part of variance w^2 and, for stereo, a smooth part c^2, of which the
-   patch's mean keeps c_m^2 and shows c^2 - c_m^2 as spread. With sigma^2 = w^2 + c^2 - c_m^2 and the registration's error
-   ~ N(0, reg^2):
+   floor. Several viewpoints may hide it on both sides: w_a = s - h (max(0, t_a...) - min(0, t_a...)). Both epochs are compared
+   over the visible rest.
+3  Noise. A point's error along the normal has a white part of variance w^2 and, for stereo, a grid-correlated part of variance
+   c^2. Of the latter the patch's mean keeps c_m^2, and c^2 - c_m^2 appears as scatter. With sigma^2 = w^2 + c^2 - c_m^2 and a
+   registration error ~ N(0, reg^2):
        D ~ N(h, tau^2),  tau^2 = w^2/N_1 + w^2/N_2 + 2 c_m^2 + reg^2,      se^2 = sigma^2/N_1 + sigma^2/N_2
-   A beam that leaves in another direction than recorded, by b_a on the surface, misses the floor near its edge: the share
-   f_a = erf(r) - (1 - exp(-r^2))/(r sqrt(pi)), r = w_a/(b_a sqrt(2)), hits it. With f = f_a f_b the change is f h in the mean,
-   and the points after the fall scatter by f (1 - f) h^2 more.
-4  Test. s1, s2 are estimates from the same points, so (D - z reg)/se^ times se/tau is noncentral t with
+   A beam that leaves in another direction than recorded, by b_a on the surface, may miss the floor near its edge. The share
+   f_a = erf(r) - (1 - exp(-r^2))/(r sqrt(pi)), r = w_a/(b_a sqrt(2)), hits it. With f = f_a f_b the mean change is f h, and the
+   variance of the points after the fall increases by f (1 - f) h^2.
+4  Test. s1, s2 are estimated from the same points, so (D - z reg)/se^ times se/tau is noncentral t with
    nu = se^4 / (se_1^4/(N_1 - 1) + se_2^4/(N_2 - 1)) (Welch, Satterthwaite) and delta = (f h - z reg)/tau:
        P(detected | N_1, N_2) = P(T_nu(delta) > q),  q = z se/tau  ~  1 - Phi((q (1 - 1/(4 nu)) - delta) / sqrt(1 + q^2/(2 nu)))
-   (Abramowitz & Stegun 26.7.10, within 0.005 from nu = 4). For white noise and N_1 = N_2 the noncentral t is exact, and for many
-   points P is Phi((h - LoD)/se).
+   (Abramowitz & Stegun 26.7.10, accurate to 0.005 from nu = 4 on). For white noise and N_1 = N_2 the noncentral t is exact, and
+   for many points P is Phi((h - LoD)/se).
 5  P(detected) = sum over the cases of (N_a, N_b) in both epochs.
 
-Limits: the wall is a plane over the block, as steep as its normal at that place; roughness that is not the same in both epochs is
-not counted, nor are points of the niche's side walls, which help; a niche whose floor is hidden altogether counts as not seen.
-Seen very obliquely, beams that miss the floor are taken to hit the face, where some hit a side wall: the probability is then
-somewhat low. The block lies along the scan lines or the image's columns; a turned one has the same mean number of points.
-Where the lattice is askew, every line is taken to hold as many points as the others.
+Limits: the wall is a plane over the block, with the wall's normal at that place. Roughness that differs between the epochs is
+ignored, and so are points on the niche's side walls, which would help. A niche whose floor is hidden completely counts as not
+seen. At very oblique views, beams that miss the floor count as hitting the face, although some hit a side wall; the probability
+is then somewhat too low. The block is aligned with the scan lines or the image's columns; a rotated one has the same mean number
+of points. Where the lattice is oblique, all its lines count as having the same number of points.
 """
 
 from __future__ import annotations
@@ -50,39 +49,53 @@ from pydantic import Field
 from scene.common.config import Config
 from scene.geometry.mesh import FloatArray
 
-FINDABLE = 4.0
-"""Signal-to-noise ratio from which a block can be told from the noise of the whole wall, as in a data set's card."""
+CLEAR_SNR = 4.0
+"""Signal-to-noise ratio from which a block differs from the noise of the whole wall, as in a data set's card."""
 _SMALLEST_M, _LARGEST_M, _HALVINGS = 1e-3, 30.0, 13
-"""The search of the smallest block: ln(30000) / 2^13 leaves 0.13 %."""
+"""Range and number of bisections of the search for the smallest block; its accuracy is ln(30000) / 2^13 = 0.13 %."""
 
 
 class PlanningConfig(Config):
     """What `scarpsim inspect` maps, and when a block counts as seen."""
 
-    gsd_m: float | None = Field(None, gt=0, description="side of a map's pixel; none: some 100,000 pixels for the wall [m]")
+    gsd_m: float | None = Field(None, gt=0, description="side of a map's pixel; none: about 100,000 pixels for the wall [m]")
     image_sigma_px: float = Field(
-        0.0, ge=0, description="stereo: noise of each image coordinate beyond the sensor model's, as of measured points [px]"
+        0.0,
+        ge=0,
+        description="stereo: noise of each image coordinate in addition to the sensor model's, as of measured points [px]",
     )
     registration_sigma_m: float = Field(0.0, ge=0, description="standard deviation of the registration between two epochs [m]")
     critical_value: float = Field(1.96, gt=0, description="standard errors in the level of detection (1.96: 95 %)")
     minimum_points: int = Field(4, ge=2, description="points that each epoch needs on the niche's floor")
     depth_ratio: float = Field(
-        0.5, gt=0, le=1, description="depth of the niche over the block's side (a half: it protruded half)"
+        0.5, gt=0, le=1, description="ratio of the niche's depth to the block's side (0.5: half of it was embedded)"
     )
-    probability: float = Field(0.95, gt=0, lt=1, description="share of cases in which the smallest block is to be seen")
+    probability: float = Field(0.95, gt=0, lt=1, description="share of cases in which the smallest block must be seen")
     block_size_m: tuple[Annotated[float, Field(ge=_SMALLEST_M, le=_LARGEST_M)], ...] = Field(
-        (0.1, 0.2, 0.5), min_length=1, max_length=50, description="sides of the blocks of curves and maps [m]"
+        (0.1, 0.2, 0.5), min_length=1, max_length=50, description="sides of the blocks for which curves and maps are made [m]"
     )
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """What a sensor puts on n places of a surface; all (n,) or numbers.
+    """How a sensor samples a surface at n places; all attributes are (n,) or numbers.
 
-    step_a, step_b: of the lattice of points on the surface, along two perpendicular directions, m; shadow_a, shadow_b: hidden
-    width of a niche's floor over its depth; white: standard deviation of a point along the normal, m; slope_a, slope_b: tangents
-    of the rays that make the lattice against the normal; blur_a, blur_b: standard deviation of where on the surface a point
-    really lies, m; smooth: of a smooth error along the normal whose nodes are grain_a, grain_b apart, averaged over places, m.
+    Attributes
+    ----------
+    step_a, step_b
+        Steps of the lattice of points on the surface, along two perpendicular directions, m.
+    shadow_a, shadow_b
+        Hidden width of a niche's floor over its depth.
+    white
+        Standard deviation of a point along the normal, white part, m.
+    slope_a, slope_b
+        Tangents of the rays that make the lattice, against the normal.
+    blur_a, blur_b
+        Standard deviation of a point's true position on the surface, m.
+    smooth
+        Standard deviation of the grid-correlated error along the normal, averaged over positions, m.
+    grain_a, grain_b
+        Distance between the nodes of the grid-correlated error, m.
     """
 
     step_a: FloatArray
@@ -100,12 +113,20 @@ class Sampling:
 
 
 def lattice(step_a: FloatArray, step_b: FloatArray, normals: FloatArray, sights: Sequence[FloatArray]) -> dict[str, FloatArray]:
-    """The steps, shadows and slopes of a `Sampling`, by name.
+    """Compute the steps, shadows and slopes of a `Sampling`, by name.
 
-    step_a, step_b: (n, 3) steps of the lattice on the surface, m, taken as the rectangle of the same area along step_b, the
-    scan lines or the image's columns: on a steep wall they run upright, and so does the block. Seen from aside and from below,
-    the other step runs askew, and the rim of a niche along it would hide another part of the floor than that of an upright one;
-    sights: (n, 3) each, from the viewpoints to the places, any length; the lattice is made by the first.
+    The lattice is replaced by the rectangle of equal area along step_b, the scan lines or the image's columns. On a steep wall
+    these run upright, and so does the block. Seen from aside and from below, the other step is oblique, and the rim of a niche
+    along it would hide another part of the floor than that of an upright niche.
+
+    Parameters
+    ----------
+    step_a, step_b : (n, 3) arrays
+        Steps of the lattice on the surface, m.
+    normals : (n, 3) array
+        Unit normals.
+    sights : sequence of (n, 3) arrays
+        From each viewpoint to the places, of any length. The first viewpoint makes the lattice.
     """
     length = np.linalg.norm(step_b, axis=1)
     width = np.linalg.norm(np.cross(step_a, step_b), axis=1) / length
@@ -123,7 +144,7 @@ def lattice(step_a: FloatArray, step_b: FloatArray, normals: FloatArray, sights:
 
 
 def detection_probability(sampling: Sampling, side_m: FloatArray | float, config: PlanningConfig) -> FloatArray:
-    """(n,) the probability that the fall of a block of side `side_m` exceeds the level of detection (see the module)."""
+    """Return the probability (n,) that the fall of a block with side `side_m` exceeds the level of detection (see the module)."""
     depth = config.depth_ratio * np.asarray(side_m)
     width_a, width_b = (np.maximum(side_m - depth * shadow, 0.0) for shadow in (sampling.shadow_a, sampling.shadow_b))
     kept = sampling.smooth**2 * _kept(width_a / sampling.grain_a) * _kept(width_b / sampling.grain_b)
@@ -136,24 +157,29 @@ def detection_probability(sampling: Sampling, side_m: FloatArray | float, config
             points = lines_a * lines_b
             found = _exceeds(hit * depth, points, white, spread, kept, config)
             total += share_a * share_b * np.where(points.min(axis=0) >= config.minimum_points, found, 0.0)
-    return np.minimum(total, 1.0)  # a sum of rounded shares
+    return np.minimum(total, 1.0)  # the shares are rounded
 
 
 def smallest_block(sampling: Sampling, config: PlanningConfig) -> FloatArray:
-    """(n,) side of the smallest block that is seen with `config.probability`, m; NaN where 30 m are not, or no floor shows."""
+    """Return the side (n,) of the smallest block that is seen with `config.probability`, m; NaN if 30 m are not, or no floor is
+    visible.
+    """
     return _smallest(sampling, lambda side: detection_probability(sampling, side, config) >= config.probability)
 
 
-def smallest_findable(sampling: Sampling, config: PlanningConfig) -> FloatArray:
-    """(n,) side of the smallest block that any detector could see, m: one that knows its place and shape has a ratio of 4.
+def smallest_clear_block(sampling: Sampling, config: PlanningConfig) -> FloatArray:
+    """Return the side (n,) of the smallest block whose signal-to-noise ratio is CLEAR_SNR, m; NaN as in `smallest_block`.
 
-    Below it noise alone looks as much like a block somewhere on the wall. NaN as in `smallest_block`.
+    Any detector that does not know place and shape of the block needs at least this ratio: below it, noise somewhere else on
+    the wall looks as much like a block.
     """
-    return _smallest(sampling, lambda side: signal_to_noise(sampling, side, config) >= FINDABLE)
+    return _smallest(sampling, lambda side: signal_to_noise(sampling, side, config) >= CLEAR_SNR)
 
 
 def signal_to_noise(sampling: Sampling, side_m: FloatArray | float, config: PlanningConfig) -> FloatArray:
-    """(n,) f h / tau (steps 2 and 3 of the module) at the mean number of points on the floor, 0 where that is less than one."""
+    """Return f h / tau (n,), steps 2 and 3 of the module, at the mean number of points on the floor; 0 if that is less than
+    one.
+    """
     depth = config.depth_ratio * np.asarray(side_m)
     width_a, width_b = (np.maximum(side_m - depth * shadow, 0.0) for shadow in (sampling.shadow_a, sampling.shadow_b))
     kept = sampling.smooth**2 * _kept(width_a / sampling.grain_a) * _kept(width_b / sampling.grain_b)
@@ -165,7 +191,7 @@ def signal_to_noise(sampling: Sampling, side_m: FloatArray | float, config: Plan
 
 
 def _smallest(sampling: Sampling, seen: Callable[[FloatArray], NDArray[np.bool_]]) -> FloatArray:
-    """(n,) the smallest side, m, from which on a block is `seen`, by bisection; NaN where the largest is not."""
+    """Find the smallest side (n,), m, from which on a block is `seen`, by bisection; NaN if the largest is not."""
     low, high = (np.full(np.shape(sampling.step_a), np.log(limit)) for limit in (_SMALLEST_M, _LARGEST_M))
     possible = seen(np.exp(high))
     for _ in range(_HALVINGS):
@@ -176,9 +202,9 @@ def _smallest(sampling: Sampling, seen: Callable[[FloatArray], NDArray[np.bool_]
 
 
 def _lines(steps: FloatArray, shift: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-    """The four cases of how many lattice lines fall in a width of `steps` steps, and their probabilities.
+    """Return the four cases of how many lattice lines lie within a width of `steps` steps, and their probabilities.
 
-    Each case holds the numbers before and after, (2, n); shift: of the lattice between the two, in steps.
+    Each case holds the numbers before and after, (2, n). shift: of the lattice between the two, in steps.
     """
     fewer, rest, shift = np.floor(steps), steps % 1.0, shift % 1.0
     both = np.maximum(0.0, rest - shift) + np.maximum(0.0, rest + shift - 1.0)
@@ -187,7 +213,7 @@ def _lines(steps: FloatArray, shift: FloatArray) -> list[tuple[FloatArray, Float
 
 
 def _hit(width: FloatArray, blur: FloatArray | float) -> FloatArray:
-    """The share f_a of the points recorded in a width that really lie in it (step 3 of the module)."""
+    """Return the share f_a of the points recorded within a width that truly lie in it (step 3 of the module)."""
     from scipy.special import erf
 
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -199,13 +225,15 @@ def _hit(width: FloatArray, blur: FloatArray | float) -> FloatArray:
 def _exceeds(
     change: FloatArray, points: FloatArray, white: FloatArray, spread: FloatArray, kept: FloatArray, config: PlanningConfig
 ) -> FloatArray:
-    """P(detected | N_1, N_2), step 4 of the module; points, white, spread: (2, n) before and after; the latter and kept: m2."""
+    """Return P(detected | N_1, N_2), step 4 of the module; points, white, spread: (2, n) before and after; the latter two and
+    kept in m2.
+    """
     from scipy.special import ndtr
 
     z, registration, number = config.critical_value, config.registration_sigma_m, np.maximum(points, 2.0)
     squared = spread / number
-    error = np.maximum(squared.sum(axis=0), 1e-24)  # without noise a step function
-    with np.errstate(over="ignore", invalid="ignore"):  # a ray along the surface has a spread without bound
+    error = np.maximum(squared.sum(axis=0), 1e-24)  # positive, so that the case without noise is a step function
+    with np.errstate(over="ignore", invalid="ignore"):  # at grazing incidence the variance is unbounded
         freedom = error**2 / np.maximum((squared**2 / (number - 1)).sum(axis=0), 1e-48)
         tau = np.maximum(np.sqrt((white / number).sum(axis=0) + 2 * kept + registration**2), 1e-12)
         q, delta = z * np.sqrt(error) / tau, (change - z * registration) / tau
@@ -213,17 +241,19 @@ def _exceeds(
 
 
 def _kept(width: FloatArray) -> FloatArray:
-    """The share of a smooth error's variance that the mean over a width, in units of its nodes' distance, keeps (one axis)."""
+    """Return the share of a grid-correlated error's variance that the mean over a width keeps; width in units of the nodes'
+    distance.
+    """
     steps, share = _averaging()
     return np.where(width > steps[-1], 1.5 / np.maximum(width, 1.0), np.interp(width, steps, share))
 
 
 @cache
 def _averaging() -> tuple[FloatArray, FloatArray]:
-    """Widths and `_kept` at them, for white nodes interpolated linearly.
+    """Return widths and `_kept` at them, for white nodes with linear interpolation.
 
-    The autocovariance, averaged over the phase, is the cubic B-spline R(t), R(0) = 2/3; the mean over a width w has the variance
-    2/w int_0^w (1 - t/w) R(t) dt, which tends to 1/w.
+    The autocovariance, averaged over the phase, is the cubic B-spline R(t) with R(0) = 2/3. The mean over a width w has the
+    variance 2/w int_0^w (1 - t/w) R(t) dt, which tends to 1/w.
     """
     t = np.linspace(0, 2, 4001)
     covariance = np.where(t < 1, 2 / 3 - t**2 + t**3 / 2, (2 - t) ** 3 / 6)
@@ -236,5 +266,5 @@ def _averaging() -> tuple[FloatArray, FloatArray]:
 
 
 def _integral(values: FloatArray, t: FloatArray) -> FloatArray:
-    """The integral of `values` from the first `t` to each, by the trapezoidal rule."""
+    """Return the integral of `values` from the first `t` to each, by the trapezoidal rule."""
     return np.concatenate([[0.0], np.cumsum(np.diff(t) * (values[1:] + values[:-1]) / 2)])

@@ -1,4 +1,6 @@
-"""What a stereo set-up promises at places on the wall: GSD, base to distance, convergence, precision of the intersection."""
+"""Predict what a stereo pair achieves at places on the wall: GSD, base-to-distance ratio, convergence, precision of the
+intersection.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.precision.detectability import Sampling, lattice
-from pipeline.precision.surface import BoolArray, Places, slide, turned
+from pipeline.precision.surface import BoolArray, Places, rotate_vectors, surface_shift
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.cameras.camera import Camera, CameraPair, Side
@@ -20,13 +22,32 @@ from sensors.stereo.stereo_pair import REDUCTION, StereoPair
 
 @dataclass(frozen=True)
 class StereoGeometry:
-    """A pair's figures at n places; (n,) each, as if nothing stood in between.
+    """A pair's figures at n places, (n,) each, as if nothing obstructed the view.
 
-    distance_m: from the middle of the base; gsd_m: side of the square that has the area which a frame pixel of the left image
-    covers on the surface; cell_m: the same of a cell of the depth map; base_to_distance; convergence_rad: angle between the two
-    rays; incidence_rad: of the more oblique ray; covariance: (n, 3, 3) by matching and image noise, wall frame, m2;
-    orientation_covariance: (n, 3, 3) by the noise of the orientation, common to the whole observation and largely taken up by
-    the registration; normal_sigma_m: along the surface's normal; in_left, in_right: within the frame.
+    Attributes
+    ----------
+    distance_m
+        Distance from the middle of the base, m.
+    gsd_m
+        Side of the square with the area that a frame pixel of the left image covers on the surface, m.
+    cell_m
+        The same for a cell of the depth map, m.
+    base_to_distance
+        Base over distance.
+    convergence_rad
+        Angle between the two rays.
+    incidence_rad
+        Angle of incidence of the more oblique ray.
+    covariance : (n, 3, 3)
+        From matching and image noise, wall frame, m2.
+    orientation_covariance : (n, 3, 3)
+        From the noise of the orientation, m2. It is common to the whole observation and largely removed by the registration.
+    normal_sigma_m
+        Standard deviation along the surface's normal, m.
+    in_left, in_right
+        Whether the place is within the frame.
+    sampling : Sampling
+        Input of the detection probability.
     """
 
     distance_m: FloatArray
@@ -45,7 +66,9 @@ class StereoGeometry:
 
 @dataclass(frozen=True)
 class DisparityNoise:
-    """Standard deviations, px: white, from cell to cell; smooth, averaged over places, with nodes `step` px apart."""
+    """Standard deviations of the disparity, px: white; grid-correlated, averaged over positions; and the distance between nodes,
+    px.
+    """
 
     white: float
     smooth: float
@@ -53,7 +76,7 @@ class DisparityNoise:
 
     @classmethod
     def of(cls, model: StereoModel) -> DisparityNoise:
-        """The sources in quadrature; the coarsest step of several that neighbours share."""
+        """Combine the model's sources of noise in quadrature; of several grids, the coarsest step is used."""
         noise = [effect for effect in model.matching_noise if not effect.is_null]
         white, smooth = (sum(each.total_variance for each in noise if each.shared == shared) for shared in (False, True))
         step = max((each.step_px for each in noise if isinstance(each, NodeNoise)), default=np.inf)
@@ -61,9 +84,9 @@ class DisparityNoise:
 
 
 def stereo_geometry(pair: StereoPair, places: Places, image_sigma_px: float = 0.0) -> StereoGeometry:
-    """The figures of `pair` at `places` (wall frame).
+    """Compute the figures of `pair` at `places` (wall frame).
 
-    image_sigma_px: noise of each coordinate of measured image points, on top of the sensor model's matching noise.
+    image_sigma_px: noise of each coordinate of measured image points, in addition to the sensor model's matching noise.
     """
     nominal = pair.cameras.in_wall_frame(pair.frame)
     noise = DisparityNoise.of(pair.model)
@@ -103,16 +126,19 @@ def stereo_geometry(pair: StereoPair, places: Places, image_sigma_px: float = 0.
 
 @dataclass(frozen=True)
 class _Derivatives:
-    """dP by the rectified disparity d = u_l - u_r, by u_l at fixed disparity, and by the row v; (n, 3) each, wall frame, m/px."""
+    """Derivatives of a point by the rectified disparity d = u_l - u_r, by u_l at fixed disparity, and by the row v, (n, 3) each,
+    wall frame, m/px.
+    """
 
     by_disparity: FloatArray
     by_u: FloatArray
     by_v: FloatArray
 
     def by_image_noise(self) -> FloatArray:
-        """(n, 3, 3) covariance of the least-squares intersection, m2/px2, for noise of 1 px in each of u_l, v_l, u_r, v_r.
+        """Return the covariance (n, 3, 3) of the least-squares intersection, m2/px2, for noise of 1 px in each of u_l, v_l, u_r,
+        v_r.
 
-        In the rectified pair both rows are the same unknown, so that their mean counts: its variance is a half.
+        In the rectified pair both rows measure the same unknown, so their mean counts, with half the variance.
         """
         left = self.by_u + self.by_disparity
         terms = ((1.0, left), (1.0, self.by_disparity), (0.5, self.by_v))
@@ -120,24 +146,25 @@ class _Derivatives:
 
 
 def _intersection(nominal: CameraPair, points: FloatArray) -> _Derivatives:
-    """Derivatives of the forward intersection in the rectified pair.
+    """Compute the derivatives of the forward intersection in the rectified pair.
 
-    z = f B / d, x = u z / f, y = v z / f, so dP/dd = -(x, y, z) z / (f B), whose z part is Kraus' Z^2 / (c B) of the normal case,
-    dP/du = (z/f, 0, 0) and dP/dv = (0, z/f, 0).
+    z = f B / d, x = u z / f, y = v z / f, so dP/dd = -(x, y, z) z / (f B), whose z part is Kraus' Z^2 / (c B) of the normal
+    case, dP/du = (z/f, 0, 0) and dP/dv = (0, z/f, 0).
     """
     geometry = rectify(nominal)
     to_wall = nominal.left.rotation @ geometry.left.T
-    local = turned(to_wall.T, points - nominal.left.position)
+    local = rotate_vectors(to_wall.T, points - nominal.left.position)
     z = local[:, 2:]
     by_disparity = -local * z / (geometry.f * geometry.base_m)
-    return _Derivatives(turned(to_wall, by_disparity), z / geometry.f * to_wall[:, 0], z / geometry.f * to_wall[:, 1])
+    return _Derivatives(rotate_vectors(to_wall, by_disparity), z / geometry.f * to_wall[:, 0], z / geometry.f * to_wall[:, 1])
 
 
 def orientation_covariance(pair: StereoPair, points: FloatArray) -> FloatArray:
-    """(n, 3, 3) covariance of recorded points by the noise of both cameras' orientation, wall frame, m2, to first order.
+    """Compute the covariance (n, 3, 3) of recorded points from the noise of both cameras' orientation, wall frame, m2, to first
+    order.
 
-    Each of the 16 parameters is moved by its standard deviation alone, in each camera or in both alike: the real cameras see the
-    point there, the nominal ones intersect.
+    Each of the parameters is changed by its standard deviation alone, in each camera or in both alike. The real cameras see
+    the point with the change, the nominal ones intersect without it.
     """
     covariance = np.zeros((len(points), 3, 3))
     noise, nominal = pair.model.noise.orientation, pair.cameras.in_wall_frame(pair.frame)
@@ -155,28 +182,29 @@ def orientation_covariance(pair: StereoPair, points: FloatArray) -> FloatArray:
 
 
 def _recorded(nominal: CameraPair, geometry: Rectification, real: CameraPair, points: FloatArray) -> FloatArray:
-    """(n, 3) where the nominal calibration puts points that the real cameras see, wall frame, m."""
+    """Return where the nominal calibration puts points that the real cameras see, (n, 3), wall frame, m."""
     left = _rectified_tangents(nominal.left, geometry.left, *_project(real.left, points))
     right = _rectified_tangents(nominal.right, geometry.right, *_project(real.right, points))
     z = geometry.base_m / (left[0] - right[0])
     local = np.stack([left[0] * z, left[1] * z, z], axis=1)
-    return turned(nominal.left.rotation @ geometry.left.T, local) + nominal.left.position
+    return rotate_vectors(nominal.left.rotation @ geometry.left.T, local) + nominal.left.position
 
 
 def _rectified_tangents(camera: Camera, rotation: FloatArray, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Convert pixels to tangents in the rectified frame."""
     x, y = camera.tangents(u, v)
-    ray = turned(rotation, np.stack([x, y, np.ones_like(x)], axis=1))
+    ray = rotate_vectors(rotation, np.stack([x, y, np.ones_like(x)], axis=1))
     return ray[:, 0] / ray[:, 2], ray[:, 1] / ray[:, 2]
 
 
 def _project(camera: Camera, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pixels (u, v) of (n, 3) points."""
-    local = turned(camera.rotation.T, points - camera.position)
+    """Return the pixels (u, v) of points (n, 3)."""
+    local = rotate_vectors(camera.rotation.T, points - camera.position)
     return camera.pixel(local[:, 0] / local[:, 2], local[:, 1] / local[:, 2])
 
 
 def _in_frame(camera: Camera, points: FloatArray) -> BoolArray:
-    """(n,) whether points lie in front of the camera and on its frame."""
+    """Return whether points (n,) lie in front of the camera and on its frame."""
     depth = np.einsum("ni,i->n", points - camera.position, camera.rotation[:, 2])
     with np.errstate(all="ignore"):
         u, v = _project(camera, points)
@@ -184,17 +212,17 @@ def _in_frame(camera: Camera, points: FloatArray) -> BoolArray:
 
 
 def _pixel_steps(camera: Camera, places: Places) -> tuple[FloatArray, FloatArray]:
-    """(n, 3) each, m: how far one frame pixel to the right, and one down, lie on the surface (central differences)."""
-    local = turned(camera.rotation.T, places.points - camera.position)
+    """Return how far one frame pixel to the right, and one down, extend on the surface, (n, 3) each, m (central differences)."""
+    local = rotate_vectors(camera.rotation.T, places.points - camera.position)
     u, v = _project(camera, places.points)
     steps = []
     for du, dv in ((0.5, 0.0), (0.0, 0.5)):
         (x_0, y_0), (x_1, y_1) = camera.tangents(u - du, v - dv), camera.tangents(u + du, v + dv)
         turn = np.stack([x_1 - x_0, y_1 - y_0, np.zeros_like(u)], axis=1) * local[:, 2:]
-        steps.append(slide(places.points - camera.position, turned(camera.rotation, turn), places.normals))
+        steps.append(surface_shift(places.points - camera.position, rotate_vectors(camera.rotation, turn), places.normals))
     return steps[0], steps[1]
 
 
 def _angle(first: FloatArray, second: FloatArray) -> FloatArray:
-    """(n,) angle between vectors (n, 3) each, rad."""
+    """Return the angle (n,) between vectors (n, 3), rad."""
     return np.arctan2(np.linalg.norm(np.cross(first, second), axis=1), np.einsum("ni,ni->n", first, second))

@@ -1,4 +1,4 @@
-"""The wall as a planner sees it: a raster of places with normals, and which of them a viewpoint sees."""
+"""Sample the wall for planning: a raster of places with normals, and which of them a viewpoint sees."""
 
 from __future__ import annotations
 
@@ -17,43 +17,54 @@ from sensors.numerics.device import vector
 from sensors.stereo.stereo_pair import SHADOW_MARGIN
 
 _PIXELS = 1e5
-"""Pixels of a map whose GSD is left open; on a wall of 70 x 45 m they measure 18 cm."""
+"""Approximate number of pixels of a map without a given GSD; on a wall of 70 x 45 m they measure 18 cm."""
 _MOST_PIXELS = 2e7
+"""Most pixels of a map."""
 BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class Places:
-    """n places on a surface, wall frame. points: (n, 3), m; normals: (n, 3) unit, outside; albedo: (n,)."""
+    """n places on a surface, wall frame: points (n, 3), m; outward unit normals (n, 3); albedo (n,)."""
 
     points: FloatArray
     normals: FloatArray
     albedo: FloatArray
 
     def at(self, chosen: BoolArray) -> Places:
-        """Return some of the places: a mask (n,)."""
+        """Return some of the places, selected by a mask (n,)."""
         return Places(self.points[chosen], self.normals[chosen], self.albedo[chosen])
 
 
 @dataclass(frozen=True)
 class WallRaster:
-    """The wall looked at along -z. found: (height, width), where there is a surface; places: of those n pixels, row by row."""
+    """The wall seen along -z.
+
+    Attributes
+    ----------
+    grid : Grid
+        Its pixels.
+    found : (height, width) bool array
+        Where there is a surface.
+    places : Places
+        The places of those n pixels, row by row.
+    """
 
     grid: Grid
     found: BoolArray
     places: Places
 
     def image(self, values: NDArray[np.generic]) -> FloatArray:
-        """(height, width) the n values at their pixels, NaN where there is no surface."""
+        """Return n values at their pixels, (height, width), NaN where there is no surface."""
         result = np.full(self.grid.shape, np.nan)
         result[self.found] = values
         return result
 
 
 def wall_raster(caster: RayCaster, gsd_m: float | None = None) -> WallRaster:
-    """Sample a wall (wall frame) at the pixels of a grid; without `gsd_m` the grid has some 100,000 of them.
+    """Sample a wall (wall frame) at the pixels of a grid; without `gsd_m` it has about 100,000 pixels.
 
-    Raises InputError for a GSD larger than the wall or so fine that the maps have more than 20 million pixels.
+    Raises InputError if the GSD is larger than the wall, or so small that the maps would have more than 20 million pixels.
     """
     bounds = caster.mesh.bounds
     extent = bounds[1, :2] - bounds[0, :2]
@@ -61,7 +72,7 @@ def wall_raster(caster: RayCaster, gsd_m: float | None = None) -> WallRaster:
     finest, coarsest = float(np.sqrt(extent.prod() / _MOST_PIXELS)), float(extent.min())
     if not finest <= gsd <= coarsest:
         raise InputError(
-            f"a pixel of {gsd:g} m does not suit a wall of {extent[0]:.1f} x {extent[1]:.1f} m",
+            f"a pixel of {gsd:g} m is too large or too small for a wall of {extent[0]:.1f} x {extent[1]:.1f} m",
             where="planning.gsd_m",
             allowed=f"{finest:.2g} to {coarsest:.3g} m",
         )
@@ -71,14 +82,14 @@ def wall_raster(caster: RayCaster, gsd_m: float | None = None) -> WallRaster:
     dr.eval(valid, point, normal, albedo)
     found = np.array(valid)
     if not found.any():
-        raise InputError("its surface is not seen along its mean plane's normal", where="wall", remedy="check the mesh")
+        raise InputError("nothing of it is visible along its mean plane's normal", where="wall", remedy="check the mesh")
     points, normals = (np.array(array, dtype=np.float64).T[found] for array in (point, normal))
     places = Places(points, normals, np.array(albedo, dtype=np.float64)[found])
     return WallRaster(grid, found.reshape(grid.shape), places)
 
 
 def seen_from(caster: RayCaster, places: Places, viewpoint: FloatArray) -> BoolArray:
-    """(n,) whether each place turns its front to `viewpoint` ((3,), m) with nothing in between."""
+    """Return whether each place (n,) faces `viewpoint` (3,), m, with nothing in between."""
     facing = np.einsum("ni,ni->n", places.normals, places.points - viewpoint) < 0
     origin = vector(viewpoint)
     sight = vectors_on_device(places.points) - origin
@@ -86,16 +97,24 @@ def seen_from(caster: RayCaster, places: Places, viewpoint: FloatArray) -> BoolA
     return facing & ~np.array(hidden)
 
 
-def turned(matrix: FloatArray, vectors: FloatArray) -> FloatArray:
-    """(n, 3) `matrix` (3, 3) times each of the vectors (n, 3)."""
+def rotate_vectors(matrix: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Multiply a matrix (3, 3) with each of the vectors (n, 3)."""
     return np.einsum("ij,nj->ni", matrix, vectors)
 
 
-def slide(ray: FloatArray, turn: FloatArray, normals: FloatArray) -> FloatArray:
-    """(n, 3) how far the point of a tangent plane that a ray hits moves when the ray changes.
+def surface_shift(ray: FloatArray, turn: FloatArray, normals: FloatArray) -> FloatArray:
+    """Return how far (n, 3) the point where a ray hits a tangent plane moves when the ray changes.
 
-    The ray is c + t r, the plane's normal n: dp = t (dr - r (n . dr) / (n . r)).
-    ray: (n, 3), t r, from the centre to the surface; turn: (n, 3), t dr.
+    With the ray c + t r and the plane's normal n: dp = t (dr - r (n . dr) / (n . r)).
+
+    Parameters
+    ----------
+    ray : (n, 3) array
+        t r, from the centre to the surface, m.
+    turn : (n, 3) array
+        t dr, m.
+    normals : (n, 3) array
+        Unit normals.
     """
     along = np.einsum("ni,ni->n", normals, turn) / np.einsum("ni,ni->n", normals, ray)
     return turn - ray * along[:, None]

@@ -1,4 +1,4 @@
-"""What a laser scanner's station promises at places on the wall: range, incidence, spacing, footprint, precision, power."""
+"""Predict what a scanner station achieves at places on the wall: range, incidence, spacing, footprint, precision, power."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.precision.detectability import Sampling, lattice
-from pipeline.precision.surface import BoolArray, Places, slide, turned
+from pipeline.precision.surface import BoolArray, Places, rotate_vectors, surface_shift
 from scene.geometry.mesh import FloatArray
 from sensors.effects.angle_noise import AngleNoise
 from sensors.effects.base import Effect, Stage
@@ -17,18 +17,33 @@ from sensors.signal_chain.polar import polar, polar_axes
 from sensors.signal_chain.pulses import REFERENCE_RANGE_M, PulseGeometry
 
 _OFTEN = 0.5
-"""Probability of an echo beyond which a place counts as reached."""
+"""Probability of an echo above which a place counts as reached."""
 
 
 @dataclass(frozen=True)
 class TlsGeometry:
-    """A station's figures at n places; (n,) each, as if nothing stood in between.
+    """A station's figures at n places, (n,) each, as if nothing obstructed the view.
 
-    range_m; incidence_rad; spacing_line_m, spacing_pulse_m: on the surface, from scan line to scan line (azimuth) and from pulse
-    to pulse (zenith); footprint_m: diameter of the beam across itself, at the range; footprint_long_m: its longest extent on the
-    surface; both 0 where no divergence is given. range_sigma_m, azimuth_sigma_m, zenith_sigma_m: semi-axes of the error
-    ellipsoid, along the beam and across it; covariance: (n, 3, 3) of a point, wall frame, m2; normal_sigma_m: along the surface's
-    normal; power: relative to albedo 1, hit squarely, at 100 m; reached: within window, reach and detection limit.
+    Attributes
+    ----------
+    range_m, incidence_rad
+        Range, m, and angle of incidence, rad.
+    spacing_line_m, spacing_pulse_m
+        Point spacing on the surface, from scan line to scan line (azimuth) and from pulse to pulse (zenith), m.
+    footprint_m, footprint_long_m
+        Diameter of the beam across itself, and its longest extent on the surface, m; 0 if no divergence is given.
+    range_sigma_m, azimuth_sigma_m, zenith_sigma_m
+        Semi-axes of the error ellipsoid, along the beam and across it, m.
+    covariance : (n, 3, 3)
+        Of a point, wall frame, m2.
+    normal_sigma_m
+        Standard deviation along the surface's normal, m.
+    power
+        Received power, relative to that of albedo 1 at 100 m and normal incidence.
+    reached
+        Whether the place is within window, range limits and detection limit.
+    sampling : Sampling
+        Input of the detection probability.
     """
 
     range_m: FloatArray
@@ -48,28 +63,28 @@ class TlsGeometry:
 
 
 def tls_geometry(scanner: LaserScanner, places: Places) -> TlsGeometry:
-    """The figures of `scanner` at `places` (wall frame).
+    """Compute the figures of `scanner` at `places` (wall frame).
 
-    With u the beam's direction, e_az and e_ze the unit vectors towards rising azimuth and zenith, and white noise of range (R)
-    and angles, the covariance is  s_R^2 u u' + (R sin z s_az)^2 e_az e_az' + (R s_ze)^2 e_ze e_ze'. On a plane, a beam that
-    leaves in another direction than recorded makes the same error along the normal as a point moved across. The mean of two
-    faces has half of these variances; each of its beams misses a niche's floor as often as a single one.
+    With u the beam's direction, e_az and e_ze the unit vectors towards increasing azimuth and zenith, and white noise of range
+    (R) and angles, the covariance is s_R^2 u u' + (R sin z s_az)^2 e_az e_az' + (R s_ze)^2 e_ze e_ze'. On a plane, a beam that
+    leaves in another direction than recorded causes the same error along the normal as a point moved across the beam. The mean
+    of two faces has half of these variances; each of its beams misses a niche's floor as often as a single one.
     """
     effects = scanner.model.chain()
-    local = turned(scanner.rotation.T, places.points - scanner.position)
+    local = rotate_vectors(scanner.rotation.T, places.points - scanner.position)
     range_m, azimuth, zenith = polar(local)
-    sight, rising_azimuth, rising_zenith = (turned(scanner.rotation, axis) for axis in polar_axes(azimuth, zenith))
+    sight, rising_azimuth, rising_zenith = (rotate_vectors(scanner.rotation, axis) for axis in polar_axes(azimuth, zenith))
     cosine = -np.einsum("ni,ni->n", sight, places.normals)
     power = _power(scanner, places.albedo, cosine, range_m)
     echo = PulseGeometry(azimuth, zenith, range_m=range_m, cos_incidence=cosine, power=power)
     axes = np.stack([sight, rising_azimuth, rising_zenith], axis=1)
     single = np.stack([_range_sigma(effects, echo), *_across_sigma(effects, range_m, zenith)], axis=1)
-    sigma = single / np.sqrt(scanner.config.faces)  # of the mean of two faces with noise of their own
+    sigma = single / np.sqrt(scanner.config.faces)  # two faces have independent noise
     covariance = np.einsum("nk,nki,nkj->nij", sigma**2, axes, axes)
     normal_sigma = np.sqrt(np.einsum("ni,nij,nj->n", places.normals, covariance, places.normals))
     ray, step = sight * range_m[:, None], scanner.pattern
-    line = slide(ray, rising_azimuth * (range_m * np.sin(zenith) * step.azimuth_step)[:, None], places.normals)
-    pulse = slide(ray, rising_zenith * (range_m * step.zenith_step)[:, None], places.normals)
+    line = surface_shift(ray, rising_azimuth * (range_m * np.sin(zenith) * step.azimuth_step)[:, None], places.normals)
+    pulse = surface_shift(ray, rising_zenith * (range_m * step.zenith_step)[:, None], places.normals)
     steps = lattice(line, pulse, places.normals, [sight])
     footprint = _divergence(effects) * range_m
     return TlsGeometry(
@@ -96,13 +111,15 @@ def tls_geometry(scanner: LaserScanner, places: Places) -> TlsGeometry:
 
 
 def _power(scanner: LaserScanner, albedo: FloatArray, cosine: FloatArray, range_m: FloatArray) -> FloatArray:
-    """The lidar range equation, rho cos i / R^2 exp(-2 sigma R), relative to albedo 1, hit squarely, at 100 m, in clear air."""
+    """Evaluate the lidar range equation, rho cos i / R^2 exp(-2 sigma R), relative to albedo 1 at 100 m, normal incidence and
+    clear air.
+    """
     power = albedo * np.maximum(cosine, 0.0) * np.square(REFERENCE_RANGE_M / range_m)
     return power * np.exp(-2 * scanner.config.extinction_per_m * range_m)
 
 
 def _range_sigma(effects: tuple[Effect, ...], echo: PulseGeometry) -> FloatArray:
-    """(n,) standard deviation of the range, m: the sources in quadrature; infinite where nothing returns."""
+    """Return the standard deviation (n,) of the range, m, from all sources in quadrature; infinite where nothing returns."""
     sources = (effect.variance(echo) for effect in effects if effect.stage == Stage.RANGE and not effect.is_null)
     with np.errstate(divide="ignore"):
         variance = sum(sources, np.zeros_like(echo.range_m))
@@ -110,19 +127,19 @@ def _range_sigma(effects: tuple[Effect, ...], echo: PulseGeometry) -> FloatArray
 
 
 def _across_sigma(effects: tuple[Effect, ...], range_m: FloatArray, zenith: FloatArray) -> list[FloatArray]:
-    """(n,) standard deviations of a point's place across the beam, m, along rising azimuth and rising zenith."""
+    """Return the standard deviations (n,) of a point's position across the beam, m, towards increasing azimuth and zenith."""
     noise = [effect for effect in effects if isinstance(effect, AngleNoise)]
     azimuth, polar = np.linalg.norm([(0.0, 0.0), *((each.azimuth_sigma_rad, each.zenith_sigma_rad) for each in noise)], axis=0)
     return [range_m * np.sin(zenith) * azimuth, range_m * polar]
 
 
 def _divergence(effects: tuple[Effect, ...]) -> float:
-    """The beam's divergence, full angle, 1/e^2, rad; 0 where no effect gives it."""
+    """Return the beam's full divergence (1/e^2), rad; 0 if no effect gives it."""
     return max((effect.divergence_rad for effect in effects if isinstance(effect, BeamDivergence)), default=0.0)
 
 
 def _reached(scanner: LaserScanner, effects: tuple[Effect, ...], echo: PulseGeometry) -> BoolArray:
-    """(n,) whether a place lies in the scanned window and its echo is one that the instrument records, more often than not."""
+    """Return whether each place (n,) lies in the scanned window and the instrument probably records its echo."""
     pattern, config = scanner.pattern, scanner.config
     turned = np.mod(echo.azimuth - pattern.azimuth_start + pattern.azimuth_step / 2, 2 * np.pi)
     lowered = echo.zenith - pattern.zenith_start + pattern.zenith_step / 2

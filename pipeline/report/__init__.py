@@ -1,5 +1,4 @@
-"""Hold what all reports share: page template, figures, progress line, provenance.
+"""Provide what all reports share: page template, figures, progress, provenance.
 
-The content of a report stands beside the command that writes it.
-Start with `page.py`.
+The content of a report is defined beside the command that writes it. Start with `page.py`.
 """

@@ -1,6 +1,6 @@
-"""The pictures of a report: hillshades, difference maps, histograms, convergence of the registration; each as PNG bytes.
+"""Draw the pictures of reports: hillshades, difference maps, histograms, convergence of the registration; each as PNG bytes.
 
-Equal arguments give equal bytes. Colours can be told apart by colour-blind readers (Okabe and Ito's pair, RdBu for differences).
+Equal arguments give equal bytes. Colours can be distinguished by colour-blind readers (Okabe and Ito's, RdBu for differences).
 """
 
 from __future__ import annotations
@@ -31,48 +31,51 @@ from scene.geometry.grid import Grid
 from scene.geometry.mesh import WALL, IntArray
 
 SCALE_SIGMAS = 6.0
-"""A difference map's colours end at this many sigma on either side of zero."""
+"""The colour scale of a difference map ends at this many sigma on either side of zero."""
 DIFFERENCE_LABEL = "reference minus epoch, mm; missing rock positive"
-"""The one sign of all difference maps, whose colours are those of COLOURS: red where rock is missing."""
+"""Label of all difference maps, which share one sign and the colours COLOURS: red where rock is missing."""
 _WIDEST_PX = 2000
+"""Largest side of a picture, px; larger rasters are averaged."""
 DPI = 150
 _MAP_WIDTH_IN, _MAP_HEIGHT_IN = 9.6, 9.0
 _PAIRED = 0.55
-"""Size of a picture that stands beside another one; its text is larger in proportion, its pixels are as many."""
+"""Relative size of a picture that stands beside another one. Its text is larger in proportion; its number of pixels is the
+same.
+"""
 _LOW_IN, _BENEATH_IN = 3.6, 0.65
-"""Below this height of maps the label of a colour bar has no room beside them; what it takes beneath them."""
+"""Height of maps below which the colour bar's label has no room beside them; height of the bar beneath them."""
 _FAR_M, _ROUND_M = 1e4, 1e3
-"""From here on coordinates are given relative to a multiple of this, as those of a national grid."""
+"""Coordinates beyond the first value, such as those of a national grid, are given relative to a multiple of the second."""
 _LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _TOP_IN = 0.7, 1.25, 0.6, 0.4
 _OUTSIDE, _INSIDE = "#0072B2", "#D55E00"
 FAMILY = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 """Okabe and Ito's colours for families of curves."""
 NO_DATA, _NO_DATA_HILLSHADE = "#b5b5b5", "#c9dced"
 _LIGHT = np.array([-0.5, 0.5, np.sqrt(0.5)])
-"""Towards the light: from the upper left, 45 degrees above the wall's plane."""
+"""Direction towards the light: from the upper left, 45 degrees above the wall's plane."""
 _BINS = 120
 COLOURS = colormaps["RdBu_r"].resampled(49)
-"""In steps of a quarter of a sigma, which cannot be told apart by eye and make a smaller file."""
+"""Steps of a quarter of a sigma, which the eye cannot distinguish and which make a smaller file."""
 _GREYS = colormaps["gray"].resampled(64)
 SEQUENTIAL = colormaps["viridis"].resampled(48)
 _MOST_NUMBERED, _MOST_ZOOMED, _ZOOMS_A_ROW = 200, 24, 6
-"""Blocks whose numbers stand on a map, and that are shown by themselves."""
+"""Most blocks that are numbered on a map, most that are shown enlarged, and enlarged ones per row."""
 _ONE_DECADE = 10.0
-"""Span of a logarithmic colour bar below which powers of ten, their doubles and fives are too few marks."""
+"""Span of a logarithmic colour bar below which ticks at 1, 2, 5, 10 are too few."""
 _CONSTANT = ListedColormap(["#dbe6ee"])
-"""Of a map that has one value everywhere."""
+"""Colour of a map with one value everywhere."""
 _MOST_STEPS = 12
-"""Whole numbers that can be told apart by their colours."""
+"""Largest range of whole numbers that get separate colours."""
 _LETTER_IN = 0.066
-"""Width of a letter of a colour bar's label."""
+"""Width of a letter in the label of a colour bar, in."""
 _TWO_DECADES = 250.0
-"""Span of a logarithmic axis from which on the numbers of 2 and 5 have no room."""
+"""Span of a logarithmic axis from which on 2 and 5 are not labelled."""
 _CROWDED = 0.15
-"""A map whose median lies within this share of its range from the low end would be of one colour."""
+"""A map whose median lies within this share of its range from the lower end gets a logarithmic scale."""
 
 
 class Iteration(Protocol):
-    """What a convergence picture needs of an iteration of the registration."""
+    """What a convergence picture shows of an iteration of the registration."""
 
     @property
     def rms_m(self) -> float: ...
@@ -84,7 +87,7 @@ class Iteration(Protocol):
 
 @dataclass(frozen=True)
 class CurvePanel:
-    """One family of curves. x: (k,); curves: by name, shares in 0 .. 1, (k,); at: where the set-up is."""
+    """One family of curves: shares in 0 to 1 (k,) by name, at positions x (k,); `at` is the position of the present set-up."""
 
     label: str
     x: NDArray[np.floating]
@@ -94,7 +97,7 @@ class CurvePanel:
 
 
 def hillshade_figure(heights: NDArray[np.floating], grid: Grid, title: str = "") -> bytes:
-    """A raster of heights (h, w), m, NaN without data, lit from the upper left."""
+    """Draw a raster of heights (h, w), m, NaN without data, lit from the upper left."""
     heights, pixel = mean_pooled(heights, pooling(grid)), grid.gsd * pooling(grid)
     down, right = np.gradient(heights, pixel) if min(heights.shape) > 1 else (0 * heights, 0 * heights)
     shade = (-_LIGHT[0] * right + _LIGHT[1] * down + _LIGHT[2]) / np.sqrt(
@@ -108,9 +111,20 @@ def hillshade_figure(heights: NDArray[np.floating], grid: Grid, title: str = "")
 
 
 def difference_figure(difference: NDArray[np.floating], grid: Grid, block: IntArray, sigma_m: float, title: str = "") -> bytes:
-    """A difference map (h, w), m, NaN without data, on a scale of +-6 `sigma_m`, with outlines and numbers of the labels `block`.
+    """Draw a difference map on a scale of +-6 sigma, with outlines and numbers of the blocks.
 
-    block: (h, w); of more than 200 blocks the numbers are left out.
+    Parameters
+    ----------
+    difference : (h, w) array
+        Difference, m; NaN without data.
+    grid : Grid
+        Its pixels.
+    block : (h, w) array
+        Block labels. With more than 200 blocks the numbers are omitted.
+    sigma_m : float
+        Noise of the map, m.
+    title : str
+        Title of the picture.
     """
     if not sigma_m > 0:
         raise ValueError(f"sigma_m must be positive, got {sigma_m}")
@@ -133,8 +147,9 @@ def difference_figure(difference: NDArray[np.floating], grid: Grid, block: IntAr
 
 
 def block_boxes(block: IntArray) -> dict[int, tuple[int, int, int, int]]:
-    """Left, right, bottom, top of the pixels of each label but WALL in (h, w), px from the top-left corner; right and bottom are
-    the first beyond."""
+    """Return left, right, bottom, top of the pixels of each label in (h, w), px from the top-left corner; right and bottom are
+    exclusive.
+    """
     rows, columns = np.nonzero(block != WALL)
     if not len(rows):
         return {}
@@ -152,9 +167,18 @@ def block_boxes(block: IntArray) -> dict[int, tuple[int, int, int, int]]:
 def blocks_figure(
     difference: NDArray[np.floating], grid: Grid, block: IntArray, sigma_m: float, captions: Mapping[int, str]
 ) -> bytes | None:
-    """Each block of a difference map by itself, twice as large as the block, on the map's scale; none where there are no blocks.
+    """Draw each block of a difference map enlarged, in a window twice as large as the block; None if there are no blocks.
 
-    captions: by label, in the order in which they are shown; 24 at most.
+    Parameters
+    ----------
+    difference, block : (h, w) arrays
+        Difference, m, and block labels.
+    grid : Grid
+        Their pixels.
+    sigma_m : float
+        Noise of the map, m, for the colour scale.
+    captions : mapping of int to str
+        Captions by label, in the order in which blocks are shown, at most 24.
     """
     places = block_boxes(block)
     shown = [label for label in captions if label in places][:_MOST_ZOOMED]
@@ -183,10 +207,10 @@ def blocks_figure(
 
 
 def map_figure(values: NDArray[np.floating], grid: Grid, label: str, title: str = "") -> bytes:
-    """Any quantity (h, w) over the wall, NaN without data, in the unit of `label`; colours span its 1 to 99 % quantiles.
+    """Draw any quantity over the wall (h, w), in the unit of `label`, NaN without data; colours span its 1 to 99 % quantiles.
 
-    They grow by equal factors where the wall would be nearly all of one colour otherwise. Whole numbers, such as counts, get a
-    colour each. A quantity that is the same everywhere is told in words instead of a colour bar.
+    The scale is logarithmic if the map would otherwise have nearly one colour. Whole numbers, such as counts, get a colour
+    each. A quantity that is the same everywhere is stated in words instead of a colour bar.
     """
     known = values[np.isfinite(values)]
     counts = bool(known.size) and np.array_equal(known, np.round(known))
@@ -220,7 +244,7 @@ def map_figure(values: NDArray[np.floating], grid: Grid, label: str, title: str 
 
 
 def _count_scale(known: NDArray[np.floating]) -> Normalize:
-    """Return the colour scale of whole numbers (n,): a colour for each, or a continuous scale where there are many."""
+    """Return the colour scale of whole numbers (n,): a colour for each, or a continuous scale if there are many."""
     low, high = float(known.min()), float(known.max())
     if high - low > _MOST_STEPS:
         return _scale(known)
@@ -228,14 +252,16 @@ def _count_scale(known: NDArray[np.floating]) -> Normalize:
 
 
 def _scale(known: NDArray[np.floating]) -> Normalize:
-    """The colour scale of a map's values (n,): their 1 to 99 % quantiles, logarithmic where half of them crowd at its low end."""
+    """Return the colour scale of a map's values (n,): their 1 to 99 % quantiles, logarithmic if half of them are near its lower
+    end.
+    """
     low, middle, high = np.quantile(known, [0.01, 0.5, 0.99]).tolist() if known.size else (0.0, 0.5, 1.0)
     crowded = low > 0 and middle - low < _CROWDED * (high - low)
     return LogNorm(low, high) if crowded else Normalize(low, high)
 
 
 def plain_numbers(axis: Axis) -> None:
-    """Ticks at 1, 2, 5, 10, ... of a logarithmic axis, as people write numbers; of many decades 1, 10, ... alone."""
+    """Label a logarithmic axis at 1, 2, 5, 10, ... with ordinary numbers; over many decades only at 1, 10, ..."""
 
     def number(value: float, _: Any) -> str:
         low, high = axis.get_view_interval()
@@ -248,7 +274,7 @@ def plain_numbers(axis: Axis) -> None:
 
 
 def curves_figure(panels: Sequence[CurvePanel], y_label: str, title: str = "") -> bytes:
-    """Families of curves side by side, all in per cent; a dashed line marks where the set-up is."""
+    """Draw families of curves side by side, in per cent; a dashed line marks the present set-up."""
     figure = Figure(figsize=(_LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN, 4.0), dpi=DPI, layout="constrained")
     figure.suptitle(title, fontsize=11)
     row = np.atleast_1d(figure.subplots(1, len(panels), sharey=True))
@@ -260,7 +286,7 @@ def curves_figure(panels: Sequence[CurvePanel], y_label: str, title: str = "") -
             axes.set_xscale("log")
             plain_numbers(axes.xaxis)
         axes.set_ylim(-2, 102)
-        dress(axes, panel.label, y_label)
+        label_axes(axes, panel.label, y_label)
         axes.label_outer()
         axes.grid(color="0.9", linewidth=0.6)
     figure.legend(*row[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=9, frameon=False)
@@ -268,7 +294,9 @@ def curves_figure(panels: Sequence[CurvePanel], y_label: str, title: str = "") -
 
 
 def histogram_figure(outside: NDArray[np.floating], inside: NDArray[np.floating], title: str = "") -> bytes:
-    """Histograms of differences, m, outside and inside the blocks: the noise on a linear scale, all on a logarithmic one."""
+    """Draw histograms of differences, m, outside and inside the blocks: the noise on a linear scale, everything on a logarithmic
+    one.
+    """
     groups = [("outside the blocks", outside, _OUTSIDE), ("inside the blocks", inside, _INSIDE)]
     samples = [(name, values[~np.isnan(values)] * 1e3, colour) for name, values, colour in groups]
     figure = Figure(figsize=(_LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN, 4.6), dpi=DPI, layout="constrained")
@@ -287,7 +315,7 @@ def histogram_figure(outside: NDArray[np.floating], inside: NDArray[np.floating]
 
 
 def convergence_figure(history: Sequence[Iteration], title: str = "") -> bytes:
-    """RMS of the inliers' residuals and share of inliers over the iterations of the registration."""
+    """Draw the RMS of the inliers' residuals and the share of inliers over the iterations of the registration."""
     iteration = np.arange(1, len(history) + 1)
     figure = Figure(figsize=(_LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN, 3.4), dpi=DPI, layout="constrained")
     figure.suptitle(title, fontsize=11)
@@ -298,7 +326,7 @@ def convergence_figure(history: Sequence[Iteration], title: str = "") -> bytes:
     for axes, (label, values, colour) in zip(figure.subplots(1, 2), panels, strict=True):
         axes.plot(iteration, values, color=colour, marker="o", markersize=3.5, linewidth=1.2)
         axes.xaxis.get_major_locator().set_params(integer=True)
-        dress(axes, "iteration", label)
+        label_axes(axes, "iteration", label)
         axes.grid(color="0.9", linewidth=0.6)
     return png_bytes(figure)
 
@@ -311,11 +339,11 @@ def _histogram(axes: Axes, samples: Sequence[tuple[str, NDArray[np.floating], st
         axes.stairs(counts, edges, color=colour, linewidth=1.2)
     axes.axvline(0, color="0.3", linewidth=0.8)
     axes.set_xlim(limits)
-    dress(axes, DIFFERENCE_LABEL, f"pixels per {edges[1] - edges[0]:.3g} mm")
+    label_axes(axes, DIFFERENCE_LABEL, f"pixels per {edges[1] - edges[0]:.3g} mm")
 
 
 def _noise_range(values: NDArray[np.floating]) -> tuple[float, float]:
-    """Median and SCALE_SIGMAS of the NMAD on either side, mm."""
+    """Return the median plus and minus SCALE_SIGMAS times the NMAD, mm."""
     found = statistics(values)
     centre, half = (found.median, SCALE_SIGMAS * found.nmad) if found.count else (0.0, 0.0)
     return centre - (half or 1.0), centre + (half or 1.0)
@@ -330,7 +358,7 @@ def _whole_range(samples: Sequence[tuple[str, NDArray[np.floating], str]]) -> tu
 
 
 def _in_words(found: DifferenceStatistics) -> str:
-    """Statistics of values in mm."""
+    """Describe the statistics of values in mm."""
     if not found.count:
         return "no data"
     return (
@@ -340,9 +368,9 @@ def _in_words(found: DifferenceStatistics) -> str:
 
 
 def _map_figure(grid: Grid, title: str, *, bar: bool = True, size: float = 1.0) -> tuple[Figure, Axes]:
-    """A figure whose axes have the aspect of the grid, in wall-frame metres.
+    """Make a figure whose axes have the aspect of the grid, in wall-frame metres.
 
-    bar: with room for a colour bar; size: of the map, its pixels stay as many.
+    bar: whether to leave room for a colour bar; size: relative size of the map, whose number of pixels stays the same.
     """
     aspect = grid.height / grid.width
     width = min(_MAP_WIDTH_IN, _MAP_HEIGHT_IN / aspect) * size
@@ -353,19 +381,21 @@ def _map_figure(grid: Grid, title: str, *, bar: bool = True, size: float = 1.0) 
     figure = Figure(figsize=(full_width, full_height), dpi=DPI / size)
     axes = figure.add_axes((_LEFT_IN / full_width, bottom / full_height, width / full_width, height / full_height))
     axes.set_title(title, fontsize=11, loc="left")
-    dress_map(axes, grid.x_min, grid.y_max - grid.height * grid.gsd)
+    label_map_axes(axes, grid.x_min, grid.y_max - grid.height * grid.gsd)
     return figure, axes
 
 
-def dress_map(axes: Axes, left: float, bottom: float) -> None:
-    """Labels of a map over a wall; coordinates far from zero, m, are given relative to round ones that stand beneath the map."""
+def label_map_axes(axes: Axes, left: float, bottom: float) -> None:
+    """Label the axes of a map over a wall. Coordinates far from zero, m, are given relative to round numbers, which the label
+    states.
+    """
     offsets = [_shortened(axis, low) for axis, low in ((axes.xaxis, left), (axes.yaxis, bottom))]
     far = f" (from x {offsets[0]:,.0f}, y {offsets[1]:,.0f})" if any(offsets) else ""
-    dress(axes, f"x along the wall, m{far}", "y up the wall, m")
+    label_axes(axes, f"x along the wall, m{far}", "y up the wall, m")
 
 
 def _shortened(axis: Axis, low: float) -> float:
-    """What the numbers of an axis that begins at `low` are relative to."""
+    """Make the tick labels of an axis that starts at `low` relative to a round number, and return that number."""
     if abs(low) < _FAR_M:
         return 0.0
     offset = float(_ROUND_M * np.floor(low / _ROUND_M))
@@ -373,23 +403,22 @@ def _shortened(axis: Axis, low: float) -> float:
     return offset
 
 
-def bar_place(height_in: float) -> tuple[dict[str, Any], float]:
-    """Where the colour bar of maps stands, and the height that it takes, in: beside them, or beneath low ones, where its label
-    would have no room."""
+def colour_bar_position(height_in: float) -> tuple[dict[str, Any], float]:
+    """Return where the colour bar of maps stands, and the height that it takes, in: beside maps, or beneath low ones."""
     if height_in < _LOW_IN:
         return {"location": "bottom", "shrink": 0.6, "aspect": 45}, _BENEATH_IN
     return {"location": "right", "shrink": 0.8}, 0.0
 
 
-def dress(axes: Axes, x_label: str, y_label: str) -> None:
-    """The labels of the axes, in the size that all pictures share."""
+def label_axes(axes: Axes, x_label: str, y_label: str) -> None:
+    """Label the axes in the size that all pictures share."""
     axes.set_xlabel(x_label, fontsize=9)
     axes.set_ylabel(y_label, fontsize=9)
     axes.tick_params(labelsize=8)
 
 
 def _colour_bar(figure: Figure, axes: Axes, image: AxesImage, label: str, extend: str) -> Colorbar:
-    """A colour bar at the right of a map, or beneath a low one."""
+    """Add a colour bar at the right of a map, or beneath a low one."""
     box, width, height = axes.get_position(), figure.get_figwidth(), figure.get_figheight()
     if box.height * height < _LOW_IN:
         place, orientation = (box.x0 + 0.1 * box.width, _BENEATH_IN / height, 0.8 * box.width, 0.14 / height), "horizontal"
@@ -406,14 +435,14 @@ def _sigma_bar(figure: Figure, axes: Axes, image: AxesImage, sigma_mm: float) ->
     limit = SCALE_SIGMAS * sigma_mm
     ticks = MaxNLocator(nbins=8, steps=[1, 2, 2.5, 5, 10], symmetric=True).tick_values(-limit, limit)
     ticks = ticks[np.abs(ticks) <= 1.001 * limit]
-    digits = max(0, int(np.ceil(-np.log10(np.diff(ticks).min()) + 0.39)))  # 0.39: 2.5 needs one more digit
+    digits = max(0, int(np.ceil(-np.log10(np.diff(ticks).min()) + 0.39)))  # + 0.39, because 2.5 needs one more digit
     sigma = "\N{GREEK SMALL LETTER SIGMA}"
     label = f"{DIFFERENCE_LABEL}; to 6 {sigma}, {sigma} = {sigma_mm:.3g} mm"
     _colour_bar(figure, axes, image, label, "both").set_ticks(ticks, labels=[_signed(tick, digits) for tick in ticks])
 
 
 def _signed(value: float, digits: int) -> str:
-    """A number with its sign, a true minus, and no sign on a zero."""
+    """Format a number with its sign, with a true minus, and no sign for zero."""
     return f"{value:+.{digits}f}".replace("-", "\N{MINUS SIGN}") if round(value, digits) else f"{0:.{digits}f}"
 
 
@@ -426,25 +455,25 @@ def _no_data_legend(axes: Axes, values: NDArray[np.floating], colour: str, outli
 
 
 def pooling(grid: Grid) -> int:
-    """How many pixels of the raster, each way, become one of the picture."""
+    """Return how many pixels of the raster, along a row or column, are averaged to one of the picture."""
     return max(1, int(np.ceil(max(grid.width, grid.height) / _WIDEST_PX)))
 
 
 def raster_extent(grid: Grid, shape: tuple[int, ...]) -> tuple[float, float, float, float]:
-    """Left, right, bottom, top of a pooled raster, wall frame, m."""
+    """Return left, right, bottom, top of a pooled raster, wall frame, m."""
     pixel = grid.gsd * pooling(grid)
     return grid.x_min, grid.x_min + shape[1] * pixel, grid.y_max - shape[0] * pixel, grid.y_max
 
 
 def _cells(raster: NDArray[Any], factor: int) -> NDArray[Any]:
-    """View a raster as (h, factor, w, factor); what does not fill a cell at the right and the bottom is left out."""
+    """View a raster as (h, factor, w, factor); incomplete cells at the right and the bottom are left out."""
     height, width = (max(size // factor, 1) for size in raster.shape)
     rows, columns = min(factor, raster.shape[0]), min(factor, raster.shape[1])
     return raster[: height * rows, : width * columns].reshape(height, rows, width, columns)
 
 
 def mean_pooled(raster: NDArray[np.floating], factor: int) -> NDArray[np.float32]:
-    """Means over cells, of what is not NaN in them."""
+    """Return the mean of each cell of `factor` x `factor` pixels, ignoring NaN."""
     if factor == 1:
         return raster.astype(np.float32)
     cells = _cells(raster, factor)
@@ -459,7 +488,7 @@ def _max_pooled(mask: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
 
 
 def png_bytes(figure: Figure) -> bytes:
-    """The figure as a PNG file that holds no date or version: equal figures give equal bytes."""
+    """Return the figure as a PNG file without date or version, so that equal figures give equal bytes."""
     buffer = io.BytesIO()
     with plain_text(figure):
         FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})

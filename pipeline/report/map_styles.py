@@ -1,4 +1,4 @@
-"""The colours of the reports as QGIS styles beside the maps."""
+"""Write the colours of the reports as QGIS styles beside the maps."""
 
 from __future__ import annotations
 
@@ -14,15 +14,28 @@ from pipeline.formats.rasters.qgis_style import Stop, write_style
 from pipeline.report.figures import COLOURS, SEQUENTIAL
 
 _STEPS = 12
+"""Number of colour steps."""
 
 
 def difference_style(raster: Path, limit_m: float) -> None:
-    """Of a map about zero, m: red where rock is missing, colours end at +-`limit_m`, the legend is in mm."""
+    """Write the style of a difference map: red where rock is missing, colours to +-`limit_m`, legend in mm."""
     _write(raster, COLOURS, -limit_m, limit_m, lambda value: f"{1e3 * value:+.3g} mm")
 
 
 def quantity_style(raster: Path, values: NDArray[np.floating], unit: str, factor: float = 1.0) -> None:
-    """Of any other map, over the 1 to 99 % quantiles of its `values`; factor: from them to `unit`, in which the legend is."""
+    """Write the style of any other map, over the 1 to 99 % quantiles of its values.
+
+    Parameters
+    ----------
+    raster : Path
+        File of the map.
+    values : array
+        Its values.
+    unit : str
+        Unit of the legend.
+    factor : float
+        Conversion from the values to `unit`.
+    """
     known = values[np.isfinite(values)]
     low, high = np.quantile(known, [0.01, 0.99]).tolist() if known.size else (0.0, 1.0)
     high = high if high > low else low + max(abs(low), 1.0) * 1e-3
@@ -30,6 +43,7 @@ def quantity_style(raster: Path, values: NDArray[np.floating], unit: str, factor
 
 
 def _write(raster: Path, colours: Any, low: float, high: float, label: Callable[[float], str]) -> None:
+    """Write a style with evenly spaced colours."""
     places = np.linspace(0.0, 1.0, _STEPS + 1).tolist()
     values = [low + place * (high - low) for place in places]
     write_style(raster, [Stop(value, to_hex(colours(place)), label(value)) for place, value in zip(places, values, strict=True)])

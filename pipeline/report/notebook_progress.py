@@ -1,4 +1,4 @@
-"""Progress as a bar in a notebook."""
+"""Show progress as a bar in a notebook."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _BAR = '<progress value="{share:.3f}" max="1" style="width: 20em"></progress> {p
 
 
 class NotebookProgress(Progress):
-    """An HTML bar, drawn again whenever a stage begins or says how far it is; it vanishes at the end."""
+    """An HTML bar, redrawn whenever a stage begins or advances, which vanishes at the end."""
 
     def __init__(self, display: Any) -> None:
-        """display: IPython's, or what has its arguments."""
+        """Make a bar. display: IPython's function, or one with the same arguments."""
         super().__init__()
         self._display, self._handle, self._shown = display, None, ""
 
@@ -51,7 +51,10 @@ class NotebookProgress(Progress):
 
 
 def python_progress(show: bool | str = "auto") -> Progress:
-    """The progress of a call from Python. show: "auto", a bar in a notebook and on a terminal, nothing elsewhere; or a choice."""
+    """Return the progress for a call from Python.
+
+    show: True, False, or "auto": a bar in a notebook and on a terminal, nothing elsewhere.
+    """
     if show is False:
         return Progress()
     if in_notebook():
@@ -62,7 +65,7 @@ def python_progress(show: bool | str = "auto") -> Progress:
 
 
 def in_notebook() -> bool:
-    """Whether the code runs in a notebook's kernel."""
+    """Return whether the code runs in a notebook's kernel."""
     ipython = sys.modules.get("IPython")
     shell = ipython.get_ipython() if ipython is not None else None
     return shell is not None and hasattr(shell, "kernel")

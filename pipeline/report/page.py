@@ -1,4 +1,4 @@
-"""What all reports share: their templates, pictures inside the page, numbers in words. A page needs no network and prints."""
+"""Provide templates, embedded pictures and formatted numbers for all reports. The pages need no network and can be printed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _LEAST_P = 0.001
 
 @cache
 def template(name: str) -> jinja2.Template:
-    """A template by its path in `pipeline`, with the filters that reports share; it includes style.css for their look."""
+    """Return a template by its path in `pipeline`, with the filters that reports share. It includes style.css."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader([_HERE, _HERE.parent]),
         autoescape=True,
@@ -36,41 +36,42 @@ def template(name: str) -> jinja2.Template:
 
 
 def p_value_in_words(p: float | None) -> str:
-    """A p-value as far as it means something: tests of many pixels give powers of ten that do not."""
+    """Format a p-value to the precision that is meaningful: with many pixels, tests give powers of ten that are not."""
     if p is None:
         return _NOTHING
     return f"{p:.2g}" if p >= _LEAST_P else f"< {_LEAST_P:g}"
 
 
 def millimetres(metres: float | None, digits: int = 1) -> str:
-    """Metres as millimetres; a dash where there is no value."""
-    return _NOTHING if metres is None or math.isnan(metres) else f"{true_minus(metres * 1e3, digits)} mm"
+    """Format metres as millimetres; a dash if there is no value."""
+    return _NOTHING if metres is None or math.isnan(metres) else f"{with_minus_sign(metres * 1e3, digits)} mm"
 
 
 def percent(ratio: float | None, digits: int = 1, *, signed: bool = False) -> str:
-    """A share as per cent; a dash where there is no value."""
+    """Format a share as per cent; a dash if there is no value."""
     if ratio is None or math.isnan(ratio):
         return _NOTHING
     plus = "+" if signed and ratio >= 0 else ""
-    return f"{plus}{true_minus(100 * ratio, digits)} %"
+    return f"{plus}{with_minus_sign(100 * ratio, digits)} %"
 
 
-def true_minus(value: float, digits: int) -> str:
-    """A number with a minus sign that is as wide as a plus, and none on a zero."""
+def with_minus_sign(value: float, digits: int) -> str:
+    """Format a number with a true minus sign, and none for zero."""
     return f"{value:.{digits}f}".replace("-", "\N{MINUS SIGN}" if round(value, digits) else "")
 
 
 def picture_source(png: bytes) -> str:
-    """A PNG as the `src` of a picture that stands inside the page."""
+    """Return a PNG as the `src` of an embedded picture."""
     return f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
 
 
 def _numbers(values: Sequence[float], digits: int = 2, factor: float = 1.0) -> str:
-    return ", ".join(true_minus(factor * value, digits) for value in values)
+    """Format several numbers."""
+    return ", ".join(with_minus_sign(factor * value, digits) for value in values)
 
 
 def litres(cubic_metres: float | None) -> str:
-    """Cubic metres as litres, to three significant digits, so that a pebble and a house both show."""
+    """Format cubic metres as litres with three significant digits, which suits a pebble as well as a house."""
     if cubic_metres is None:
         return _NOTHING
     value = 1e3 * cubic_metres

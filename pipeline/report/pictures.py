@@ -1,4 +1,4 @@
-"""What the pictures of a diagnosis share."""
+"""Convert the pictures of a diagnosis to PNG."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pipeline.report.plain_text import plain_text
 
 
 def png(figure: Figure, dpi: int = 110) -> bytes:
-    """The figure as PNG; equal figures give equal bytes."""
+    """Return the figure as PNG; equal figures give equal bytes."""
     buffer = io.BytesIO()
     with plain_text(figure):
         figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})

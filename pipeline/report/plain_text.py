@@ -1,4 +1,4 @@
-"""Text in pictures as it stands: a $ in the name of a sensor or a file is no formula."""
+"""Draw text in pictures literally: a $ in the name of a sensor or a file is not a formula."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 @contextmanager
 def plain_text(figure: Figure) -> Iterator[None]:
-    """Draw a figure inside: none of its texts is taken for Matplotlib's mathematics; a logarithmic axis needs plain labels.
+    """Draw a figure inside the `with` block without Matplotlib's mathematics. A logarithmic axis needs plain labels.
 
-    Control characters, halves of characters and what the font lacks become boxes.
+    Control characters, surrogates and characters that the font lacks become boxes.
     """
-    with rc_context({"text.parse_math": False}), warnings.catch_warnings():  # for the ticks, whose texts are made while drawing
+    with rc_context({"text.parse_math": False}), warnings.catch_warnings():  # for tick labels, which are made while drawing
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
         for text in figure.findobj(Text):
             text.set_parse_math(False)
@@ -30,12 +30,12 @@ def plain_text(figure: Figure) -> Iterator[None]:
 
 
 def powers_of_ten(axis: Axis) -> None:
-    """Label the ticks of a logarithmic (or symlog) axis 10⁻² ... 10³; others than powers of ten, and 0, as numbers."""
+    """Label the ticks of a logarithmic (or symlog) axis 10⁻² ... 10³, and other values as numbers."""
     axis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value)))
     axis.set_minor_formatter(NullFormatter())
 
 
 def power_of_ten(value: float) -> str:
-    """A number as a power of ten in Unicode, where it is one."""
+    """Format a power of ten in Unicode; other values as numbers."""
     mantissa, exponent = f"{value:.6e}".split("e")
     return f"10{str(int(exponent)).translate(_SUPERSCRIPTS)}" if float(mantissa) == 1 else f"{value:g}"

@@ -1,7 +1,7 @@
-"""Progress of a long command: named stages with weights, the time left, and each stage's wall time.
+"""Track the progress of a long command: named stages with weights, the remaining time, and each stage's wall time.
 
-Library code takes an optional `Progress`; the base class shows nothing and only takes the times. `shown_progress` picks the one
-that suits the terminal.
+Library code takes an optional `Progress`; the base class shows nothing and only measures times. `shown_progress` chooses the
+variant that suits the terminal.
 """
 
 from __future__ import annotations
@@ -14,19 +14,24 @@ from contextlib import contextmanager
 from typing import Self, TextIO
 
 _QUIET_S = 2.0
-"""A command shorter than this shows no plain lines."""
+"""A command shorter than this prints no progress lines, s."""
 _INTERVAL_S = 5.0
+"""Time between progress lines, s."""
 _GUESS_LIMIT = 0.95
-"""A stage that does not say how far it is counts as at most this much done."""
+"""Largest share that a stage counts as done if it does not report its progress."""
 _OVERDUE = 2.0
-"""A stage that takes so many times what the stages before it let one expect: the time left is anyone's guess."""
+"""A stage that takes this many times as long as the pace of earlier stages predicts makes the remaining time unknown."""
 
 
 class Progress:
-    """Stages as they go by, shown to nobody.
+    """Tracks stages without showing them. Use it as a context manager around the stages.
 
-    `timings` holds the wall time of each stage, s, summed where a stage comes several times; `current` is the stage under way.
-    Use it as a context manager around the stages.
+    Attributes
+    ----------
+    timings : dict
+        Wall time of each stage, s, summed if it occurs several times.
+    current : str
+        The present stage.
     """
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
@@ -46,10 +51,11 @@ class Progress:
         """Stop showing."""
 
     def plan(self, weights: Mapping[str, float]) -> None:
-        """Name stages to come and the seconds each is expected to take; only their ratios matter once one is done.
+        """Announce stages and the seconds that each is expected to take; once one is done, only their ratios matter.
 
-        Stages that were named before and are not done stay planned. A plan made under way divides the share that is left, so
-        that the share never falls. A stage that is not in the plan is timed like the others, and adds nothing to the share done.
+        Stages that were announced before and are not done remain planned. A plan made on the way divides the remaining share,
+        so that the share done never decreases. A stage that is not in the plan is timed like the others but adds nothing to
+        the share done.
         """
         self._share_before, self._weight_before = self.share, self._weight_before + self._done()
         left = {name: weight for name, weight in self._weights.items() if name not in self._finished}
@@ -57,7 +63,7 @@ class Progress:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[Self]:
-        """Mark what is done inside as the stage `name`; stages do not nest."""
+        """Mark what is done inside the `with` block as the stage `name`. Stages do not nest."""
         self.current, self._stage_began, self._fraction = name, self._clock(), 0.0
         try:
             yield self
@@ -67,7 +73,7 @@ class Progress:
             self.current = ""
 
     def advance(self, fraction: float) -> None:
-        """Say how much of the current stage is done, 0 to 1."""
+        """Report how much of the current stage is done, 0 to 1."""
         self._fraction = min(max(fraction, self._fraction), 1.0)
 
     @property
@@ -77,41 +83,44 @@ class Progress:
 
     @property
     def share(self) -> float:
-        """The share of all the work that is done, 0 to 1; it never falls."""
+        """Share of all the work that is done, 0 to 1; it never decreases."""
         part = self._done() / (sum(self._weights.values()) or 1.0)
         self._most = max(self._most, self._share_before + (1 - self._share_before) * part)
         return self._most
 
     @property
     def left_s(self) -> float:
-        """The wall time that the rest will take at the pace so far, s."""
+        """Expected remaining wall time at the pace so far, s."""
         done = self._done()
         so_far = self._weight_before + done
         return (sum(self._weights.values()) - done) * (self.elapsed_s / so_far if so_far > 0 else 1.0)
 
     @property
     def time(self) -> str:
-        """The time left, for people; the time so far without a plan, or where a stage takes longer than one could have told."""
+        """The remaining time in words; the elapsed time without a plan, or if the present stage is much slower than expected."""
         overdue = bool(self._finished) and self._guess() > _OVERDUE
         if self._weights and not overdue:
             return f"about {duration(self.left_s)} left"
-        return f"{duration(self.elapsed_s)} so far" + (", longer than usual" if overdue else "")
+        return f"{duration(self.elapsed_s)} so far" + (", slower than expected" if overdue else "")
 
     def _done(self) -> float:
-        """Weight done of the plan; a stage that has not said how far it is goes by the pace of the stages before it."""
+        """Return the weight that is done. A stage that has not reported its progress is estimated from the pace of earlier
+        stages.
+        """
         return self._weight_finished() + self._weight() * (self._fraction or min(self._guess(), _GUESS_LIMIT))
 
     def _weight_finished(self) -> float:
-        """Of the plan's stages that are over."""
+        """Return the weight of the finished stages."""
         return sum(self._weights.get(name, 0.0) for name in self._finished)
 
     def _weight(self) -> float:
-        """Of the current stage; nothing where it came before."""
+        """Return the weight of the current stage; 0 if it occurred before."""
         return 0.0 if self.current in self._finished else self._weights.get(self.current, 0.0)
 
     def _guess(self) -> float:
-        """Share of the current stage that is done at the pace of the stages before it, above 1 where it takes longer; what the
-        stage says where it says so."""
+        """Return the share of the current stage that is done: as reported, else estimated from the pace of earlier stages (above
+        1 if it is slower).
+        """
         weight = self._weight()
         if not weight or self._fraction:
             return self._fraction
@@ -121,7 +130,7 @@ class Progress:
 
 
 class LineProgress(Progress):
-    """Progress as plain lines, one at most every few seconds: for log files and pipes."""
+    """Prints progress as plain lines, at most one every few seconds, for log files and pipes."""
 
     def __init__(self, stream: TextIO, quiet_s: float = _QUIET_S, interval_s: float = _INTERVAL_S) -> None:
         super().__init__()
@@ -138,27 +147,30 @@ class LineProgress(Progress):
         self._ticker.join()
 
     def _tick(self) -> None:
+        """Print a line from time to time."""
         wait = self._quiet_s
         while not self._stop.wait(wait):
-            self._stream.write(f"{int(100 * self.share)} % done, {self.time}: {self.current}\n")
+            self._stream.write(f"{int(100 * self.share)} %  {self.current}  ({self.time})\n")
             self._stream.flush()
             wait = self._interval_s
 
 
 def shown_progress(*, quiet: bool = False, stream: TextIO | None = None) -> Progress:
-    """The progress for a command: a bar on a terminal, plain lines elsewhere, nothing where `quiet`; on stderr, if it is open."""
+    """Return the progress for a command: a bar on a terminal, plain lines elsewhere, nothing if `quiet`; on stderr if it is
+    open.
+    """
     stream = stream or sys.stderr
     if quiet or stream is None:
         return Progress()
     if not stream.isatty():
         return LineProgress(stream)
-    from pipeline.report.progress_bar import BarProgress  # rich is slow to import, and of no use elsewhere
+    from pipeline.report.progress_bar import BarProgress  # slow to import, and only needed here
 
     return BarProgress(stream)
 
 
 def duration(seconds: float) -> str:
-    """A duration for people: 40 s, 3 min 20 s, 2 h 5 min."""
+    """Format a duration: 40 s, 3 min 20 s, 2 h 5 min."""
     total = round(seconds)
     hours, minutes = total // 3600, total % 3600 // 60
     if hours:

@@ -1,4 +1,4 @@
-"""Progress as a bar on a terminal."""
+"""Show progress as a bar on a terminal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pipeline.report.progress import Progress
 
 
 class BarProgress(Progress):
-    """A bar that is drawn again several times a second and vanishes at the end."""
+    """A bar that is redrawn several times a second and vanishes at the end."""
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__()
@@ -28,7 +28,7 @@ class BarProgress(Progress):
 
 
 class _Bar(RichProgress):
-    """rich's bar, asking `source` how far it is whenever it is drawn."""
+    """rich's progress bar, which asks `source` for the progress whenever it is drawn."""
 
     def __init__(self, source: Progress, stream: TextIO) -> None:
         self._source = source
@@ -38,7 +38,8 @@ class _Bar(RichProgress):
         self.add_task("", total=1.0, time="")
 
     def get_renderables(self) -> Iterable[RenderableType]:
+        """Update and return what rich draws."""
         source = self._source
-        for task in self.task_ids:  # rich draws once before there is one
+        for task in self.task_ids:  # none when rich draws for the first time
             self.update(task, completed=source.share, description=source.current, time=source.time)
         yield from super().get_renderables()

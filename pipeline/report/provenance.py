@@ -1,4 +1,4 @@
-"""Which versions of what made a result."""
+"""Record the versions of the software that made a result."""
 
 from __future__ import annotations
 
@@ -20,10 +20,13 @@ PACKAGES = (
     "tifffile",
     "pycocotools",
 )
+"""Packages whose versions are recorded."""
 
 
 def versions() -> dict[str, str]:
-    """Version of Python, of this package and of those it computes with; packages that are not installed are left out."""
+    """Return the versions of Python, of this package and of those it computes with; packages that are not installed are left
+    out.
+    """
     found = {"python": platform.python_version(), "platform": platform.platform()}
     for package in PACKAGES:
         try:

@@ -1,4 +1,4 @@
-"""One look at the wall: what the sensor records, the depth maps that go to others, and the surface made of them."""
+"""Observe the wall once: the sensor's observation, the depth maps for other programs, and the surface made of them."""
 
 from __future__ import annotations
 
@@ -22,13 +22,24 @@ from sensors.stereo.stereo_pair import StereoPair
 from sensors.stereo.stereo_vertices import observe_vertices
 
 DepthMaps = tuple[DepthMap, DepthMap]
-"""Of the left and of the right camera."""
+"""Depth maps of the left and the right camera."""
 
 
 @dataclass(frozen=True)
-class Look:
-    """observation: the sensor's, of several stations the first one's; depth_maps: where the config sends them to others; joined:
-    all stations of a laser scanner that has several; vertices: the surface of a pair that measures the wall's own vertices."""
+class Acquisition:
+    """Everything that is recorded of the wall in one epoch.
+
+    Attributes
+    ----------
+    observation : Observation
+        The sensor's observation; with several stations that of the first.
+    depth_maps : DepthMaps, optional
+        If another program or COLMAP needs them.
+    joined : JoinedStations, optional
+        All stations of a laser scanner that has several.
+    vertices : TriangleMesh, optional
+        Surface of a pair that measures the wall's own vertices.
+    """
 
     observation: Observation
     depth_maps: DepthMaps | None
@@ -37,14 +48,30 @@ class Look:
 
     @property
     def observations(self) -> tuple[Observation, ...]:
-        """Of every station."""
+        """The observations of all stations."""
         return (self.observation,) if self.joined is None else self.joined.observations
 
 
-def look(config: SimulationConfig, site: SensorSite, scene: RayCaster, random: KeyedRandom) -> Look:
-    """Observe `scene`; the right depth map costs a second observation and is made only where it is needed.
+def acquire(config: SimulationConfig, site: SensorSite, scene: RayCaster, random: KeyedRandom) -> Acquisition:
+    """Observe `scene` with the site's sensor. The right depth map, which takes a second observation, is only made if it is
+    needed.
 
-    Raises InputError where a laser scanner's points should be reconstructed by COLMAP, or any but simulated ones by vertices.
+    Parameters
+    ----------
+    config : SimulationConfig
+        Says which products are needed.
+    site : SensorSite
+        The sensor and its position.
+    scene : RayCaster
+        The wall, wall frame.
+    random : KeyedRandom
+        Source of the sensor's noise.
+
+    Raises
+    ------
+    InputError
+        If the reconstruction does not fit the sensor: COLMAP for a laser scanner, or vertices for anything but a simulated
+        pair.
     """
     sensor, colmap = site.sensor, config.reconstruction == "colmap"
     vertices = None
@@ -57,17 +84,17 @@ def look(config: SimulationConfig, site: SensorSite, scene: RayCaster, random: K
     if not isinstance(sensor, StereoPair | MatchedStereoPair):
         if colmap:
             raise InputError("colmap fuses depth maps", where="reconstruction", allowed="direct, for the tls sensor")
-        return Look(seen, None, _join_stations(config, site, scene, seen, random))
+        return Acquisition(seen, None, _join_stations(config, site, scene, seen, random))
     if not (colmap or config.products.metashape):
-        return Look(seen, None, vertices=vertices)
+        return Acquisition(seen, None, vertices=vertices)
     left, right = depth_cameras(pair_of(sensor))
-    return Look(
+    return Acquisition(
         seen, (DepthMap(left, seen.depth), DepthMap(right, observe_right(sensor, scene, random).depth)), vertices=vertices
     )
 
 
-def reconstruct(config: SimulationConfig, seen: Look) -> TriangleMesh:
-    """The surface of a look, wall frame, by the config's reconstruction."""
+def reconstruct(config: SimulationConfig, seen: Acquisition) -> TriangleMesh:
+    """Make the surface of an acquisition, wall frame, by the config's method of reconstruction."""
     observation = seen.observation
     if seen.joined is not None:
         return seen.joined.surface

@@ -1,8 +1,8 @@
-"""How far an epoch's map is displaced: what carries the outlines of the carved niches to where sensor and ICP put them.
+"""Estimate how far an epoch's map is displaced, to move the outlines of the carved niches to where sensor and ICP put them.
 
-A label is that of the carved wall's face seen along -z. The sensor's samples tell how far the map is displaced: x and y of
-what was recorded and registered, minus where it was. Averaged over cells of some hundred samples this is smooth, and free of
-white noise that would fray the outlines of small niches; a pixel takes the label of the place that it came from.
+A label is that of the carved wall's face seen along -z. The sensor's samples tell the displacement of the map: x and y of what
+was recorded and registered, minus the true x and y. Averaged over cells of some hundred samples, it is smooth and free of
+white noise that would fray the outlines of small niches. A pixel takes the label of the place from which it came.
 """
 
 from __future__ import annotations
@@ -17,14 +17,25 @@ from scene.geometry.mesh import FloatArray
 from sensors.signal_chain.observation import Observation
 
 _CELL_M = 0.5
-"""Side of the cells that displacements are averaged over, where samples are dense enough."""
+"""Side of the cells over which displacements are averaged, if samples are dense enough."""
 _LEAST_SAMPLES = 30
+"""Number of samples that a cell has on average at least."""
 _OUTLIER = 6.0
-"""Samples displaced by more than this many NMAD from the median met another surface than the one they are beside."""
+"""Samples displaced by more than this many NMAD from the median belong to another surface, beyond a depth edge."""
 
 
 def displacement(observations: tuple[Observation, ...], registration: Registration | None, grid: Grid) -> NDArray[np.float32]:
-    """(h, w, 2) x and y of the map minus the truth at the pixels of `grid`, m; 0 where the samples do not know it."""
+    """Estimate x and y of the map minus the truth at the pixels of `grid`, (h, w, 2), m; 0 if the samples do not tell.
+
+    Parameters
+    ----------
+    observations : tuple of Observation
+        Of all stations.
+    registration : Registration, optional
+        Transform that was applied to the points.
+    grid : Grid
+        Pixels of the map.
+    """
     samples = [_samples(each, registration) for each in observations]
     place, offset = (np.concatenate(parts) for parts in zip(*samples, strict=True))
     result = np.zeros((*grid.shape, 2), dtype=np.float32)
@@ -47,7 +58,7 @@ def displacement(observations: tuple[Observation, ...], registration: Registrati
 
 
 def _samples(seen: Observation, registration: Registration | None) -> tuple[FloatArray, FloatArray]:
-    """(n, 2) places of the samples in the map, m, and how far each is displaced, without outliers."""
+    """Return positions (n, 2) of the samples in the map, m, and the displacement of each, without outliers."""
     if seen.offset is None:
         return np.empty((0, 2)), np.empty((0, 2))
     points, offset = seen.points[seen.valid], seen.offset[seen.valid].astype(np.float64)
@@ -61,7 +72,7 @@ def _samples(seen: Observation, registration: Registration | None) -> tuple[Floa
 
 
 def _filled(total: FloatArray, count: NDArray[np.signedinteger]) -> FloatArray:
-    """Means of cells; one with too few samples takes the nearest one's."""
+    """Return the mean of each cell; a cell with too few samples takes that of the nearest one."""
     from scipy import ndimage
 
     known = count >= _LEAST_SAMPLES / 3

@@ -1,4 +1,4 @@
-"""One epoch, read from top to bottom: carve, observe, mesh, register, rasterise, difference, annotate."""
+"""Make one epoch, read from top to bottom: carve, observe, mesh, register, rasterise, difference, annotate."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from pipeline.config.simulation import SimulationConfig
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import Registration, register_to
 from pipeline.report.progress import Progress
-from pipeline.run.acquisition import Look, look, reconstruct
+from pipeline.run.acquisition import Acquisition, acquire, reconstruct
 from pipeline.run.displacement import displacement
-from pipeline.run.registered import reference_and_target, reference_sensor
+from pipeline.run.reference import reference_and_target, reference_sensor
 from pipeline.run.site import SensorSite
 from scene.blocks.block import Blocks, place_blocks
 from scene.blocks.carve import Carved, block_records, carve
@@ -29,14 +29,23 @@ from sensors.models.placement import check_in_front
 
 @dataclass(frozen=True)
 class ReferenceEpoch:
-    """The first epoch, of the untouched wall: all later ones are compared with it.
+    """The first epoch, of the untouched wall, with which all later ones are compared.
 
-    seen: what the sensor saw, None once it is written, which spares its memory; caster: the untouched wall; surface:
-    reconstructed; raster: of the surface, its grid is that of every difference map; target: the surface as ICP wants it, where
-    epochs are registered.
+    Attributes
+    ----------
+    seen : Acquisition, optional
+        What the sensor recorded; None once it is written, which frees its memory.
+    caster : RayCaster
+        The untouched wall.
+    surface : TriangleMesh
+        The reconstructed surface.
+    raster : SurfaceRaster
+        The surface as a raster; every difference map has its grid.
+    target : ReferenceSurface, optional
+        The surface to which epochs are registered.
     """
 
-    seen: Look | None
+    seen: Acquisition | None
     caster: RayCaster
     surface: TriangleMesh
     raster: SurfaceRaster
@@ -47,13 +56,34 @@ class ReferenceEpoch:
 class LaterEpoch:
     """A later epoch.
 
-    seen: what the sensor saw; solids: the blocks; blocks: records of what was carved, with what the difference map shows of each;
-    surface: reconstructed, before registration; raster: after it; difference: (h, w) float32, m, reference minus epoch; m3c2:
-    distances of the registered surface's vertices, where the config asks for them.
+    Attributes
+    ----------
+    number : int
+        Number of the epoch, from 1.
+    seen : Acquisition
+        What the sensor recorded.
+    carved : Carved
+        The wall without the blocks.
+    solids : Blocks
+        The blocks.
+    blocks : list of dict
+        Records of the carved blocks, with what the difference map shows of each.
+    surface : TriangleMesh
+        The reconstructed surface before registration.
+    registration : Registration, optional
+        To the reference.
+    raster : SurfaceRaster
+        The registered surface.
+    difference : (h, w) float32 array
+        Reference minus epoch, m.
+    statistics : BlockStatistics
+        Of the difference map.
+    m3c2 : M3c2Map, optional
+        Distances of the registered surface's vertices, if the config asks for them.
     """
 
     number: int
-    seen: Look
+    seen: Acquisition
     carved: Carved
     solids: Blocks
     blocks: list[dict[str, Any]]
@@ -66,16 +96,16 @@ class LaterEpoch:
 
 
 STAGES = {"carve": 4.0, "observe": 3.0, "mesh": 1.0, "register": 4.0, "difference": 2.0, "write": 8.0}
-"""The stages of an epoch and their rough weights for the time left."""
+"""The stages of an epoch and their approximate weights, for the estimate of the remaining time."""
 
 
 def observe_reference(config: SimulationConfig, site: SensorSite, random: KeyedRandom, progress: Progress) -> ReferenceEpoch:
-    """Observe the untouched wall, reconstruct and rasterise it; `random` is the run's."""
+    """Observe the untouched wall, reconstruct it and rasterise it. `random` is the run's source."""
     with progress.stage("epoch 0: observe"):
-        caster = RayCaster(as_observed(config, site.mesh))
+        caster = RayCaster(with_wetness(config, site.mesh))
         for where, viewpoint in site.viewpoints.items():
             check_in_front(caster, viewpoint, where)
-        seen = look(config, reference_sensor(config, site), caster, random.child("epoch", 0, "observe"))
+        seen = acquire(config, reference_sensor(config, site), caster, random.child("epoch", 0, "observe"))
     with progress.stage("epoch 0: mesh"):
         found, keyed = reconstruct(config, seen), random.child("epoch", 0, "register")
         surface, target = reference_and_target(config, found, caster.mesh, keyed)
@@ -87,19 +117,34 @@ def observe_reference(config: SimulationConfig, site: SensorSite, random: KeyedR
 def observe_epoch(
     config: SimulationConfig, site: SensorSite, reference: ReferenceEpoch, number: int, random: KeyedRandom, progress: Progress
 ) -> LaterEpoch:
-    """Carve blocks from the untouched wall, observe it and compare with the reference.
+    """Carve blocks from the untouched wall, observe it and compare it with the reference.
 
-    A pure function of config, site and (seed, number): the result does not depend on other epochs.
+    The result is a pure function of config, site and (seed, number); it does not depend on other epochs.
+
+    Parameters
+    ----------
+    config : SimulationConfig
+        Config of the run.
+    site : SensorSite
+        Wall and sensor.
+    reference : ReferenceEpoch
+        The reference epoch.
+    number : int
+        Number of the epoch, from 1.
+    random : KeyedRandom
+        The run's source of random numbers.
+    progress : Progress
+        Is told the stages.
     """
     keyed = random.child("epoch", number)
     with progress.stage(f"epoch {number}: carve"):
         blocks = place_blocks(config.rockfall, site.mesh, keyed.child("blocks"), reference.caster)
         carved = carve(site.mesh, blocks)
-        carved = replace(carved, mesh=as_observed(config, carved.mesh))
+        carved = replace(carved, mesh=with_wetness(config, carved.mesh))
         records = block_records(blocks, carved.removed_volume_m3)
     with progress.stage(f"epoch {number}: observe"):
         after = RayCaster(carved.mesh)
-        seen = look(config, site, after, keyed.child("observe"))
+        seen = acquire(config, site, after, keyed.child("observe"))
     with progress.stage(f"epoch {number}: mesh"):
         surface = reconstruct(config, seen)
     registration, registered = None, surface
@@ -125,16 +170,24 @@ def observe_epoch(
     return LaterEpoch(number, seen, carved, blocks, found, surface, registration, raster, change, statistics, clouds)
 
 
-def as_observed(config: SimulationConfig, mesh: TriangleMesh) -> TriangleMesh:
-    """The wall in the state that sensors meet: wet where the config says so."""
+def with_wetness(config: SimulationConfig, mesh: TriangleMesh) -> TriangleMesh:
+    """Return the wall as sensors see it: with wet patches if the config has them."""
     return mesh if config.wetness is None else config.wetness.with_wet_patches(mesh)
 
 
 def measure_blocks(change: NDArray[np.float32], raster: SurfaceRaster, ratio: FloatArray) -> list[dict[str, Any]]:
-    """What the difference map shows of each block: area (of its label, with data), volume and mean depth, SI, and the matched
-    filter's signal-to-noise `ratio` (k,).
+    """Measure what the difference map shows of each block: area (of its label, with data), volume and mean depth, SI.
 
-    Volume is the sum of the differences over the label's pixels times the pixel's area.
+    The volume is the sum of the differences over the label's pixels, times the area of a pixel.
+
+    Parameters
+    ----------
+    change : (h, w) array
+        Difference map, m.
+    raster : SurfaceRaster
+        Labels of the map.
+    ratio : (k,) array
+        Signal-to-noise ratios of the matched filter, which are added to the records.
     """
     count = len(ratio)
     seen = (raster.block != WALL) & ~np.isnan(change)
@@ -154,6 +207,6 @@ def measure_blocks(change: NDArray[np.float32], raster: SurfaceRaster, ratio: Fl
 
 
 def to_world(site: SensorSite, position: list[float]) -> list[float]:
-    """A wall-frame position, m, in the wall's own (world) coordinates."""
+    """Convert a position from the wall frame to world coordinates, m."""
     world: FloatArray = site.frame.to_world(np.array(position))
     return world.tolist()

@@ -1,4 +1,4 @@
-"""What a run was observed with, as rows of its report: sensor, place, distance, noise, and how finely it samples the wall."""
+"""Describe what a run was observed with, as rows of its report: sensor, position, distance, noise, sampling of the wall."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.report.page import true_minus
+from pipeline.report.page import with_minus_sign
 from pipeline.run.site import SensorSite
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect
@@ -17,17 +17,20 @@ from sensors.stereo.stereo_matched import MatchedStereoPair
 from sensors.stereo.stereo_pair import REDUCTION
 
 _ARCSEC = np.degrees(1.0) * 3600
-"""Seconds of arc in a radian."""
+"""Seconds of arc per radian."""
 _ONE_SIGMA = "(1 \N{GREEK SMALL LETTER SIGMA})"
 
 
 def instrument_figures(site: SensorSite) -> dict[str, str]:
-    """Name to value, with its unit, of what a reader looks for first: which sensor saw the wall, from where, how well."""
+    """Return name and value, with unit, of what a reader asks first: which sensor observed the wall, from where, how
+    precisely.
+    """
     own = _scanner_figures(site.sensor, site) if isinstance(site.sensor, LaserScanner) else _pair_figures(site.sensor, site)
     return {**own, **_places(site)}
 
 
 def _scanner_figures(scanner: LaserScanner, site: SensorSite) -> dict[str, str]:
+    """Describe a laser scanner."""
     config, noise = scanner.config, scanner.model.noise
     steps = config.azimuth_step_rad, config.zenith_step_rad
     on_the_wall = [step * _ranges(site.mesh.vertices, scanner.position)[1] * 1e3 for step in steps]
@@ -45,6 +48,7 @@ def _scanner_figures(scanner: LaserScanner, site: SensorSite) -> dict[str, str]:
 
 
 def _pair_figures(sensor: StereoSensor, site: SensorSite) -> dict[str, str]:
+    """Describe a stereo pair."""
     pair = pair_of(sensor)
     left, right, noise = pair.cameras.left, pair.cameras.right, pair.model.noise
     base = float(np.linalg.norm(right.position - left.position))
@@ -63,16 +67,17 @@ def _pair_figures(sensor: StereoSensor, site: SensorSite) -> dict[str, str]:
 
 
 def _is_drawn(noise: OrientationNoise) -> bool:
-    """Whether any orientation parameter differs from its calibrated value."""
+    """Return whether any orientation parameter differs from its calibrated value."""
     return any(getattr(noise, name) != DrawnParameter() for name in type(noise).model_fields)
 
 
 def _effects(effects: Sequence[Effect]) -> str:
-    """Their names, with the parameters that are not at their defaults."""
+    """List the effects by name, with the parameters that are not at their defaults."""
     return "; ".join(_with_parameters(effect) for effect in effects if not effect.is_null) or "none beyond the noise"
 
 
 def _with_parameters(effect: Effect) -> str:
+    """Describe one effect."""
     values = {name: getattr(effect, name) for name in type(effect).model_fields if name != "name"}
     own = {name: value for name, value in values.items() if value != type(effect).model_fields[name].default}
     told = ", ".join(f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}" for name, value in own.items())
@@ -80,23 +85,27 @@ def _with_parameters(effect: Effect) -> str:
 
 
 def _places(site: SensorSite) -> dict[str, str]:
-    """World coordinates of the sensor's eyes and how far the wall is from each."""
+    """Return the world coordinates of the sensor's viewpoints, and the distance of the wall from each."""
     return {
         row: value
         for name, eye in site.viewpoints.items()
         for row, value in (
-            (f"Position ({name})", ", ".join(true_minus(each, 2) for each in site.frame.to_world(eye)) + " m (x, y, z, world)"),
+            (
+                f"Position ({name})",
+                ", ".join(with_minus_sign(each, 2) for each in site.frame.to_world(eye)) + " m (x, y, z, world)",
+            ),
             (f"Distance to the wall ({name})", _in_words(_ranges(site.mesh.vertices, eye))),
         )
     }
 
 
 def _ranges(vertices: FloatArray, eye: FloatArray) -> tuple[float, float, float]:
-    """Least, median and largest distance, m, of the wall's (n, 3) vertices from a (3,) eye in the same frame."""
+    """Return smallest, median and largest distance, m, of vertices (n, 3) from a viewpoint (3,) in the same frame."""
     least, median, largest = np.quantile(np.linalg.norm(vertices - eye, axis=1), [0.0, 0.5, 1.0])
     return float(least), float(median), float(largest)
 
 
 def _in_words(ranges: tuple[float, float, float]) -> str:
+    """Describe distances in words."""
     least, median, largest = ranges
     return f"{median:.1f} m (median; {least:.1f} m to {largest:.1f} m)"

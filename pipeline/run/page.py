@@ -1,4 +1,4 @@
-"""A run's report: what it shows, and the page that it becomes."""
+"""Define the content of a run's report, and write it as a page."""
 
 from __future__ import annotations
 
@@ -15,16 +15,31 @@ from pipeline.report.page import litres, millimetres, template
 
 _SENSORS = {"stereo": "stereo pair", "tls": "terrestrial laser scanner"}
 _UNFOLDED_ROWS = 60
-"""A longer table of blocks comes folded."""
+"""Tables of blocks with more rows than this are folded."""
 
 Statistics = Mapping[str, float | int | None]
-"""As DifferenceStatistics.to_dict() gives it: count, median_m, standard_deviation_m, rmse_m, nmad_m, ...; None: no data."""
+"""The result of DifferenceStatistics.to_dict(): count, median_m, standard_deviation_m, rmse_m, nmad_m, ...; None: no data."""
 
 
 @dataclass(frozen=True)
 class BlockRow:
-    """A carved block. size_m: (3,); volumes in m3, measured_volume_m3 None where the map does not show the block;
-    position_m: (3,) wall frame; world_position_m: (3,) the wall's own coordinates; annotated: it is in annotations.json."""
+    """One carved block in the report.
+
+    Attributes
+    ----------
+    label, shape
+        As in blocks.json.
+    size_m : (3,) sequence
+        Lengths of the axes, m.
+    volume_m3 : float
+        True volume.
+    measured_volume_m3 : float or None
+        Volume in the difference map; None if the map does not show the block.
+    position_m, world_position_m : (3,) sequences
+        Position in the wall frame and in world coordinates, m.
+    annotated : bool
+        Whether it is in annotations.json.
+    """
 
     label: int
     shape: str
@@ -37,7 +52,7 @@ class BlockRow:
 
     @property
     def relative_error(self) -> float | None:
-        """Measured over true volume, minus one."""
+        """Measured over true volume, minus one; None if the block was not measured."""
         if self.measured_volume_m3 is None or not self.volume_m3:
             return None
         return self.measured_volume_m3 / self.volume_m3 - 1
@@ -45,8 +60,23 @@ class BlockRow:
 
 @dataclass(frozen=True)
 class EpochReport:
-    """What the report shows of an epoch; pictures are PNG bytes. sigma_m: of the difference map's colour scale; zooms: on blocks;
-    registration: RMS of the inliers, m, and iterations, None where epochs are not registered, then convergence is None too."""
+    """What the report shows of one epoch. Pictures are PNG bytes.
+
+    Attributes
+    ----------
+    number, points : int
+        Number of the epoch, and of its points.
+    inside, outside : Statistics
+        Of the difference map, inside and outside the blocks.
+    sigma_m : float
+        Noise level that sets the colour scale of the difference map, m.
+    blocks : sequence of BlockRow
+        The carved blocks.
+    hillshade, difference, histogram, convergence, zooms : bytes
+        Pictures; convergence is None without registration, zooms None without blocks.
+    registration : RegistrationSummary, optional
+        How the registration ended.
+    """
 
     number: int
     points: int
@@ -63,15 +93,16 @@ class EpochReport:
 
     @property
     def annotated(self) -> int:
+        """Number of annotated blocks."""
         return sum(block.annotated for block in self.blocks)
 
     @property
     def total(self) -> tuple[float, float]:
-        """Volume of all blocks together, m3: true, and measured of those that the map shows."""
+        """True volume of all blocks, m3, and measured volume of those that the map shows."""
         return sum(block.volume_m3 for block in self.blocks), sum(block.measured_volume_m3 or 0.0 for block in self.blocks)
 
     def summary(self) -> str:
-        """One sentence in plain words."""
+        """Describe the epoch in one or two sentences."""
         true, measured = map(litres, self.total)
         volumes = f" of {true} l together, of which the map shows {measured} l" if self.blocks else ""
         carved = f"Epoch {self.number}: {_count(len(self.blocks), 'block')} carved{volumes}, {self.annotated} annotated"
@@ -83,7 +114,7 @@ class EpochReport:
 
 @dataclass(frozen=True)
 class RegistrationSummary:
-    """How the registration ended. rms_m: of the inliers' residuals; reason: why it stopped, in words."""
+    """How the registration ended. rms_m: RMS of the inliers' residuals, m; reason: why it stopped, in words."""
 
     rms_m: float
     inliers: int
@@ -94,8 +125,27 @@ class RegistrationSummary:
 
 @dataclass(frozen=True)
 class RunReport:
-    """What the report of a run shows. sensor: stereo or tls; reference: PNG of its hillshade; key_figures: further rows of the
-    table at the top, name to value with its unit; config: resolved; complete: False where the run was interrupted."""
+    """What the report of a run shows.
+
+    Attributes
+    ----------
+    title : str
+        Title of the page.
+    sensor : str
+        "stereo" or "tls".
+    seed : int
+        Seed of the run.
+    reference : bytes
+        Hillshade of the reference, PNG.
+    epochs : sequence of EpochReport
+        The later epochs.
+    config : mapping
+        The resolved config.
+    key_figures : mapping
+        Further rows of the table at the top: name to value with its unit.
+    complete : bool
+        False if the run was interrupted.
+    """
 
     title: str
     sensor: str
@@ -107,14 +157,14 @@ class RunReport:
     complete: bool = True
 
     def summary(self) -> str:
-        """What was done, in plain words."""
+        """Describe in words what was done."""
         sensor = _SENSORS.get(self.sensor, self.sensor)
         end = "" if self.complete else " The run was interrupted: later epochs are missing."
         return f"A {sensor} observed a rock wall before and after rocks fell, in {_count(len(self.epochs), 'epoch')}.{end}"
 
 
 def write_report(path: Path, report: RunReport) -> None:
-    """Write report.html, whole or not at all; equal arguments give equal bytes. Raises InputError where it cannot be written."""
+    """Write report.html completely or not at all. Equal arguments give equal bytes. Raises InputError if it cannot be written."""
     config = yaml.safe_dump(dict(report.config), sort_keys=False, allow_unicode=True)
     values = {"report": report, "config": config, "scale_sigmas": SCALE_SIGMAS, "unfolded_rows": _UNFOLDED_ROWS}
     page = template("run/report.html.jinja").render(values)
@@ -122,4 +172,5 @@ def write_report(path: Path, report: RunReport) -> None:
 
 
 def _count(number: int, noun: str) -> str:
+    """Return a number with its noun, in the plural if needed."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

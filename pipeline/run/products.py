@@ -1,6 +1,6 @@
-"""The files of an epoch. A folder gets its final name when all of its files are written.
+"""Write the files of an epoch. A folder gets its final name when all its files are written.
 
-What is written is known by its checksums, so that a later call can tell whether it is whole.
+The checksums of everything written are recorded, so that a later call can tell whether it is complete.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from pipeline.report.figures import (
 )
 from pipeline.report.map_styles import difference_style, quantity_style
 from pipeline.report.page import litres
-from pipeline.run.acquisition import Look
+from pipeline.run.acquisition import Acquisition
 from pipeline.run.epoch import LaterEpoch, ReferenceEpoch
 from pipeline.run.recorded_points import recorded_points, scans_of
 from pipeline.run.site import SensorSite
@@ -56,20 +56,25 @@ from scene.geometry.mesh import WALL, FloatArray, TriangleMesh
 from scene.walls.imported import ImportedWall
 
 EPOCH_RECORD = "epoch.json"
+"""File in an epoch's folder that holds its record."""
 Checksums = dict[str, str]
-"""SHA-256 of files, by their names relative to the run's folder."""
+"""SHA-256 of files by their names relative to the run's folder."""
 M3C2_ANNOTATIONS = "annotations_m3c2"
-"""Key of an epoch's record, and the name of the run's file."""
+"""Key in an epoch's record, and the name of the run's file."""
 
 
 def is_whole(out: Path, checksums: Checksums, where: Path) -> bool:
-    """Whether the files are there with these checksums. Raises InputError for a name, of the file `where`, out of the folder."""
+    """Return whether all files exist with the given checksums. Raises InputError if a name in the file `where` leads out of the
+    folder.
+    """
     files = {inside(out, name, where): digest for name, digest in checksums.items()}
     return bool(files) and all(path.is_file() and sha256(path) == digest for path, digest in files.items())
 
 
-def write_reference(out: Path, config: SimulationConfig, site: SensorSite, reference: ReferenceEpoch, seen: Look) -> Checksums:
-    """Write epoch_000, of what the sensor has `seen`, and the hillshade of the reference."""
+def write_reference(
+    out: Path, config: SimulationConfig, site: SensorSite, reference: ReferenceEpoch, seen: Acquisition
+) -> Checksums:
+    """Write epoch_000, with what the sensor recorded (`seen`), and the hillshade of the reference."""
     with noting() as written, _folder(out, 0) as folder:
         _write_common(folder, config, site, seen, reference.surface, reference.caster.mesh, [])
         write_bytes(out / "reference.png", hillshade_figure(reference.raster.heights, reference.raster.grid, "Reference"))
@@ -118,10 +123,12 @@ def write_epoch(out: Path, config: SimulationConfig, site: SensorSite, reference
 
 
 def _checksums(out: Path, written: list[Path]) -> Checksums:
+    """Return the checksums of the files that were written."""
     return {str(path.relative_to(out)): sha256(path) for path in written if path.exists()}
 
 
 def _record(config: SimulationConfig, epoch: LaterEpoch, images: list[LabelledImage], sigma: float) -> dict[str, Any]:
+    """Make the record of an epoch."""
     return {
         "epoch": epoch.number,
         **_seen_record(epoch.seen),
@@ -140,12 +147,13 @@ def _record(config: SimulationConfig, epoch: LaterEpoch, images: list[LabelledIm
 
 
 def _m3c2_record(config: SimulationConfig, number: int, found: M3c2Map) -> dict[str, Any]:
+    """Make the M3C2 part of an epoch's record."""
     image = LabelledImage(f"m3c2_{number:03d}.tif", found.block, found.grid, number)
     return {"m3c2": found.summary(), M3C2_ANNOTATIONS: coco([image], config.annotation)}
 
 
 def _write_m3c2(out: Path, number: int, found: M3c2Map) -> None:
-    """The distances and their level of detection as maps, the distances as a picture, and all of it as points."""
+    """Write the distances and their levels of detection as maps, the distances as a picture, and everything as points."""
     write_geotiff(out / f"m3c2_{number:03d}.tif", found.distance, found.grid, description="M3C2, m; missing rock is positive")
     write_geotiff(out / f"m3c2_lod_{number:03d}.tif", found.level, found.grid, description="M3C2 level of detection 95 %, m")
     calm = statistics(found.distance[found.block == WALL])
@@ -159,8 +167,8 @@ def _write_m3c2(out: Path, number: int, found: M3c2Map) -> None:
     write_laz(out / f"m3c2_{number:03d}.laz", PointCloud(found.points, extra=extra))
 
 
-def _seen_record(seen: Look) -> dict[str, Any]:
-    """Number of points and, of several stations, how the further ones were registered to the first."""
+def _seen_record(seen: Acquisition) -> dict[str, Any]:
+    """Return the number of points and, with several stations, the registrations of the further ones to the first."""
     points = sum(int(each.valid.sum()) + (0 if each.further is None else len(each.further.cell)) for each in seen.observations)
     registered = () if seen.joined is None else seen.joined.registrations
     return {"points": points} | ({"stations": [found.to_dict() for found in registered]} if registered else {})
@@ -169,7 +177,7 @@ def _seen_record(seen: Look) -> dict[str, Any]:
 def _images(
     out: Path, config: SimulationConfig, epoch: LaterEpoch, reference: ReferenceEpoch, name: str
 ) -> Iterator[LabelledImage]:
-    """The images of the data set: the difference map, or its tiles, which are written here."""
+    """Yield the images of the data set: the difference map, or its tiles, which are written here."""
     labels = np.where(np.isnan(epoch.difference), WALL, epoch.raster.block)
     if config.tiles is None:
         yield LabelledImage(f"{name}.tif", labels, reference.raster.grid, epoch.number)
@@ -184,12 +192,12 @@ def _write_common(
     folder: Path,
     config: SimulationConfig,
     site: SensorSite,
-    seen: Look,
+    seen: Acquisition,
     surface: TriangleMesh,
     truth: TriangleMesh,
     blocks: list[dict[str, Any]],
 ) -> None:
-    """What every epoch has: points, depth map, surface, truth, blocks."""
+    """Write what every epoch has: points, depth map, surface, truth, blocks."""
     products = config.products
     cloud = recorded_points(seen.observations)
     write_cloud(folder / "points.laz", cloud)
@@ -214,7 +222,7 @@ def _write_common(
 
 
 def _write_formats(stem: Path, formats: Sequence[str], cloud: PointCloud, scans: Callable[[], list[E57Scan]], wkt: str) -> None:
-    """Points in the formats beside LAZ, by one stem."""
+    """Write points in the formats besides LAZ, all with the same stem."""
     if "copc" in formats:
         write_cloud(stem.with_suffix(COPC), cloud, wkt)
     if "ply" in formats:
@@ -228,7 +236,8 @@ def _write_formats(stem: Path, formats: Sequence[str], cloud: PointCloud, scans:
 
 
 def write_cloud(path: Path, cloud: PointCloud, wkt: str = "") -> None:
-    """Write LAZ, or COPC where `path` ends in .copc.laz, with the channels that the format has a place of its own for in theirs.
+    """Write a point cloud as LAZ, or as COPC if `path` ends in .copc.laz. Channels with a field of their own in the format go
+    there.
 
     wkt: coordinate system of the points. Raises InputError as `write_laz` and `write_copc` do.
     """
@@ -239,7 +248,7 @@ def write_cloud(path: Path, cloud: PointCloud, wkt: str = "") -> None:
 
 
 def _write_block_meshes(folder: Path, wall: TriangleMesh, blocks: Blocks) -> None:
-    """The four meshes of each block (thesis 3.3): wall difference, intersection, niche, removed block."""
+    """Write the four meshes of each block (thesis 3.3): wall difference, intersection, niche, removed block."""
     for index in range(len(blocks)):
         meshes = block_meshes(wall, blocks, index)
         for field in fields(meshes):
@@ -247,13 +256,14 @@ def _write_block_meshes(folder: Path, wall: TriangleMesh, blocks: Blocks) -> Non
 
 
 def _in_world(mesh: TriangleMesh, site: SensorSite) -> TriangleMesh:
+    """Convert a mesh to world coordinates."""
     vertices: FloatArray = site.frame.to_world(mesh.vertices)
     return replace(mesh, vertices=vertices)
 
 
 @contextmanager
 def _folder(out: Path, number: int) -> Iterator[Path]:
-    """The epoch's folder under a temporary name, renamed when everything in it and beside it is written."""
+    """Provide the epoch's folder under a temporary name, and rename it when everything in it and beside it is written."""
     final = epoch_folder(out, number)
     temporary = final.with_name(f".{final.name}")
     temporary.mkdir(parents=True, exist_ok=True)
@@ -269,7 +279,7 @@ def _folder(out: Path, number: int) -> Iterator[Path]:
 
 
 def _give_names(temporary: Path, final: Path, files: list[Path]) -> None:
-    """Put the files into an epoch's folder that was found damaged, beside what else is in it."""
+    """Move the files into an existing, damaged folder of the epoch, beside what else is in it."""
     for name in files:
         with explained(final / name):
             (final / name).parent.mkdir(parents=True, exist_ok=True)

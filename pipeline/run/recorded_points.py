@@ -1,4 +1,4 @@
-"""An epoch's points as a file holds them: those of the sensor's grid, further returns of a pulse, of all stations."""
+"""Collect an epoch's points as a file holds them: the points of the sensor's grid and further returns, of all stations."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from sensors.signal_chain.observation import Observation
 
 
 def recorded_points(observations: Sequence[Observation]) -> PointCloud:
-    """The points of every station, one after another, each in the order of its pulses and their returns; m, their frame.
+    """Collect the points of every station, one after another, each in the order of its pulses and their returns, in m.
 
-    The extra channels are those of the truth, `block`, where a pulse has several returns `return_number` and `number_of_returns`,
-    `scan_angle_rad` (nominal, from straight down) of a scanner, and of several stations `station`, counted from 1. Times start
-    with each station's scan.
+    The extra channels are those of the truth; `block`; `return_number` and `number_of_returns` if a pulse has several returns;
+    `scan_angle_rad` of a scanner (nominal, from straight down); and, with several stations, `station`, counted from 1. Times
+    start with each station's scan.
     """
     clouds = [_of_station(observation) for observation in observations]
     if len(clouds) == 1:
@@ -37,9 +37,10 @@ def recorded_points(observations: Sequence[Observation]) -> PointCloud:
 
 
 def scans_of(observations: Sequence[Observation], frame: WallFrame | None = None) -> list[E57Scan]:
-    """Each observation as an E57 scan: its grid as `row` and `column`, the sensor's place as the pose (the wall frame's axes).
+    """Convert each observation to an E57 scan, with its grid as `row` and `column` and the sensor's position as pose (the wall
+    frame's axes).
 
-    frame: then the pose leads to the world instead of to the wall frame.
+    frame: if given, the pose leads to the world instead of the wall frame.
     """
     frame = frame or WallFrame.identity()
     scans = []
@@ -52,11 +53,12 @@ def scans_of(observations: Sequence[Observation], frame: WallFrame | None = None
 
 
 def _grid_points(seen: Observation) -> PointCloud:
-    """The returns in the grid, one for each cell that has any."""
+    """Return the points in the grid, one for each cell with a return."""
     return _of_station(replace(seen, further=None))
 
 
 def _of_station(seen: Observation) -> PointCloud:
+    """Collect the points of one station."""
     valid, further = seen.valid, seen.further
     channels = {**seen.truth, "block": seen.block}
     if seen.zenith_rad is not None:
@@ -83,11 +85,12 @@ def _of_station(seen: Observation) -> PointCloud:
 
 
 def _with_returns(cloud: PointCloud) -> PointCloud:
-    """The cloud with return numbers: 1 of 1 where it has none."""
+    """Return the cloud with return numbers: 1 of 1 if it has none."""
     ones = np.ones(len(cloud.points), dtype=np.uint8)
     extra = {"return_number": ones, "number_of_returns": ones} | cloud.extra
     return PointCloud(cloud.points, cloud.intensity, cloud.gps_time, extra)
 
 
 def _joined(channels: Sequence[Any]) -> Any:
+    """Concatenate a channel of several clouds; None if one of them lacks it."""
     return None if any(channel is None for channel in channels) else np.concatenate(channels)

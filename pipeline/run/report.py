@@ -1,4 +1,4 @@
-"""A run's report out of what its folder holds: the epochs' records and pictures."""
+"""Make a run's report from the contents of its folder: the epochs' records and pictures."""
 
 from __future__ import annotations
 
@@ -13,9 +13,20 @@ from pipeline.run.site import SensorSite
 def write_run_report(
     out: Path, identity: dict[str, Any], site: SensorSite, records: list[dict[str, Any]], *, complete: bool
 ) -> Path:
-    """Write report.html of a run folder.
+    """Write report.html of a run folder and return its path.
 
-    identity: sensor, seed and config as in run.json; records: of the finished epochs, the reference first. Returns its path.
+    Parameters
+    ----------
+    out : Path
+        The run's folder.
+    identity : dict
+        Sensor, seed and config, as in run.json.
+    site : SensorSite
+        Wall and sensor.
+    records : list of dict
+        Records of the finished epochs, the reference first.
+    complete : bool
+        False if the run was interrupted.
     """
     path = out / "report.html"
     reference = out / "reference.png"
@@ -34,10 +45,12 @@ def write_run_report(
 
 
 def _instrument(sensor: str) -> str:
+    """Name the sensor."""
     return "a stereo pair" if sensor == "stereo" else "a laser scanner"
 
 
 def _key_figures(site: SensorSite, config: dict[str, Any], records: list[dict[str, Any]]) -> dict[str, str]:
+    """Return the rows of the table at the top."""
     width, height, _ = site.mesh.bounds[1] - site.mesh.bounds[0]
     figures = {
         **instrument_figures(site),
@@ -49,6 +62,7 @@ def _key_figures(site: SensorSite, config: dict[str, Any], records: list[dict[st
 
 
 def _epoch(out: Path, record: dict[str, Any]) -> EpochReport:
+    """Collect what the report shows of one epoch."""
     number, annotated = record["epoch"], {annotation["block"] for annotation in record["annotations"]["annotations"]}
     registration = record["registration"]
     pictures = {name: out / f"{name}_{number:03d}.png" for name in ("hillshade", "difference", "histogram", "icp", "blocks")}
@@ -70,6 +84,7 @@ def _epoch(out: Path, record: dict[str, Any]) -> EpochReport:
 
 
 def _row(block: dict[str, Any], annotated: bool) -> BlockRow:
+    """Convert a block's record to a row of the report."""
     return BlockRow(
         label=block["label"],
         shape=block["shape"],

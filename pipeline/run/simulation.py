@@ -1,8 +1,8 @@
-"""A whole run: the folder that `simulate` fills, epoch by epoch, and how an interrupted one goes on.
+"""Run a whole simulation: fill the folder of `simulate`, epoch by epoch, and continue an interrupted run.
 
-An epoch is done when its folder has its final name and run.json its checksums: everything of it is written before. What is in an
-interrupted run's folder is therefore usable, and a later call with `resume` makes only what is missing or damaged; the bytes are
-those of an undisturbed run. One process at a time works in a folder.
+An epoch is done when its folder has its final name and run.json its checksums; everything in it has been written before. The
+contents of an interrupted run's folder are therefore usable. A later call with `resume` makes only what is missing or damaged,
+and the result is byte for byte that of an undisturbed run. Only one process at a time works in a folder.
 """
 
 from __future__ import annotations
@@ -41,11 +41,12 @@ from scene.common.keyed_random import KeyedRandom
 from scene.walls.imported import ImportedWall
 
 SCHEMA = 1
+"""Version of run.json's structure."""
 
 
 @dataclass(frozen=True)
 class RunSummary:
-    """What a run left behind. folder: of the run; report: its report.html; epochs: the records of the finished epochs."""
+    """What a run has written: its folder, its report.html, and the records of the finished epochs."""
 
     folder: Path
     report: Path
@@ -54,7 +55,21 @@ class RunSummary:
 
 @dataclass
 class _Run:
-    """A run under way. identity: what tells it from others; products: as in run.json; site: once it is set up."""
+    """A run in progress.
+
+    Attributes
+    ----------
+    out : Path
+        Its folder.
+    identity : dict
+        Sensor, seed, config and inputs, which distinguish it from other runs.
+    progress : Progress
+        Is told the stages.
+    products : dict
+        Checksums by epoch folder, as in run.json.
+    site : SensorSite, optional
+        Wall and sensor, once they are set up.
+    """
 
     out: Path
     identity: dict[str, Any]
@@ -63,10 +78,11 @@ class _Run:
     site: SensorSite | None = None
 
     def has(self, number: int) -> bool:
+        """Return whether an epoch is finished."""
         return epoch_folder(self.out, number).name in self.products
 
     def note(self, number: int, checksums: Checksums) -> None:
-        """Write into run.json that an epoch is finished."""
+        """Record in run.json that an epoch is finished."""
         found = {**self.products, epoch_folder(self.out, number).name: checksums}
         self.products = {name: found[name] for name in sorted(found, key=lambda name: (len(name), name))}
         write_json(self.out / RUN_FILE, {**self.identity, "complete": False, "products": self.products})
@@ -77,13 +93,29 @@ def simulate(
 ) -> RunSummary:
     """Observe a wall before and after rocks fall, and write a run folder.
 
-    out: a folder that is new or empty, or with `resume` that of an interrupted run of the same config. Raises InputError for
-    a folder in use, another config, and whatever is wrong with wall, sensor or blocks. On an interrupt the products of the
-    finished epochs are completed before KeyboardInterrupt goes on.
+    On an interrupt, the products that cover all finished epochs are written before KeyboardInterrupt is raised again.
+
+    Parameters
+    ----------
+    config : SimulationConfig
+        Config of the run.
+    sensor : str
+        "stereo" or "tls".
+    out : Path
+        A new or empty folder; with `resume`, that of an interrupted run with the same config.
+    resume : bool
+        Whether to continue an interrupted run.
+    progress : Progress, optional
+        Is told the stages.
+
+    Raises
+    ------
+    InputError
+        If the folder is in use or belongs to another run, or if wall, sensor or blocks cannot be used.
     """
     progress = progress or Progress()
     if config.products.crs is not None:
-        wkt_of(config.products.crs, "products.crs")  # a mistake there should not cost a simulation
+        wkt_of(config.products.crs, "products.crs")  # report a mistake there before simulating
     progress.plan(_plan(config))
     identity = {"schema": SCHEMA, "sensor": sensor, "seed": config.seed, "config": config.model_dump(mode="json")}
     identity["inputs"] = _inputs(config)
@@ -93,9 +125,9 @@ def simulate(
     with locked(out), noting() as written:
         _claim(run, resume)
         try:
-            site = _observe(run, config, sensor)
+            site = _make_epochs(run, config, sensor)
         except InputError:
-            _leave_nothing_half_written(run, resume, written)
+            _clean_up_after_error(run, resume, written)
             raise
         except KeyboardInterrupt:
             _remove_unfinished(out)
@@ -106,8 +138,8 @@ def simulate(
             return _finish(run, site, complete=True)
 
 
-def _observe(run: _Run, config: SimulationConfig, sensor: SensorName) -> SensorSite:
-    """Make the epochs that are not there; returns what they were observed of."""
+def _make_epochs(run: _Run, config: SimulationConfig, sensor: SensorName) -> SensorSite:
+    """Make the epochs that are missing, and return the site."""
     out, progress, random = run.out, run.progress, KeyedRandom(config.seed)
     with progress.stage("wall"):
         site = run.site = prepare_site(config, sensor, random)
@@ -125,15 +157,16 @@ def _observe(run: _Run, config: SimulationConfig, sensor: SensorName) -> SensorS
 
 
 def _plan(config: SimulationConfig) -> dict[str, float]:
+    """Return the stages of the run and their weights."""
     stages = {f"epoch 0: {name}": STAGES[name] for name in ("observe", "mesh", "difference", "write")}
     stages |= {f"epoch {number}: {name}": weight for number in range(1, config.epochs + 1) for name, weight in STAGES.items()}
     return {"wall": 3.0, **stages, "report": 1.0}
 
 
 def _inputs(config: SimulationConfig) -> dict[str, str]:
-    """The config's input files and their SHA-256: a mesh replaced under the same name makes another run.
+    """Return the SHA-256 of the config's input files: a file replaced under the same name makes it another run.
 
-    A file that is not there is left out: whoever reads it says so.
+    Missing files are left out; reading them raises the error.
     """
     named = [*config.wall.files] if isinstance(config.wall, ImportedWall) else []
     named += [config.cameras.file] if isinstance(config.cameras, CamerasFile) else []
@@ -142,16 +175,18 @@ def _inputs(config: SimulationConfig) -> dict[str, str]:
 
 
 def _claim(run: _Run, resume: bool) -> None:
-    """Make sure that the folder is ours to write to: new, empty, or an interrupted run of the same identity, whose epochs that
-    are whole are taken over."""
+    """Make sure that the folder may be written to: it is new, empty, or that of an interrupted run with the same identity.
+
+    The complete epochs of an interrupted run are kept.
+    """
     out, identity, path = run.out, run.identity, run.out / RUN_FILE
     if not resume:
         if not is_free(out):
-            remedy = "go on with --resume, or choose another --out" if path.exists() else "choose another --out"
+            remedy = "continue with --resume, or choose another --out" if path.exists() else "choose another --out"
             raise InputError("the folder exists and is not empty", where=f"--out {out}", remedy=remedy)
         write_json(path, {**identity, "complete": False})
         return
-    earlier = read_run(path, "the run cannot be gone on with; choose another --out")
+    earlier = read_run(path, "the run cannot be continued; choose another --out")
     _require_same(earlier, identity, out)
     _remove_unfinished(out)
     known: dict[str, Checksums] = earlier.get("products", {})
@@ -163,14 +198,14 @@ def _claim(run: _Run, resume: bool) -> None:
 
 
 def _require_same(earlier: dict[str, Any], identity: dict[str, Any], out: Path) -> None:
-    """Raise InputError where the run in the folder is another one."""
+    """Raise InputError if the folder belongs to another run."""
     changed = [key for key, value in identity.items() if earlier.get(key) != json.loads(json.dumps(value))]
     if changed == ["inputs"]:
         replaced = [
             Path(path).name for path, digest in identity["inputs"].items() if earlier.get("inputs", {}).get(path) != digest
         ]
         raise InputError(
-            f"the run in the folder was begun with another {', '.join(replaced)}",
+            f"the run in the folder was started with another {', '.join(replaced)}",
             where=f"--out {out}",
             remedy="put the file back as it was, or choose another --out",
         )
@@ -183,15 +218,16 @@ def _require_same(earlier: dict[str, Any], identity: dict[str, Any], out: Path) 
 
 
 def _remove_unfinished(out: Path) -> None:
+    """Remove the temporary folders of unfinished epochs."""
     for left in out.glob(".epoch_*"):
         require_own_folder(left)
         shutil.rmtree(left)
 
 
-def _leave_nothing_half_written(run: _Run, resumed: bool, written: list[Path]) -> None:
-    """After wrong input: remove what this run has written, unless an epoch is finished that could be gone on from.
+def _clean_up_after_error(run: _Run, resumed: bool, written: list[Path]) -> None:
+    """After wrong input, remove what this run has written, unless a finished epoch makes it possible to continue.
 
-    What others put into the folder meanwhile stays, and the folder with it.
+    Files that others put into the folder meanwhile stay, and the folder with them.
     """
     _remove_unfinished(run.out)
     if resumed or run.has(1):

@@ -1,4 +1,4 @@
-"""The stage of a simulation: the wall in its frame, and the sensor in front of it."""
+"""Set up a simulation: the wall in its frame, and the sensor in front of it."""
 
 from __future__ import annotations
 
@@ -21,15 +21,29 @@ from sensors.stereo.stereo_matched import MatchedStereoPair
 from sensors.stereo.stereo_pair import StereoPair
 
 Origin = Literal["rule", "file", "given"]
-"""Where a wall comes from: made here, read and cleaned here, or handed in as it is."""
+"""Where a wall comes from: generated here, read from a file and repaired, or given by the caller as it is."""
 
 
 @dataclass(frozen=True)
 class SensorSite:
     """The untouched wall (wall frame), its frame, and the sensor that observes it.
 
-    name: of the wall; repairs: what was mended in an imported mesh; viewpoints: where the sensor's eyes are, by their place in
-    the config, wall frame; further_stations: of a laser scanner with several, those after the first, which is `sensor`.
+    Attributes
+    ----------
+    name : str
+        Name of the wall.
+    repairs : tuple of str
+        What was repaired in an imported mesh.
+    mesh : TriangleMesh
+        The wall, wall frame.
+    frame : WallFrame
+        The wall frame.
+    sensor : LaserScanner or stereo sensor
+        The sensor; of several stations the first.
+    viewpoints : dict of (3,) arrays
+        Positions of the sensor's viewpoints, by their place in the config, wall frame, m.
+    further_stations : tuple of LaserScanner
+        The stations after the first.
     """
 
     name: str
@@ -42,10 +56,23 @@ class SensorSite:
 
 
 def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRandom, given: Wall | None = None) -> SensorSite:
-    """Build the wall, place the sensor and fit the wall's frame, whose z axis points to the sensor.
+    """Build the wall, place the sensor, and fit the wall frame, whose z axis points to the sensor.
 
-    given: a wall that takes the place of the config's.
-    Raises InputError for a wall that cannot be used and a sensor that cannot be placed.
+    Parameters
+    ----------
+    config : SimulationConfig
+        Wall, sensor and frame.
+    sensor : str
+        "stereo" or "tls".
+    random : KeyedRandom
+        The run's source of random numbers.
+    given : Wall, optional
+        A wall to use instead of the config's.
+
+    Raises
+    ------
+    InputError
+        If the wall cannot be used or the sensor cannot be placed.
     """
     wall = given or build_wall(config.wall, random.child("wall"))
     origin: Origin = "given" if given is not None else "file" if isinstance(config.wall, ImportedWall) else "rule"
@@ -54,16 +81,16 @@ def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRand
         cameras = config.camera_pair(target)
         frame = config.frame.fit(wall.mesh.vertices, (cameras.left.position + cameras.right.position) / 2)
         positions = {f"cameras, {side}": getattr(cameras, side).position for side in ("left", "right")}
-        mesh, repairs = _faced(wall, frame, positions, origin)
+        mesh, repairs = _orient_wall(wall, frame, positions, origin)
         pair = _stereo(config, cameras, frame, random)
         eyes = {name: frame.to_wall(position) for name, position in positions.items()}
         return SensorSite(wall.name, repairs, mesh, frame, pair, eyes)
-    stations = config.stations_of_the_scanner()
+    stations = config.station_configs()
     poses = [station.place(target) for station in stations]
     frame = config.frame.fit(wall.mesh.vertices, poses[0][0])
     positions = {f"station, number {number}": position for number, (position, _) in enumerate(poses, start=1)}
     positions = positions if len(poses) > 1 else {"station": poses[0][0]}
-    mesh, repairs = _faced(wall, frame, positions, origin)
+    mesh, repairs = _orient_wall(wall, frame, positions, origin)
     instrument = config.scanner, config.tls_model(), config.products.truth_channels
     scanners = [
         LaserScanner.aimed(pose, frame, mesh.vertices, *instrument, station.pose_sigma)
@@ -73,12 +100,12 @@ def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRand
     return SensorSite(wall.name, repairs, mesh, frame, scanners[0], eyes, tuple(scanners[1:]))
 
 
-def _faced(
+def _orient_wall(
     wall: Wall, frame: WallFrame, positions: Mapping[str, FloatArray], origin: Origin
 ) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """The wall in its frame, one that others made wound as the sensors see it, and what was mended in it.
+    """Return the wall in its frame, with the winding corrected for walls that were not generated here, and all repairs.
 
-    positions: world frame.
+    positions: of the sensors, world frame.
     """
     check_distances(wall.mesh.vertices, positions, wall.name)
     mesh = wall.mesh.with_vertices(frame.to_wall(wall.mesh.vertices))
@@ -90,7 +117,7 @@ def _faced(
 
 
 def _stereo(config: SimulationConfig, cameras: CameraPair, frame: WallFrame, random: KeyedRandom) -> StereoSensor:
-    """The pair with the config's matcher; the rock's texture stays the same from epoch to epoch."""
+    """Return the pair with the config's matcher. The rock's texture is the same in every epoch."""
     pair = StereoPair(cameras, frame, config.stereo_model(), config.depth_map, config.products.truth_channels)
     if config.matcher == "simulated":
         return pair

@@ -1,4 +1,4 @@
-"""The two pictures of the page, of Plotly: the wall in 3D and the same window as a map."""
+"""Make the two pictures of the page with Plotly: the wall in 3D and the same window as a map."""
 
 from __future__ import annotations
 
@@ -12,23 +12,26 @@ from plotly.colors import diverging, sequential
 
 from pipeline.view.results import Item, Layer, Patch, PointLayer, ViewWindow
 
-ITEM_TRACES = ("block", "detection", "scene change")
-_COLOURS = {"block": "#000000", "detection": "#D55E00", "scene change": "#009E73"}
-"""Black and Okabe and Ito's: they stand out from red, blue and grey, also for colour-blind readers."""
-_DASHES = {"block": "solid", "detection": "dash", "scene change": "dot"}
+ITEM_TRACES = ("block", "detection", "event", "scene change")
+"""Kinds of items, in drawing order."""
+_COLOURS = {"block": "#000000", "detection": "#D55E00", "event": "#000000", "scene change": "#009E73"}
+"""Black, and colours of Okabe and Ito that differ from red, blue and grey also for colour-blind readers."""
+_DASHES = {"block": "solid", "detection": "dash", "event": "solid", "scene change": "dot"}
 _SELECTED = "#E69F00"
 _GREYS = [[0.0, "#202020"], [1.0, "#f4f4f4"]]
 _PLAIN = "#9aa0a6"
 _NO_DATA = "#c9ccd0"
 _EDGES = ((0, 2, 4), (1, 2, 4), (1, 3, 4), (0, 3, 4), (0, 2, 4), (0, 2, 5), (1, 2, 5), (1, 3, 5), (0, 3, 5), (0, 2, 5))
 _POSTS = ((1, 2), (1, 3), (0, 3))
-"""A box drawn in one line, bottom and top, and its other three upright edges: indices into (x0, x1, y0, y1, z0, z1)."""
+"""Edges of a box: one line around bottom and top, and the other three upright edges; indices into (x0, x1, y0, y1, z0, z1)."""
 _FLAT = {"ambient": 0.75, "diffuse": 0.45, "specular": 0.02, "roughness": 0.9, "fresnel": 0.05}
+"""Plotly's lighting of the surface."""
 _LIGHT = np.array([-0.5, 0.5, np.sqrt(0.5)])
+"""Direction towards the light of the shaded map."""
 _FROM = np.array([-0.16, -0.1, 1.0])
-"""The direction of the camera: from the front, a little from the left and from below."""
+"""Direction of the camera: from the front, slightly from the left and from below."""
 _FIELD_OF_VIEW, _WIDE, _MARGIN = np.radians(45.0), 1.5, 1.15
-"""Plotly's, up and down; width of the picture over its height, at least on a desktop; what is left around the wall."""
+"""Plotly's vertical field of view; smallest ratio of width to height of the picture on a desktop; margin around the wall."""
 _FACTS_SHOWN = 6
 _MARKER_PX, _FEW = 4.5, 80
 
@@ -41,7 +44,23 @@ def wall_figure(
     shown: Collection[str],
     selected: int | None = None,
 ) -> go.Figure:
-    """The wall in 3D. shown: of surface, points and the kinds of items; selected: the item to mark."""
+    """Draw the wall in 3D.
+
+    Parameters
+    ----------
+    patch : Patch
+        The surface in the window.
+    points : PointLayer or None
+        The measured points in the window.
+    items : sequence of Item
+        Blocks, detections and the like.
+    layer : Layer
+        Gives the colours.
+    shown : collection of str
+        Which of "surface", "points" and the kinds of items to draw.
+    selected : int, optional
+        Number of the item to highlight.
+    """
     figure = go.Figure()
     if "surface" in shown:
         figure.add_trace(_surface(patch, layer))
@@ -73,7 +92,7 @@ def wall_figure(
 
 
 def _eye(patch: Patch) -> dict[str, float]:
-    """Where the camera stands to have the whole patch in the picture; 1 is the geometric mean of the patch's extents."""
+    """Return the position of the camera that shows the whole patch; 1 is the geometric mean of the patch's extents."""
     heights = patch.height[np.isfinite(patch.height)]
     extent = np.array([np.ptp(patch.x), np.ptp(patch.y), np.ptp(heights) if heights.size else 0.0])
     extent = np.maximum(extent, 1e-3 * extent.max())
@@ -90,7 +109,7 @@ def map_figure(
     window: ViewWindow | None,
     selected: int | None = None,
 ) -> go.Figure:
-    """The window as a map; to zoom it is to choose the window of both pictures."""
+    """Draw the window as a map; zooming it changes the window of both pictures. Arguments as in `wall_figure`."""
     figure = go.Figure(_heatmap(patch, layer))
     for kind in ITEM_TRACES:
         chosen = [(number, item) for number, item in enumerate(items) if item.kind == kind and _overlaps(item, patch)]
@@ -117,6 +136,7 @@ def map_figure(
 
 
 def _surface(patch: Patch, layer: Layer) -> go.Surface:
+    """Make the trace of the surface."""
     colour = hillshade(patch) if layer.key == "rock" else patch.value
     return go.Surface(
         x=patch.x,
@@ -133,6 +153,7 @@ def _surface(patch: Patch, layer: Layer) -> go.Surface:
 
 
 def _heatmap(patch: Patch, layer: Layer) -> go.Heatmap:
+    """Make the trace of the map."""
     colour = hillshade(patch) if layer.key == "rock" else patch.value
     scale = _scale(colour, layer)
     limits = {"zmin": scale.pop("cmin"), "zmax": scale.pop("cmax")}
@@ -148,7 +169,7 @@ def _heatmap(patch: Patch, layer: Layer) -> go.Heatmap:
 
 
 def _hover_data(patch: Patch) -> dict[str, Any]:
-    """Value and block of each cell, for its label."""
+    """Return value and block of each cell, for the hover label."""
     names = {0: ""} | {int(number): f"<br>block {number}" for number in np.unique(patch.label) if number}
     return {
         "customdata": patch.value.astype(np.float32),
@@ -157,13 +178,14 @@ def _hover_data(patch: Patch) -> dict[str, Any]:
 
 
 def _hover_value(layer: Layer) -> str:
+    """Return the hover label's template for a layer."""
     digits = 1 if layer.unit == "mm" else 3
     value = "" if layer.key == "rock" else f"<br><b>{layer.label}: %{{customdata:.{digits}f}} {layer.unit}</b>"
     return f"{value}%{{text}}<extra></extra>"
 
 
 def _scale(colour: NDArray[np.floating], layer: Layer) -> dict[str, Any]:
-    """Colour scale and limits, with the bar's title."""
+    """Return the colour scale with its limits and title."""
     if layer.key == "rock":
         return {"colorscale": _GREYS, "cmin": -0.1, "cmax": 1.0, "showscale": False}
     if layer.diverging and layer.limit is not None:
@@ -177,7 +199,7 @@ def _scale(colour: NDArray[np.floating], layer: Layer) -> dict[str, Any]:
 
 
 def hillshade(patch: Patch) -> NDArray[np.floating]:
-    """The patch lit from the upper left, as the reports' hillshades are."""
+    """Shade the patch as lit from the upper left, like the reports' hillshades."""
     if min(patch.height.shape) < 2:
         return np.ones_like(patch.height)
     down, right = np.gradient(patch.height, -patch.y, patch.x)
@@ -186,7 +208,7 @@ def hillshade(patch: Patch) -> NDArray[np.floating]:
 
 
 def _cloud(points: PointLayer, layer: Layer, *, coloured_alone: bool) -> go.Scatter3d:
-    """The measured points; what is known of each stands in its label."""
+    """Make the trace of the measured points, with their properties in the hover labels."""
     facts = {name.replace("_", " "): channel for name, channel in list(points.facts.items())[:_FACTS_SHOWN]}
     if points.value is not None:
         facts = {f"{layer.label}, {layer.unit}": np.round(points.value, 2), **facts}
@@ -210,13 +232,14 @@ def _cloud(points: PointLayer, layer: Layer, *, coloured_alone: bool) -> go.Scat
 
 
 def _overlaps(item: Item, patch: Patch) -> bool:
+    """Return whether an item overlaps the patch."""
     x0, x1, y0, y1 = item.box[:4]
     left, right, low, high = _extent(patch)
     return x1 >= left and x0 <= right and y1 >= low and y0 <= high
 
 
 def _with_depth(item: Item, patch: Patch) -> tuple[float, ...]:
-    """The item's box, with the surface's heights there where it has none of its own."""
+    """Return the item's box, with the range of the surface's heights there if it has none of its own."""
     x0, x1, y0, y1, z0, _ = item.box
     if np.isfinite(z0):
         return item.box
@@ -229,7 +252,7 @@ def _with_depth(item: Item, patch: Patch) -> tuple[float, ...]:
 
 
 def _wires(boxes: Sequence[Sequence[float]], colour: str, width: int, dash: str = "solid") -> go.Scatter3d:
-    """The edges of boxes, as one trace."""
+    """Make one trace of the edges of boxes."""
     x: list[float | None] = []
     y: list[float | None] = []
     z: list[float | None] = []
@@ -243,7 +266,7 @@ def _wires(boxes: Sequence[Sequence[float]], colour: str, width: int, dash: str 
 
 
 def _handles(chosen: Sequence[tuple[int, Item]], boxes: Sequence[Sequence[float]], kind: str) -> go.Scatter3d:
-    """A marker in front of each item, to point at and click on; its custom datum is the item's number."""
+    """Make markers in front of the items to point at and click on; the custom datum is the item's number."""
     return go.Scatter3d(
         x=[(box[0] + box[1]) / 2 for box in boxes],
         y=[(box[2] + box[3]) / 2 for box in boxes],
@@ -255,6 +278,7 @@ def _handles(chosen: Sequence[tuple[int, Item]], boxes: Sequence[Sequence[float]
 
 
 def _map_handles(chosen: Sequence[tuple[int, Item]], kind: str) -> go.Scatter:
+    """Make the markers of the map."""
     return go.Scatter(
         x=[(item.box[0] + item.box[1]) / 2 for _, item in chosen],
         y=[(item.box[2] + item.box[3]) / 2 for _, item in chosen],
@@ -266,12 +290,13 @@ def _map_handles(chosen: Sequence[tuple[int, Item]], kind: str) -> go.Scatter:
 
 
 def _marker(kind: str, count: int) -> dict[str, Any]:
-    """The more there are, the smaller, so that the wall shows between them."""
+    """Return the style of markers. The more there are, the smaller they are, so that the wall remains visible."""
     size = float(np.clip(_MARKER_PX * np.sqrt(_FEW / count), 2.0, _MARKER_PX))
     return {"size": size, "color": _COLOURS[kind], "line": {"width": 0}}
 
 
 def _labels(chosen: Sequence[tuple[int, Item]]) -> dict[str, Any]:
+    """Return the hover labels of items."""
     text = [
         "<br>".join([f"<b>{item.name}</b>", *(f"{name}: {value}" for name, value in item.facts.items())]) for _, item in chosen
     ]
@@ -279,6 +304,7 @@ def _labels(chosen: Sequence[tuple[int, Item]]) -> dict[str, Any]:
 
 
 def _outlines(items: Sequence[Item]) -> tuple[list[float | None], list[float | None]]:
+    """Return the outlines of items as one line."""
     x: list[float | None] = []
     y: list[float | None] = []
     for item in items:
@@ -289,4 +315,5 @@ def _outlines(items: Sequence[Item]) -> tuple[list[float | None], list[float | N
 
 
 def _extent(patch: Patch) -> ViewWindow:
+    """Return the window that a patch covers."""
     return ViewWindow(float(patch.x.min()), float(patch.x.max()), float(patch.y.min()), float(patch.y.max()))

@@ -1,4 +1,4 @@
-"""The folder of `scarpsim gap` as something to look at: the measured points with their residuals, before and after."""
+"""Show the folder of `scarpsim gap`: the measured points with their residuals, before and after."""
 
 from __future__ import annotations
 
@@ -21,25 +21,30 @@ from scene.geometry.mesh import FloatArray
 
 _MM = 1e3
 _POINTS_PER_CELL = 4
+"""Mean number of points per cell of the surface."""
 _CHANNELS = ("residual_m", "held_out")
+"""Channels that the files must have."""
 _FEWEST = 3
+"""Fewest points from which a plane can be fitted."""
 _FAR_M = 1e6
+"""Height of the viewpoint from which the wall is assumed to be seen."""
 _MOST_TOGETHER = 4
-"""Effects of which every choice can be shown; of more each by itself."""
+"""Up to this number of effects, all their combinations can be shown; of more effects only single ones."""
 _QUANTILE = 0.98
+"""Quantile of the residuals at which the colour scale ends."""
 
 
 class GapResults:
-    """Residuals: by how much the measured surface lies deeper than the predicted one, positive where rock is missing.
+    """Residuals of a diagnosis: how much deeper the measured surface is than the predicted one; positive where rock is missing.
 
-    The folder does not say where the sensor stood, so the wall is looked at from the side on which its normal points upwards.
+    The folder does not state the sensor's position, so the wall is shown from the side on which its normal points upwards.
     """
 
     step_name = "model"
     surfaces = {"surface": "mean of the points"}  # noqa: RUF012
 
     def __init__(self, folder: Path) -> None:
-        """Raises InputError where a file of the diagnosis is absent or damaged."""
+        """Read the folder. Raises InputError if a file of the diagnosis is missing or damaged."""
         self._record = read_gap(folder / GAP_FILE)
         self.title = f"{folder.name}: {INSTRUMENTS[self._record['sensor']]}, verdict: {self._record['verdict'].replace('_', ' ')}"
         self._clouds = {step: _cloud(folder / f"{step}.laz") for step in ("before", "after")}
@@ -53,12 +58,15 @@ class GapResults:
         self._cells = lru_cache(8)(self._binned)
 
     def layers(self, step: str) -> list[Layer]:
+        """Return the only layer, the residual."""
         return [Layer("residual", "deeper than predicted (missing rock positive)", "mm", _MM, diverging=True, limit=self._limit)]
 
     def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
+        """Return mean residuals over cells."""
         return self._cells(step, window, budget)
 
     def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
+        """Return the points in the window, with their residuals."""
         shown = np.flatnonzero(inside(self._local[step], window))
         shown = shown[:: max(1, int(np.ceil(len(shown) / budget)))]
         cloud = self._clouds[step]
@@ -69,9 +77,11 @@ class GapResults:
         )
 
     def items(self, step: str) -> list[Item]:
+        """Return the changes of the scene."""
         return [self._change(number, each) for number, each in enumerate(self._record.get("scene_changes", []), start=1)]
 
     def _change(self, number: int, change: dict[str, Any]) -> Item:
+        """Convert a change of the scene to an item."""
         low, high = np.array(change["bbox_m"]).reshape(2, 3)
         corners = np.stack(np.meshgrid(*np.stack([low, high]).T), axis=-1).reshape(-1, 3)
         local = self._frame.to_wall(corners)
@@ -80,7 +90,7 @@ class GapResults:
         return Item("scene change", f"scene change {number}", (x0, x1, y0, y1, z0, z1), facts)
 
     def _binned(self, step: str, window: ViewWindow | None, budget: int) -> Patch:
-        """Means of residual and height over cells of about four points."""
+        """Average residual and height over cells of about four points."""
         chosen = inside(self._local[step], window)
         points, residual = self._local[step][chosen], _residual(self._clouds[step])[chosen]
         if not len(points):
@@ -103,9 +113,9 @@ class GapResults:
 
 
 def _in_part(before: PointCloud, names: list[str]) -> dict[str, PointCloud]:
-    """The points with the residuals that are left with some of several effects in the model, by the effects' numbers: "1", "1 3".
+    """Return the points with the residuals that remain when only some of several effects are in the model.
 
-    Empty where before.laz does not say what each effect takes away.
+    Keys are the effects' numbers: "1", "1 3". The result is empty if before.laz does not state what each effect explains.
     """
     parts = [before.extra.get(f"effect_{number}_m") for number in range(1, len(names) + 1)]
     if len(parts) < 2 or any(part is None for part in parts):
@@ -121,6 +131,7 @@ def _in_part(before: PointCloud, names: list[str]) -> dict[str, PointCloud]:
 
 
 def _in_words(step: str, names: list[str]) -> str:
+    """Describe a step."""
     if step == "before":
         return "before: model as it was"
     return (
@@ -131,13 +142,13 @@ def _in_words(step: str, names: list[str]) -> str:
 
 
 def _cloud(path: Path) -> PointCloud:
-    """A file of a diagnosis; raises InputError where it is another cloud."""
+    """Read a file of a diagnosis. Raises InputError if it is another point cloud."""
     cloud, remedy = read_laz(path), "run scarpsim gap again"
     missing = [name for name in _CHANNELS if name not in cloud.extra]
     if missing:
         raise InputError(f"has no channel {missing[0]}", where=str(path), allowed="a file of scarpsim gap", remedy=remedy)
     if not all(np.isfinite(cloud.extra[name]).all() and cloud.extra[name].ndim == 1 for name in _CHANNELS):
-        raise InputError(f"has values in {' or '.join(_CHANNELS)} that are no numbers", where=str(path), remedy=remedy)
+        raise InputError(f"has values in {' or '.join(_CHANNELS)} that are not finite", where=str(path), remedy=remedy)
     if len(cloud.points) < _FEWEST:
         raise InputError(f"holds {len(cloud.points)} points", where=str(path), allowed=f"at least {_FEWEST}", remedy=remedy)
     check_reach(cloud.points, str(path))
@@ -145,9 +156,11 @@ def _cloud(path: Path) -> PointCloud:
 
 
 def _residual(cloud: PointCloud) -> FloatArray:
+    """Return the residuals in mm."""
     return cloud.extra["residual_m"].astype(np.float64) * _MM
 
 
 def _frame(points: FloatArray) -> WallFrame:
+    """Return the wall frame as seen from above."""
     above = points.mean(axis=0) + np.array([0.0, 0.0, _FAR_M])
     return WallFrame.fit(points, above)

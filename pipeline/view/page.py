@@ -1,4 +1,4 @@
-"""The page's parts and what happens when they are used."""
+"""Define the page's parts and what happens when they are used."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from typing import Any
 import dash
 from dash import Input, Output, State, ctx, dcc, html, no_update
 
-from pipeline.view.beside import OTHER, Pair, beside, border
 from pipeline.view.figures import ITEM_TRACES, map_figure, wall_figure
 from pipeline.view.results import Item, Layer, Results, ViewWindow
+from pipeline.view.split_view import OTHER, Pair, border, split_patch
 
 CELLS, POINTS = 60_000, 40_000
-"""What a window is thinned to: it turns smoothly on a laptop without a graphics card."""
+"""Limits on what a window shows, so that it rotates smoothly on a laptop without a graphics card."""
 _NOTHING = ""
-"""The choice of nothing beside."""
+"""The choice to show nothing beside."""
 _PLAY, _STOP, _EPOCH_MS = "play", "stop", 2500
 _GRAPH: Any = {"displaylogo": False, "scrollZoom": True, "modeBarButtonsToRemove": ["sendDataToCloud", "select2d", "lasso2d"]}
 
 
 def layout(results: Results, other: Results | None = None) -> html.Div:
-    """Controls at the left, the wall in 3D, the map and what is known of the thing that was clicked on.
+    """Make the page: controls on the left, the wall in 3D, the map, and a table for the item that is selected.
 
-    other: a second run of the same wall, to be put beside.
+    other: a second run of the same wall, to be shown beside.
     """
     first, surface = next(iter(results.steps)), next(iter(results.surfaces))
     shown = ["surface", *ITEM_TRACES]
@@ -72,7 +72,19 @@ def layout(results: Results, other: Results | None = None) -> html.Div:
 
 
 def register_callbacks(app: dash.Dash, results: Results, lock: Lock, other: Results | None = None) -> None:
-    """Connect the page's parts; `lock` lets one request at a time compute."""
+    """Connect the page's parts.
+
+    Parameters
+    ----------
+    app : dash.Dash
+        The page.
+    results : Results
+        What is shown.
+    lock : Lock
+        Lets one request at a time compute.
+    other : Results, optional
+        A second run of the same wall.
+    """
 
     @app.callback(Output("layer", "options"), Output("layer", "value"), Input("step", "value"), State("layer", "value"))
     def offer_layers(step: str, chosen: str | None) -> tuple[list[dict[str, str]], str]:
@@ -173,16 +185,31 @@ def pictures(
     window: ViewWindow | None,
     second: tuple[Pair, str, float] | None = None,
 ) -> tuple[Any, Any, str]:
-    """Both pictures of a window, and what is to be known about them.
+    """Make both pictures of a window and a note about them.
 
-    second: what stands right of a border, its choice, and the border's share of the width, 0 to 1.
+    Parameters
+    ----------
+    results : Results
+        What is shown.
+    step, surface : str
+        Keys of the step and the surface.
+    layer : Layer
+        Gives the colours.
+    shown : list of str
+        What to draw.
+    number : int or None
+        The selected item.
+    window : ViewWindow or None
+        Part of the wall.
+    second : (Pair, str, float), optional
+        What is shown right of a border, its choice, and the border's share of the width, 0 to 1.
     """
     patch = results.patch(step, surface, layer, window, CELLS)
     sides = ""
     if second is not None:
         pair, choice, share = second
         at = border(patch, share)
-        patch = beside(patch, pair.patch(choice, surface, layer, window, CELLS), share)
+        patch = split_patch(patch, pair.patch(choice, surface, layer, window, CELLS), share)
         own = f"{results.title}, {results.steps[step]}" if choice.startswith(OTHER) else results.steps[step]
         sides = f"left of the border: {own}; right of it: {pair.choices[choice]}, on the same colours"
     points = results.points(step, layer, window, POINTS) if "points" in shown else None
@@ -200,19 +227,19 @@ def pictures(
 
 
 def following(steps: list[str], step: str) -> str:
-    """The step after one, the first after the last."""
+    """Return the step after the given one; after the last comes the first."""
     return steps[(steps.index(step) + 1) % len(steps)]
 
 
 def clicked(data: Any) -> int | None:
-    """The number of the item that a click was on; None for a click on the wall itself."""
+    """Return the number of the item that was clicked; None for a click on the wall itself."""
     point = (data or {}).get("points", [{}])[0]
     known = point.get("customdata")
     return int(known[0]) if isinstance(known, list) and len(known) == 1 and "text" in point else None
 
 
 def zoom(change: Any, now: Any) -> Any:
-    """The window after the map was zoomed or moved: its ranges; None for the whole wall."""
+    """Return the window after the map was zoomed or moved; None for the whole wall."""
     change = change or {}
     if change.get("xaxis.autorange") or change.get("yaxis.autorange"):
         return None
@@ -224,25 +251,27 @@ def zoom(change: Any, now: Any) -> Any:
 
 
 def facts_table(item: Item) -> html.Div:
-    """What is known of an item."""
+    """Make the table of an item's properties."""
     rows = [html.Tr([html.Th(name), html.Td(value)]) for name, value in item.facts.items()]
     return html.Div([html.H2(item.name), html.Table(html.Tbody(rows))])
 
 
 def _first_beside(other: Results | None) -> str:
-    """What stands beside at first: of a second run its first step."""
+    """Return the initial choice of what is shown beside: the first step of a second run."""
     return _NOTHING if other is None else f"{OTHER}{next(iter(other.steps))}"
 
 
 def _kinds(results: Results) -> list[str]:
-    """The kinds of things that any of the first steps holds."""
+    """Return the kinds of items in the first steps."""
     found = {item.kind for step in list(results.steps)[:20] for item in results.items(step)}
     return [kind for kind in ITEM_TRACES if kind in found]
 
 
 def _control(name: str, part: Any) -> html.Label:
+    """Label a control."""
     return html.Label([html.Span(name), part])
 
 
 def _options(choices: Any) -> list[dict[str, str]]:
+    """Convert choices to the options of a dropdown."""
     return [{"label": label, "value": key} for key, label in choices.items()]

@@ -1,4 +1,4 @@
-"""What can be looked at: rasters, points and things in boxes, all in the wall frame, cut to a window and thinned to a budget."""
+"""Define what can be shown: rasters, points and items in boxes, in the wall frame, cut to a window and limited in number."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray
 
 _SURROUNDINGS, _LEAST_M, _ASPECT = 4.0, 1.0, 2.5
-"""An item is shown with this many times its size, and the smallest as if it were so large; width over height of the view."""
+"""Size of the view around an item, in sizes of the item; smallest size assumed, m; ratio of the view's width to height."""
 
 
 class ViewWindow(NamedTuple):
@@ -27,9 +27,18 @@ class ViewWindow(NamedTuple):
 
 @dataclass(frozen=True)
 class Layer:
-    """A quantity by which the wall is coloured. limit: colours end here, in the layer's unit; None: at the 1 and 99 % quantiles.
+    """A quantity that gives the colours.
 
-    diverging: about zero, from -limit to limit; factor: from the file's metres to `unit`.
+    Attributes
+    ----------
+    key, label, unit : str
+        Identifier, title and unit.
+    factor : float
+        Conversion from the file's metres to `unit`.
+    diverging : bool
+        Whether the scale is symmetric about zero, from -limit to limit.
+    limit : float, optional
+        End of the colour scale, in `unit`; None: the 1 and 99 % quantiles.
     """
 
     key: str
@@ -45,8 +54,19 @@ INSTRUMENTS = {"stereo": "stereo pair", "tls": "laser scanner"}
 
 @dataclass(frozen=True)
 class Patch:
-    """A raster over a window. x: (w,), y: (h,) centres, m; height: (h, w) m; value: (h, w) in the layer's unit, both NaN without
-    data; label: (h, w) number of the block, 0 for none; pooled: pixels of the file, each way, in one of these."""
+    """A raster over a window.
+
+    Attributes
+    ----------
+    x, y : (w,) and (h,) arrays
+        Centres of the cells, m.
+    height, value : (h, w) arrays
+        Height, m, and value in the layer's unit; NaN without data.
+    label : (h, w) array
+        Block label, 0 for none.
+    pooled : int
+        Pixels of the file per cell, along a row or a column.
+    """
 
     x: FloatArray
     y: FloatArray
@@ -58,7 +78,19 @@ class Patch:
 
 @dataclass(frozen=True)
 class PointLayer:
-    """Points in a window. points: (n, 3) m; value: (n,) of the layer, or None; facts: (n,) by name; share: of all there are."""
+    """Points in a window.
+
+    Attributes
+    ----------
+    points : (n, 3) array
+        Positions, m.
+    value : (n,) array, optional
+        Values of the layer.
+    facts : mapping of (n,) arrays
+        Further properties by name.
+    share : float
+        Share of all points that are shown.
+    """
 
     points: FloatArray
     value: FloatArray | None
@@ -68,7 +100,19 @@ class PointLayer:
 
 @dataclass(frozen=True)
 class Item:
-    """A thing to click on. kind: block, detection, scene change; box: x0, x1, y0, y1, z0, z1, m, z NaN where it is not known."""
+    """Something that can be selected.
+
+    Attributes
+    ----------
+    kind : str
+        "block", "detection", "event" or "scene change".
+    name : str
+        Title.
+    box : tuple
+        x0, x1, y0, y1, z0, z1, m; z is NaN if unknown.
+    facts : mapping of str
+        Properties by name.
+    """
 
     kind: str
     name: str
@@ -76,7 +120,7 @@ class Item:
     facts: Mapping[str, str] = field(default_factory=dict)
 
     def window(self) -> ViewWindow:
-        """The item with its surroundings, of the page's wide shape."""
+        """Return the window that shows the item with its surroundings, with the page's aspect ratio."""
         x0, x1, y0, y1 = self.box[:4]
         half = max(x1 - x0, y1 - y0, _LEAST_M) * _SURROUNDINGS / 2
         x, y = (x0 + x1) / 2, (y0 + y1) / 2
@@ -84,7 +128,17 @@ class Item:
 
 
 class Results(Protocol):
-    """A folder that can be looked at. steps, surfaces: keys and what people read; the first is shown first."""
+    """A folder that can be shown.
+
+    Attributes
+    ----------
+    title : str
+        Title of the page.
+    step_name : str
+        What a step is called, such as "epoch".
+    steps, surfaces : mapping
+        Keys and labels; the first is shown first.
+    """
 
     title: str
     step_name: str
@@ -95,24 +149,40 @@ class Results(Protocol):
     def surfaces(self) -> Mapping[str, str]: ...
 
     def layers(self, step: str) -> Sequence[Layer]:
-        """What the wall can be coloured by."""
+        """Return the quantities that can give the colours."""
         ...
 
     def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
-        """The surface in a window (None: all of it), coloured by the layer, of at most about `budget` cells."""
+        """Return the surface in a window (None: all of it), coloured by the layer, with at most about `budget` cells.
+
+        Parameters
+        ----------
+        step, surface : str
+            Keys of the step and the surface.
+        layer : Layer
+            Gives the colours.
+        window : ViewWindow or None
+            Part of the wall.
+        budget : int
+            Approximate limit on the number of cells.
+        """
         ...
 
     def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
-        """The measured points in a window, at most about `budget` of them; None where the folder holds none."""
+        """Return at most about `budget` of the measured points in a window; None if the folder has none. Arguments as in
+        `patch`.
+        """
         ...
 
     def items(self, step: str) -> Sequence[Item]:
-        """Blocks, detections and the like of a step."""
+        """Return blocks, detections and the like of a step."""
         ...
 
 
 def cut(grid: Grid, window: ViewWindow | None, budget: int) -> tuple[slice, slice, int]:
-    """Rows and columns of `grid` inside `window` (at least one), and how many pixels, each way, to take together for `budget`."""
+    """Return the rows and columns of `grid` inside `window` (at least one each), and how many pixels, along a row or column, to
+    average for `budget` cells.
+    """
     window = window or ViewWindow(-np.inf, np.inf, -np.inf, np.inf)
     columns = _inside(grid.columns(np.array([window.x0, window.x1])), grid.width)
     rows = _inside(grid.rows(np.array([window.y1, window.y0])), grid.height)
@@ -122,12 +192,13 @@ def cut(grid: Grid, window: ViewWindow | None, budget: int) -> tuple[slice, slic
 
 
 def _inside(edges: FloatArray, size: int) -> slice:
+    """Return the pixels between two edges."""
     first = int(np.clip(np.floor(edges[0]), 0, size - 1))
     return slice(first, int(np.clip(np.ceil(edges[1]), first + 1, size)))
 
 
 def centres(grid: Grid, rows: slice, columns: slice, factor: int) -> tuple[FloatArray, FloatArray]:
-    """x (w,) and y (h,) of the centres of cells of `factor` pixels, m."""
+    """Return x (w,) and y (h,) of the centres of cells of `factor` pixels, m."""
     width, height = (columns.stop - columns.start) // factor, (rows.stop - rows.start) // factor
     x = grid.x_min + (columns.start + (np.arange(width) + 0.5) * factor) * grid.gsd
     y = grid.y_max - (rows.start + (np.arange(height) + 0.5) * factor) * grid.gsd
@@ -135,7 +206,7 @@ def centres(grid: Grid, rows: slice, columns: slice, factor: int) -> tuple[Float
 
 
 def inside(points: FloatArray, window: ViewWindow | None) -> NDArray[np.bool_]:
-    """(n,) which of the points (n, 3) lie in the window."""
+    """Return which of the points (n, 3) lie in the window."""
     if window is None:
         return np.ones(len(points), bool)
     x, y = points[:, 0], points[:, 1]

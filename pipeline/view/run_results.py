@@ -1,4 +1,4 @@
-"""A run folder as something to look at."""
+"""Show a run folder."""
 
 from __future__ import annotations
 
@@ -27,17 +27,19 @@ _ROCK, _HEIGHT = Layer("rock", "rock (shaded)", ""), Layer("height", "relief", "
 
 
 class RunResults:
-    """The folder of `simulate`, with the detections in the folder `detections` where one is given."""
+    """The folder of `simulate`, with the detections in the folder `detections` if given."""
 
     step_name = "epoch"
 
     def __init__(self, folder: Path, detections: Path | None = None) -> None:
-        """Raises InputError where run.json is damaged, no epoch is finished, or the detections are of other maps."""
+        """Read the folder. Raises InputError if run.json is damaged, no epoch is finished, or the detections belong to other
+        maps.
+        """
         self.folder = folder
-        record = read_run(folder / RUN_FILE, "go on with it by simulate --resume")
+        record = read_run(folder / RUN_FILE, "continue it with simulate --resume")
         self._epochs = {str(each["epoch"]): each for each in record.get("epochs", []) if each["epoch"] > 0}
         if not self._epochs or "wall" not in record or any("statistics" not in each for each in self._epochs.values()):
-            raise InputError("holds no finished epoch", where=str(folder), remedy="go on with it by simulate --resume")
+            raise InputError("holds no finished epoch", where=str(folder), remedy="continue it with simulate --resume")
         self.world_to_wall = np.array(record["wall_frame"]["matrix_world_to_wall"]) if "wall_frame" in record else np.eye(4)
         self.title = f"{folder.name}: {INSTRUMENTS[record['sensor']]}, {record['wall']['name']}"
         self.steps = {key: f"epoch {key}" for key in self._epochs}
@@ -52,11 +54,12 @@ class RunResults:
 
     @property
     def extent_m(self) -> float:
-        """The longer side of the maps."""
+        """Longer side of the maps, m."""
         grid = self._map(self._map_path("difference", next(iter(self.steps))))[1]
         return max(grid.width, grid.height) * grid.gsd
 
     def layers(self, step: str) -> list[Layer]:
+        """Return the layers of an epoch: difference, M3C2 if it was computed, shaded rock and relief."""
         limit = SCALE_SIGMAS * self._epochs[step]["statistics"]["sigma_m"] * _MM
         maps = [Layer("difference", "reference minus epoch (missing rock positive)", "mm", _MM, diverging=True, limit=limit)]
         if self._map_path("m3c2", step).exists():
@@ -64,6 +67,7 @@ class RunResults:
         return [*maps, _ROCK, _HEIGHT]
 
     def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
+        """Return a surface of an epoch in the window."""
         grid = self._map(self._map_path("difference", step))[1]
         raster = self._heights(self._surface_path(step, surface), grid)
         rows, columns, factor = cut(grid, window, budget)
@@ -74,6 +78,7 @@ class RunResults:
         return Patch(*centres(grid, rows, columns, factor), height, value, middle, factor)
 
     def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
+        """Return the points of an epoch in the window."""
         path = epoch_folder(self.folder, int(step)) / "points.laz"
         if not path.exists():
             return None
@@ -83,38 +88,45 @@ class RunResults:
         return PointLayer(cloud.points[shown], None, facts, len(shown) / max(len(cloud.points), 1))
 
     def items(self, step: str) -> list[Item]:
+        """Return the blocks and detections of an epoch."""
         blocks = [_block(each) for each in self._epochs[step]["blocks"]]
         return blocks + self._found.get(step, [])
 
     def _values(
         self, step: str, layer: Layer, rows: slice, columns: slice, factor: int, height: NDArray[np.floating]
     ) -> NDArray[np.floating]:
+        """Return the values of a layer."""
         if layer.key in ("rock", "height"):
             return height
         return mean_pooled(self._map(self._map_path(layer.key, step))[0][rows, columns], factor) * layer.factor
 
     def _map_path(self, name: str, step: str) -> Path:
+        """Return the path of a map."""
         return self.folder / f"{name}_{int(step):03d}.tif"
 
     def _surface_path(self, step: str, surface: str) -> Path:
+        """Return the path of a surface."""
         number = 0 if surface == "reference" else int(step)
         return epoch_folder(self.folder, number) / ("truth.ply" if surface == "truth" else "surface.ply")
 
     def _raster_of(self, path: Path, grid: Grid) -> SurfaceRaster:
+        """Rasterise a surface."""
         return surface_raster(read_surface(path), grid)
 
 
 def _channels(cloud: PointCloud) -> dict[str, NDArray[Any]]:
+    """Return the channels of a point cloud."""
     known = {} if cloud.intensity is None else {"intensity": cloud.intensity}
     return known | dict(cloud.extra)
 
 
 def _thinned(index: NDArray[np.integer], budget: int) -> NDArray[np.integer]:
-    """Every k-th of the indices, so that at most `budget` are left."""
+    """Return every k-th index, so that at most `budget` remain."""
     return index[:: max(1, int(np.ceil(len(index) / budget)))]
 
 
 def _block(block: dict[str, Any]) -> Item:
+    """Convert a block's record to an item."""
     x0, y0, z0, x1, y1, z1 = block["bbox_m"]
     depth = block["measured_mean_depth_m"]
     facts = {
@@ -129,7 +141,7 @@ def _block(block: dict[str, Any]) -> Item:
 
 
 def _detections(folder: Path) -> dict[str, list[Item]]:
-    """The events of `scarpsim detect` at its lowest confidence, by epoch."""
+    """Read the events of `scarpsim detect` at its lowest confidence, by epoch."""
     tables = sorted((_confidence(path), path) for path in folder.glob("events_*.csv"))
     if not tables:
         raise InputError("holds no events_*.csv", where=str(folder), remedy="give the folder that scarpsim detect filled")
@@ -142,7 +154,7 @@ def _detections(folder: Path) -> dict[str, list[Item]]:
 
 
 def _confidence(path: Path) -> float:
-    """The confidence in the name of a table of events."""
+    """Return the confidence in the name of a table of events."""
     try:
         value = float(path.stem.removeprefix("events_"))
     except ValueError:
@@ -153,6 +165,7 @@ def _confidence(path: Path) -> float:
 
 
 def _detection(event: Event) -> Item:
+    """Convert an event to an item."""
     facts = {
         "score": f"{event.score:.3f}",
         "volume": f"{event.volume_m3:.4g} m³",

@@ -1,4 +1,4 @@
-"""The local page of `scarpsim view`: Dash serves it, with its scripts, to this machine alone; nothing is fetched."""
+"""Serve the local page of `scarpsim view` with Dash, with all its scripts, to this machine only; nothing is downloaded."""
 
 from __future__ import annotations
 
@@ -17,16 +17,18 @@ import dash
 import flask
 from werkzeug.serving import BaseWSGIServer, WSGIRequestHandler, make_server
 
-from pipeline.view.beside import check_same_wall
 from pipeline.view.gap_results import GapResults
+from pipeline.view.monitor_results import MONITOR_FILE, MonitorResults
 from pipeline.view.page import layout, register_callbacks
 from pipeline.view.results import Results
 from pipeline.view.run_results import RunResults
+from pipeline.view.split_view import check_same_wall
 from pipeline.view.tile_results import TileResults
 from scene.common.errors import InputError, one_line
 
 HOST = "127.0.0.1"
-_NO_TOKEN = "Take the whole address that scarpsim view said, with its token."
+_NO_TOKEN = "Use the complete address that scarpsim view printed, with its token."
+"""Answer to a request without the token."""
 _OWN_NAMES = {"127.0.0.1", "localhost"}
 _POLICY = {
     "default-src": "'none'",
@@ -39,12 +41,12 @@ _POLICY = {
     "form-action": "'none'",
     "frame-ancestors": "'none'",
 }
-"""What the page may load and run: its own scripts and, by their hashes ({inline}), the lines in the page by which Dash starts
-them. Plotly sets styles from scripts and saves pictures through data and blob addresses."""
+"""What the page may load and run: its own scripts and, by their hashes ({inline}), the inline scripts with which Dash starts.
+Plotly sets styles from scripts and saves pictures through data and blob addresses."""
 
 
 def open_results(folder: Path, detections: Path | None = None) -> Results:
-    """What lies in a folder, told by its files; raises InputError where it is none of those that can be looked at."""
+    """Open a folder by the files in it. Raises InputError if it is none of the kinds that can be shown."""
     if not folder.is_dir():
         raise InputError("there is no such folder", where=str(folder), remedy="give the folder that a command filled")
     if (folder / "run.json").exists():
@@ -53,18 +55,23 @@ def open_results(folder: Path, detections: Path | None = None) -> Results:
         raise InputError("belong to a run", where="--detections", remedy="leave it out, or give the run's folder")
     if (folder / "gap.json").exists():
         return GapResults(folder)
+    if (folder / MONITOR_FILE).exists():
+        return MonitorResults(folder)
     if (folder / "annotations.json").exists():
         return TileResults(folder)
-    allowed = "a run (run.json), a result of scarpsim gap (gap.json), a split of a data set (annotations.json)"
+    allowed = (
+        "a run (run.json), a result of scarpsim gap (gap.json) or monitor (monitor.json), "
+        "a split of a data set (annotations.json)"
+    )
     raise InputError("holds nothing to look at", where=str(folder), allowed=allowed)
 
 
 def make_app(results: Results, token: str, other: Results | None = None) -> dash.Dash:
-    """The page on `results`, for those who know the token; other: a second run of the same wall."""
+    """Make the page for `results`, accessible with the token; other: a second run of the same wall."""
     app = dash.Dash(
         __name__,
         serve_locally=True,
-        title=html.escape(f"scarpsim: {results.title}"),  # Dash puts it into the page as it is
+        title=html.escape(f"scarpsim: {results.title}"),  # Dash does not escape it
         update_title="",
         assets_folder=str(Path(__file__).parent / "assets"),
         on_error=_tell,
@@ -78,9 +85,26 @@ def make_app(results: Results, token: str, other: Results | None = None) -> dash
 
 
 def make_page_server(results: Results, port: int, token: str, other: Results | None = None) -> BaseWSGIServer:
-    """The page's server at `port` (0: any that is free); raises InputError where the port is taken."""
+    """Make the page's server.
+
+    Parameters
+    ----------
+    results : Results
+        What is shown.
+    port : int
+        Port, or 0 for any free one.
+    token : str
+        Secret that grants access.
+    other : Results, optional
+        A second run of the same wall.
+
+    Raises
+    ------
+    InputError
+        If the port cannot be used.
+    """
     try:
-        with redirect_stderr(io.StringIO()):  # where werkzeug says the same at length
+        with redirect_stderr(io.StringIO()):  # werkzeug's own message is long
             return make_server(HOST, port, make_app(results, token, other).server, threaded=True, request_handler=_Silent)
     except (OSError, SystemExit, OverflowError):
         remedy = "choose another, or 0 for any that is free"
@@ -88,7 +112,7 @@ def make_page_server(results: Results, port: int, token: str, other: Results | N
 
 
 def open_second(folder: Path, first: Results) -> Results:
-    """A second run of the wall of `first`; raises InputError where either is no run, or the walls or frames differ."""
+    """Open a second run of the same wall as `first`. Raises InputError if either is not a run, or if walls or frames differ."""
     second = open_results(folder)
     if not isinstance(first, RunResults) or not isinstance(second, RunResults):
         raise InputError("is to be shown beside another", where=str(folder), allowed="two runs of one wall")
@@ -97,12 +121,26 @@ def open_second(folder: Path, first: Results) -> Results:
 
 
 def serve(folder: Path, second: Path | None, detections: Path | None, port: int, *, open_browser: bool) -> None:
-    """Show a folder until interrupted; second: a run to be put beside it."""
+    """Show a folder until interrupted.
+
+    Parameters
+    ----------
+    folder : Path
+        What to show.
+    second : Path or None
+        A run to show beside it.
+    detections : Path or None
+        Folder of `scarpsim detect`.
+    port : int
+        Port, or 0 for any free one.
+    open_browser : bool
+        Whether to open the page in the browser.
+    """
     token = secrets.token_urlsafe(24)
     results = open_results(folder, detections)
     server = make_page_server(results, port, token, open_second(second, results) if second else None)
     address = f"http://{HOST}:{server.server_port}/?token={token}"
-    print(f"{address} shows {folder}; Ctrl-C ends it", flush=True)  # noqa: T201  (what the command is asked for)
+    print(f"{address} shows {folder}; Ctrl-C ends it", flush=True)  # noqa: T201  (the command's output)
     if open_browser:
         webbrowser.open(address)
     try:
@@ -114,30 +152,32 @@ def serve(folder: Path, second: Path | None, detections: Path | None, port: int,
 
 
 def _tell(error: Exception) -> None:
-    """Say on the page what is wrong with a file that it was to show; the pictures stay as they are."""
-    fault = "" if isinstance(error, InputError) else f"unexpected fault of the program, {type(error).__name__}: "
+    """Show an error on the page; the pictures stay as they are."""
+    fault = "" if isinstance(error, InputError) else f"internal error, {type(error).__name__}: "
     dash.set_props("note", {"children": f"{fault}{one_line(str(error))}"})
 
 
 def _refuse_other_names() -> Any:
-    """A page elsewhere that reaches this one under a name of its own gets nothing."""
+    """Refuse requests under another host name, by which a foreign page could reach this one."""
     name = flask.request.host.rpartition(":")[0] or flask.request.host
     return None if name in _OWN_NAMES else flask.abort(403)
 
 
 def cookie_name(host: str) -> str:
-    """Of the page at a host and port: a browser sends its cookies to all ports of a machine."""
+    """Return the name of the page's cookie, by its port, because a browser sends cookies to all ports of a machine."""
     return f"scarpsim_view_{host.rpartition(':')[2]}"
 
 
 def _refuse_strangers(token: str) -> Callable[[], Any]:
-    """Whoever comes with the address that the command said gets a cookie, and with it all else; another user of the machine,
-    who finds the port, gets nothing."""
+    """Make a check that grants access by the token in the address, and from then on by a cookie.
+
+    Another user of the machine who finds the port gets nothing.
+    """
 
     def refuse() -> Any:
         given = flask.request.args.get("token", "")
         if hmac.compare_digest(given.encode(), token.encode()):
-            answer = flask.redirect(flask.request.path)  # the token leaves the address, and so the browser's history
+            answer = flask.redirect(flask.request.path)  # keeps the token out of the browser's history
             answer.set_cookie(cookie_name(flask.request.host), token, httponly=True, samesite="Strict")
             return answer
         known = flask.request.cookies.get(cookie_name(flask.request.host), "")
@@ -147,7 +187,7 @@ def _refuse_strangers(token: str) -> Callable[[], Any]:
 
 
 def _with_headers(inline: Sequence[str]) -> Callable[[flask.Response], flask.Response]:
-    """What each answer tells the browser to refuse. inline: hashes of the scripts in the page itself."""
+    """Make a function that adds security headers to each answer. inline: hashes of the scripts in the page itself."""
     policy = "; ".join(f"{key} {value}" for key, value in _POLICY.items()).format(inline=" ".join(inline))
 
     def add(response: flask.Response) -> flask.Response:
@@ -160,7 +200,7 @@ def _with_headers(inline: Sequence[str]) -> Callable[[flask.Response], flask.Res
 
 
 class _Silent(WSGIRequestHandler):
-    """Writes no line for each request."""
+    """A request handler that logs nothing."""
 
     def log(self, type: str, message: str, *args: Any) -> None:
-        """Nothing."""
+        """Do nothing."""

@@ -1,4 +1,4 @@
-"""A split of a data set as something to look at: tile by tile, the differences themselves as relief."""
+"""Show a split of a data set tile by tile, with the differences themselves as relief."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pipeline.view.results import Item, Layer, Patch, PointLayer, ViewWindow, ce
 
 _MM = 1e3
 _SIGMA_M = 0.01
-"""Of the colours, where a tile does not say its own noise."""
+"""Noise that sets the colour scale if a tile does not state its own, m."""
 
 
 class TileResults:
@@ -25,7 +25,7 @@ class TileResults:
     surfaces = {"relief": "difference, as relief (rock that is missing lies deep)"}  # noqa: RUF012
 
     def __init__(self, folder: Path) -> None:
-        """Raises InputError where annotations.json cannot be used."""
+        """Read the folder. Raises InputError if annotations.json cannot be used."""
         self.folder, self._coco = folder, CocoFolder(folder, masks=False)
         self.title = f"{folder.parent.name}/{folder.name}: {len(self._coco)} tiles"
         self._images = {str(image["id"]): image for image in self._coco.images}
@@ -33,6 +33,7 @@ class TileResults:
         self._map = lru_cache(8)(read_geotiff)
 
     def layers(self, step: str) -> list[Layer]:
+        """Return the only layer, the difference."""
         sigma = _number(self._images[step].get("noise_sigma_m")) or _SIGMA_M
         return [
             Layer(
@@ -46,26 +47,30 @@ class TileResults:
         ]
 
     def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
+        """Return a tile as relief."""
         values, grid = self._map(self._coco.path(self._images[step]))
         rows, columns, factor = cut(grid, window, budget)
         shown = mean_pooled(values[rows, columns], factor)
         return Patch(*centres(grid, rows, columns, factor), -shown, shown * _MM, np.zeros(shown.shape, int), factor)
 
     def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
+        """Return None: a data set has no points."""
         return None
 
     def items(self, step: str) -> list[Item]:
+        """Return the blocks of a tile."""
         grid = self._map(self._coco.path(self._images[step]))[1]
         found = [each for each in self._coco.annotations if each["image_id"] == self._images[step]["id"]]
         return [_block(each, grid.x_min, grid.y_max, grid.gsd) for each in found]
 
 
 def _number(value: Any) -> float | None:
-    """What a key of another program may hold, if it is a finite number of at least 0, as all that is shown here."""
+    """Return the value if it is a finite number of at least 0, else None; other programs may write anything here."""
     return value if isinstance(value, int | float) and 0 <= value < np.inf else None
 
 
 def _block(annotation: dict[str, Any], x_min: float, y_max: float, gsd: float) -> Item:
+    """Convert an annotation to an item."""
     column, row, width, height = annotation["bbox"]
     x0, y1 = x_min + column * gsd, y_max - row * gsd
     known = {"volume_m3": "m³", "measured_volume_m3": "m³", "depth_m": "m", "share_in_tile": ""}

@@ -79,7 +79,7 @@ def test_a_tile_that_is_cut_short_stops_a_training_before_it_begins(split, tmp_p
         make_set(tmp_path / "set" / name, 2, 5)
     _cut(tmp_path / "set" / split / "2.tif")
     message = _fails(["train", str(tmp_path / "set"), "--quiet"], tmp_path / "out", capsys)
-    assert f"{split}/2.tif: is not a whole TIFF file" in message
+    assert f"{split}/2.tif: is not a complete TIFF file" in message
 
 
 @pytest.mark.slow
@@ -90,7 +90,7 @@ def test_a_training_that_fails_in_its_first_epoch_leaves_nothing(tmp_path, eager
     for name in ("train", "val"):
         make_set(tmp_path / "set" / name, 1, 5)
     _cut(tmp_path / "set" / "val" / "1.tif")
-    with pytest.raises(InputError, match="whole TIFF"):
+    with pytest.raises(InputError, match="complete TIFF"):
         train(tmp_path / "set", TrainConfig(detector=SMALL, training=TrainingConfig(batch=1, epochs=2)), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

@@ -190,10 +190,10 @@ def test_inputs_that_are_none_are_refused(tmp_path):
     with pytest.raises(InputError, match="no difference map"):
         find_inputs([tmp_path])
     (tmp_path / "annotations.json").write_text("[1, 2]")
-    with pytest.raises(InputError, match="no COCO annotation file"):
+    with pytest.raises(InputError, match="not a COCO annotation file"):
         find_inputs([tmp_path])
     (tmp_path / "annotations.json").write_text(json.dumps({"images": [], "annotations": [], "categories": []}))
-    with pytest.raises(InputError, match="names no image"):
+    with pytest.raises(InputError, match="its list 'images' is empty"):
         find_inputs([tmp_path])
     (tmp_path / "a.tif").write_bytes(b"II*\0garbage")
     with pytest.raises(InputError, match="TIFF"):

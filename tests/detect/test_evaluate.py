@@ -191,7 +191,7 @@ def test_the_tables_say_how_many_blocks_stand_out_where_the_truth_knows(truth, f
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ('{"a": 1}', "no list of COCO detections"),
+        ('{"a": 1}', "not a list of COCO detections"),
         ('[{"image_id": 1, "area": 3}]', "without a score"),
         ('[{"image_id": 9, "category_id": 1, "score": 0.3}]', "does not have"),
         ("nothing", "not JSON"),

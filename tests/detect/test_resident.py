@@ -87,7 +87,7 @@ from keras import ops
 from pipeline.detection.network.config import DetectorConfig, NormalisationConfig, TrainingConfig
 from pipeline.detection.network.data import CocoFolder
 from pipeline.detection.network.model import LOSSES
-from pipeline.detection.training.resident import ResidentLearner, resident
+from pipeline.detection.training.resident import ResidentLearner, load_resident_set
 
 
 class Darkest(keras.Model):
@@ -111,7 +111,7 @@ detector = DetectorConfig(image_px=128, most_blocks=4, normalisation=Normalisati
 model = Darkest()
 model.compile(optimizer=keras.optimizers.AdamW(3e-3, global_clipnorm=5.0))
 model.optimizer.build(model.trainable_variables)
-data = [resident(CocoFolder(Path(part)), detector, 64) for part in ("train", "val")]
+data = [load_resident_set(CocoFolder(Path(part)), detector, 64) for part in ("train", "val")]
 learner = ResidentLearner(model, *data, TrainingConfig(batch=2, crop_px=64, data="resident"))
 variables = [*model.variables, *model.optimizer.variables]
 losses, kept, judged = [], [], []

@@ -17,8 +17,8 @@ from pipeline.cli import main as cli
 from pipeline.formats.meshes.ply import write_ply
 from pipeline.formats.points.laz import read_laz
 from pipeline.formats.rasters.geotiff import read_geotiff
-from pipeline.monitor.follow import follow
-from pipeline.monitor.options import MonitorOptions
+from pipeline.monitoring.follow import follow
+from pipeline.monitoring.options import MonitorOptions
 from pipeline.surface.raster_mesh import mesh_of_raster
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid

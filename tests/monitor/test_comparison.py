@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from monitor_cases import HEIGHT_M, WIDTH_M, depth
 
-from pipeline.monitor.alignment import applied, refine
-from pipeline.monitor.comparison import ReferenceHeights, compare_epoch
-from pipeline.monitor.events import Catalogue
-from pipeline.monitor.gridding import gridded
-from pipeline.monitor.magnitude import fit_power_law
-from pipeline.monitor.significance import significance
+from pipeline.monitoring.alignment import applied, refine
+from pipeline.monitoring.comparison import ReferenceHeights, compare_epoch
+from pipeline.monitoring.events import Catalogue
+from pipeline.monitoring.gridding import gridded
+from pipeline.monitoring.magnitude import fit_power_law
+from pipeline.monitoring.significance import significance
 from pipeline.registration.rigid import RigidTransform
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid

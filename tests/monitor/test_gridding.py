@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.monitor.gridding import gridded
+from pipeline.monitoring.gridding import gridded
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from monitor_cases import las, points
 
-from pipeline.monitor.times import SIDECAR, EpochTime, check_order, parsed_time, time_of
+from pipeline.monitoring.times import SIDECAR, EpochTime, check_order, parsed_time, time_of
 from scene.common.errors import InputError
 
 

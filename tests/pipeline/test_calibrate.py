@@ -29,7 +29,7 @@ from pipeline.config.calibration import CalibrationConfig
 from pipeline.config.simulation import SimulationConfig, load_config
 from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.report.progress import Progress
-from pipeline.run.acquisition import look, reconstruct
+from pipeline.run.acquisition import acquire, reconstruct
 from pipeline.run.site import SensorSite, prepare_site
 from scene.common.config import parse
 from scene.common.errors import InputError
@@ -64,7 +64,7 @@ def small(sensor: str, *more: str) -> tuple[SimulationConfig, SensorSite]:
 def seen_by(config: SimulationConfig, site: SensorSite, epochs: int, seed: int) -> CalibrationInputs:
     """Difference maps of the whole simulation, each of two observations of its own."""
     caster, random = RayCaster(site.mesh), KeyedRandom(seed)
-    grid = raster_grid(reconstruct(config, look(config, site, caster, random)).bounds, config.difference)
+    grid = raster_grid(reconstruct(config, acquire(config, site, caster, random)).bounds, config.difference)
     maps = [noise_map(config, site, site, caster, random.child("map", number), grid) for number in range(epochs)]
     names = tuple(f"epoch {number}" for number in range(epochs))
     return CalibrationInputs(names, grid, np.stack(maps), ~np.isnan(maps).any(axis=0), False, site, False)

@@ -151,7 +151,7 @@ def test_an_opencv_coefficient_without_counterpart_is_named(tmp_path: Path, plac
 def test_colmap_refuses_models_beyond_ours(tmp_path: Path) -> None:
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
     for line, what in (
-        ("1 OPENCV_FISHEYE 640 480 500 500 320 240 0 0 0 0", "OPENCV_FISHEYE is not covered"),
+        ("1 OPENCV_FISHEYE 640 480 500 500 320 240 0 0 0 0", "OPENCV_FISHEYE is not supported"),
         ("1 FULL_OPENCV 640 480 500 500 320 240 0 0 0 0 0 0.5 0 0", "k4 = 0.5"),
         ("1 PINHOLE 640 480 500 500 320", "needs width, height and fx, fy, cx, cy"),
         ("2 PINHOLE 640 480 500 500 320 240", "names the camera 1"),
@@ -227,12 +227,12 @@ def test_a_camera_of_a_rig_is_no_unaligned_one(tmp_path: Path) -> None:
         ("<k1>-0.05</k1>", "<k1>minus</k1>", "expected 1 numbers, got 'minus'"),
         ("<k1>-0.05</k1>", "<k1>-50</k1>", "folds the image"),
         ('label="B"', 'label="A"', "labelled 'A'"),
-        ('sensor_id="0" component_id="0" label="A"', 'component_id="0" label="A"', "names no sensor"),
-        ("0 -1 0 1 0 0 0 0 1<", "0 1 0 1 0 0 0 0 1<", "no rotation"),
+        ('sensor_id="0" component_id="0" label="A"', 'component_id="0" label="A"', "sensor of camera"),
+        ("0 -1 0 1 0 0 0 0 1<", "0 1 0 1 0 0 0 0 1<", "not a rotation"),
         (">2.5<", ">-2.5<", "scale -2.5"),
         ("<document", "<!DOCTYPE x><document", "entities"),
         ("</document>", "", "not valid XML"),
-        ("document", "calibration", "no Metashape camera XML"),
+        ("document", "calibration", "not a Metashape camera XML"),
         ("<k1>-0.05</k1>", "<k1>-0.05</k1><p3>0.001</p3>", "lens parameter p3 = 0.001"),
         (
             "0 0 0 1</transform></camera>",
@@ -276,7 +276,7 @@ def test_the_pair_has_to_be_clear(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=what):
             CamerasFile(file=path, left=labels[0], right=labels[1]).pair()
     path.write_text(EXPORT.replace('label="C"/', 'label="C"><transform>1 0 0 4 0 1 0 0 0 0 1 0 0 0 0 1</transform></camera'))
-    with pytest.raises(InputError, match="holds 3 aligned cameras"):
+    with pytest.raises(InputError, match="has 3 aligned cameras"):
         CamerasFile(file=path).pair()
 
 
@@ -304,7 +304,7 @@ def test_unreadable_files_are_one_line(tmp_path: Path) -> None:
         ("none.xml", "cannot be read"),
         ("lens.yml", "FileStorage"),
         ("part.yml", "has no matrix"),
-        ("lens.txt", "no number"),
+        ("lens.txt", "not a number"),
     ):
         with pytest.raises(InputError, match=what):
             read_lens(tmp_path / name)
@@ -319,7 +319,7 @@ def test_depth_and_normal_maps_of_colmap(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_map(tmp_path / "d.bin"), depth)
     np.testing.assert_array_equal(read_map(tmp_path / "n.bin"), normals)
     (tmp_path / "d.bin").write_bytes(b"4&3&1&short")
-    with pytest.raises(InputError, match="no whole depth"):
+    with pytest.raises(InputError, match="not a complete depth"):
         read_map(tmp_path / "d.bin")
 
 

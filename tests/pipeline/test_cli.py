@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from pipeline.cli import main as cli
-from pipeline.cli.answer import as_json
+from pipeline.cli.command_output import as_json
 from pipeline.cli.json_schema import json_schema
 from pipeline.config.presets import read_preset
 from pipeline.config.simulation import CamerasFile, load_config
@@ -96,7 +96,7 @@ MISTAKES = [
     (["simulat"], "did you mean 'simulate'?"),
     (
         ["frobnicate"],
-        "allowed: simulate, inspect, compare, icp-study, calibrate, dataset, measurement, gap, train, detect, evaluate, "
+        "allowed: simulate, inspect, compare, icp-study, calibrate, dataset, monitor, measurement, gap, train, detect, evaluate, "
         "view, export, surface, init, schema, completion, doctor",
     ),
     (["--versio"], "did you mean '--version'?"),
@@ -140,7 +140,7 @@ def test_a_mistake_is_one_line_and_exit_2(
         ),
         (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "x.laz"), 2, "error: x.laz: No space left on device; make room"),
         (PermissionError(errno.EACCES, "Permission denied", "here"), 2, "error: here: Permission denied; check the permissions"),
-        (KeyboardInterrupt(), 130, "error: interrupted; what was finished is in here and usable; go on with --resume --out here"),
+        (KeyboardInterrupt(), 130, "interrupted; finished epochs are in here and usable; continue with --resume --out here"),
         (ImportError("libGL.so.1"), 1, "`scarpsim doctor` says what is missing"),
         (RuntimeError("two\nlines"), 1, "RuntimeError: two lines; the traceback is in "),
     ],
@@ -224,7 +224,7 @@ def test_init_writes_once(capsys: pytest.CaptureFixture[str], tmp_path: Path, mo
         (["--site", "../demo"], "there is no '../demo'"),
         (["--scanner", "riegl_vz400"], "exists already"),
         (["--scanner", "riegl"], "configs/scanners: there is no 'riegl'"),
-        (["--dataset", "small", "--site", "glendale"], "--dataset: stands beside --site"),
+        (["--dataset", "small", "--site", "glendale"], "--dataset: cannot be combined with --site"),
     ):
         assert cli.main(["init", "--out", "site.yaml", *words]) == 2
         assert expected in capsys.readouterr().err

@@ -241,7 +241,7 @@ def test_numpy_iterator(made: Path) -> None:
         Tiles(made / "train", noises="low")
     with pytest.raises(InputError, match="no tile has"):
         Tiles(made / "train", noise="loud")
-    with pytest.raises(InputError, match="give the folder of a split"):
+    with pytest.raises(InputError, match="name the folder of a split"):
         Tiles(made)
 
 

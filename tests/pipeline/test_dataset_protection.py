@@ -259,8 +259,8 @@ def test_a_job_that_cannot_begin_leaves_nothing(
     for options, message in (
         (["--scheduler", "tcp://127.0.0.1:9"], "no scheduler answers"),
         (["--workers", "100000"], "--workers: got 100,000 workers; allowed: 1 to"),
-        (["--by", "sensor"], "--by: goes with split"),
-        (["--report-only"], "--report-only: goes with verify"),
+        (["--by", "sensor"], "--by: works only with split"),
+        (["--report-only"], "--report-only: works only with verify"),
         (["--set", "tiles.size_px=4096"], "columns of tiles"),
     ):
         assert message in in_one_line(["dataset", str(file), "--out", str(out), "--quiet", *options], capsys)
@@ -304,7 +304,7 @@ def test_what_stands_in_the_place_of_a_folder_is_named(
     shutil.rmtree(copy / name, ignore_errors=True)
     make(copy / name)
     before = sorted(copy.rglob("*"))
-    assert f"{name}: is no folder" in in_one_line(["dataset", "verify", str(copy), "--quiet"], capsys)
+    assert f"{name}: is not a folder" in in_one_line(["dataset", "verify", str(copy), "--quiet"], capsys)
     assert sorted(copy.rglob("*")) == before
 
 
@@ -312,7 +312,7 @@ def test_nothing_is_staged_through_a_link(copy: Path, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (copy / ".staging").symlink_to(tmp_path / "elsewhere")
     next((copy / "train").glob("*.tif")).unlink()
-    with pytest.raises(InputError, match="is no folder"):
+    with pytest.raises(InputError, match="is not a folder"):
         verify_dataset(copy)
     assert not list((tmp_path / "elsewhere").iterdir())
 

@@ -11,12 +11,12 @@ from surfaces import heightfield
 
 from pipeline.planning.trials import Trials, detection_trials
 from pipeline.precision.detectability import (
-    FINDABLE,
+    CLEAR_SNR,
     PlanningConfig,
     Sampling,
     detection_probability,
     smallest_block,
-    smallest_findable,
+    smallest_clear_block,
 )
 from pipeline.precision.surface import Places
 from pipeline.precision.tls_geometry import tls_geometry
@@ -158,15 +158,15 @@ def test_the_smallest_findable_block_is_that_of_the_closed_form() -> None:
     """White noise w on a lattice a x b: S/N = r s^2 / (w sqrt(2 a b)), r depth over side; at least one point on it."""
     white, a, b = np.array([0.003, 0.01, 0.05]), np.array([0.02, 0.03, 0.1]), np.array([0.02, 0.05, 0.1])
     cases = sampling(white=white, step_a=a, step_b=b, shadow_a=0.0, shadow_b=0.0)
-    expected = np.sqrt(FINDABLE * white * np.sqrt(2 * a * b) / PLAN.depth_ratio)
-    np.testing.assert_allclose(smallest_findable(cases, PLAN), np.maximum(expected, np.sqrt(a * b)), rtol=2e-3)
+    expected = np.sqrt(CLEAR_SNR * white * np.sqrt(2 * a * b) / PLAN.depth_ratio)
+    np.testing.assert_allclose(smallest_clear_block(cases, PLAN), np.maximum(expected, np.sqrt(a * b)), rtol=2e-3)
 
 
 def test_a_floor_that_the_rim_hides_is_never_seen() -> None:
     hidden = sampling(shadow_a=2.0 / PLAN.depth_ratio)
     assert detection_probability(hidden, 5.0, PLAN)[0] == 0
     assert np.isnan(smallest_block(hidden, PLAN)[0])
-    assert np.isnan(smallest_findable(hidden, PLAN)[0])
+    assert np.isnan(smallest_clear_block(hidden, PLAN)[0])
 
 
 def test_the_points_on_a_block_are_its_area_times_the_cosine_over_the_squared_spacing() -> None:

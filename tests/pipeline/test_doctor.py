@@ -37,8 +37,8 @@ def test_missing_things_are_told_with_their_remedy(monkeypatch: pytest.MonkeyPat
     lines = {line[8:40].strip(): line for line in capsys.readouterr().out.splitlines()}
     assert lines["libnonesuch.so.7"].startswith("PROBLEM")
     assert lines["libnonesuch.so.7"].endswith("apt-get install -y --no-install-recommends libnonesuch7")
-    assert "not installed, wanted >=3; run `make setup`" in lines["nonesuch"]
-    assert "wanted >=1000" in lines["numpy"]
+    assert "not installed, needs >=3; run `make setup`" in lines["nonesuch"]
+    assert "needs >=1000" in lines["numpy"]
     assert "does not load: ModuleNotFoundError" in lines["rich"]
     assert "ModuleNotFoundError" in lines["machine"]
 
@@ -66,7 +66,7 @@ def test_a_probe_that_fails_is_a_finding() -> None:
     def explode() -> None:
         raise ZeroDivisionError("by nought")
 
-    (finding,) = doctor._guarded(explode)
+    (finding,) = doctor._run_probe(explode)
     assert (finding.name, finding.ok, finding.found) == ("explode", False, "ZeroDivisionError: by nought")
 
 

@@ -149,8 +149,8 @@ def test_a_package_refuses_links_out_of_its_folder(tmp_path: Path, capsys: pytes
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["epochs", "--epoch", "1"], "--epoch: goes with picture, gltf, scan"),
-        (["picture", "--epoch", "9"], "--epoch: epoch 9 is not there; allowed: 0 to 2"),
+        (["epochs", "--epoch", "1"], "--epoch: works only with picture, gltf, scan"),
+        (["picture", "--epoch", "9"], "--epoch: there is no epoch 9; allowed: 0 to 2"),
         (["gltf", "--out", "wall.obj"], "--out: got 'wall.obj'; allowed: .glb"),
         (["movie"], "got 'movie'; allowed: picture"),
         (["yolo"], "holds no split of a data set"),

@@ -60,9 +60,9 @@ def refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 @pytest.mark.parametrize(
     ("mesh", "message"),
     [
-        (surface(CORNERS * np.nan), "vertices that are no numbers"),
+        (surface(CORNERS * np.nan), "vertices with coordinates that are not numbers"),
         (surface(CORNERS * 1e300), "coordinates up to"),
-        (surface(faces=FACES[:0]), "holds no triangle"),
+        (surface(faces=FACES[:0]), "has no triangles"),
     ],
 )
 def test_a_spoilt_surface(
@@ -80,11 +80,11 @@ def test_a_spoilt_surface(
 @pytest.mark.parametrize(
     ("cloud", "message"),
     [
-        (PointCloud(np.empty((0, 3))), "holds no points"),
+        (PointCloud(np.empty((0, 3))), "has no points"),
         (PointCloud(np.zeros((5, 3))), "one place or line of sight"),
-        (PointCloud(CORNERS, gps_time=np.full(4, np.nan)), "other times"),
-        (PointCloud(CORNERS, gps_time=np.array([0.0, 1.0, np.inf, np.inf])), "other times"),
-        (PointCloud(CORNERS, gps_time=np.array([0.0, 1.0, 2.0, 1e300])), "other times"),
+        (PointCloud(CORNERS, gps_time=np.full(4, np.nan)), "no valid times"),
+        (PointCloud(CORNERS, gps_time=np.array([0.0, 1.0, np.inf, np.inf])), "no valid times"),
+        (PointCloud(CORNERS, gps_time=np.array([0.0, 1.0, 2.0, 1e300])), "no valid times"),
     ],
 )
 def test_spoilt_points(cloud: PointCloud, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -98,7 +98,7 @@ def test_killed_in_the_middle_leaves_no_file(tmp_path: Path, number: signal.Sign
     [
         (errno.ENOSPC, "the disk is full"),
         (errno.EDQUOT, "quota"),
-        (errno.EACCES, "may not be written"),
+        (errno.EACCES, "cannot be written"),
         (errno.EROFS, "Read-only"),
     ],
 )

@@ -17,9 +17,9 @@ from gap_cases import Scan, write_scan
 from pipeline.cli.main import main
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import STEPS, GapDiagnosis, diagnose
-from pipeline.gap.report.covariate_ranking import where
-from pipeline.gap.report.in_words import paragraph
-from pipeline.gap.report.report import summary, to_dict
+from pipeline.gap.report.covariate_ranking import rank_disagreements
+from pipeline.gap.report.report import summarise, to_dict
+from pipeline.gap.report.wording import paragraph
 from scene.common import threads
 from scene.common.backend import dr
 from sensors.numerics.curve import Axis, interpolate_on_host
@@ -84,8 +84,8 @@ def test_a_jump_in_azimuth_is_unknown(tmp_path: Path) -> None:
     found = found_in(tmp_path, 18, ranges=lambda scan: scan.R + 0.002 * np.where(scan.az > 1.6, 1.0, -1.0))
     assert found.verdict == "unknown"
     assert found.effects[0].kind == "empirical"
-    assert "depends on" in paragraph(found, where(found))
-    assert "_empirical (covariate" in summary(found)
+    assert "depends on" in paragraph(found, rank_disagreements(found))
+    assert "_empirical (covariate" in summarise(found)
 
 
 def test_a_range_error_that_jumps_is_folded_with_its_high_overtones(tmp_path: Path) -> None:
@@ -156,7 +156,7 @@ def test_a_model_that_is_too_noisy_is_told_so(tmp_path: Path) -> None:
     model.write_text(model.read_text().replace("range_sigma_m: 0.003", "range_sigma_m: 0.006"))
     found = diagnose(read_measurement(tmp_path))
     assert (found.verdict, found.effects) == ("unknown", ())
-    told = re.search(r"the residuals spread (\d+) % of what the model predicts", found.remaining["note"])
+    told = re.search(r"the residuals have (\d+) % of the predicted standard deviation", found.remaining["note"])
     assert told is not None
     assert 45 <= int(told[1]) <= 75
     assert found.model_after.noise.range_sigma_m == pytest.approx(0.003, rel=0.15)

@@ -10,7 +10,7 @@ import pytest
 from gap_cases import Scan, write_scan
 
 from pipeline.formats.measurements.measurement import read_measurement
-from pipeline.gap.naming.entries import Named, only_within_bounds, with_effects
+from pipeline.gap.naming.named_effects import NamedEffect, only_within_bounds, with_effects
 from pipeline.gap.naming.workflow import diagnose
 from sensors.effects import STEREO_EFFECTS, TLS_EFFECTS
 from sensors.models.sensor_model import StereoModel, TlsModel
@@ -37,12 +37,12 @@ def test_an_effect_beyond_its_bounds_is_left_out_and_the_others_stay(sensor: str
     wide, good = _named(sensor, name, {key: 1.5 * largest + 1.0}), _named(sensor, other, {key_of_other: value})
     kept, words = only_within_bounds(model, [wide, good])
     assert kept == [good]
-    assert words == [f"{sensor}.{name} left out: the best value is beyond what a config may hold"]
+    assert words == [f"{sensor}.{name} left out: its best value is outside the bounds of the effect"]
     assert with_effects(model, [item.entry for item in kept]).effects
 
 
-def _named(sensor: str, name: str, values: dict[str, Any]) -> Named:
-    return Named(f"{sensor}.{name}", "physical", {"name": name, **values}, {}, (), 0.001, 10.0)
+def _named(sensor: str, name: str, values: dict[str, Any]) -> NamedEffect:
+    return NamedEffect(f"{sensor}.{name}", "physical", {"name": name, **values}, {}, (), 0.001, 10.0)
 
 
 def test_noise_whose_coefficient_no_config_may_hold_ends_in_a_verdict(tmp_path: Path) -> None:
@@ -57,4 +57,4 @@ def test_noise_whose_coefficient_no_config_may_hold_ends_in_a_verdict(tmp_path: 
     found = diagnose(read_measurement(tmp_path))
     assert found.verdict != "no_gap"
     assert not [effect for effect in found.effects if effect.name == "tls.range_noise_intensity"]
-    assert "range_noise_intensity left out: the best value is beyond what a config may hold" in found.remaining["note"]
+    assert "range_noise_intensity left out: its best value is outside the bounds of the effect" in found.remaining["note"]

@@ -15,7 +15,7 @@ from gap_cases import STEP, smooth_noise, write_scan
 
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import diagnose
-from pipeline.gap.report.report import summary, to_dict
+from pipeline.gap.report.report import summarise, to_dict
 from pipeline.gap.residuals.ray_hits import RayGeometry
 from pipeline.gap.residuals.scene_changes import SceneChange, find_scene_changes
 from pipeline.gap.residuals.sensor_view import SensorView
@@ -148,7 +148,7 @@ def test_where_much_of_the_wall_moved_nothing_is_said_of_the_sensor(tmp_path: Pa
     assert found.evidence.moved > 0.3
     assert found.effects == ()
     assert found.remaining["note"].index("name stable_areas") < 400
-    assert "stable_areas in measurement.yaml" in summary(found)
+    assert "stable_areas in measurement.yaml" in summarise(found)
 
 
 @pytest.mark.parametrize(("half", "depth", "reference"), [((0.1, 0.4), (0.02, 0.05), 1e-3), ((0.3, 0.9), (0.1, 0.4), 4e-4)])

@@ -10,7 +10,7 @@ from gap_cases import write_scan
 
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.mean.search import MeanSearch
-from pipeline.gap.naming.families import families_of
+from pipeline.gap.naming.candidate_families import candidate_families
 from pipeline.gap.residuals.alignment import align
 from scene.common.keyed_random import KeyedRandom
 
@@ -32,7 +32,7 @@ def _search(folder: Path, step_rad: float, bent: float = BENT) -> tuple[list[str
     noise = 0.001 * np.random.default_rng(6).standard_normal(len(part))
     value = TRUE * (slant + bent * np.std(slant) * np.sin(6 * part.covariates["incidence"])) + noise
     part = replace(part, value=value, sigma=np.full(len(part), 0.001))
-    search = MeanSearch(part, families_of(there, part), KeyedRandom(1))
+    search = MeanSearch(part, candidate_families(there, part), KeyedRandom(1))
     chosen, _ = search.select()
     names = [each.candidate.name for each in chosen]
     ours = next((each.candidate for each in chosen if each.candidate.name == "range_incidence_bias"), None)

@@ -96,10 +96,10 @@ def sweeps(azimuth: list[float], zenith: list[float]) -> Callable[[Path], None]:
 
 BAD: dict[str, tuple[Callable[[Path], None], str]] = {
     "no files": (changed(points=[]), "names no file"),
-    "step of the pattern": (sweeps([0.9, 2.3, 1e-12], [0.8, 1.7, 0.01]), "pulses, for"),
+    "step of the pattern": (sweeps([0.9, 2.3, 1e-12], [0.8, 1.7, 0.01]), "pulses for"),
     "pattern in degrees": (sweeps([50.0, 130.0, 0.7], [45.0, 95.0, 0.7]), "angles are in radians"),
     "zenith beyond nadir": (sweeps([0.9, 2.3, 0.012], [0.8, 5.0, 0.012]), "straight down"),
-    "elevation for zenith": (sweeps([0.9, 2.3, 0.012], [0.0, 0.7, 0.012]), "'pattern' holds"),
+    "elevation for zenith": (sweeps([0.9, 2.3, 0.012], [0.0, 0.7, 0.012]), "'pattern' contains"),
     "world taken for scanner": (in_world, "`frame: world`"),
     "scanner taken for world": (changed(frame="world"), "`frame: scanner`"),
     "no noise": (silent, "range_sigma_m"),
@@ -107,8 +107,8 @@ BAD: dict[str, tuple[Callable[[Path], None], str]] = {
     "scale 0": (header(SCALE_AT, 0.0), "scale factors"),
     "scale infinite": (header(SCALE_AT, float("inf")), "scale factors"),
     "offset 1e9": (header(OFFSET_AT, 1e9), "states a box from"),
-    "one point 5000 times": (put(lambda points: np.repeat(points[:1], 5000, axis=0)), "are the same one"),
-    "one point 3 times": (put(lambda points: np.repeat(points[:1], 3, axis=0)), "are the same one"),
+    "one point 5000 times": (put(lambda points: np.repeat(points[:1], 5000, axis=0)), "are at the same place"),
+    "one point 3 times": (put(lambda points: np.repeat(points[:1], 3, axis=0)), "are at the same place"),
     "on one line": (put(lambda points: points[0] + np.linspace(0, 1, 500)[:, None] * (points[900] - points[0])), "on one line"),
     "negative intensity": (put(lambda points: np.column_stack([points, -np.ones(len(points))])), "intensities from -1 to -1"),
     "huge intensity": (put(lambda points: np.column_stack([points, np.full(len(points), 1e300)])), "relative received power"),
@@ -116,7 +116,7 @@ BAD: dict[str, tuple[Callable[[Path], None], str]] = {
     "NaN": (put(lambda points: points * np.nan), "no point with finite values"),
     "one of 1e300": (put(lambda points: np.concatenate([points, [[1e300, 0.0, 0.0]]])), "1 of "),
     "1e9 away": (put(lambda points: points + 1e9), "check the unit"),
-    "1e7 away": (put(lambda points: points + 1e7), "of the points lie in a direction"),
+    "1e7 away": (put(lambda points: points + 1e7), "of the points lie in directions"),
     "10 m behind": (put(lambda points: points * (1 + 10 / np.linalg.norm(points, axis=1, keepdims=True))), "10 m behind the"),
     "in millimetres": (put(lambda points: 1000 * points), "check the sensor's position, the unit (m)"),
     "one long line": (one_line, "a line of more than 65,536 bytes"),
@@ -186,5 +186,5 @@ def test_a_pair_may_be_off_by_what_a_turned_camera_does(sensor: Sensor, off_m: f
 def test_one_epoch_under_two_names_is_named() -> None:
     points = np.random.default_rng(1).normal(size=(50, 3))
     check_different({"a.laz": PointCloud(points), "b.laz": PointCloud(points + 1e-9)})
-    with pytest.raises(InputError, match=r"c\.laz: holds the same points as a\.laz"):
+    with pytest.raises(InputError, match=r"c\.laz: has the same points as a\.laz"):
         check_different({"a.laz": PointCloud(points), "b.laz": PointCloud(points[1:]), "c.laz": PointCloud(points.copy())})

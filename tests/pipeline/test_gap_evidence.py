@@ -15,11 +15,11 @@ from gap_cases import Array, Scan, smooth_noise, write_scan
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.mean.candidates import SPATIAL_NULL, Candidate
 from pipeline.gap.mean.selection import EffectSet, FamilyScore, ForwardSelection
-from pipeline.gap.naming.attempts import few
-from pipeline.gap.naming.entries import Named
-from pipeline.gap.naming.held_out import score_effects, weakness
+from pipeline.gap.naming.named_effects import NamedEffect
+from pipeline.gap.naming.selection_passes import subsample
+from pipeline.gap.naming.validation_scores import describe_weakness, validate_effects
 from pipeline.gap.naming.workflow import diagnose
-from pipeline.gap.other.spread import find_spread
+from pipeline.gap.noise_and_edges.variance_model import fit_variance_model
 from pipeline.gap.residuals.alignment import align, fit_pose_robustly
 from pipeline.gap.residuals.wall_blocks import WallCells, in_validation_blocks
 from scene.common.keyed_random import KeyedRandom
@@ -37,8 +37,8 @@ def test_debris_on_blocks_that_were_held_out_does_not_speak_against_an_effect(tm
         held_out = in_validation_blocks(found.wall_xy, WallCells.over(found.wall_xy).side_m)
         rows = np.flatnonzero(held_out | (np.abs(fit_pose_robustly(found)[0]) < 0.05))  # the others no step of naming looks at
         entry = {"name": "range_incidence_bias", "coefficient_m": 0.004}
-        effect = Named("tls.range_incidence_bias", "physical", entry, {}, (), 0.001, 9.0)
-        scored = score_effects(*few(there, found, rows), [effect], ~held_out[rows], 0.0004)
+        effect = NamedEffect("tls.range_incidence_bias", "physical", entry, {}, (), 0.001, 9.0)
+        scored = validate_effects(*subsample(there, found, rows), [effect], ~held_out[rows], 0.0004)
         return 0.0 if scored.failed else scored.named[0].gain
 
     without, with_debris = gain(tmp_path / "without", 0.0), gain(tmp_path / "with", 0.01)
@@ -60,14 +60,14 @@ def test_an_effect_beside_others_whose_one_value_may_be_none_is_only_mentioned(
     bias = {"name": "range_incidence_bias", "coefficient_m": 0.004}
     sine = {"name": "range_cyclic", "amplitude_m": 0.004, "period_m": 1.7, "phase_rad": 0.0}
     named = [
-        Named("tls.range_incidence_bias", "physical", bias, {"coefficient_m": std}, (), 0.001, 9.0),
-        Named("tls.range_cyclic", "physical", sine, {"amplitude_m": 0.01, "period_m": 1.0}, (), 0.001, 9.0),
+        NamedEffect("tls.range_incidence_bias", "physical", bias, {"coefficient_m": std}, (), 0.001, 9.0),
+        NamedEffect("tls.range_cyclic", "physical", sine, {"amplitude_m": 0.01, "period_m": 1.0}, (), 0.001, 9.0),
     ]
-    scored = score_effects(
+    scored = validate_effects(
         there, found, named, ~in_validation_blocks(found.wall_xy, WallCells.over(found.wall_xy).side_m), 0.0004
     )
     assert [item.name for item in scored.weak] == weak
-    assert all("within its uncertainty of none" in weakness(item) for item in scored.weak)
+    assert all("within its uncertainty of zero" in describe_weakness(item) for item in scored.weak)
     assert not scored.failed
 
 
@@ -87,7 +87,7 @@ def test_noise_differs_between_neighbours_and_an_error_of_the_reference_does_not
     else:
         extra = rng.standard_normal(len(part))
     value = fit_pose_robustly(replace(part, value=part.value + 0.002 * extra))[0]
-    spread, _, _ = find_spread(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
+    spread, _, _ = fit_variance_model(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
     assert len(spread) == count
 
 
@@ -108,12 +108,12 @@ def test_two_effects_that_only_make_up_for_each_other_both_fail(tmp_path: Path) 
     against = -0.022 * (1 / np.cos(incidence) - 1)
     form = {"covariate": "incidence", "along": {"low": 0.0, "high": 1.4}, "values_m": [against.tolist()]}
     named = [
-        Named("tls.range_empirical", "empirical", {"name": "range_empirical", **form}, {}, (), 0.001, 30.0),
-        Named(
+        NamedEffect("tls.range_empirical", "empirical", {"name": "range_empirical", **form}, {}, (), 0.001, 30.0),
+        NamedEffect(
             "tls.range_incidence_bias", "physical", {"name": "range_incidence_bias", "coefficient_m": 0.02}, {}, (), 0.001, 9.0
         ),
     ]
-    scored = score_effects(there, residuals, named, ~held_out, 0.0004)
+    scored = validate_effects(there, residuals, named, ~held_out, 0.0004)
     assert not scored.named
     assert [item.name for item in scored.failed] == ["tls.range_empirical", "tls.range_incidence_bias"]
 

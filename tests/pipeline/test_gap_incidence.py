@@ -93,13 +93,13 @@ def test_references_of_points_ask_for_planes(tmp_path: Path) -> None:
     path = scan(tmp_path / "ground.xyz")
     request = Request([path], "half", "riegl_vz400i", position=(0.0, 0.0, 0.0))
     found = build(request, tmp_path / "out")
-    assert "planes through 24 points of it" in found.about["reference"][-1]
+    assert "planes through 24 of its points" in found.about["reference"][-1]
     assert yaml.safe_load((tmp_path / "out/measurement.yaml").read_text())["incidence"] == "planes"
 
 
 def test_planes_are_not_asked_for_where_nothing_looks_at_them() -> None:
     values = {"sensor": "stereo", "reference": "a.ply", "points": "b.ply", "model": "model.yaml", "incidence": "planes"}
-    with pytest.raises(InputError, match="of laser scans; leave it out"):
+    with pytest.raises(InputError, match="for laser scans only; remove it"):
         parse(MeasurementConfig, values, "measurement.yaml")
 
 

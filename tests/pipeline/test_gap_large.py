@@ -16,28 +16,28 @@ from benchmarks.gap_challenge.cases import Case, make
 from benchmarks.gap_challenge.strength import Target
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import read_measurement
-from pipeline.gap.decisions import Decisions, deciding
 from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.mean_model import MeanModel, fit_reml
 from pipeline.gap.mean.search import MeanSearch
-from pipeline.gap.naming import relinearised
-from pipeline.gap.naming.entries import Named, from_mean
-from pipeline.gap.naming.families import families_of
-from pipeline.gap.naming.held_out import score_effects
-from pipeline.gap.naming.relinearised import (
-    SearchedPoints,
-    _largest_alone,
-    _with_class,
-    fitted_together,
-    searched_at_best_fit,
-    weighed,
+from pipeline.gap.naming import nonlinear_refit
+from pipeline.gap.naming.candidate_families import candidate_families
+from pipeline.gap.naming.named_effects import NamedEffect, effect_from_estimate
+from pipeline.gap.naming.nonlinear_refit import (
+    SearchInput,
+    _strongest_single_fits,
+    _with_equivalence_class,
+    fit_jointly,
+    search_at_joint_fit,
+    with_fitted_variance,
 )
+from pipeline.gap.naming.validation_scores import validate_effects
 from pipeline.gap.naming.workflow import diagnose
-from pipeline.gap.other.spread import SpreadFound, find_spread
+from pipeline.gap.noise_and_edges.variance_model import VarianceTerm, fit_variance_model
 from pipeline.gap.residuals.alignment import align, fit_pose_robustly
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.wall_blocks import WallCells, in_validation_blocks
+from pipeline.gap.thresholds import Thresholds, use_thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 
@@ -80,7 +80,7 @@ def test_whose_principal_point_is_off_shows_with_it_in_the_model(tmp_path: Path,
 
 
 @pytest.fixture(scope="module")
-def turned_and_zoomed(tmp_path_factory: pytest.TempPathFactory) -> tuple[SearchedPoints, dict[str, dict[str, Any]]]:
+def turned_and_zoomed(tmp_path_factory: pytest.TempPathFactory) -> tuple[SearchInput, dict[str, dict[str, Any]]]:
     """What is measured by a pair with a turned camera (4 mrad) and another focal length (8 px), and both effects' parameters."""
     folder = tmp_path_factory.mktemp("large")
     kinds = ("camera_kappa", "focal_length")
@@ -91,11 +91,11 @@ def turned_and_zoomed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Searche
     there, residuals, _ = align(read_measurement(folder / "case"))
     part = residuals.part(residuals.usable)
     there, part = there.part(part.index), replace(part, index=np.arange(residuals.usable.sum()))
-    return SearchedPoints(there, part, families_of(there, part), lambda _: [], 0.0, KeyedRandom(1)), truth
+    return SearchInput(there, part, candidate_families(there, part), lambda _: [], 0.0, KeyedRandom(1)), truth
 
 
 def test_slopes_are_the_true_ones_where_all_effects_together_fit_best(
-    turned_and_zoomed: tuple[SearchedPoints, dict[str, dict[str, Any]]],
+    turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]],
 ) -> None:
     """Least squares with the columns of both effects there find both values to 15 %, two to three standard errors;
     by the slopes at the model they miss a third of one."""
@@ -110,24 +110,24 @@ def test_slopes_are_the_true_ones_where_all_effects_together_fit_best(
         return [abs(one / other - 1) for one, other in zip(found, wanted, strict=True)]
 
     assert max(both(points.families, points.part, points.part.value)) > 0.3
-    fit_reml = fitted_together(points, [each for each in points.families if isinstance(each, Candidate) and not each.empirical])
+    fit_reml = fit_jointly(points, [each for each in points.families if isinstance(each, Candidate) and not each.empirical])
     assert fit_reml is not None
     there, at, explained = fit_reml
-    assert max(both(families_of(there, at), at, at.value + explained)) < 0.15
+    assert max(both(candidate_families(there, at), at, at.value + explained)) < 0.15
 
 
 def test_noise_beside_effects_is_asked_for_with_these_in_the_model(
-    turned_and_zoomed: tuple[SearchedPoints, dict[str, dict[str, Any]]],
+    turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]],
 ) -> None:
     """Without them what they do, hundreds of times the noise, is found as noise of some pixels; with them none is, and the
     residuals spread as predicted: an NMAD of 3,000 values errs by 2 %, and the effects' values by their own errors."""
     points, _ = turned_and_zoomed
     asked: list[Residuals] = []
-    searched_at_best_fit(replace(points, spread_at=lambda at: asked.append(at) or []))  # type: ignore[func-returns-value]
+    search_at_joint_fit(replace(points, spread_at=lambda at: asked.append(at) or []))  # type: ignore[func-returns-value]
     (at,) = asked
 
-    def noise_in(part: Residuals) -> list[SpreadFound]:
-        return find_spread(part, WallCells.over(part.wall_xy), fit_pose_robustly(part)[0], KeyedRandom(1), frozenset())[0]
+    def noise_in(part: Residuals) -> list[VarianceTerm]:
+        return fit_variance_model(part, WallCells.over(part.wall_xy), fit_pose_robustly(part)[0], KeyedRandom(1), frozenset())[0]
 
     assert noise_in(points.part)
     assert noise_in(at) == []
@@ -135,39 +135,39 @@ def test_noise_beside_effects_is_asked_for_with_these_in_the_model(
 
 
 def test_the_class_of_an_effect_taken_exactly_is_by_exact_likelihoods(
-    turned_and_zoomed: tuple[SearchedPoints, dict[str, dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
+    turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is what the answer says: with any margin all that were taken exactly are in it, with none those alone that slopes put
     there and that were not taken exactly."""
     points, _ = turned_and_zoomed
-    first = MeanSearch(weighed(points.part, [], 1.0), points.families, KeyedRandom(1))
+    first = MeanSearch(with_fitted_variance(points.part, [], 1.0), points.families, KeyedRandom(1))
     classes = {}
     for margin in (0.0, 1e9):
-        monkeypatch.setattr(relinearised, "equivalence_margin", lambda _, margin=margin: margin)
-        one = _with_class(_largest_alone(points, first, first.select()[0]))
-        classes[margin] = set(from_mean(one.estimate, points.part).alike)
+        monkeypatch.setattr(nonlinear_refit, "equivalence_margin", lambda _, margin=margin: margin)
+        one = _with_equivalence_class(_strongest_single_fits(points, first, first.select()[0]))
+        classes[margin] = set(effect_from_estimate(one.estimate, points.part).alike)
     exactly = classes[1e9] - classes[0.0]
     assert len(exactly) == 2
     assert f"stereo.{one.name}" not in classes[1e9]
 
 
 def test_slopes_do_not_serve_where_what_they_miss_is_as_much_as_something_gains(
-    turned_and_zoomed: tuple[SearchedPoints, dict[str, dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
+    turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A weak second effect may be what the first one's slopes are wrong by: the first is taken exactly then, else not."""
     points, _ = turned_and_zoomed
-    first = MeanSearch(weighed(points.part, [], 1.0), points.families, KeyedRandom(1))
+    first = MeanSearch(with_fitted_variance(points.part, [], 1.0), points.families, KeyedRandom(1))
     chosen = first.select()[0]
-    (leading, *_) = _largest_alone(points, first, chosen)
+    (leading, *_) = _strongest_single_fits(points, first, chosen)
     wrong_by = abs(leading.log_likelihood - first.design.log_likelihood(points.part.value, leading.estimate.candidate))
     monkeypatch.setattr(first, "leading_effects", lambda: [leading.estimate.candidate])
-    monkeypatch.setattr(relinearised, "_taken_exactly", lambda *_: leading)
-    monkeypatch.setattr(relinearised, "_likeliest", lambda *_: [leading])
-    monkeypatch.setattr(relinearised, "_with_others", lambda _points, _first, alone, _names: alone)
-    by = Decisions().model_copy(update={"mean": Decisions().mean.model_copy(update={"slopes_serve": 2 * wrong_by})})
-    with deciding(by):
-        assert _largest_alone(points, first, [replace(chosen[0], log_likelihood_ratio=3 * wrong_by)]) == []
-        assert _largest_alone(
+    monkeypatch.setattr(nonlinear_refit, "_single_fit", lambda *_: leading)
+    monkeypatch.setattr(nonlinear_refit, "_best_variants", lambda *_: [leading])
+    monkeypatch.setattr(nonlinear_refit, "_with_alternatives", lambda _points, _first, alone, _names: alone)
+    by = Thresholds().model_copy(update={"mean": Thresholds().mean.model_copy(update={"slopes_serve": 2 * wrong_by})})
+    with use_thresholds(by):
+        assert _strongest_single_fits(points, first, [replace(chosen[0], log_likelihood_ratio=3 * wrong_by)]) == []
+        assert _strongest_single_fits(
             points,
             first,
             [replace(chosen[0], log_likelihood_ratio=3 * wrong_by), replace(chosen[0], log_likelihood_ratio=1.5 * wrong_by)],
@@ -175,10 +175,10 @@ def test_slopes_do_not_serve_where_what_they_miss_is_as_much_as_something_gains(
 
 
 def test_two_large_effects_are_found_where_all_together_fit_best(
-    turned_and_zoomed: tuple[SearchedPoints, dict[str, dict[str, Any]]],
+    turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]],
 ) -> None:
     """By slopes at the model two others, and a free form, say it."""
-    found = searched_at_best_fit(turned_and_zoomed[0])
+    found = search_at_joint_fit(turned_and_zoomed[0])
     assert found is not None
     assert {each.candidate.name for each in found.chosen} <= {"focal_length", "camera_kappa", "affinity_skew"}  # a turn is a skew
     assert [each.candidate.name for each in found.chosen].count("focal_length") == 1
@@ -207,7 +207,7 @@ def test_what_is_known_of_one_effect_holds_beside_another(tmp_path: Path) -> Non
     write_scan(tmp_path, 8, ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1), step_rad=0.012)
     there, residuals, _ = align(read_measurement(tmp_path))
     part = residuals.part(residuals.usable)
-    families = families_of(there, part)
+    families = candidate_families(there, part)
     bias = next(each for each in families if isinstance(each, Candidate) and each.name == "range_incidence_bias")
     rng = np.random.default_rng(1)
     faint = 1e-7 * (bias.columns[:, :1] + rng.standard_normal((len(part), 1)))
@@ -227,10 +227,10 @@ def test_an_effect_that_is_not_there_fails_on_blocks_that_were_held_out(tmp_path
     there, residuals, _ = align(read_measurement(tmp_path))
     trained = ~in_validation_blocks(residuals.wall_xy, WallCells.over(residuals.wall_xy).side_m)
     true, wrong = (
-        Named(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
+        NamedEffect(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
         for name, key, value in (("range_incidence_bias", "coefficient_m", 0.01), ("range_scale", "scale_ppm", 900.0))
     )
-    scored = score_effects(there, residuals, [wrong, true], trained, 0.0004)
+    scored = validate_effects(there, residuals, [wrong, true], trained, 0.0004)
     assert [item.name for item in scored.failed] == ["tls.range_scale"]
     assert [item.name for item in scored.named] == ["tls.range_incidence_bias"]
     assert scored.named[0].gain > 50
@@ -242,10 +242,10 @@ def test_an_effect_that_gains_no_more_than_its_standard_error_is_only_mentioned_
     there, residuals, _ = align(read_measurement(tmp_path))
     trained = ~in_validation_blocks(residuals.wall_xy, WallCells.over(residuals.wall_xy).side_m)
     true, slight = (
-        Named(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
+        NamedEffect(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
         for name, key, value in (("range_incidence_bias", "coefficient_m", 0.01), ("range_scale", "scale_ppm", 1.0))
     )
-    both = score_effects(there, residuals, [true, slight], trained, 0.0004)
+    both = validate_effects(there, residuals, [true, slight], trained, 0.0004)
     assert [item.name for item in both.named] == ["tls.range_incidence_bias"]
     assert [item.name for item in both.weak] == ["tls.range_scale"]
     assert 0 < both.weak[0].gain < 2

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.gap.other.locking import SpreadAllowed, find_locking
+from pipeline.gap.noise_and_edges.pixel_locking import NoiseBounds, find_locking
 from sensors.effects.pixel_locking import PixelLocking
 
 
@@ -46,7 +46,7 @@ def test_a_small_amplitude_is_told_from_noise_by_how_much_of_it_there_may_be() -
         random = np.random.default_rng(seed)
         surface = random.uniform(100, 160, 6000)
         measured = surface + 0.115 * np.sin(2 * np.pi * surface) + 0.22 * random.standard_normal(6000)
-        locking = find_locking(measured, surface, spread=SpreadAllowed(0.22, float(np.std(measured - surface))))
+        locking = find_locking(measured, surface, noise=NoiseBounds(0.22, float(np.std(measured - surface))))
         assert locking is not None
         found.append((locking.amplitude_px, locking.std_px))
     amplitude, std = np.transpose(found)

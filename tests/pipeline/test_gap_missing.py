@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import norm
 
 from pipeline.formats.measurements.measurement import TlsMeasurement, read_measurement
-from pipeline.gap.naming.verify import measure_losses
-from pipeline.gap.other.missing import MissingFound, find_missing, isolated
+from pipeline.gap.naming.gap_score import measure_losses
+from pipeline.gap.noise_and_edges.missing_returns import LossExplanation, count_isolated_returns, explain_missing_returns
 from pipeline.gap.residuals.residuals import ExpectedPulses
 from pipeline.gap.residuals.tls_residuals import find_expected_pulses, tls_residuals
 
@@ -37,12 +37,12 @@ def pulses() -> tuple[Array, Array, dict[str, Array]]:
     return x, y, covariates
 
 
-def found(chance: Array, early: int = 0, seed: int = 6) -> MissingFound | None:
+def found(chance: Array, early: int = 0, seed: int = 6) -> LossExplanation | None:
     """What is found where pulses are lost with a chance (n,)."""
     x, y, covariates = pulses()
     lost = np.random.default_rng(seed).uniform(size=COUNT) < chance
     every = np.arange(COUNT) % 5 != 0
-    return find_missing(ExpectedPulses(lost, covariates, np.stack([x, y], axis=1)), every, early, COUNT, None)
+    return explain_missing_returns(ExpectedPulses(lost, covariates, np.stack([x, y], axis=1)), every, early, COUNT, None)
 
 
 def test_a_limit_is_found_with_its_spread_of_albedo() -> None:
@@ -100,8 +100,8 @@ def test_drops_scatter_and_what_stands_before_the_wall_does_not() -> None:
     x, y, _ = pulses()
     at = np.stack([x, y], axis=1)
     drops = np.random.default_rng(7).uniform(size=COUNT) < 0.003
-    assert isolated(at, drops) == drops.sum()
-    assert isolated(at, np.hypot(x - 8, y - 10) < 1.0) == 0
+    assert count_isolated_returns(at, drops) == drops.sum()
+    assert count_isolated_returns(at, np.hypot(x - 8, y - 10) < 1.0) == 0
 
 
 def test_the_score_of_losses_closes_the_gap_of_the_true_chance() -> None:

@@ -53,4 +53,4 @@ def test_much_moved_rock_is_no_agreement(epochs: Path, tmp_path: Path, measured:
     assert (found.verdict, found.effects) == ("insufficient_data", ())
     assert found.remaining["moved"] > 0.5
     assert found.remaining["wide"] > 1.5
-    assert "name stable_areas" in found.remaining["note"]
+    assert "add stable_areas" in found.remaining["note"]

@@ -22,8 +22,8 @@ from pipeline.gap.mean.candidates import (
 )
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.signatures import _searched, systematic_families
-from pipeline.gap.naming.entries import Estimate, from_mean
-from pipeline.gap.naming.families import families_of
+from pipeline.gap.naming.candidate_families import candidate_families
+from pipeline.gap.naming.named_effects import Estimate, effect_from_estimate
 from pipeline.gap.residuals.alignment import compute_residuals
 from pipeline.gap.residuals.disparity_raster import raster_cell_px, raster_spacing_px
 from pipeline.gap.residuals.nominal_pair import PixelGeometry
@@ -95,7 +95,7 @@ def test_a_square_wave_is_folded_over_its_period_in_pixels(period: float, least:
     _, estimate = best(found, [])
     assert estimate.candidate.form == HARMONIC_SERIES
     assert estimate.candidate.columns.shape[1] == (10 if period == PERIOD else 22)
-    entry = from_mean(estimate, found).entry
+    entry = effect_from_estimate(estimate, found).entry
     assert entry["along"]["period"] == pytest.approx(period, rel=0.01)
     effect = DisparityEmpirical.model_validate(entry)
     curve = interpolate_on_host(PIXELS[:, 0], PIXELS[:, 0], effect.along, effect.across, effect.values_px)
@@ -116,7 +116,7 @@ def test_offsets_of_every_few_columns_are_found_with_their_number(lines: int) ->
     found = residuals(error)
     _, estimate = best(found, [*line_pattern_terms("image_x", column, STRIDE)])
     assert estimate.candidate.form == f"{LINE_PATTERN} {lines}"
-    entry = from_mean(estimate, found).entry
+    entry = effect_from_estimate(estimate, found).entry
     assert entry["along"]["period"] == lines * STRIDE
     effect = DisparityEmpirical.model_validate(entry)
     curve = interpolate_on_host(PIXELS[:, 0], PIXELS[:, 0], effect.along, effect.across, effect.values_px)
@@ -132,7 +132,7 @@ def test_a_matcher_that_is_off_alike_at_each_half_of_a_pixel_is_found(scale: flo
     error = 0.1 * np.sin(4 * np.pi * scale * disparity + 0.7)
     found = replace(residuals(error), covariates={"image_x": PIXELS[:, 0], "image_y": PIXELS[:, 1], "disparity": disparity})
     _, estimate = best(found, [*nonparametric_terms("disparity", disparity), *half_pixel_sine("disparity", disparity)])
-    entry = from_mean(estimate, found).entry
+    entry = effect_from_estimate(estimate, found).entry
     assert entry["covariate"] == "disparity"
     assert entry["along"]["period"] == pytest.approx(0.5 / scale, rel=1e-3)
     effect = DisparityEmpirical.model_validate(entry)
@@ -147,7 +147,7 @@ def test_waves_along_the_columns_are_tried_as_far_as_the_raster_shows_them(tmp_p
     make(Case(0, (3, 1), "none", "stereo", (), points, 6_000), tmp_path / "case", tmp_path / "truth.json")
     measurement = read_measurement(tmp_path / "case")
     found = compute_residuals(measurement)
-    waves = [each for each in families_of(measurement, found) if isinstance(each, SineGrid) and each.name == "image_x"]
+    waves = [each for each in candidate_families(measurement, found) if isinstance(each, SineGrid) and each.name == "image_x"]
     shortest = float(found.covariates["image_x"].std()) / max(float(each.frequencies[-1]) for each in waves)
     reach, step = float(np.ptp(found.covariates["image_x"])), raster_spacing_px(found.covariates["image_x"])
     assert step is not None

@@ -160,7 +160,7 @@ def test_a_lower_noise_is_the_instruments_alone(folder: Path, tmp_path: Path) ->
 
 def test_errors_of_vertices_are_of_laser_scans() -> None:
     values = {"sensor": "stereo", "reference": "a.ply", "points": "b.ply", "model": "model.yaml", "reference_error_m": 0.001}
-    with pytest.raises(InputError, match="'reference_error_m' is of laser scans; leave it out"):
+    with pytest.raises(InputError, match="'reference_error_m' is for laser scans only; remove it"):
         parse(MeasurementConfig, values, "measurement.yaml")
 
 

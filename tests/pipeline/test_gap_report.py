@@ -16,25 +16,27 @@ from matplotlib.text import Text
 from pipeline.cli.main import main
 from pipeline.formats.measurements.measurement import Measurement, read_measurement
 from pipeline.formats.points.laz import read_laz
-from pipeline.gap.decisions import read_decisions
-from pipeline.gap.naming.entries import Named
-from pipeline.gap.naming.splitting import split_of_noises
+from pipeline.gap.naming.gap_score import Gap
+from pipeline.gap.naming.named_effects import NamedEffect
+from pipeline.gap.naming.separating_measurements import measurement_separating_noises
 from pipeline.gap.naming.verdict import VERDICTS
-from pipeline.gap.naming.verify import Gap
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
 from pipeline.gap.report import figures, report
 from pipeline.gap.report.contributions import contributions
-from pipeline.gap.report.covariate_ranking import where
+from pipeline.gap.report.covariate_ranking import rank_disagreements
 from pipeline.gap.report.figures import gap_figure, maps_figure
-from pipeline.gap.report.quantities import with_std
+from pipeline.gap.report.quantities import format_with_std
 from pipeline.gap.residuals.nominal_pair import PixelGeometry
 from pipeline.gap.residuals.residuals import ExpectedPulses
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.thresholds import read_thresholds
 from sensors.models.sensor_model import StereoModel
 
 FILES = {"gap.json", "model_after.yaml", "before.laz", "after.laz", "report.html"}
 GAP = Gap(before=0.004, after=0.0011, floor=0.001, error=0.0002, floor_error=0.0002, points=900)
-NAMED = Named("tls.range_offset", "physical", {"name": "range_offset", "offset_m": 0.004}, {"offset_m": 3e-10}, (), 0.002, 80.0)
+NAMED = NamedEffect(
+    "tls.range_offset", "physical", {"name": "range_offset", "offset_m": 0.004}, {"offset_m": 3e-10}, (), 0.002, 80.0
+)
 ALIKE = replace(NAMED, alike=("tls.range_scale",), split_by="a second station at another range")
 EMPIRICAL = replace(NAMED, name="tls.range_empirical", kind="empirical", entry={"name": "range_empirical", "covariate": "zenith"})
 EFFECTS = {"named": (NAMED,), "several": (NAMED, NAMED), "ambiguous": (ALIKE,), "unknown": (EMPIRICAL,)}
@@ -60,8 +62,8 @@ def few(tmp_path_factory: pytest.TempPathFactory) -> tuple[GapDiagnosis, Measure
 )
 def test_noises_are_split_by_what_they_depend_on(name: str, alike: str, expected: str) -> None:
     """A second distance does not tell white disparities from smooth ones."""
-    item = Named(name, "physical", {"name": name.partition(".")[2]}, {}, (alike,), 0.002, 80.0)
-    assert split_of_noises(item, name.partition(".")[0]).startswith(expected)
+    item = NamedEffect(name, "physical", {"name": name.partition(".")[2]}, {}, (alike,), 0.002, 80.0)
+    assert measurement_separating_noises(item, name.partition(".")[0]).startswith(expected)
 
 
 @pytest.mark.parametrize("pictures", [True, False])
@@ -81,7 +83,7 @@ def test_every_verdict_has_a_report(
     )
     if not pictures:
         monkeypatch.setattr(report, "_pictures", lambda _: {})
-    page = report.write(tmp_path, case, measurement).read_text()
+    page = report.write_report(tmp_path, case, measurement).read_text()
     assert {path.name for path in tmp_path.iterdir()} >= FILES
     assert VERDICTS[verdict] in page
     assert ("effect_2_m" in read_laz(tmp_path / "before.laz").extra) == (verdict == "several")
@@ -90,7 +92,7 @@ def test_every_verdict_has_a_report(
     order = ["What it means", "Where they disagree", "What was named", "<h2>The gap", "What was tried", "The model after"]
     places = [page.index(title) for title in order if title in page]
     assert places == sorted(places)
-    assert "On blocks that no step has used" not in page[: page.index("</p>")]  # the scores are evidence, no headline
+    assert "On validation blocks, which no fit has used" not in page[: page.index("</p>")]  # the scores are evidence, no headline
     assert ("± &lt; 0.001 mm" in page) == (verdict in ("named", "several", "ambiguous"))
 
 
@@ -98,9 +100,9 @@ def test_what_is_closed_is_said_by_the_thresholds_of_the_diagnosis(few: tuple[Ga
     """As it was diagnosed, wherever that is written: of a gap 500 of its errors wide none, where 1000 are asked for."""
     found, measurement = few
     gap = Gap(before=0.006, after=0.001, floor=0.001, error=1e-5, floor_error=1e-5, points=100)
-    strict = read_decisions(["verdict.gap_sigmas=1000", "verdict.floor_sigmas=1000"])
+    strict = read_thresholds(["verdict.gap_sigmas=1000", "verdict.floor_sigmas=1000"])
     assert report.to_dict(replace(found, gap=gap), measurement)["gap"]["closed"] == 1.0
-    assert report.to_dict(replace(found, gap=gap, decisions=strict), measurement)["gap"]["closed"] is None
+    assert report.to_dict(replace(found, gap=gap, thresholds=strict), measurement)["gap"]["closed"] is None
 
 
 def test_each_of_several_effects_says_what_it_takes_away(few: tuple[GapDiagnosis, Measurement]) -> None:
@@ -118,9 +120,9 @@ def test_nothing_is_written_where_the_report_cannot_be_made(
     def broken(*_: Any) -> str:
         raise RuntimeError("a fault in the page")
 
-    monkeypatch.setattr(report, "_page", broken)
+    monkeypatch.setattr(report, "_render_page", broken)
     with pytest.raises(RuntimeError, match="a fault"):
-        report.write(tmp_path / "out", *few)
+        report.write_report(tmp_path / "out", *few)
     assert not (tmp_path / "out").exists()
 
 
@@ -163,10 +165,10 @@ def test_missing_rock_is_positive_of_both_sensors(few: tuple[GapDiagnosis, Measu
         own = {field.name: getattr(residuals, field.name) for field in fields(StereoResiduals)}
         geometry = PixelGeometry(**dict.fromkeys((field.name for field in fields(PixelGeometry)), deeper))
         case = replace(case, residuals=StereoResiduals(**own | {"geometry": geometry}), model_after=StereoModel())
-    report.write(tmp_path, case, measurement)
+    report.write_report(tmp_path, case, measurement)
     for name in ("before", "after"):
         np.testing.assert_allclose(read_laz(tmp_path / f"{name}.laz").extra["residual_m"], 0.02, rtol=1e-12)
-    means = [row["size_m"] for row in where(case) if row["statistic"] == "mean"]
+    means = [row["size_m"] for row in rank_disagreements(case) if row["statistic"] == "mean"]
     assert means
     np.testing.assert_allclose(means, 0.02, rtol=1e-9)
 
@@ -226,7 +228,7 @@ def _drawn(monkeypatch: pytest.MonkeyPatch, draw: Any) -> Figure:
     ],
 )
 def test_a_value_ends_where_its_uncertainty_does(key: str, value: float, std: float | None, shown: str) -> None:
-    assert with_std(key, value, std) == shown
+    assert format_with_std(key, value, std) == shown
 
 
 def test_losses_behind_shrubs_are_told_from_losses_by_a_covariate(few: tuple[GapDiagnosis, Measurement]) -> None:
@@ -242,7 +244,7 @@ def test_losses_behind_shrubs_are_told_from_losses_by_a_covariate(few: tuple[Gap
         for centre in random.uniform(0, 1, (6, 2)) * (40, 20):
             lost |= np.hypot(*(at - centre).T) < 0.8
         missing = ExpectedPulses(lost, {"azimuth": at[:, 0]}, at)
-        rows = where(replace(few_found, residuals=replace(few_found.residuals, expected_pulses=missing)))
+        rows = rank_disagreements(replace(few_found, residuals=replace(few_found.residuals, expected_pulses=missing)))
         least[half] += [row["p_value"] for row in rows if row["statistic"] == "missing"] or [1.0]
     assert sum(p < 0.01 for p in least[False]) <= 3
     assert all(p < 0.01 for p in least[True])

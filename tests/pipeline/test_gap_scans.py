@@ -127,7 +127,7 @@ def test_an_ambiguous_effect_is_named_with_both_faces(tmp_path: Path) -> None:
     ("keys", "said"),
     [
         ({"scanners": [{"position_m": [0.0, 0.0, 0.0], "rotation": np.eye(3).tolist()}]}, "1 poses for 2 files"),
-        ({"scanner": {"position_m": [0.0, 0.0, 0.0], "rotation": np.eye(3).tolist()}}, "stands instead of 'scanner'"),
+        ({"scanner": {"position_m": [0.0, 0.0, 0.0], "rotation": np.eye(3).tolist()}}, "replaces 'scanner'"),
         ({"scanners": [{"position_m": [0.0, 0.0, 0.0], "rotation": np.eye(3).tolist(), "face": 3}] * 2}, "face"),
     ],
 )
@@ -148,7 +148,7 @@ def test_raw_scans_from_two_places_are_one_measurement(tmp_path: Path) -> None:
         files.append(tmp_path / f"{number}.e57")
         write_e57(files[-1], [E57Scan("one", PointCloud(cloud.points, cloud.intensity), np.array(pose["position_m"]), rotation)])
     found = build(Request(files, str(tmp_path / "wall.ply"), "riegl_vz400i"), tmp_path / "out")
-    assert "with a pose of its own" in found.summary()
+    assert "so it has its own pose" in found.summary()
     measurement = read_measurement(tmp_path / "out")
     assert isinstance(measurement, TlsMeasurement)
     assert len(measurement.scans) == 2

@@ -15,14 +15,14 @@ from benchmarks.gap_challenge.cases import Case, make
 from pipeline.formats.measurements.measurement import StereoMeasurement, read_measurement
 from pipeline.gap.mean.candidates import SPATIAL_NULL
 from pipeline.gap.naming import workflow
-from pipeline.gap.naming.attempts import Attempt, Starts, State, attempt
-from pipeline.gap.naming.entries import Named, with_effects
-from pipeline.gap.naming.held_out import Scored
-from pipeline.gap.naming.naming import FREE_FORMS, _most_like
-from pipeline.gap.naming.relinearised import at_points
-from pipeline.gap.naming.verify import simulated
-from pipeline.gap.other.shapes import ShapeFound
-from pipeline.gap.other.spread import SpreadFound
+from pipeline.gap.naming.effect_selection import NONPARAMETRIC_TERMS, _note_most_similar
+from pipeline.gap.naming.gap_score import simulate_errors
+from pipeline.gap.naming.named_effects import NamedEffect, with_effects
+from pipeline.gap.naming.nonlinear_refit import at_points_of
+from pipeline.gap.naming.selection_passes import PassInput, PassInputs, SelectionPass, best_pass
+from pipeline.gap.naming.validation_scores import ValidatedEffects
+from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
+from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
 from pipeline.gap.residuals.alignment import align, compute_residuals
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.nominal_pair import NominalPair
@@ -43,16 +43,16 @@ def test_an_effect_that_turns_all_rays_off_the_wall_leaves_no_residuals(tmp_path
     found = align(measurement.changed(model=with_effects(measurement.model, away)))
     assert len(found.residuals) == 0
     assert not found.pose.any()
-    assert len(at_points(found.residuals, compute_residuals(measurement))) == 0
+    assert len(at_points_of(found.residuals, compute_residuals(measurement))) == 0
 
 
 def test_noise_found_on_some_points_adds_alike_to_all() -> None:
-    found = SpreadFound("a", "a", (), 0.1, 3.0, {}, {}, False, np.full(5, 0.04))
-    np.testing.assert_array_equal(found.everywhere(8).variance, np.full(8, 0.04))
+    found = VarianceTerm("a", "a", (), 0.1, 3.0, {}, {}, False, np.full(5, 0.04))
+    np.testing.assert_array_equal(found.with_constant_variance(8).variance, np.full(8, 0.04))
 
 
-def _named(name: str, kind: str) -> Named:
-    return Named(f"tls.{name}", kind, {"name": name}, {}, (), 0.002, 50.0)
+def _named(name: str, kind: str) -> NamedEffect:
+    return NamedEffect(f"tls.{name}", kind, {"name": name}, {}, (), 0.002, 50.0)
 
 
 @pytest.mark.parametrize(
@@ -63,34 +63,34 @@ def _named(name: str, kind: str) -> Named:
     ],
 )
 def test_where_a_free_form_fails_all_is_named_again_without_any(
-    without: list[Named], kept: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    without: list[NamedEffect], kept: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_scan(tmp_path, 10, step_rad=0.007)
     there, plain, _ = align(read_measurement(tmp_path))
     nowhere = np.zeros(len(there.cloud.points), dtype=bool)
-    state = State.of(there, plain, nowhere, [])
+    pass_input = PassInput.of(there, plain, nowhere, [])
     seen: list[bool] = []
 
     def named(*given: Any) -> Any:
-        seen.append(FREE_FORMS in given[-1])
+        seen.append(NONPARAMETRIC_TERMS in given[-1])
         items = without if seen[-1] else [_named("range_empirical", "empirical")]
-        naming = SimpleNamespace(reference_sigma=0.0, asked=seen[-1])
-        return SimpleNamespace(state=state, naming=naming, named=items)
+        selection = SimpleNamespace(reference_sigma=0.0, asked=seen[-1])
+        return SimpleNamespace(pass_input=pass_input, selection=selection, named=items)
 
-    def scored(_there: Any, _residuals: Any, items: list[Named], *_: Any) -> Scored:
+    def scored(_there: Any, _residuals: Any, items: list[NamedEffect], *_: Any) -> ValidatedEffects:
         failed = [item for item in items if item.kind == "empirical"]
-        return Scored([item for item in items if item not in failed], failed, [])
+        return ValidatedEffects([item for item in items if item not in failed], failed, [])
 
-    monkeypatch.setattr(workflow, "attempt", named)
-    monkeypatch.setattr(workflow, "score_effects", scored)
+    monkeypatch.setattr(workflow, "best_pass", named)
+    monkeypatch.setattr(workflow, "validate_effects", scored)
     monkeypatch.setattr(workflow, "only_within_bounds", lambda _, items: (items, []))
-    monkeypatch.setattr(workflow, "_with_tails", lambda *given: (given[2], None))
-    monkeypatch.setattr(workflow, "with_splits", lambda _, items: items)
-    found = workflow._held(Starts(there, plain, nowhere), KeyedRandom(1))
+    monkeypatch.setattr(workflow, "_with_heavy_tails", lambda *given: (given[2], None))
+    monkeypatch.setattr(workflow, "with_separating_measurements", lambda _, items: items)
+    found = workflow._select_and_validate(PassInputs(there, plain, nowhere), KeyedRandom(1))
     assert [item.name for item in found.named] == kept
-    assert found.words == ["tls.range_empirical dropped: it does not hold on blocks that were held out"]
+    assert found.words == ["tls.range_empirical dropped: it does not improve the validation blocks"]
     assert seen == [False, True]
-    assert found.naming.asked is bool(kept)  # type: ignore[attr-defined]
+    assert found.selection.asked is bool(kept)  # type: ignore[attr-defined]
 
 
 def test_a_simulation_without_noise_departs_nowhere_from_the_surface(tmp_path: Path) -> None:
@@ -100,7 +100,7 @@ def test_a_simulation_without_noise_departs_nowhere_from_the_surface(tmp_path: P
     there, residuals, _ = align(read_measurement(tmp_path / "case"))
     assert isinstance(there, StereoMeasurement)
     noise = StereoNoise(parallax_sigma_px=1e-6, regularization_sigma_px=0.0)
-    (seen,) = simulated(there, there.model.model_copy(update={"noise": noise}), residuals, [KeyedRandom(1)])
+    (seen,) = simulate_errors(there, there.model.model_copy(update={"noise": noise}), residuals, [KeyedRandom(1)])
     nominal, u, v = NominalPair.of(there), there.cloud.extra["pixel_x"], there.cloud.extra["pixel_y"]
     between = nominal.surface_disparity(there.scene, u + 0.5, v + 0.5) - nominal.surface_disparity(there.scene, u, v)
     assert np.nanstd(between[residuals.index[residuals.usable]]) > 0.01, "px of disparity on smooth surface"
@@ -120,7 +120,7 @@ def test_outlines_grow_among_the_measurement_s_own_pixels_when_it_is_simulated(t
     grown = {"name": "edge_fattening", "radius_px": 2.5 * raster.step}
     model = with_effects(read.model, [grown])
     quiet = StereoNoise(parallax_sigma_px=1e-6, regularization_sigma_px=0.0)
-    (seen,) = simulated(read, model.model_copy(update={"noise": quiet}), plain, [KeyedRandom(1)])
+    (seen,) = simulate_errors(read, model.model_copy(update={"noise": quiet}), plain, [KeyedRandom(1)])
     expected = raster.added_by([EdgeFattening(radius_px=2.5 * raster.step)], plain.geometry.disparity)
     known = np.isfinite(seen)
     assert np.count_nonzero(expected[known]) > 50
@@ -140,7 +140,7 @@ def test_outlines_grow_where_a_turned_camera_sees_them_when_they_are_simulated(t
     model = with_effects(there.model, [{"name": effect["name"], **effect["parameters"]} for effect in effects])
     model = model.model_copy(update={"noise": StereoNoise(parallax_sigma_px=0, regularization_sigma_px=0)})
     nominal, turned = stereo_residuals(there), stereo_residuals(there.changed(model=model))
-    drawn = simulated(there, model, nominal, [KeyedRandom(1)])[0]
+    drawn = simulate_errors(there, model, nominal, [KeyedRandom(1)])[0]
     _, before, after = np.intersect1d(nominal.index, turned.index, return_indices=True)
     shaped = turned.geometry.shaped[after]
     predicted = turned.geometry.disparity[after] + shaped - nominal.geometry.disparity[before]
@@ -152,23 +152,25 @@ def test_outlines_grow_where_a_turned_camera_sees_them_when_they_are_simulated(t
 def test_a_low_pass_that_others_feign_takes_no_outlines_along(monkeypatch: pytest.MonkeyPatch) -> None:
     """Seen only beside what was named, it does not count; what was seen with it does."""
     nowhere = np.zeros(1, dtype=bool)
-    seen = [ShapeFound(effect, {}, 50.0, nowhere) for effect in (EdgeFattening(radius_px=3.0), Smoothing(sigma_px=2.0))]
+    seen = [EdgeEffect(effect, {}, 50.0, nowhere) for effect in (EdgeFattening(radius_px=3.0), Smoothing(sigma_px=2.0))]
 
-    def named(_: Any, state: list[ShapeFound], *_given: Any) -> Any:
-        naming = SimpleNamespace(spreads=1.0)
-        return SimpleNamespace(named=["noise"], shapes={each.name for each in state}, complexity=(0, len(state)), naming=naming)
+    def named(_: Any, state: list[EdgeEffect], *_given: Any) -> Any:
+        selection = SimpleNamespace(noise_ratio=1.0)
+        return SimpleNamespace(
+            named=["noise"], edge_effect_names={each.name for each in state}, complexity=(0, len(state)), selection=selection
+        )
 
-    monkeypatch.setattr(Attempt, "of", classmethod(named))
-    starts: Any = SimpleNamespace(first=[], seen_beside=lambda _: seen, beside=lambda shapes: shapes)
-    assert attempt(starts, KeyedRandom(1), frozenset()).shapes == {"edge_fattening"}
+    monkeypatch.setattr(SelectionPass, "of", classmethod(named))
+    starts: Any = SimpleNamespace(with_edge_effects=[], edge_effects_beside=lambda _: seen, with_these=lambda effects: effects)
+    assert best_pass(starts, KeyedRandom(1), frozenset()).edge_effect_names == {"edge_fattening"}
 
 
 @pytest.mark.parametrize(
     ("smooth", "spreads", "expected"),
     [
-        ((0, 1), 1.0, {"first", "smooth"}),
-        ((0, 1), 2.0, {"first", "smooth", "staying"}),
-        ((1, 2), 1.0, {"first", "smooth", "staying"}),
+        ((0, 1), 1.0, {"with_edge_effects", "without_edge_effects"}),
+        ((0, 1), 2.0, {"with_edge_effects", "without_edge_effects", "at_initial_pose"}),
+        ((1, 2), 1.0, {"with_edge_effects", "without_edge_effects", "at_initial_pose"}),
     ],
 )
 def test_a_low_pass_is_tried_where_the_sensor_stays_unless_one_effect_explains_all(
@@ -176,24 +178,28 @@ def test_a_low_pass_is_tried_where_the_sensor_stays_unless_one_effect_explains_a
 ) -> None:
     """One effect by itself that leaves no more spread; the answer is the least complex of what was tried."""
     asked: dict[str, tuple[tuple[int, int], float]] = {
-        "first": ((1, 3), 1.0),
-        "smooth": (smooth, spreads),
-        "staying": ((0, 2), 1.0),
+        "with_edge_effects": ((1, 3), 1.0),
+        "without_edge_effects": (smooth, spreads),
+        "at_initial_pose": ((0, 2), 1.0),
     }
     tried = []
 
     def named(_: Any, state: str, *_given: Any) -> Any:
         tried.append(state)
         complexity, wide = asked[state]
-        shapes = set() if state == "smooth" else {"smoothing"}
+        shapes = set() if state == "without_edge_effects" else {"smoothing"}
         return SimpleNamespace(
-            named=["effect"], shapes=shapes, complexity=complexity, naming=SimpleNamespace(spreads=wide), state=state
+            named=["effect"],
+            edge_effect_names=shapes,
+            complexity=complexity,
+            selection=SimpleNamespace(noise_ratio=wide),
+            state=state,
         )
 
-    monkeypatch.setattr(Attempt, "of", classmethod(named))
-    seen = [ShapeFound(Smoothing(sigma_px=2.0), {}, 50.0, np.zeros(1, dtype=bool))]
-    starts: Any = SimpleNamespace(**{name: name for name in asked}, seen_beside=lambda _: seen, beside=lambda _: None)
-    found = attempt(starts, KeyedRandom(1), frozenset())
+    monkeypatch.setattr(SelectionPass, "of", classmethod(named))
+    seen = [EdgeEffect(Smoothing(sigma_px=2.0), {}, 50.0, np.zeros(1, dtype=bool))]
+    starts: Any = SimpleNamespace(**{name: name for name in asked}, edge_effects_beside=lambda _: seen, with_these=lambda _: None)
+    found = best_pass(starts, KeyedRandom(1), frozenset())
     assert set(tried) == expected
     assert found.complexity == min(asked[name][0] for name in expected if asked[name][1] < 2)
 
@@ -211,7 +217,7 @@ def test_an_unknown_without_a_name_says_what_remains_is_most_like() -> None:
             goodness_of_fit_p_value=lambda _, p_value=p_value: p_value, fitted_std=lambda each: 0.01 * each.score
         )
         found: Any = SimpleNamespace(search=search, tried=tried, estimates=estimates)
-        said = _most_like(found, part)
+        said = _note_most_similar(found, part)
         assert len(said) == expected
         assert all("a change with azimuth (spline), 8 mm" in words for words in said)
 
@@ -222,8 +228,8 @@ def test_what_shapes_do_is_found_once_for_a_search(tmp_path: Path) -> None:
     read = read_measurement(tmp_path / "case")
     there = read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 40.0}]))
     plain, nowhere = compute_residuals(there), np.zeros(len(there.cloud.points), dtype=bool)
-    state = State.of(there, plain, nowhere, [])
-    part, residuals = state.part
+    pass_input = PassInput.of(there, plain, nowhere, [])
+    part, residuals = pass_input.training_part
     found = compute_residuals(part).value
     assert len(found) > 1000
     np.testing.assert_allclose(found, residuals.value, atol=1e-6)

@@ -16,14 +16,14 @@ from benchmarks.gap_challenge.cases import Case, make
 from benchmarks.gap_judge.cases import build, schedule
 from pipeline.formats.measurements.measurement import Measurement, TlsMeasurement, read_measurement
 from pipeline.gap.mean.candidates import Candidate, SineGrid
-from pipeline.gap.naming import naming as steps
-from pipeline.gap.naming.entries import with_effects
-from pipeline.gap.naming.families import families_of
-from pipeline.gap.other.mixed_pixels import find_footprint
-from pipeline.gap.other.shapes import WallBlocks
-from pipeline.gap.other.spread import find_spread
-from pipeline.gap.other.stereo_noise import find_nodes, told_apart
-from pipeline.gap.other.stereo_shapes import find_shapes
+from pipeline.gap.naming import effect_selection as steps
+from pipeline.gap.naming.candidate_families import candidate_families
+from pipeline.gap.naming.named_effects import with_effects
+from pipeline.gap.noise_and_edges.beam_footprint import find_footprint
+from pipeline.gap.noise_and_edges.disparity_edges import find_disparity_edge_effects
+from pipeline.gap.noise_and_edges.edge_effects import WallBlocks
+from pipeline.gap.noise_and_edges.grid_noise import find_grid_noise, separate_white_and_grid_noise
+from pipeline.gap.noise_and_edges.variance_model import fit_variance_model
 from pipeline.gap.residuals import disparity_raster, stereo_residuals
 from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.disparity_raster import DisparityRaster, raster_spacing_px
@@ -55,7 +55,9 @@ def shapes_of(case: Made) -> dict[str, Any]:
     there, residuals, _ = case
     return {
         each.name: each
-        for each in find_shapes(there, residuals, fit_pose_robustly(residuals)[0], np.zeros(len(residuals), dtype=bool))
+        for each in find_disparity_edge_effects(
+            there, residuals, fit_pose_robustly(residuals)[0], np.zeros(len(residuals), dtype=bool)
+        )
     }
 
 
@@ -207,10 +209,10 @@ def test_outlines_in_few_places_agree_by_signs() -> None:
     """A block of 60 points and 14 of two, all for it: 15 of 15 signs are 3.9 deviations, the sums, of which one is most, 1.5."""
     number = np.repeat(np.arange(15), [60, *[2] * 14])
     blocks, gains = WallBlocks(number), np.full(len(number), 2.0)
-    assert blocks.tested(gains) is None
-    assert blocks.tested(gains, by_signs=True) == pytest.approx(176)
+    assert blocks.total_if_agreed(gains) is None
+    assert blocks.total_if_agreed(gains, by_signs=True) == pytest.approx(176)
     against = np.where(number % 3 == 1, -2.0, 2.0)
-    assert blocks.tested(against, by_signs=True) is None
+    assert blocks.total_if_agreed(against, by_signs=True) is None
 
 
 @pytest.mark.parametrize(("kind", "seed"), [("smoothing", 1), ("edge_fattening", 1), ("occlusion_fill", 6)])
@@ -244,7 +246,7 @@ def test_a_wall_without_effects_shows_no_shape(tmp_path: Path, seed: int) -> Non
 
 def test_points_that_are_held_out_have_no_say(tmp_path: Path) -> None:
     there, residuals, _ = made(tmp_path, "stereo", ("smoothing",), 1)
-    assert not find_shapes(there, residuals, fit_pose_robustly(residuals)[0], np.ones(len(residuals), dtype=bool))
+    assert not find_disparity_edge_effects(there, residuals, fit_pose_robustly(residuals)[0], np.ones(len(residuals), dtype=bool))
 
 
 @pytest.mark.parametrize("seed", [2, 3])
@@ -302,9 +304,9 @@ def test_white_noise_and_noise_on_a_grid_are_told_apart(tmp_path: Path, kind: st
     assert step is not None
     part = residuals.part(residuals.usable & (np.rint((row - row.min()) / step) % every == 0))
     value = fit_pose_robustly(part)[0]
-    spread, _, _ = find_spread(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
+    spread, _, _ = fit_variance_model(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
     assert isinstance(there.model, StereoModel)
-    (found,) = told_apart(spread, part, value, there.model)
+    (found,) = separate_white_and_grid_noise(spread, part, value, there.model)
     assert found.name == kind
     # of 64 px nodes there are some 80 on the wall: their own standard deviation varies by 8 %
     assert found.parameters["sigma_px"] == pytest.approx(truth["sigma_px"], rel=0.2)
@@ -316,12 +318,12 @@ def test_noise_on_a_grid_goes_before_an_empirical_term(tmp_path: Path, kind: str
     there, residuals, _ = made(tmp_path, "stereo", (kind,), seed)
     part = residuals.part(residuals.usable)
     value = fit_pose_robustly(part)[0]
-    spread, _, _ = find_spread(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
+    spread, _, _ = fit_variance_model(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
     assert isinstance(there.model, StereoModel)
-    described = [replace(each, name="spread by disparity", empirical=True) for each in spread]
-    (found,) = told_apart(described, part, value, there.model)
+    described = [replace(each, name="variance by disparity", empirical=True) for each in spread]
+    (found,) = separate_white_and_grid_noise(described, part, value, there.model)
     assert found.empirical == empirical
-    assert found.name == ("spread by disparity" if empirical else kind)
+    assert found.name == ("variance by disparity" if empirical else kind)
 
 
 def test_noise_on_a_coarse_grid_is_found_where_no_point_is_noisier_than_it_should_be(tmp_path: Path) -> None:
@@ -329,7 +331,7 @@ def test_noise_on_a_coarse_grid_is_found_where_no_point_is_noisier_than_it_shoul
     there, residuals, truth = made(tmp_path, "stereo", ("regularization_noise",), 8)
     part = residuals.part(residuals.usable)
     assert isinstance(there.model, StereoModel)
-    found, _ = find_nodes(part, fit_pose_robustly(part)[0], there.model, KeyedRandom(1))
+    found, _ = find_grid_noise(part, fit_pose_robustly(part)[0], there.model, KeyedRandom(1))
     assert found is not None
     assert found.parameters["step_px"] == pytest.approx(truth["step_px"], rel=0.5)
     assert found.parameters["sigma_px"] == pytest.approx(truth["sigma_px"], rel=0.2)
@@ -337,7 +339,7 @@ def test_noise_on_a_coarse_grid_is_found_where_no_point_is_noisier_than_it_shoul
 
 
 def _few_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
-    return [each for each in families_of(measurement, part) if isinstance(each, Candidate)][:3]
+    return [each for each in candidate_families(measurement, part) if isinstance(each, Candidate)][:3]
 
 
 def test_noise_on_a_coarse_grid_counts_as_no_error_of_the_reference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -351,9 +353,11 @@ def test_noise_on_a_coarse_grid_counts_as_no_error_of_the_reference(tmp_path: Pa
     nodes = 0.4 * np.random.default_rng(5).standard_normal([len(line) for line in lines])
     part = replace(part, value=part.value + RectBivariateSpline(*lines, nodes, kx=1, ky=1)(x, y, grid=False))
     monkeypatch.setattr(
-        steps, "families_of", lambda *known: [each for each in families_of(*known) if isinstance(each, Candidate)][:3]
+        steps,
+        "candidate_families",
+        lambda *known: [each for each in candidate_families(*known) if isinstance(each, Candidate)][:3],
     )
-    named, naming = steps.name_effects(there, part, fit_pose_robustly(part)[2], KeyedRandom(1))
+    named, naming = steps.select_effects(there, part, fit_pose_robustly(part)[2], KeyedRandom(1))
     assert [item.name for item in named] == ["stereo.regularization_noise"]
     assert naming.p_value is not None
     assert naming.p_value > 0.01
@@ -367,7 +371,7 @@ def test_the_reference_error_is_not_taken_for_noise_on_a_grid(tmp_path: Path, se
     there, residuals, _ = made(tmp_path, "stereo", (), seed)
     part = residuals.part(residuals.usable)
     assert isinstance(there.model, StereoModel)
-    assert find_nodes(part, fit_pose_robustly(part)[0], there.model, KeyedRandom(1))[0] is None
+    assert find_grid_noise(part, fit_pose_robustly(part)[0], there.model, KeyedRandom(1))[0] is None
 
 
 @pytest.mark.parametrize(("off_m", "length_m", "found"), [(0.012, 0.8, False), (0.015, 0.3, True), (0.0, 0.3, False)])
@@ -383,6 +387,6 @@ def test_noise_that_neighbours_share_is_the_reference_s_error_only_where_that_ma
     field = np.sqrt(2 / 400) * np.cos(part.wall_xy @ k.T + phase).sum(axis=1)
     part = replace(part, value=part.value + off_m * field / part.unit_m)
     assert isinstance(there.model, StereoModel)
-    nodes, words = find_nodes(part, fit_pose_robustly(part)[0], there.model, KeyedRandom(1))
+    nodes, words = find_grid_noise(part, fit_pose_robustly(part)[0], there.model, KeyedRandom(1))
     assert (nodes is not None) == found
-    assert ("taken for its error" in words) == (off_m > 0 and not found)
+    assert ("attributed to the reference" in words) == (off_m > 0 and not found)

@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.formats.measurements.measurement import read_measurement, read_model
 from pipeline.gap.naming.workflow import diagnose
-from pipeline.gap.report.report import write
+from pipeline.gap.report.report import write_report
 
 SHARED = Path(__file__).parents[3] / "shared" / "measurements"
 
@@ -20,7 +20,7 @@ def test_a_second_gap_on_the_corrected_model_answers_no_gap(tmp_path: Path) -> N
     measurement = read_measurement(SHARED / "tls_outside_catalogue")
     found = diagnose(measurement)
     assert found.verdict == "unknown"
-    write(tmp_path, found, measurement)
+    write_report(tmp_path, found, measurement)
     again = diagnose(measurement.changed(model=read_model(tmp_path / "model_after.yaml")))
     assert again.verdict == "no_gap"
     assert again.model_after == found.model_after

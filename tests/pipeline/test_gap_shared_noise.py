@@ -13,8 +13,8 @@ from pipeline.gap.mean.candidates import nonparametric_terms
 from pipeline.gap.mean.mean_model import MeanModel
 from pipeline.gap.mean.normal_equations import NoiseDraws
 from pipeline.gap.mean.search import MeanSearch
-from pipeline.gap.naming.held_out import _Registered
-from pipeline.gap.other.spread import TimesPredicted, standardised
+from pipeline.gap.naming.validation_scores import _RegisteredResiduals
+from pipeline.gap.noise_and_edges.variance_model import NoiseRatio, standardised_deviations
 from pipeline.gap.residuals import wall_blocks
 from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise, NodeField
 from pipeline.gap.residuals.nominal_pair import PixelGeometry
@@ -104,7 +104,8 @@ def test_the_score_on_held_out_blocks_is_the_density_of_all_points_together() ->
     value = multivariate_normal(np.zeros(count), together).rvs(random_state=4)
     other = multivariate_normal(np.zeros(count), together).rvs(random_state=5)
     scores = [
-        _Registered(each, np.full(count, SIGMA), shared).log_score(np.arange(count), patch, reference) for each in (value, other)
+        _RegisteredResiduals(each, np.full(count, SIGMA), shared).log_score(np.arange(count), patch, reference)
+        for each in (value, other)
     ]
     expected = [multivariate_normal(np.zeros(count), together).logpdf(each) for each in (value, other)]
     assert scores[0] - scores[1] == pytest.approx(expected[0] - expected[1], rel=1e-6)
@@ -148,9 +149,9 @@ def test_noise_that_neighbours_share_is_not_said_to_be_too_large_since_cells_tak
     residuals = noisy(seed, pixels, field.weights @ np.linalg.cholesky(field.covariance))
     residuals = replace(residuals, sigma=np.full(len(pixels), np.sqrt(WHITE**2 + field.variance)))
     found = WallCells.over(residuals.wall_xy)
-    assert np.nanmean(standardised(residuals, found, residuals.value) ** 2) < 0.8
-    assert TimesPredicted.of(residuals, found, residuals.value, KeyedRandom(1)).share == 1.0
-    assert TimesPredicted.of(residuals, found, 0.7 * residuals.value, KeyedRandom(1)).share == pytest.approx(0.7, rel=0.2)
+    assert np.nanmean(standardised_deviations(residuals, found, residuals.value) ** 2) < 0.8
+    assert NoiseRatio.of(residuals, found, residuals.value, KeyedRandom(1)).at_most_one == 1.0
+    assert NoiseRatio.of(residuals, found, 0.7 * residuals.value, KeyedRandom(1)).at_most_one == pytest.approx(0.7, rel=0.2)
 
 
 @pytest.mark.slow

@@ -11,9 +11,9 @@ import pytest
 from gap_cases import Array, Scan, write_scan
 
 from pipeline.formats.measurements.measurement import read_measurement
-from pipeline.gap.naming.entries import Named
-from pipeline.gap.naming.verification import Showing
-from pipeline.gap.naming.verify import Gap
+from pipeline.gap.naming.gap_score import Gap
+from pipeline.gap.naming.named_effects import NamedEffect
+from pipeline.gap.naming.validation import Validation
 from pipeline.gap.residuals.alignment import align
 from pipeline.gap.residuals.wall_blocks import WallCells, in_validation_blocks
 from scene.common.keyed_random import KeyedRandom
@@ -24,36 +24,36 @@ def _biased(coefficient_m: float) -> Callable[[Scan], Array]:
     return lambda scan: scan.R + coefficient_m * (1 / scan.cos_i - 1)
 
 
-def _showing(folder: Path, ranges: Callable[[Scan], Array]) -> Showing:
+def _validation(folder: Path, ranges: Callable[[Scan], Array]) -> Validation:
     """What a gap is measured with, of a scan with some ranges."""
     write_scan(folder, 8, ranges=ranges, step_rad=0.007)
     there, residuals, _ = align(read_measurement(folder))
     held_out = in_validation_blocks(residuals.wall_xy, WallCells.over(residuals.wall_xy).side_m)
-    return Showing(
+    return Validation(
         measurement=there,
         residuals=residuals,
-        chosen=np.flatnonzero(residuals.usable & ~held_out),
+        registration_rows=np.flatnonzero(residuals.usable & ~held_out),
         tested=residuals.usable & held_out,
-        learned=residuals.usable & ~held_out,
+        training=residuals.usable & ~held_out,
         losses=None,
         reference_sigma=0.0004,
-        largest=20.0,
+        most_sigmas=20.0,
         random=KeyedRandom(1),
     )
 
 
-def _named(name: str, key: str, value: float) -> Named:
-    return Named(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
+def _named(name: str, key: str, value: float) -> NamedEffect:
+    return NamedEffect(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
 
 
 def test_a_harmful_effect_is_taken_out_and_a_true_one_stays(tmp_path: Path) -> None:
     """Beside a true effect a noise is named that is not there, ten times the true one."""
     true, wrong = _named("range_incidence_bias", "coefficient_m", 0.01), _named("range_noise", "sigma_m", 0.03)
-    shown, words = _showing(tmp_path, _biased(0.01)).show([wrong, true])
-    assert shown.named == [true]
-    assert words == ["tls.range_noise dropped: with it the model predicts worse"]
-    assert shown.gap is not None
-    assert (shown.gap.closed or 0.0) > 0.8
+    result, words = _validation(tmp_path, _biased(0.01)).validate([wrong, true])
+    assert result.named == [true]
+    assert words == ["tls.range_noise dropped: the model predicts worse with it"]
+    assert result.gap is not None
+    assert (result.gap.closed or 0.0) > 0.8
 
 
 @pytest.mark.parametrize(
@@ -70,8 +70,8 @@ def test_an_effect_that_does_little_harm_is_taken_out_too(
 ) -> None:
     """Half as much noise again, no more than chance would make of it, goes, named or not, and so does a description that clearly
     does harm; what is there, and as small, stays."""
-    shown, _ = _showing(tmp_path, _biased(0.003)).show([replace(_named(name, key, value), kind=kind)])
-    assert len(shown.named) == kept
+    result, _ = _validation(tmp_path, _biased(0.003)).validate([replace(_named(name, key, value), kind=kind)])
+    assert len(result.named) == kept
 
 
 def test_drops_are_no_harm_to_ranges_on_the_wall(tmp_path: Path) -> None:
@@ -79,28 +79,28 @@ def test_drops_are_no_harm_to_ranges_on_the_wall(tmp_path: Path) -> None:
     true = _named("range_incidence_bias", "coefficient_m", 0.01)
     rain = {"name": "precipitation", "rate_per_m": 2e-3, "early_share": 0.2}
     drops = replace(_named("precipitation", "rate_per_m", 2e-3), entry=rain)
-    showing = _showing(tmp_path, _biased(0.01))
-    alone, _ = showing.show([true])
-    shown, words = showing.show([true, drops])
-    assert (shown.named, words) == ([true, drops], [])
-    assert shown.gap == alone.gap
-    assert [effect.name for effect in shown.model.effects] == ["range_incidence_bias", "precipitation"]
+    validation = _validation(tmp_path, _biased(0.01))
+    alone, _ = validation.validate([true])
+    result, words = validation.validate([true, drops])
+    assert (result.named, words) == ([true, drops], [])
+    assert result.gap == alone.gap
+    assert [effect.name for effect in result.model.effects] == ["range_incidence_bias", "precipitation"]
 
 
 def test_harm_is_that_of_the_same_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An effect brings points near that were too far off to count: 7 mm without it on all of these, 3 with it. That the
     others score 1 mm alone, and that a few held-out edges score worse, is nothing against it."""
-    showing = _showing(tmp_path, _biased(0.003))
+    validation = _validation(tmp_path, _biased(0.003))
     with_it, alone = {True: (0.009, 0.011), False: (0.007, 0.003)}, {True: (0.001, 0.001), False: (0.001, 0.001)}
 
-    def scored(self: Showing, named: list[Named], versions: object, rows: np.ndarray) -> Gap:
-        before, after = (with_it if named else alone)[rows is showing.tested]
+    def scored(self: Validation, named: list[NamedEffect], versions: object, rows: np.ndarray) -> Gap:
+        before, after = (with_it if named else alone)[rows is validation.tested]
         return Gap(before, after, floor=0.0006, error=0.0075, floor_error=0.0075, points=100)
 
-    monkeypatch.setattr(Showing, "_gap", scored)
+    monkeypatch.setattr(Validation, "_gap", scored)
     effect = _named("range_incidence_bias", "coefficient_m", 0.003)
-    shown, words = showing.show([effect])
-    assert shown.named == [effect]
+    result, words = validation.validate([effect])
+    assert result.named == [effect]
     assert not words
 
 
@@ -113,10 +113,10 @@ def test_a_few_points_far_off_do_not_stand_for_the_wall(tmp_path: Path) -> None:
         strip = np.abs(scan.az - middle) < half
         return scan.R + 0.01 * (1 / scan.cos_i - 1) + 0.3 * (strip & (scan.rng.uniform(size=len(strip)) < 0.5))
 
-    showing = _showing(tmp_path, moved)
+    validation = _validation(tmp_path, moved)
     along = {"low": middle - half, "high": middle + half}
     strip = {"name": "range_empirical", "covariate": "azimuth", "along": along, "values_m": [[0.0, *[0.3] * 30, 0.0]]}
-    described = Named("tls.range_empirical", "empirical", strip, {}, (), 0.001, 10.0)
-    shown, _ = showing.show([_named("range_incidence_bias", "coefficient_m", 0.01), described])
-    assert shown.gap is not None
-    assert shown.gap.after < shown.gap.before < 0.012
+    described = NamedEffect("tls.range_empirical", "empirical", strip, {}, (), 0.001, 10.0)
+    result, _ = validation.validate([_named("range_incidence_bias", "coefficient_m", 0.01), described])
+    assert result.gap is not None
+    assert result.gap.after < result.gap.before < 0.012

@@ -215,13 +215,13 @@ BAD = {
     "elsewhere": "lie",
     "beside": "of the points lie near the reference",
     "millimetres": "--unit mm",
-    "one point": "holds 1 points",
+    "one point": "has 1 points",
     "all NaN": "no point with finite values",
-    "scanner": "is for laser scans",
-    "half": "is for scans",
+    "scanner": "needs laser scans",
+    "half": "half needs scans",
     "cameras too": "whose cameras are not at hand",
     "a model in pixels": "a model whose noise is in metres",
-    "cameras in the model": "the model holds focal_length",
+    "cameras in the model": "the model has focal_length",
 }
 
 
@@ -263,7 +263,7 @@ def test_points_without_a_number_are_left_out_with_a_word(coarse: Path, tmp_path
     points[:7] = np.nan
     write_cloud(tmp_path / "cloud.ply", points)
     found = build_surface(Request([tmp_path / "cloud.ply"], str(coarse)), tmp_path / "out")
-    assert "7 points that are no numbers are left out" in found.about["points"][0]
+    assert "7 points with coordinates that are not numbers are left out" in found.about["points"][0]
 
 
 def test_what_a_cloud_alone_lacks_is_said(coarse: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from pipeline.gap.mean.selection import SelectedEffect
-from pipeline.gap.naming import naming
-from pipeline.gap.naming.entries import Named
-from pipeline.gap.naming.naming import with_doubtful
-from pipeline.gap.naming.relinearised import undone
-from pipeline.gap.other.spread import find_tails
+from pipeline.gap.naming import effect_selection
+from pipeline.gap.naming.effect_selection import keep_implausible_in_class
+from pipeline.gap.naming.named_effects import NamedEffect
+from pipeline.gap.naming.nonlinear_refit import absorbed_by_registration
+from pipeline.gap.noise_and_edges.variance_model import find_heavy_tails
 
 POINTS, BLOCKS = 30_000, 100
 
@@ -28,24 +28,24 @@ def _residuals(share: float, uneven: bool, seed: int = 1) -> tuple[np.ndarray, n
 
 
 def test_normal_residuals_have_no_tails() -> None:
-    assert find_tails(*_residuals(0.0, False)) is None
+    assert find_heavy_tails(*_residuals(0.0, False)) is None
 
 
 @pytest.mark.parametrize("uneven", [False, True])
 def test_where_far_points_lie_says_whose_they_are(uneven: bool) -> None:
     """Of 3 % of width 10 a share of 0.689 lies beyond 4: P(|z| > 0.4)."""
-    found = find_tails(*_residuals(0.03, uneven))
+    found = find_heavy_tails(*_residuals(0.03, uneven))
     assert found is not None
-    assert found.even is not uneven
+    assert found.uniform is not uneven
     assert found.share == pytest.approx(0.03 * 0.689, rel=0.15)
-    assert ("all over the wall" in found.words) is not uneven
-    assert f"{100 * found.share:.2g} % of the points lie beyond 4 predicted sigmas" in found.words
+    assert ("all over the wall" in found.note) is not uneven
+    assert f"{100 * found.share:.2g} % of the points lie beyond 4 predicted standard deviations" in found.note
 
 
 def test_what_far_points_gain_is_a_log_likelihood_and_not_their_number() -> None:
     """Of a mixture over a normal distribution: an oracle by the same densities written out."""
     z, block = _residuals(0.03, False)
-    found = find_tails(z, block)
+    found = find_heavy_tails(z, block)
     assert found is not None
     cut = np.clip(z, -12, 12)
     far = np.abs(z) > 4
@@ -61,7 +61,7 @@ def test_what_far_points_gain_is_a_log_likelihood_and_not_their_number() -> None
 
 def _estimate(monkeypatch: pytest.MonkeyPatch, amplitude: float) -> Any:
     entry = {"name": "horizontal_eccentricity", "amplitude_rad": amplitude, "phase_rad": 0.0}
-    monkeypatch.setattr("pipeline.gap.naming.relinearised.from_mean", lambda *_: SimpleNamespace(entry=entry))
+    monkeypatch.setattr("pipeline.gap.naming.nonlinear_refit.effect_from_estimate", lambda *_: SimpleNamespace(entry=entry))
     return SimpleNamespace(candidate=SimpleNamespace(name="horizontal_eccentricity", empirical=False))
 
 
@@ -69,7 +69,7 @@ def _estimate(monkeypatch: pytest.MonkeyPatch, amplitude: float) -> Any:
 def test_an_effect_that_registration_undoes_is_not_believed_at_38_times_its_size(
     monkeypatch: pytest.MonkeyPatch, amplitude: float, left: float, out: bool
 ) -> None:
-    found = undone([_estimate(monkeypatch, amplitude)], Any, {"horizontal_eccentricity": left})  # type: ignore[arg-type]
+    found = absorbed_by_registration([_estimate(monkeypatch, amplitude)], Any, {"horizontal_eccentricity": left})  # type: ignore[arg-type]
     assert found == (frozenset({("horizontal_eccentricity", False)}) if out else frozenset())
 
 
@@ -84,7 +84,7 @@ def test_such_an_effect_stands_where_it_leaves_no_more_than_chance(
     found: Any = SimpleNamespace(
         search=SimpleNamespace(goodness_of_fit_p_value=lambda _: p_value), tried=(), estimates=[estimate]
     )
-    assert naming._explains_all(found) is all_of_it
+    assert effect_selection._explains_everything(found) is all_of_it
 
 
 def test_an_effect_that_is_not_believed_stays_in_the_class_of_what_looks_like_it() -> None:
@@ -92,19 +92,26 @@ def test_an_effect_that_is_not_believed_stays_in_the_class_of_what_looks_like_it
     turn: Any = SimpleNamespace(name="camera_omega", empirical=False)
     chosen = SelectedEffect(turn, ("tangential_distortion",), 0.002, 70.0, 67.0, ())
     named = [
-        Named(f"stereo.{name}", "physical", {"name": name}, {}, (), 0.002, 70.0)
+        NamedEffect(f"stereo.{name}", "physical", {"name": name}, {}, (), 0.002, 70.0)
         for name in ("smoothing", "tangential_distortion")
     ]
     left_out = frozenset({("camera_omega", False)})
-    found = with_doubtful(named, [chosen], frozenset({"camera_omega"}), left_out)
+    found = keep_implausible_in_class(named, [chosen], frozenset({"camera_omega"}), left_out)
     assert [item.alike for item in found] == [(), ("stereo.camera_omega",)]
-    assert [item.alike for item in with_doubtful(named, [chosen], frozenset({"camera_omega"}), frozenset())] == [(), ()]
+    assert [item.alike for item in keep_implausible_in_class(named, [chosen], frozenset({"camera_omega"}), frozenset())] == [
+        (),
+        (),
+    ]
 
 
 def test_what_is_named_in_the_place_of_an_effect_that_is_not_believed_shares_its_class() -> None:
     """A drift of the tilt that was not there beside a vertical index is what that leaves; an offset that was there is not."""
     index: Any = SimpleNamespace(name="vertical_index", empirical=False)
     chosen = SelectedEffect(index, (), 0.002, 70.0, 67.0, ())
-    named = [Named(f"tls.{name}", "physical", {"name": name}, {}, (), 0.002, 70.0) for name in ("tilt_drift", "range_offset")]
-    found = with_doubtful(named, [chosen], frozenset({"vertical_index", "range_offset"}), frozenset({("vertical_index", False)}))
+    named = [
+        NamedEffect(f"tls.{name}", "physical", {"name": name}, {}, (), 0.002, 70.0) for name in ("tilt_drift", "range_offset")
+    ]
+    found = keep_implausible_in_class(
+        named, [chosen], frozenset({"vertical_index", "range_offset"}), frozenset({("vertical_index", False)})
+    )
     assert [item.alike for item in found] == [("tls.vertical_index",), ()]

@@ -9,17 +9,17 @@ import pytest
 from gap_cases import Array, write_scan
 
 from pipeline.formats.measurements.measurement import TlsMeasurement, read_measurement
-from pipeline.gap.decisions import Decisions, deciding
 from pipeline.gap.naming.workflow import diagnose
-from pipeline.gap.residuals.subsampling import subsample
+from pipeline.gap.residuals.subsampling import subsample_measurement
 from pipeline.gap.residuals.tls_residuals import find_expected_pulses, tls_residuals, with_scan_order
+from pipeline.gap.thresholds import Thresholds, use_thresholds
 from scene.common.keyed_random import KeyedRandom
 
 _MOST = 6_000
 
 
-def _few() -> Decisions:
-    usual = Decisions()
+def _few() -> Thresholds:
+    usual = Thresholds()
     return usual.model_copy(update={"points": usual.points.model_copy(update={"most": _MOST})})
 
 
@@ -37,9 +37,9 @@ def test_points_are_drawn_alike_all_over_the_scan_and_lost_pulses_as_often(tmp_p
     """Shares within 4 of their standard errors: the count, that of either half of the lines, that of the losses."""
     scan = _scan(tmp_path)
     share = _MOST / len(scan.cloud.points)
-    with deciding(_few()):
-        part, rows = subsample(scan, KeyedRandom(1))
-        again, others = (subsample(scan, KeyedRandom(seed))[1] for seed in (1, 2))
+    with use_thresholds(_few()):
+        part, rows = subsample_measurement(scan, KeyedRandom(1))
+        again, others = (subsample_measurement(scan, KeyedRandom(seed))[1] for seed in (1, 2))
     assert isinstance(part, TlsMeasurement)
     np.testing.assert_array_equal(part.cloud.points, scan.cloud.points[rows])
     assert scan.order is not None
@@ -63,7 +63,7 @@ def test_points_are_drawn_alike_all_over_the_scan_and_lost_pulses_as_often(tmp_p
 def test_a_part_of_the_points_names_the_same(tmp_path: Path) -> None:
     """Of a sixth of the points the wobble is named, and the rows of the answer are those of the whole scan."""
     scan = _scan(tmp_path)
-    found = diagnose(scan, decisions=_few())
+    found = diagnose(scan, thresholds=_few())
     assert [each.name for each in found.effects][:1] == ["tls.wobble"]
     assert len(found.before) < 1.1 * _MOST
     assert found.residuals.index.max() > 0.9 * len(scan.cloud.points)
@@ -72,6 +72,6 @@ def test_a_part_of_the_points_names_the_same(tmp_path: Path) -> None:
 
 def test_fewer_points_than_the_bound_are_all_looked_at(tmp_path: Path) -> None:
     scan = _scan(tmp_path)
-    part, rows = subsample(scan, KeyedRandom(1))
+    part, rows = subsample_measurement(scan, KeyedRandom(1))
     assert part is scan
     np.testing.assert_array_equal(rows, np.arange(len(scan.cloud.points)))

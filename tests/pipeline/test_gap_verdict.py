@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from pipeline.gap.decisions import Decisions
-from pipeline.gap.naming.entries import Named
-from pipeline.gap.naming.verdict import Evidence, lower_noise, much_moved, too_noisy, verdict_of
-from pipeline.gap.naming.verify import Gap
-from pipeline.gap.report.in_words import paragraph, title
-from pipeline.gap.report.report import summary
+from pipeline.gap.naming.gap_score import Gap
+from pipeline.gap.naming.named_effects import NamedEffect
+from pipeline.gap.naming.verdict import Evidence, note_excess_noise, note_moved_wall, reduced_noise, verdict_of
+from pipeline.gap.report.report import summarise
+from pipeline.gap.report.wording import paragraph, title
+from pipeline.gap.thresholds import Thresholds
 from sensors.models.sensor_model import StereoModel, TlsModel
 
 ERROR = 0.0001
@@ -36,8 +36,8 @@ ROWS = [
 ]
 
 
-def _effect(name: str, kind: str = "physical", alike: tuple[str, ...] = ()) -> Named:
-    return Named(name, kind, {"name": name.partition(".")[2], "sigma_m": 0.01}, {}, alike, 0.002, 20.0)
+def _effect(name: str, kind: str = "physical", alike: tuple[str, ...] = ()) -> NamedEffect:
+    return NamedEffect(name, kind, {"name": name.partition(".")[2], "sigma_m": 0.01}, {}, alike, 0.002, 20.0)
 
 
 NAMED = [
@@ -50,7 +50,7 @@ NAMED = [
 ]
 
 
-DECISIONS = Decisions()
+THRESHOLDS = Thresholds()
 
 
 class _Residuals(list[int]):
@@ -61,10 +61,10 @@ class _Residuals(list[int]):
 class _Found:
     """What the words of a diagnosis are made of."""
 
-    effects: tuple[Named, ...]
+    effects: tuple[NamedEffect, ...]
     evidence: Evidence
     changes: tuple[Any, ...] = ()
-    decisions: Decisions = DECISIONS
+    thresholds: Thresholds = THRESHOLDS
     residuals: _Residuals = field(default_factory=lambda: _Residuals(range(1000)))
 
     @property
@@ -77,12 +77,12 @@ class _Found:
 
     @property
     def remaining(self) -> dict[str, Any]:
-        lower = lower_noise(TlsModel(), self.evidence.spread)
-        note = "; ".join(too_noisy(self.evidence.spread, lower))
+        lower = reduced_noise(TlsModel(), self.evidence.spread)
+        note = "; ".join(note_excess_noise(self.evidence.spread, lower))
         return {"p_value": self.evidence.p_value, "note": note, "lower_noise": lower}
 
     @property
-    def mended(self) -> bool:
+    def model_changed(self) -> bool:
         return bool(self.effects or self.remaining["lower_noise"])
 
 
@@ -95,7 +95,7 @@ def _every() -> Iterator[tuple[Any, Evidence, str]]:
             continue
         found: Any = _Found(named, Evidence(gap, p_value, spread, far, wide=wide))
         for row in ROWS:
-            yield found, found.evidence, f"{title(found)}. {paragraph(found, [row])} {summary(found)}"
+            yield found, found.evidence, f"{title(found)}. {paragraph(found, [row])} {summarise(found)}"
 
 
 def test_no_gap_needs_a_gap_at_the_floor_and_a_p_value_that_does_not_reject() -> None:
@@ -120,7 +120,7 @@ def test_a_gap_that_nothing_closes_is_not_reported_as_closed() -> None:
         assert "0 % of the gap is closed" not in said.replace("100 %", "")
         assert " -" not in said
         gap = evidence.gap
-        if gap is not None and (not found.mended or gap.after >= gap.before):
+        if gap is not None and (not found.model_changed or gap.after >= gap.before):
             assert "% of the gap is closed" not in said
         if gap is not None and gap.before - gap.floor > 2 * ERROR:
             assert "no more than their uncertainty" not in said
@@ -132,8 +132,8 @@ def test_what_is_rejected_without_a_description_says_where_and_how_much() -> Non
         left_open = found.gap is not None and found.gap.left_open
         only_too_noisy = evidence.spread < 1.0 and not (evidence.rejects or evidence.far or left_open)
         assert ("noise is too large" in said) >= (bare and only_too_noisy)
-        assert ("nothing that was tried describes what is missing" in said) == (bare and not only_too_noisy)
-        assert ("It shows most in the mean against range, from 10 to 20: 2.1 mm there" in said) == bare
+        assert ("nothing that was tried describes the misfit" in said) == (bare and not only_too_noisy)
+        assert ("The disagreement is largest in the mean against range, from 10 to 20: 2.1 mm there" in said) == bare
         if bare:
             assert "an empirical term describes it" not in said
             assert "that is not in the catalogue" not in said
@@ -149,32 +149,32 @@ def test_effects_that_leave_most_of_the_gap_open_are_not_the_answer() -> None:
         for_nothing = gap is not None and gap.after > gap.before and evidence.p_value is None
         unsaid = little or for_nothing or rejected or evidence.wide > 1.5
         assert (physical and found.verdict == "unknown") == (physical and unsaid)
-        assert ("nothing speaks for them" in said) == (physical and for_nothing and not little)
+        assert ("nothing supports them" in said) == (physical and for_nothing and not little)
         assert ("does not make the gap smaller" in said) == (physical and for_nothing and not little)
         assert ("most of the gap stays open" in said) == (physical and little)
         assert ("closes little of the gap" in said) == (physical and little)
         assert ("too small to show that they close any of it" in said) == (physical and rejected and not little)
-        assert ("leaves more than chance would" in said) == (physical and rejected and not little)
+        assert ("leaves a misfit larger than chance would" in said) == (physical and rejected and not little)
         wide = physical and not (little or for_nothing or rejected) and evidence.wide > 1.5
-        assert ("spread far more than the model predicts" in said) == wide
+        assert ("still vary far more than the model predicts" in said) == wide
 
 
 def test_an_empirical_term_beside_effects_does_not_say_that_none_passed() -> None:
     for found, _, said in _every():
         kinds = {effect.kind for effect in found.effects}
-        assert ("explain a part of what is missing" in said) == (len(kinds) == 2)
+        assert ("explain part of the misfit" in said) == (len(kinds) == 2)
         assert ("no effect of the catalogue passes its own test" in said) == (kinds == {"empirical"})
 
 
 def test_what_an_effect_leaves_over_is_said() -> None:
     for found, evidence, said in _every():
         left = bool(found.effects) and evidence.p_value is not None and evidence.p_value <= 0.01
-        assert ("does not explain all of it" in said) == left
+        assert ("does not explain everything" in said) == left
 
 
 def test_too_much_noise_is_said_with_less_that_would_do() -> None:
     for found, evidence, said in _every():
-        assert ("the residuals spread 11 % of what the model predicts" in said) == (evidence.spread < 1.0)
+        assert ("the residuals have 11 % of the predicted standard deviation" in said) == (evidence.spread < 1.0)
         if evidence.spread < 1.0:
             assert "range_sigma_m 0.00033" in said
             assert "too noisy" in said or found.verdict != "no_gap"
@@ -185,14 +185,14 @@ def test_too_much_noise_is_said_with_less_that_would_do() -> None:
 def test_a_wall_much_of_which_moved_says_nothing_of_the_sensor(gap: Gap | None, p_value: float | None) -> None:
     """Nothing is named then; 30 % of the wall are much."""
     found: Any = _Found((), Evidence(gap, p_value, moved=0.41))
-    said = f"{title(found)}. {paragraph(found, ROWS[:1])} {summary(found)} {'; '.join(much_moved(found.evidence, False))}"
+    said = f"{title(found)}. {paragraph(found, ROWS[:1])} {summarise(found)} {'; '.join(note_moved_wall(found.evidence, False))}"
     assert found.verdict == "insufficient_data"
     assert "41 % of the points lie off the reference together with their neighbours" in said
-    assert "name stable_areas" in said
+    assert "add stable_areas" in said
     assert "too few" not in said.lower()
     assert verdict_of((), Evidence(gap, p_value, moved=0.29)) == verdict_of((), Evidence(gap, p_value))
-    assert much_moved(Evidence(gap, p_value, moved=0.29), False) == []
-    assert "are not stable" in much_moved(found.evidence, True)[0]
+    assert note_moved_wall(Evidence(gap, p_value, moved=0.29), False) == []
+    assert "are not stable" in note_moved_wall(found.evidence, True)[0]
 
 
 def test_nothing_found_and_nothing_measured_is_no_answer() -> None:
@@ -209,8 +209,8 @@ def test_nothing_found_and_nothing_measured_is_no_answer() -> None:
     ],
 )
 def test_all_noise_is_lowered_alike(model: TlsModel | StereoModel, expected: dict[str, float]) -> None:
-    assert lower_noise(model, 0.5) == pytest.approx(expected)
-    assert lower_noise(model, 1.0) == {}
+    assert reduced_noise(model, 0.5) == pytest.approx(expected)
+    assert reduced_noise(model, 1.0) == {}
 
 
 @pytest.mark.parametrize(("error", "open_still"), [(0.0001, True), (0.004, False)])

@@ -96,10 +96,10 @@ def test_poses_in_a_local_system_stay(tmp_path: Path, reference: str) -> None:
 @pytest.mark.parametrize(
     ("reference", "words"),
     [
-        (WGS84, r"its coordinate system 'WGS 84' has no plane; allowed: a projected coordinate system"),
+        (WGS84, r"its coordinate system 'WGS 84' is not projected; allowed: a projected coordinate system"),
         (FEET, "whose unit is US survey foot"),
         (GEOID, "heights above a geoid"),
-        ("PROJCS[nonsense", "coordinate system that is not understood"),
+        ("PROJCS[nonsense", "names an unknown coordinate system"),
     ],
 )
 def test_what_cannot_be_converted_is_named_in_one_line(tmp_path: Path, reference: str, words: str) -> None:

@@ -12,7 +12,7 @@ import tifffile
 from format_cases import GRID, a_raster
 
 from pipeline.formats.rasters.geotiff import read_geotiff, read_raster, read_tiff, write_geotiff, write_tiff
-from pipeline.measurement.reference import from_dem
+from pipeline.measurement.reference import reference_from_dem
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
 
@@ -50,7 +50,7 @@ def test_tiff_round_trips(tmp_path: Path, raster: np.ndarray) -> None:
     write_tiff(tmp_path / "b.tif", raster.astype(np.float64), description="depth, m")
     np.testing.assert_array_equal(read_tiff(tmp_path / "b.tif"), raster)
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "b.tif"), raster)
-    with pytest.raises(InputError, match="no place"):
+    with pytest.raises(InputError, match="no pixel scale and tie point"):
         read_geotiff(tmp_path / "b.tif")
     with pytest.raises(ValueError, match=r"\(40, 70\)"):
         write_geotiff(tmp_path / "c.tif", raster.T, GRID)
@@ -155,7 +155,7 @@ def test_a_raster_from_south_to_north_is_turned(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("transform", "problem"),
     [
-        (rasterio.Affine(0.5, 0.1, 0.0, 0.1, -0.5, 0.0), "turned against the axes"),
+        (rasterio.Affine(0.5, 0.1, 0.0, 0.1, -0.5, 0.0), "rotated relative to the axes"),
         (rasterio.Affine(0.5, 0.0, 0.0, 0.0, -0.25, 0.0), r"its pixels are 0\.5 x 0\.25 units"),
     ],
 )
@@ -171,8 +171,8 @@ def test_what_programs_write_for_no_data_is_no_height(tmp_path: Path, value: flo
     raster = read_raster(_gdal(tmp_path / "a.tif", holed))
     assert np.isnan(raster.values[5:20, 5:20]).all()
     assert np.isnan(raster.values).sum() == 225
-    assert raster.notes == (f"225 pixels of {value:g} are taken for pixels without data, though the file does not say so",)
-    reference = from_dem(tmp_path / "a.tif")
+    assert raster.notes == (f"225 pixels of {value:g} are read as missing data, although the file does not say so",)
+    reference = reference_from_dem(tmp_path / "a.tif")
     assert reference.mesh.bounds[0, 2] == HEIGHTS.min()
     assert raster.notes[0] in reference.words
 
@@ -200,12 +200,12 @@ def test_a_mask_scale_and_offset_of_gdal_are_applied(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("crs", "metres"), [("EPSG:2225", 1200 / 3937), ("EPSG:2222", 0.3048)])
 def test_a_model_in_feet_becomes_metres(tmp_path: Path, crs: str, metres: float) -> None:
     """State planes in US survey feet and in international feet: 5,400,030 ft differ by 3.3 m."""
-    reference = from_dem(_gdal(tmp_path / "a.tif", crs=crs))
+    reference = reference_from_dem(_gdal(tmp_path / "a.tif", crs=crs))
     centre = (CORNER[0] + SIDE / 2) * metres, (CORNER[1] - SIDE / 2) * metres, float(HEIGHTS[0, 0]) * metres
     np.testing.assert_allclose(reference.mesh.vertices[0], centre, rtol=1e-9)
     assert any("which were converted to metres" in words for words in reference.words)
-    with pytest.raises(InputError, match=r"states its unit, .*ft.*, and --unit says mm"):
-        from_dem(tmp_path / "a.tif", "mm")
+    with pytest.raises(InputError, match=r"states its unit, .*ft.*, but --unit says mm"):
+        reference_from_dem(tmp_path / "a.tif", "mm")
 
 
 def test_a_unit_that_only_the_code_of_the_coordinate_system_has_is_read(tmp_path: Path) -> None:
@@ -227,5 +227,5 @@ def test_a_compression_that_cannot_be_read_is_no_damage(tmp_path: Path, monkeypa
     content = path.read_bytes()
     tag = (259).to_bytes(2, "little") + (3).to_bytes(2, "little") + (1).to_bytes(4, "little")
     path.write_bytes(content.replace(tag + (5).to_bytes(2, "little"), tag + (34925 + 77).to_bytes(2, "little")))
-    with pytest.raises(InputError, match=r"compressed in a way that cannot be read.*save it with deflate"):
+    with pytest.raises(InputError, match=r"uses a compression that cannot be read.*save it with deflate"):
         read_tiff(path)

@@ -11,7 +11,7 @@ from surfaces import heightfield
 
 from pipeline.cli.main import main
 from pipeline.icp_study.report import write_icp_study
-from pipeline.icp_study.study import Recommendation, StudyRow, Surfaces, recommended, study, true_pose
+from pipeline.icp_study.study import EpochSurfaces, Recommendation, StudyRow, recommend, study, true_pose
 from pipeline.registration.register import IcpConfig
 from pipeline.registration.rigid import RigidTransform
 from scene.common.keyed_random import KeyedRandom
@@ -37,7 +37,7 @@ def wall() -> TriangleMesh:
 
 def test_the_true_pose_is_the_planted_one(wall: TriangleMesh) -> None:
     """8,000 points with 3 mm of noise tell a shift to some 0.02 mm across the wall, and along it to 0.1 mm by its roughness."""
-    found = true_pose(Surfaces(1, measured(wall, 1, PLANTED), wall), KeyedRandom(1)).after(PLANTED)
+    found = true_pose(EpochSurfaces(1, measured(wall, 1, PLANTED), wall), KeyedRandom(1)).after(PLANTED)
     assert found.translation == pytest.approx(np.zeros(3), abs=5e-4)
     moved = found.apply(wall.vertices) - wall.vertices
     assert np.sqrt(np.mean(moved[:, 2] ** 2)) < 1e-4
@@ -51,9 +51,9 @@ def test_composition_is_in_order() -> None:
 
 def test_a_study_of_a_planted_displacement(wall: TriangleMesh, tmp_path: Path) -> None:
     surfaces = [
-        Surfaces(0, measured(wall, 2), wall),
-        Surfaces(1, measured(wall, 3, PLANTED), wall, applied=PLANTED.inverse()),
-        Surfaces(2, measured(wall, 4), wall, applied=RigidTransform(np.eye(3), np.array([0.0, 0.0, 0.01]))),
+        EpochSurfaces(0, measured(wall, 2), wall),
+        EpochSurfaces(1, measured(wall, 3, PLANTED), wall, applied=PLANTED.inverse()),
+        EpochSurfaces(2, measured(wall, 4), wall, applied=RigidTransform(np.eye(3), np.array([0.0, 0.0, 0.01]))),
     ]
     found = study("tls", surfaces, IcpConfig(), KeyedRandom(1), repeats=1)
     assert found.sigma_m == pytest.approx(
@@ -84,12 +84,12 @@ def row(parameter: str, value: float, error: float | None) -> StudyRow:
 
 def test_what_is_recommended() -> None:
     ratios = [row("subsample_ratio", value, error) for value, error in [(0, 1e-3), (0.5, 1.05e-3), (0.9, 2e-3), (0.99, 0.9e-3)]]
-    assert recommended(ratios, "subsample_ratio") == Recommendation("subsample_ratio", 0.5, (0, 0.5), 1.05e-3)
+    assert recommend(ratios, "subsample_ratio") == Recommendation("subsample_ratio", 0.5, (0, 0.5), 1.05e-3)
     errors = [(0.01, None), (0.02, 5e-3), (0.03, 1.02e-3), (0.04, 1e-3), (0.05, 1.05e-3), (0.1, 4e-3)]
     thresholds = [row("outlier_distance_threshold", *item) for item in errors]
-    best = recommended(thresholds, "outlier_distance_threshold")
+    best = recommend(thresholds, "outlier_distance_threshold")
     assert best == Recommendation("outlier_distance_threshold", 0.04, (0.03, 0.05), 1e-3)
-    assert recommended([row("outlier_distance_threshold", 0.1, None)], "outlier_distance_threshold") is None
+    assert recommend([row("outlier_distance_threshold", 0.1, None)], "outlier_distance_threshold") is None
 
 
 @pytest.mark.parametrize(

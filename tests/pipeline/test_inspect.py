@@ -314,8 +314,8 @@ def test_without_a_sensor_the_configs_own_are_inspected(config: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--set", "planning.gsd_m=20"], "planning.gsd_m: a pixel of 20 m does not suit a wall"),
-        (["--set", "planning.gsd_m=1e-5"], "planning.gsd_m: a pixel of 1e-05 m does not suit a wall"),
+        (["--set", "planning.gsd_m=20"], "planning.gsd_m: a pixel of 20 m is too large or too small for a wall"),
+        (["--set", "planning.gsd_m=1e-5"], "planning.gsd_m: a pixel of 1e-05 m is too large or too small for a wall"),
         (["--set", "planning.probability=2"], "'planning.probability': input should be less than 1"),
         (["--set", "planing.gsd_m=1"], "did you mean 'planning'?"),
         (["--sensor", "lidar"], "allowed: stereo, tls"),

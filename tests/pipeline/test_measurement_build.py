@@ -30,7 +30,7 @@ from pipeline.formats.points.ptx import orthonormal, read_ptx
 from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
 from pipeline.measurement.build import build
-from pipeline.measurement.origin import from_order
+from pipeline.measurement.origin import origin_from_point_order
 from pipeline.measurement.request import Request
 from pipeline.measurement.scans import read_scans
 from pipeline.surface.triangulation import triangulate_seen_points
@@ -134,7 +134,7 @@ def test_what_was_guessed_is_said(case: Case, tmp_path: Path) -> None:
     scan = read_scans(as_pts(case, tmp_path))[0]
     assert "x, y, z, intensity, red, green, blue" in scan.words[0]
     scan = read_scans(as_ptx(case, tmp_path))[0]
-    assert any("made so" in words for words in scan.words)
+    assert any("was corrected" in words for words in scan.words)
     assert len(scan.cloud.points) == len(case[1].points)
     assert len(read_points(tmp_path / "a.ptx").points) == len(case[1].points)
     cells = read_ptx(tmp_path / "a.ptx")[0].cloud.extra
@@ -145,7 +145,7 @@ def test_columns_are_taken_as_named(case: Case, tmp_path: Path) -> None:
     path = as_pts(case, tmp_path)
     cloud = read_scans(path, columns=["y", "x", "z", "-", "-", "-", "intensity"])[0].cloud
     np.testing.assert_allclose(cloud.points[:, [1, 0, 2]], in_world(case), atol=1e-6)
-    assert cloud.intensity is None, "the same everywhere"
+    assert cloud.intensity is None, "constant"
     with pytest.raises(InputError, match="has 7 columns, named x, y"):
         read_scans(path, columns=["x", "y"])
 
@@ -153,14 +153,14 @@ def test_columns_are_taken_as_named(case: Case, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("decimals", "atol"), [(6, 1e-4), (4, 0.005), (3, 0.05)])
 def test_the_lines_of_a_scan_meet_in_its_scanner(decimals: int, atol: float, case: Case) -> None:
     """Rounding to 1 mm at 35 m is 8 urad in an angle; 3 sigma of the fit's own error bound what is off."""
-    found = from_order(np.round(in_world(case), decimals))
+    found = origin_from_point_order(np.round(in_world(case), decimals))
     assert found is not None
     np.testing.assert_allclose(found.position, POSITION, atol=atol)
     assert np.all(np.abs(found.position - POSITION) < 5 * found.sigma_m + 1e-6)
 
 
 def test_points_in_no_order_tell_no_scanner(case: Case) -> None:
-    assert from_order(np.random.default_rng(2).permutation(in_world(case))) is None
+    assert origin_from_point_order(np.random.default_rng(2).permutation(in_world(case))) is None
 
 
 def test_a_stated_position_gives_way_to_the_scan_lines(case: Case, tmp_path: Path) -> None:
@@ -187,7 +187,7 @@ def test_half_of_a_scan_is_compared_with_the_other(case: Case, tmp_path: Path) -
     lines = np.unique(measurement.cloud.extra["line"])
     assert set(lines % 2) == {1}
     assert "every second line" in found.about["reference"][0]
-    assert "nothing that changes slowly" in measurement.notes[0]
+    assert "errors that vary slowly" in measurement.notes[0]
     assert isinstance(measurement, TlsMeasurement)
     assert measurement.pattern is None
     assert measurement.model.noise.range_sigma_m == 0.003, "of the instrument alone"
@@ -230,10 +230,10 @@ def test_a_rotation_of_few_digits_is_made_orthonormal() -> None:
     mended, words = orthonormal(turn, "a")
     np.testing.assert_allclose(mended @ mended.T, np.eye(3), atol=1e-14)
     np.testing.assert_allclose(mended, turn, atol=1e-3)
-    assert "off from orthonormal" in words[0]
+    assert "deviated from orthonormal" in words[0]
     assert orthonormal(np.eye(3), "a")[1] == ()
     for wrong in (np.diag([1.0, 1.0, -1.0]), 2 * np.eye(3), np.full((3, 3), np.nan)):
-        with pytest.raises(InputError, match="no rotation matrix"):
+        with pytest.raises(InputError, match="not a rotation matrix"):
             orthonormal(wrong, "a")
 
 
@@ -264,7 +264,7 @@ def test_a_pattern_may_be_in_degrees_and_run_the_other_way(case: Case, tmp_path:
 
 def test_degrees_stand_beside_no_radians(case: Case, tmp_path: Path) -> None:
     folder = rewritten(case, tmp_path, lambda values: values["pattern"].update(zenith_deg=[40, 90, 0.7]))
-    with pytest.raises(InputError, match="'zenith_deg' stands beside 'zenith_rad'"):
+    with pytest.raises(InputError, match="'zenith_deg' and 'zenith_rad' are both given"):
         read_measurement(folder)
 
 
@@ -392,14 +392,14 @@ BAD: dict[str, tuple[Callable[[Case, Path], list[str]], str]] = {
     "no reference": (lambda case, folder: [str(as_laz(case, folder)), "--scanner", "x"], "a mesh, a cloud or another epoch"),
     "no such reference": (asked(reference="no.ply"), "no.ply: there is no such file"),
     "no such scanner": (asked(scanner="riegl_vz400j"), "riegl_vz400i"),
-    "millimetres": (move(lambda points: 1000 * points), "say --unit mm"),
-    "few in millimetres": (move(lambda points: 1000 * points[::50]), "say --unit mm"),
-    "one point": (move(lambda points: points[:1]), "holds 1 points"),
-    "identical points": (move(lambda points: np.repeat(points[:1], 500, axis=0)), "the same one"),
+    "millimetres": (move(lambda points: 1000 * points), "add --unit mm"),
+    "few in millimetres": (move(lambda points: 1000 * points[::50]), "add --unit mm"),
+    "one point": (move(lambda points: points[:1]), "has 1 points"),
+    "identical points": (move(lambda points: np.repeat(points[:1], 500, axis=0)), "at the same place"),
     "NaN": (move(lambda points: points * np.nan), "no point with finite values"),
     "no order": (move(lambda points: np.random.default_rng(1).permutation(points)), "give --position X,Y,Z"),
     "another place": (move(lambda points: points + UTM), "export both in one coordinate system"),
-    "behind the scanner": (move(lambda points: 2 * POSITION - points), "export both|in a direction in which"),
+    "behind the scanner": (move(lambda points: 2 * POSITION - points), "export both|in directions in which"),
     "position of two numbers": (asked("--position", "1,2"), "3 numbers between commas"),
     "no such unit": (asked("--unit", "inch"), "allowed: m, cm, mm, ft, us-ft"),
     "columns": (asked("--columns", "x,y"), "has 4 columns, named x, y"),
@@ -462,6 +462,6 @@ def test_a_real_scan_of_rounded_coordinates(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="in front of them"):
         build(Request([ROCKS], "half", "riegl_vz400i"), tmp_path / "out")
     found = build(Request([ROCKS], "half", "riegl_vz400i", position=(547450.0, 149565.0, 725.0)), tmp_path / "out")
-    assert "the rounding of the coordinates" in found.about["model"][1]
+    assert "from rounded coordinates" in found.about["model"][1]
     assert read_measurement(tmp_path / "out").fit.near > 0.9
     assert len(read_ply(tmp_path / "out" / "reference.ply").faces) > 10_000

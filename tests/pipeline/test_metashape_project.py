@@ -90,17 +90,23 @@ def test_an_only_chunk_needs_not_be_active(project: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "what"),
     [
-        (lambda psx, files: psx.write_text("<document/>"), "no Metashape project"),
+        (lambda psx, files: psx.write_text("<document/>"), "not a Metashape project"),
         (lambda psx, files: psx.write_text(DESCRIPTOR.replace("{projectname}", "../{projectname}")), "outside of its folder"),
         (lambda psx, files: (files / "project.zip").unlink(), "No such file"),
         (
             lambda psx, files: (files / "2" / "chunk.zip").write_bytes(b"PK\x03\x04 and no more"),
-            "no archive of a Metashape project",
+            "not an archive of a Metashape project",
         ),
-        (lambda psx, files: _archive(files / "2" / "chunk.zip", "<chunk/>", "other.xml"), "no archive of a Metashape project"),
-        (lambda psx, files: _damage(files / "2" / "chunk.zip", zipfile.ZIP_DEFLATED), "no archive of a Metashape project"),
-        (lambda psx, files: _damage(files / "2" / "chunk.zip", zipfile.ZIP_LZMA), "no archive of a Metashape project"),
-        (lambda psx, files: _unknown_packing(files / "2" / "chunk.zip"), r"no archive of a Metashape project \(.*not supported"),
+        (
+            lambda psx, files: _archive(files / "2" / "chunk.zip", "<chunk/>", "other.xml"),
+            "not an archive of a Metashape project",
+        ),
+        (lambda psx, files: _damage(files / "2" / "chunk.zip", zipfile.ZIP_DEFLATED), "not an archive of a Metashape project"),
+        (lambda psx, files: _damage(files / "2" / "chunk.zip", zipfile.ZIP_LZMA), "not an archive of a Metashape project"),
+        (
+            lambda psx, files: _unknown_packing(files / "2" / "chunk.zip"),
+            r"not an archive of a Metashape project \(.*not supported",
+        ),
         (lambda psx, files: _archive(files / "2" / "chunk.zip", "<frame/>"), "begins with <frame>"),
         (lambda psx, files: _archive(files / "2" / "chunk.zip", "<chunk>"), "not valid XML"),
         (lambda psx, files: _archive(files / "2" / "chunk.zip", "<!DOCTYPE x><chunk/>"), "entities"),
@@ -121,4 +127,4 @@ def test_a_document_beyond_the_limit_is_not_unpacked(project: Path, monkeypatch:
     monkeypatch.setattr("pipeline.formats.cameras.metashape_project.MOST_TEXT_BYTES", 100)
     with pytest.raises(InputError, match=r"project\.zip: its doc\.xml has 0 MB") as found:
         read_metashape(project)
-    assert "no archive" not in str(found.value)
+    assert "not an archive" not in str(found.value)

@@ -9,8 +9,8 @@ from pipeline.calibration.noise_map import noise_map, with_model
 from pipeline.change.difference import statistics
 from pipeline.config.bundled import bundled_config
 from pipeline.config.simulation import SimulationConfig, load_config
-from pipeline.run.acquisition import look, reconstruct
-from pipeline.run.registered import reference_sensor
+from pipeline.run.acquisition import acquire, reconstruct
+from pipeline.run.reference import reference_sensor
 from pipeline.run.site import SensorSite, prepare_site
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
@@ -130,7 +130,7 @@ def test_a_reference_without_noise_is_the_wall_itself(stage: tuple[SimulationCon
     config, site, caster = stage
     config = config.model_copy(update={"reconstruction": "vertices", "noisy_reference": False})
     quiet = reference_sensor(config, with_model(site, model("high")))
-    surface = reconstruct(config, look(config, quiet, caster, KeyedRandom(1)))
+    surface = reconstruct(config, acquire(config, quiet, caster, KeyedRandom(1)))
     np.testing.assert_allclose(surface.corners()[:1000], caster.mesh.corners()[:1000], atol=1e-8)
 
 

@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.noise.statistics import NORMAL_BEYOND_3, binned, histogram, normality, quantile_edges, tails, without_outliers
+from pipeline.noise.statistics import (
+    NORMAL_BEYOND_3,
+    histogram,
+    normality,
+    quantile_edges,
+    statistics_by_bin,
+    tails,
+    without_outliers,
+)
 from scene.common.keyed_random import KeyedRandom
 
 NORMAL = KeyedRandom(5).generator().normal(0.002, 0.01, 200_000)
@@ -44,16 +52,16 @@ def test_normality_holds_its_level_and_sees_a_heavy_tail() -> None:
 def test_bins_hold_what_lies_in_them() -> None:
     covariate = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 9.0, np.nan])
     values = np.array([1.0, 3.0, 10.0, np.nan, 20.0, 7.0, 8.0])
-    first, second = binned(values, covariate, [0, 1, 2])
+    first, second = statistics_by_bin(values, covariate, [0, 1, 2])
     assert (first.of.count, first.of.median) == (2, 2.0)
     assert (second.of.count, second.of.median) == (2, 15.0)
     with pytest.raises(ValueError, match="shape"):
-        binned(values, covariate[:3], [0, 1])
+        statistics_by_bin(values, covariate[:3], [0, 1])
 
 
 def test_edges_share_the_values_out() -> None:
     edges = quantile_edges(np.arange(1000.0), 4)
-    assert [item.of.count for item in binned(np.zeros(1000), np.arange(1000.0), edges)] == [250, 250, 250, 250]
+    assert [item.of.count for item in statistics_by_bin(np.zeros(1000), np.arange(1000.0), edges)] == [250, 250, 250, 250]
     assert len(quantile_edges(np.zeros(10))) == 2
 
 

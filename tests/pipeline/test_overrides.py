@@ -57,7 +57,7 @@ def test_the_rest_and_the_original_stay_as_they_are() -> None:
         ("seed.x.y=3", "'seed' is 1"),
         ("sensor.2.noise=3", "allowed: 0 to 1"),
         ("sensor.-1=3", "allowed: 0 to 1"),
-        ("sensor.noise.x=3", "no index of the list 'sensor'"),
+        ("sensor.noise.x=3", "not an index of the list 'sensor'"),
         ("effects.0.name=x", "set it as a whole: effects=[...]"),
     ],
 )

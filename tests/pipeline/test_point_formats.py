@@ -123,7 +123,7 @@ def test_a_damaged_e57_is_named(tmp_path: Path, cloud: PointCloud, keep: float) 
     path = tmp_path / "a.e57"
     write_e57(path, [scan(cloud)])
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * keep)])
-    with pytest.raises(InputError, match=r"a\.e57: is not a whole E57 file"):
+    with pytest.raises(InputError, match=r"a\.e57: is not a complete E57 file"):
         read_e57(path)
 
 
@@ -137,7 +137,7 @@ def test_an_e57_takes_memory_for_the_points_that_are_there(tmp_path: Path, cloud
         patched.setattr("pipeline.formats.points.e57._PIECE", 1000)
         assert_same(read_e57(path)[0].cloud, at_once.cloud)
     in_e57(path, claim, 'recordCount="999999999">')
-    with pytest.raises(InputError, match="5,000 points, where it says 999,999,999"):
+    with pytest.raises(InputError, match="5,000 points but states 999,999,999"):
         read_e57(path)
 
 

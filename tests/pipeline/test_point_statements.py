@@ -129,7 +129,7 @@ def test_a_coordinate_system_that_is_not_understood_is_said(tmp_path: Path, poin
 
     found = read_points(las(tmp_path / "a.las", points, of("our own grid")))
     assert any("not understood: 'our own grid'" in note for note in found.notes)
-    with pytest.raises(InputError, match=r"not understood.*in which stands 'feet'"):
+    with pytest.raises(InputError, match=r"not understood.*which mentions 'feet'"):
         read_points(las(tmp_path / "b.las", points, of("our own grid, feet")))
 
 
@@ -149,8 +149,8 @@ def patched(path: Path, at: int, form: str, value: float) -> Path:
         (131, "<d", 1e-3, "states a box from .* and its points lie from"),
         (155, "<d", 0.0, "states a box from .* and its points lie from"),
         (179, "<d", 600_050.0, "states a box from .* and its points lie from"),
-        (247, "<Q", 400, "states 400 points and has room for 500"),
-        (247, "<Q", 600, "states 600 points and has room for 500"),
+        (247, "<Q", 400, "states 400 points but has room for 500"),
+        (247, "<Q", 600, "states 600 points but has room for 500"),
         (107, "<I", 499, "states 500 points and, in the field of older versions, 499"),
     ],
 )
@@ -174,13 +174,13 @@ def test_a_box_that_states_nothing_or_too_much(tmp_path: Path, points: Any) -> N
     patched(path, 179, "<d", 700_000.0)
     (note,) = read_points(path).notes
     assert "700000" in note
-    assert "a part of a larger one, or a wrong scale" in note
+    assert "it is part of a larger file, or its scale is wrong" in note
 
 
 def test_a_laz_file_with_another_count_than_its_chunks_is_an_error(tmp_path: Path) -> None:
     write_laz(tmp_path / "a.laz", PointCloud(np.random.default_rng(1).uniform(0, 50, (120_000, 3))))
     patched(tmp_path / "a.laz", 247, "<Q", 90_000)
-    with pytest.raises(InputError, match=r"not a whole LAS or LAZ file \(3 chunks for 90,000 points\)"):
+    with pytest.raises(InputError, match=r"not a complete LAS or LAZ file \(3 chunks for 90,000 points\)"):
         read_points(tmp_path / "a.laz")
 
 
@@ -194,8 +194,8 @@ def test_points_that_las_takes_out_of_use_are_left_out_with_a_word(tmp_path: Pat
     found = read_points(las(tmp_path / "a.laz", points, change))
     np.testing.assert_allclose(found.points, np.delete(points, [*range(20), *range(30, 40)], axis=0), atol=0.6e-4)
     assert found.notes == (
-        "20 points that the file has flagged as withheld are left out",
-        "10 points that the file has classified as noise are left out",
+        "20 points flagged as withheld in the file are left out",
+        "10 points classified as noise in the file are left out",
     )
     assert set(found.extra["classification"]) == {2}
 
@@ -208,7 +208,7 @@ def test_a_flag_that_all_points_have_takes_none_out(tmp_path: Path, points: Any)
 
     found = read_points(las(tmp_path / "a.laz", points, change))
     assert len(found.points) == COUNT
-    assert found.notes == ("all points are flagged as synthetic: they are kept",)
+    assert found.notes == ("all points are flagged as synthetic and are kept",)
 
 
 def test_a_box_in_single_precision_contradicts_nothing(tmp_path: Path, points: Any) -> None:
@@ -222,7 +222,7 @@ def test_a_box_in_single_precision_contradicts_nothing(tmp_path: Path, points: A
 
 def test_a_file_that_is_no_las_says_so(tmp_path: Path) -> None:
     (tmp_path / "a.laz").write_text("1 2 3\n" * 100)
-    with pytest.raises(InputError, match=r"no LAS or LAZ file: it begins with b'1 2 '.*suffix of its format"):
+    with pytest.raises(InputError, match=r"not a LAS or LAZ file: it begins with b'1 2 '.*suffix of its format"):
         read_points(tmp_path / "a.laz")
 
 
@@ -334,7 +334,7 @@ def test_e57_fields_that_are_not_read_are_named(tmp_path: Path) -> None:
 def test_e57_in_another_unit_than_metres_is_refused(tmp_path: Path) -> None:
     """The standard has metres; a coordinate system in feet beside them contradicts it."""
     xyz = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), np.random.default_rng(1).uniform(1, 9, (3, 50)), strict=True))
-    with pytest.raises(InputError, match=r"us-ft \(US survey foot\), and E57 files hold metres"):
+    with pytest.raises(InputError, match=r"us-ft \(US survey foot\), but E57 files are in metres"):
         read_e57(raw_e57(tmp_path / "a.e57", pyproj.CRS.from_epsg(2260).to_wkt(), **xyz))
     assert len(read_e57(raw_e57(tmp_path / "b.e57", pyproj.CRS.from_epsg(28356).to_wkt(), **xyz))[0].cloud.points) == 50
 
@@ -344,7 +344,7 @@ def test_a_cut_e57_says_how_much_is_missing(tmp_path: Path, points: Any) -> None
     write_e57(path, [E57Scan("one", PointCloud(points), np.zeros(3), np.eye(3))])
     size = path.stat().st_size
     path.write_bytes(path.read_bytes()[: size // 2])
-    with pytest.raises(InputError, match=rf"its header states {size:,} bytes, and it has {size // 2:,}.*copy or export"):
+    with pytest.raises(InputError, match=rf"its header states {size:,} bytes, but it has {size // 2:,}.*copy or export"):
         read_e57(path)
     path.write_bytes(b"PK\3\4" * 100)
     with pytest.raises(InputError, match=r"it begins with b'PK.*suffix of its format"):
@@ -385,11 +385,11 @@ def test_ptx_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("how", "problem"),
     [
-        ({"size": (2, 4)}, r"scan 1 states 2 x 4 = 8 cells and has 6 lines"),
+        ({"size": (2, 4)}, r"scan 1 states 2 x 4 = 8 cells but has 6 lines"),
         ({"size": (2, 2)}, r"line 15: has more lines than the grid of scan 1 has cells: '7.0 8.0"),
         (
             {"place": "10 20 5", "matrix": "10 20 7"},
-            "two poses of the scanner: its place is 10 20 5 .* and 10 20 7",
+            "two poses of the scanner: its position is 10 20 5 .* but 10 20 7",
         ),
         ({"rows": CELLS.replace("5.0", "five")}, r"line 13, column 2: 'five' is not a number"),
         ({"rows": "1.0 2.0 3.0\n" * 6}, "have 3 values; allowed: x y z intensity"),
@@ -404,7 +404,7 @@ def test_a_ptx_file_that_contradicts_itself_is_an_error(tmp_path: Path, how: dic
 def test_a_second_ptx_scan_that_comes_too_early_is_named(tmp_path: Path) -> None:
     text = ptx(tmp_path / "a.ptx", CELLS).read_text()
     (tmp_path / "b.ptx").write_text(text.replace("2\n3\n", "2\n4\n", 1) + text)
-    with pytest.raises(InputError, match="scan 1 states 8 cells and has 6 lines before the next scan begins"):
+    with pytest.raises(InputError, match="scan 1 states 8 cells but has 6 lines before the next scan begins"):
         read_ptx(tmp_path / "b.ptx")
 
 

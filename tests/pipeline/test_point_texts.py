@@ -90,7 +90,7 @@ def test_a_unit_in_the_names_is_applied(tmp_path: Path, units: tuple[str, str, s
     assert "converted from" in " ".join(found.notes)
     by_columns = read_placed_scans(path, columns=["y", "x", "z"])[0].cloud
     np.testing.assert_allclose(by_columns.points, (POINTS * factors)[:, [1, 0, 2]], rtol=1e-15)
-    with pytest.raises(InputError, match=r"states its unit, .* in the names of its columns, and --unit says cm"):
+    with pytest.raises(InputError, match=r"states its unit, .* in the names of its columns, but --unit says cm"):
         read_placed_scans(path, unit="cm")
 
 
@@ -113,10 +113,10 @@ def test_a_grid_of_heights_is_no_list_of_points(tmp_path: Path) -> None:
     [
         ("Latitude;Longitude;Height\n", "coordinates in degrees"),
         ("X [deg];Y [deg];Z [m]\n", "coordinates in degrees"),
-        ("X [cubit];Y [cubit];Z [cubit]\n", "a unit that is not known: 'cubit'"),
-        ("X;Y;Z;Intensity\n", "names 4 columns .* and the rows have 3"),
-        ("Vorn;Seite;Oben\n", "of which not all of x, y and z are understood"),
-        ("azimuth;elevation;range\n", "of which not all of x, y and z are understood"),
+        ("X [cubit];Y [cubit];Z [cubit]\n", "an unknown unit 'cubit'"),
+        ("X;Y;Z;Intensity\n", "names 4 columns .* but the rows have 3"),
+        ("Vorn;Seite;Oben\n", "which do not include x, y and z"),
+        ("azimuth;elevation;range\n", "which do not include x, y and z"),
     ],
 )
 def test_names_that_are_not_understood_are_errors(tmp_path: Path, header: str, problem: str) -> None:
@@ -130,7 +130,7 @@ def test_names_that_are_not_understood_are_errors(tmp_path: Path, header: str, p
 def test_decimal_commas_are_read(tmp_path: Path, separator: str) -> None:
     found = read_points(written(tmp_path, rows(separator, ",")))
     np.testing.assert_array_equal(found.points, POINTS)
-    assert "commas in numbers are taken as decimal marks" in found.notes
+    assert "commas in numbers are read as decimal marks" in found.notes
 
 
 def test_commas_between_values_are_no_decimal_marks(tmp_path: Path) -> None:
@@ -184,7 +184,7 @@ def test_a_line_that_is_no_row_is_named(tmp_path: Path, text: str, line: int, pr
 
 @pytest.mark.parametrize(("stated", "suffix"), [(2, ".pts"), (4, ".pts"), (9, ".xyz")])
 def test_a_count_that_the_rows_do_not_agree_with_is_an_error(tmp_path: Path, stated: int, suffix: str) -> None:
-    with pytest.raises(InputError, match=f"states {stated} points and holds 3"):
+    with pytest.raises(InputError, match=f"states {stated} points but has 3"):
         read_points(written(tmp_path, f"{stated}\n" + rows(), name=f"a{suffix}"))
     np.testing.assert_array_equal(read_points(written(tmp_path, "3\n" + rows(), name=f"a{suffix}")).points, POINTS)
 
@@ -192,7 +192,7 @@ def test_a_count_that_the_rows_do_not_agree_with_is_an_error(tmp_path: Path, sta
 def test_a_pts_file_of_several_scans_has_a_count_before_each(tmp_path: Path) -> None:
     both = read_points(written(tmp_path, "3\n" + rows() + "3\n" + rows(), name="a.pts")).points
     np.testing.assert_array_equal(both, np.concatenate([POINTS, POINTS]))
-    with pytest.raises(InputError, match=r"line 5.*states 5 points and holds 3"):
+    with pytest.raises(InputError, match=r"line 5.*states 5 points but has 3"):
         read_points(written(tmp_path, "3\n" + rows() + "5\n" + rows(), name="a.pts"))
 
 
@@ -201,24 +201,24 @@ def test_missing_values_are_left_out_with_a_word(tmp_path: Path) -> None:
     text = rows(";", tail=";1;") + "1.#QNAN;null;;1;\n" + rows(";", tail=";1;")
     found = read_points(written(tmp_path, text))
     assert np.isnan(found.points[3]).all()
-    assert "3 values are empty or no numbers" in found.notes
+    assert "3 values are empty or not numbers" in found.notes
     rng = np.random.default_rng(1)
     many = "".join(f"{x} {y} {z}\n" for x, y, z in rng.uniform(0, 9, (200, 3)))
     (scan,) = read_scans(written(tmp_path, many + "nan nan nan\n" * 7))
     assert len(scan.cloud.points) == 200
-    assert "7 points that are no numbers are left out" in scan.words
+    assert "7 points with coordinates that are not numbers are left out" in scan.words
 
 
 def test_a_binary_file_with_a_suffix_of_text_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.xyz").write_bytes(bytes(range(256)) * 20)
-    with pytest.raises(InputError, match=r"null bytes, as binary files do.*export it as text"):
+    with pytest.raises(InputError, match=r"null bytes, like binary files.*export it as text"):
         read_points(tmp_path / "a.xyz")
 
 
 def test_a_line_that_is_passed_over_is_said(tmp_path: Path) -> None:
     found = read_points(written(tmp_path, "Scan of the north face, 3 March\n" + rows()))
     np.testing.assert_array_equal(found.points, POINTS)
-    assert any("line 1 is passed over: 'Scan of the north face" in note for note in found.notes)
+    assert any("line 1 is ignored: 'Scan of the north face" in note for note in found.notes)
 
 
 def test_sentences_before_the_points_are_no_names(tmp_path: Path) -> None:
@@ -241,13 +241,13 @@ def test_a_column_of_words_is_left_out_by_name(tmp_path: Path) -> None:
     found = read_points(written(tmp_path, "X,Y,Z,Class,Intensity\n" + rows(",", tail=",hard rock,7"), name="a.csv"))
     np.testing.assert_array_equal(found.points, POINTS)
     np.testing.assert_array_equal(found.intensity, [7, 7, 7])
-    assert found.notes == ("column 4 (class) holds words and is left out",)
+    assert found.notes == ("column 4 (class) contains words and is left out",)
     labels = "".join(f"P{number},{row}\n" for number, row in enumerate(rows(",").split()))
     found = read_points(written(tmp_path, "# Targets, 1, 2, 3\nlabel,X,Y,Z\n" + labels, name="a.csv"))
     np.testing.assert_array_equal(found.points, POINTS)
-    assert found.notes == ("column 1 (label) holds words and is left out",)
+    assert found.notes == ("column 1 (label) contains words and is left out",)
     np.testing.assert_array_equal(read_points(written(tmp_path, labels, name="a.csv")).points, POINTS)
-    with pytest.raises(InputError, match="column 1, called x, holds words"):
+    with pytest.raises(InputError, match="column 1, called x, contains words"):
         read_points(written(tmp_path, "X,Y,Z,W\n" + labels, name="a.csv"))
     with pytest.raises(InputError, match=r"line 3, column 4: 'rock' is not a number"):
         read_points(written(tmp_path, "X,Y,Z,Class\n" + rows(",", tail=",7").replace(",7", ",rock", 2).replace(",rock", ",7", 1)))
@@ -260,7 +260,7 @@ def test_a_name_that_is_a_part_of_xyz_is_a_channel(tmp_path: Path) -> None:
 
 
 def test_a_coordinate_that_is_missing_everywhere_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="column 2, taken for y, is empty in all 3 rows"):
+    with pytest.raises(InputError, match="column 2, read as y, is empty in all 3 rows"):
         read_points(written(tmp_path, rows(",").replace(",6389", ",,6389")))
 
 

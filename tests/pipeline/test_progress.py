@@ -66,7 +66,7 @@ def test_a_stage_that_takes_far_longer_than_planned_promises_no_end() -> None:
         clock.now += 70.0
         assert progress.time.endswith("left")
         clock.now += 20.0
-        assert progress.time == "1 min 40 s so far, longer than usual"
+        assert progress.time == "1 min 40 s so far, slower than expected"
         progress.advance(0.9)
         assert progress.time.endswith("left"), "a stage that says how far it is can be believed"
     assert progress.time.endswith("left")
@@ -134,7 +134,7 @@ def test_lines_appear_after_the_quiet_time_only() -> None:
             while not stream.getvalue().count("\n") >= 2:
                 time.sleep(0.005)
     first = stream.getvalue().splitlines()[0]
-    assert first.startswith("50 % done, about 0 s left: cast")
+    assert first.startswith("50 %  cast  (about 0 s left)")
 
 
 def test_the_terminal_decides_what_is_shown() -> None:

@@ -44,7 +44,7 @@ def test_a_centimetre_is_told_and_a_millimetre_is_not(tmp_path: Path) -> None:
     found = rounded(tmp_path, [0.01, 0.01, 0.01])
     (note,) = found.notes
     assert note.startswith("scan_0.ply: the coordinates are rounded, x in steps of 0.01 m")
-    assert "2.9 mm along the lines of sight, where the model has a noise of 3 mm" in note
+    assert "2.9 mm along the lines of sight, and the model has a noise of 3 mm" in note
     assert note in compute_residuals(found).notes
     assert rounded(tmp_path, [0.001, 0.001, 0.001]).notes == ()
 

@@ -66,7 +66,7 @@ def test_a_run_is_not_resumed_while_it_goes_on(tmp_path: Path, monkeypatch: pyte
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
 def test_what_stands_where_the_lock_should_is_refused_and_stays(make: Callable[[Path], None], tmp_path: Path) -> None:
     make(tmp_path / LOCK)
-    with pytest.raises(InputError, match="is no file"), locked(tmp_path):
+    with pytest.raises(InputError, match="is not a file"), locked(tmp_path):
         pass
     assert (tmp_path / LOCK).exists()
 

@@ -138,7 +138,7 @@ def test_a_tilted_scan_gives_back_its_axis_lines_and_steps() -> None:
     [
         (np.random.default_rng(1).normal(size=(20_000, 3)) * [9, 9, 2], "on no regular pattern"),
         (np.zeros((10, 3)), "10 points are too few"),
-        (np.full((1000, 3), np.nan), "no numbers"),
+        (np.full((1000, 3), np.nan), "not numbers"),
         (np.repeat([[10.0, 1.0, 2.0], [10.0, 1.2, 2.1]], 500, axis=0), "on no regular pattern"),
         (np.linspace(5, 15, 1000)[:, None] * [1.0, 0.2, 0.1], "on no regular pattern"),
         (np.random.default_rng(1).uniform(size=(1000, 3)) * [9, 0, 2], "on no regular pattern"),

@@ -28,10 +28,10 @@ from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points.laz import read_laz, write_laz
 from pipeline.formats.rasters.geotiff import read_geotiff, write_geotiff
 from pipeline.run.simulation import simulate
-from pipeline.view.beside import Pair, beside, border
 from pipeline.view.page import following, pictures
 from pipeline.view.results import Item, Patch, ViewWindow, cut
 from pipeline.view.server import cookie_name, make_app, make_page_server, open_results, open_second
+from pipeline.view.split_view import Pair, border, split_patch
 from scene.common.config import parse
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
@@ -179,7 +179,7 @@ def test_clouds_that_are_of_no_diagnosis_are_told(gap: Path, tmp_path: Path) -> 
     for extra, points, said in (
         ({}, cloud.points, "no channel residual_m"),
         ({"residual_m": cloud.extra["residual_m"]}, cloud.points, "no channel held_out"),
-        ({**cloud.extra, "residual_m": cloud.extra["residual_m"] * np.nan}, cloud.points, "no numbers"),
+        ({**cloud.extra, "residual_m": cloud.extra["residual_m"] * np.nan}, cloud.points, "not numbers"),
         ({key: value[:2] for key, value in cloud.extra.items()}, cloud.points[:2], "holds 2 points"),
     ):
         shutil.copytree(gap, tmp_path / said)
@@ -266,11 +266,11 @@ def test_what_stands_beside_begins_at_the_border() -> None:
     value = np.array([[1.0, 2.0, 3.0, np.nan], [5.0, 6.0, 7.0, np.nan]])
     right = Patch(np.array([0.5, 2.5, 4.5, 6.5]), np.array([2.5, 0.5]), value, value, np.ones((2, 4), int), 1)
     assert border(left, 1 / 3) == 3
-    both = beside(left, right, 1 / 3)
+    both = split_patch(left, right, 1 / 3)
     np.testing.assert_array_equal(both.value[0], [0, 0, 0, 0, 3, 3, np.nan, np.nan, np.nan, np.nan])
     np.testing.assert_array_equal(both.value[3], [0, 0, 0, 0, 7, 7, np.nan, np.nan, np.nan, np.nan])
     np.testing.assert_array_equal(both.label[0], [0, 0, 0, 0, 1, 1, 1, 1, 0, 0])
-    np.testing.assert_array_equal(beside(left, left, 0.0).value, left.value)
+    np.testing.assert_array_equal(split_patch(left, left, 0.0).value, left.value)
 
 
 def test_two_runs_of_one_wall_stand_side_by_side(run: Path, gap: Path, tmp_path: Path) -> None:
@@ -328,7 +328,7 @@ def test_windows_beyond_the_raster_keep_a_pixel() -> None:
         (lambda folder: _written(folder, "run.json", "{"), "run.json: is not JSON"),
         (lambda folder: _written(folder, "run.json", '{"sensor": "tls", "config": {}}'), "holds no finished epoch"),
         (lambda folder: _written(folder, "gap.json", "[]"), "gap.json: expected a mapping"),
-        (lambda folder: _written(folder, "annotations.json", "{}"), "is no COCO annotation file"),
+        (lambda folder: _written(folder, "annotations.json", "{}"), "is not a COCO annotation file"),
     ],
 )
 def test_other_folders_are_told(make: Any, expected: str, tmp_path: Path) -> None:

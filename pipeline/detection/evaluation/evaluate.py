@@ -17,7 +17,7 @@ from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
-from pipeline.change.annotate import STANDS_OUT
+from pipeline.change.annotate import DETECTABLE_SNR
 
 CONFIDENCES, THRESHOLDS = (0.9, 0.95, 0.99), (0.25, 0.75)
 """Default lowest scores and lowest overlaps that count."""
@@ -303,7 +303,7 @@ def _score(group: str, confidence: float, threshold: float, images: Iterable[_Pa
 def _stand_out(blocks: Sequence[Mapping[str, Any]]) -> float:
     """Return the share of blocks that stand out from the noise."""
     known = [block["signal_to_noise"] for block in blocks if isinstance(block.get("signal_to_noise"), int | float)]
-    return _share(sum(ratio > STANDS_OUT for ratio in known), len(known))
+    return _share(sum(ratio > DETECTABLE_SNR for ratio in known), len(known))
 
 
 def _share(part: int, whole: int) -> float:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.change.annotate import STANDS_OUT
+from pipeline.change.annotate import DETECTABLE_SNR
 from pipeline.detection.evaluation.evaluate import CONFIDENCES, Overlap, Score, coco_metrics, evaluate
 from pipeline.detection.evaluation.reliability import EDGES, OVERLAP, Reliability, reliability
 from pipeline.detection.products.figures import write_reliability
@@ -124,7 +124,7 @@ def as_text(assessment: Assessment) -> str:
         for title, name in (("precision", "precision"), ("recall", "recall"), ("F1", "f1"), ("area ratio", "area_ratio")):
             lines.append(f"{title:<12}" + "".join(_cell(getattr(score, name)) for score in scores))
         if kind == by_group[0][0][1] and not np.isnan(scores[0].stand_out):
-            lines.append(f"blocks that stand out from the noise (S/N > {STANDS_OUT:g}): {100 * scores[0].stand_out:.1f} %")
+            lines.append(f"blocks that stand out from the noise (S/N > {DETECTABLE_SNR:g}): {100 * scores[0].stand_out:.1f} %")
     lines += ["", *_reliability_table(assessment.reliability)]
     coco = "  ".join(f"{name} {value:.3f}" for name, value in assessment.coco.items() if value >= 0)
     return "\n".join([*lines[1:], "", f"COCO: {coco}"])

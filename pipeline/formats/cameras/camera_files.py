@@ -1,4 +1,4 @@
-"""Which reader a camera file needs, told by what stands in it, and which two of its cameras are the pair."""
+"""Recognise the format of a camera file by its content, read it, and select the two cameras of a pair."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ _COLMAP_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 
 
 def read_oriented(path: Path) -> MetashapeCameras | None:
-    """Cameras with poses by label: Metashape's camera XML or project, or COLMAP's text model (its folder or a file of it).
+    """Read cameras with poses by label, from Metashape's camera XML or project, or from COLMAP's text model (its folder or a file
+    of it).
 
-    None where the file is of another kind, such as the project's cameras.yaml. Raises InputError for a calibration alone.
+    Returns None for other kinds of file, such as the project's cameras.yaml. Raises InputError for a calibration without poses.
     """
     if path.is_dir() or path.name in _COLMAP_FILES:
         return MetashapeCameras(read_colmap(path if path.is_dir() else path.parent), ())
@@ -37,7 +38,7 @@ def read_oriented(path: Path) -> MetashapeCameras | None:
 
 
 def oriented_files(path: Path) -> list[Path]:
-    """The files of what `read_oriented` reads: COLMAP's model, whose folder may hold others, a project's, or `path` alone."""
+    """Return the files that `read_oriented` reads: those of COLMAP's model, of a project, or `path` only."""
     if path.is_dir() or path.name in _COLMAP_FILES:
         folder = path if path.is_dir() else path.parent
         return [folder / name for name in sorted(_COLMAP_FILES) if (folder / name).exists()]
@@ -45,7 +46,7 @@ def oriented_files(path: Path) -> list[Path]:
 
 
 def read_lens(path: Path) -> Camera:
-    """A calibration alone, at the origin: Metashape's calibration XML, OpenCV's FileStorage, or plain numbers (.txt)."""
+    """Read a calibration without a pose: Metashape's calibration XML, OpenCV's FileStorage, or plain numbers (.txt)."""
     root = _xml_root(path)
     if root == "document":
         raise InputError("is a camera XML, not a calibration", where=str(path), remedy="name it as cameras.file in the config")
@@ -55,24 +56,35 @@ def read_lens(path: Path) -> Camera:
 
 
 def stereo_pair(found: MetashapeCameras, left: str | None, right: str | None, where: str) -> CameraPair:
-    """The cameras labelled `left` and `right`; where both are None the only two, told apart by where they stand.
+    """Select the two cameras of a pair.
 
-    Cameras that are not aligned are left out with a warning. Raises InputError where the pair is not clear.
+    Cameras that are not aligned are left out with a warning.
+
+    Parameters
+    ----------
+    found : The cameras of a file.
+    left, right : Their labels; None: the only two, ordered by their positions.
+    where : Name of the file, for errors.
+
+    Raises
+    ------
+    InputError
+        If a label is unknown, or there are not exactly two cameras.
     """
     known = ", ".join(found.cameras)
     for label in (label for label in (left, right) if label is not None and label not in found.cameras):
         why = "is not aligned" if label in found.unaligned else "is not in the file"
-        why = "belongs to a rig, whose relative poses are not read" if label in found.rigged else why
+        why = "belongs to a rig, whose relative poses cannot be read" if label in found.rigged else why
         raise InputError(f"camera '{label}' {why}", where=where, allowed=known)
     if left is not None and right is not None:
         return CameraPair(found.cameras[left], found.cameras[right])
     if left is not None or right is not None or len(found.cameras) != 2:
-        what = f"holds {len(found.cameras)} aligned cameras, a pair is two"
+        what = f"has {len(found.cameras)} aligned cameras, but a pair has two"
         raise InputError(what, where=where, allowed=known, remedy="name both as cameras.left and cameras.right")
     if found.unaligned:
         warnings.warn(f"{where}: left out as not aligned: {', '.join(found.unaligned)}", stacklevel=2)
     if found.rigged:
-        words = f"{where}: left out, as their poses are those of a rig, which are not read: {', '.join(found.rigged)}"
+        words = f"{where}: left out because poses in a rig cannot be read: {', '.join(found.rigged)}"
         warnings.warn(words, stacklevel=2)
     first, second = found.cameras.values()
     swapped = first.rotation[:, 0] @ (second.position - first.position) < 0
@@ -80,16 +92,18 @@ def stereo_pair(found: MetashapeCameras, left: str | None, right: str | None, wh
 
 
 def _xml_root(path: Path) -> str:
-    """The tag of an XML file's root, "" for a file that is no XML."""
+    """Return the tag of an XML file's root; "" if the file is not XML."""
     return read_root(path).tag if path.suffix.lower() == ".xml" or _start(path).startswith(b"<") else ""
 
 
 def _is_opencv_yaml(path: Path) -> bool:
+    """Whether a file is OpenCV's YAML."""
     start = _start(path)
     return start.startswith(b"%YAML") and b"opencv-matrix" in start
 
 
 def _start(path: Path) -> bytes:
+    """Return the first bytes of a file."""
     check_file(path)
     try:
         with path.open("rb") as file:

@@ -1,4 +1,4 @@
-"""A stereo pair's calibration in the project's own YAML: the sections `left` and `right` of cameras.yaml."""
+"""Read and write the calibration of a stereo pair in the project's own YAML: sections `left` and `right` of cameras.yaml."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from sensors.cameras.camera import INTERIOR, CameraConfig, CameraPair
 
 
 class PairConfig(Config):
-    """A stereo pair, camera by camera."""
+    """Content of cameras.yaml."""
 
     left: CameraConfig
     right: CameraConfig
 
     def pair(self) -> CameraPair:
-        """The cameras, world frame."""
+        """Return the cameras, world frame."""
         return CameraPair(self.left.camera(), self.right.camera())
 
 
 def read_cameras_yaml(path: Path) -> CameraPair:
     """Read cameras.yaml: nominal calibration and pose of `left` and `right`, world frame.
 
-    A camera may name a file of Metashape's or OpenCV's as its `calibration`, relative to cameras.yaml, instead of width, height
-    and the interior orientation.
+    A camera may name a calibration file of Metashape or OpenCV as its `calibration`, relative to cameras.yaml, instead of its
+    width, height and interior orientation.
     """
     values = load_yaml(path)
     if isinstance(values, dict):
@@ -35,7 +35,7 @@ def read_cameras_yaml(path: Path) -> CameraPair:
 
 
 def cameras_yaml_files(path: Path) -> list[Path]:
-    """The files that `read_cameras_yaml` reads: itself, and the calibrations that it names."""
+    """Return the files that `read_cameras_yaml` reads: cameras.yaml and the calibrations that it names."""
     values = load_yaml(path)
     cameras = values.values() if isinstance(values, dict) else ()
     return [path, *(path.parent / camera["calibration"] for camera in cameras if _names_lens(camera))]
@@ -54,6 +54,7 @@ def write_cameras_yaml(path: Path, pair: CameraPair) -> None:
 
 
 def _with_lens(camera: Any, folder: Path) -> Any:
+    """Replace the name of a calibration file by its content."""
     if not _names_lens(camera):
         return camera
     lens = read_lens(folder / camera["calibration"])
@@ -62,14 +63,16 @@ def _with_lens(camera: Any, folder: Path) -> Any:
 
 
 def _names_lens(camera: Any) -> bool:
+    """Whether a camera names a calibration file."""
     return isinstance(camera, dict) and isinstance(camera.get("calibration"), str)
 
 
 def _row(values: Any) -> str:
+    """Format a vector."""
     return f"[{', '.join(_number(value) for value in values)}]"
 
 
 def _number(value: float) -> str:
-    """All the digits of a float in a form that every YAML reader takes for a number (1.0e-05, not 1e-05)."""
+    """Format a float with all its digits, in a form that every YAML reader takes for a number (1.0e-05, not 1e-05)."""
     text = repr(float(value))
     return text.replace("e", ".0e") if "e" in text and "." not in text else text

@@ -1,8 +1,8 @@
-"""Camera poses and calibrations in COLMAP's text form, and its depth and normal maps.
+"""Read and write COLMAP's text model (camera poses and calibrations), and its depth and normal maps.
 
-cameras.txt: CAMERA_ID MODEL WIDTH HEIGHT PARAMS; images.txt, two lines per image: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME,
-then its keypoints (which may be empty); points3D.txt: POINT3D_ID X Y Z R G B ERROR and the track as (IMAGE_ID, KEYPOINT) pairs
-(COLMAP documentation, "Output Format"). Poses lead from the world to the camera, the quaternion's scalar comes first, and the
+cameras.txt: CAMERA_ID MODEL WIDTH HEIGHT PARAMS. images.txt, two lines for each image: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID
+NAME, then its keypoints (which may be empty). points3D.txt: POINT3D_ID X Y Z R G B ERROR and the track as (IMAGE_ID, KEYPOINT)
+pairs (COLMAP documentation, "Output Format"). Poses map the world to the camera, the quaternion's scalar comes first, and the
 centre of the top-left pixel is (0.5, 0.5). The camera models are OpenCV's: see pipeline.formats.cameras.opencv.
 """
 
@@ -30,17 +30,18 @@ MODELS = {
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-"""Parameters of COLMAP's models that ours covers (where k4, k5 and k6 are zero), in the order of cameras.txt."""
+"""Parameters of those COLMAP models that our camera model covers (if k4, k5 and k6 are zero), in the order of cameras.txt."""
 _PLACE = ("f", "fx", "fy", "cx", "cy")
+"""Parameters that are not distortion."""
 _LARGEST = 1e12
-"""No coordinate, pixel or lens parameter is larger; squares and products of such numbers stay finite."""
+"""Largest coordinate, pixel or lens parameter, so that squares and products stay finite."""
 _MAP_HEADER = re.compile(rb"(\d+)&(\d+)&(\d+)&")
 
 
 def read_colmap(folder: Path) -> dict[str, Camera]:
     """Read the cameras of a COLMAP text model by image name, world frame.
 
-    Raises InputError for a missing or malformed file, and for a camera model or parameter that ours does not have.
+    Raises InputError if a file is missing or malformed, or our camera model lacks one of its models or parameters.
     """
     from scipy.spatial.transform import Rotation
 
@@ -48,7 +49,7 @@ def read_colmap(folder: Path) -> dict[str, Camera]:
     cameras = {}
     for words, where in _records(folder / "images.txt", 10, 2):
         if words[8] not in interiors:
-            raise InputError(f"names the camera {words[8]}, which cameras.txt does not hold", where=where)
+            raise InputError(f"names the camera {words[8]}, which is not in cameras.txt", where=where)
         quaternion, translation = np.split(_numbers(words[1:8], where), [4])
         if np.abs(quaternion).max() < 1e-9:
             raise InputError("the quaternion is zero", where=where)
@@ -58,10 +59,18 @@ def read_colmap(folder: Path) -> dict[str, Camera]:
 
 
 def write_colmap(folder: Path, cameras: Mapping[str, Camera], points: FloatArray | None = None) -> None:
-    """Write a COLMAP text model: cameras by image name, world frame, and points (n, 3), m, each seen by every image.
+    """Write a COLMAP text model.
 
-    COLMAP's fusion looks for overlapping images by the points that they share, so it needs some. Raises InputError where COLMAP
-    has no camera model with a parameter that is not zero (b2, k4).
+    Parameters
+    ----------
+    folder : Folder to write.
+    cameras : Cameras by image name, world frame.
+    points : (n, 3) points seen by every image, m. COLMAP's fusion finds overlapping images by their common points.
+
+    Raises
+    ------
+    InputError
+        If COLMAP has no camera model with a parameter that is not zero (b2, k4).
     """
     from scipy.spatial.transform import Rotation
 
@@ -81,7 +90,7 @@ def write_colmap(folder: Path, cameras: Mapping[str, Camera], points: FloatArray
 
 
 def write_map(path: Path, values: NDArray[np.floating]) -> None:
-    """Write a depth map (h, w), or a normal map (h, w, 3), as COLMAP does: `w&h&channels&`, then float32, channel by channel."""
+    """Write a depth map (h, w) or a normal map (h, w, 3) as COLMAP does: `w&h&channels&`, then float32, channel by channel."""
     channels = values[..., None] if values.ndim == 2 else values
     height, width, depth = channels.shape
     planes = np.ascontiguousarray(np.moveaxis(channels, 2, 0), dtype="<f4")
@@ -89,7 +98,7 @@ def write_map(path: Path, values: NDArray[np.floating]) -> None:
 
 
 def read_map(path: Path) -> NDArray[np.float32]:
-    """Read a depth map as (h, w), a normal map as (h, w, 3); raises InputError for a file that is none."""
+    """Read a depth map as (h, w), or a normal map as (h, w, 3); raise InputError for any other file."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -97,13 +106,15 @@ def read_map(path: Path) -> NDArray[np.float32]:
     header = _MAP_HEADER.match(data)
     width, height, depth = (int(number) for number in header.groups()) if header else (0, 0, 0)
     if header is None or len(data) != header.end() + 4 * width * height * depth:
-        raise InputError("is no whole depth or normal map of COLMAP", where=str(path))
+        raise InputError("is not a complete depth or normal map of COLMAP", where=str(path))
     planes = np.frombuffer(data, "<f4", offset=header.end()).reshape(depth, height, width)
     return planes[0] if depth == 1 else np.moveaxis(planes, 0, 2)
 
 
 def _records(path: Path, words: int, stride: int) -> list[tuple[list[str], str]]:
-    """The words of every `stride`-th line that is no comment, and where it stands; lines of fewer words are errors."""
+    """Return the words of every `stride`-th line that is not a comment, and its place; raise InputError if there are fewer than
+    `words`.
+    """
     remedy = "export the model as text (colmap model_converter --output_type TXT)"
     lines = read_text(path, remedy=remedy).splitlines()
     numbered = [(number, line) for number, line in enumerate(lines, start=1) if not line.startswith("#")]
@@ -119,9 +130,10 @@ def _records(path: Path, words: int, stride: int) -> list[tuple[list[str], str]]
 
 
 def _camera(words: list[str], where: str, pose: Pose) -> Camera:
+    """Return the camera of a line of cameras.txt."""
     model = words[1]
     if model not in MODELS:
-        raise InputError(f"the camera model {model} is not covered by ours", where=where, allowed=", ".join(MODELS))
+        raise InputError(f"the camera model {model} is not supported", where=where, allowed=", ".join(MODELS))
     values = _numbers(words[2:], where)
     if len(values) != 2 + len(MODELS[model]) or min(values[:3]) <= 0:
         raise InputError(f"{model} needs width, height and {', '.join(MODELS[model])}", where=where)
@@ -132,7 +144,7 @@ def _camera(words: list[str], where: str, pose: Pose) -> Camera:
 
 
 def _interior(camera: Camera, where: str) -> str:
-    """MODEL WIDTH HEIGHT PARAMS in the smallest of COLMAP's models that holds the camera."""
+    """Return MODEL WIDTH HEIGHT PARAMS for the smallest of COLMAP's models that covers the camera."""
     interior = OpencvInterior.of(camera, where)
     distorted = any(getattr(interior, name) != 0 for name in ("k1", "k2", "p1", "p2"))
     model = "FULL_OPENCV" if interior.k3 != 0 else "OPENCV" if distorted else "PINHOLE"
@@ -140,18 +152,19 @@ def _interior(camera: Camera, where: str) -> str:
 
 
 def _keypoints(camera: Camera, points: FloatArray) -> str:
-    """The image's second line: X Y POINT3D_ID of every point."""
+    """Return the second line of an image: X Y POINT3D_ID of every point."""
     local = (points - camera.position) @ camera.rotation
     u, v = camera.pixel(local[:, 0] / local[:, 2], local[:, 1] / local[:, 2])
     return " ".join(f"{_text(pixel)} {index}" for index, pixel in enumerate(zip(u, v, strict=True), start=1))
 
 
 def _text(values: object) -> str:
-    """Numbers with all the digits that they have."""
+    """Format numbers with all their digits."""
     return " ".join(repr(float(value)) for value in np.ravel(np.asarray(values, dtype=float)))
 
 
 def _numbers(words: list[str], where: str) -> FloatArray:
+    """Parse finite numbers, or raise InputError."""
     try:
         values = np.array([float(word) for word in words])
     except ValueError:

@@ -1,4 +1,4 @@
-"""Coordinate systems of the survey's own coordinates, as files state them."""
+"""Coordinate systems of the survey, as the config names them."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from scene.common.errors import InputError
 
 
 def wkt_of(name: str, where: str) -> str:
-    """The WKT (version 1, as LAS has it) of a coordinate system in metres with two or three axes, such as EPSG:28356.
+    """Return the WKT (version 1, as in LAS) of a projected coordinate system in metres, such as EPSG:28356.
 
-    Raises InputError for one that is not known or not in metres.
+    Raises InputError if it is unknown or not in metres.
     """
     from pyproj import CRS
     from pyproj.exceptions import CRSError

@@ -1,9 +1,9 @@
-"""Poses in geocentric coordinates, as Metashape keeps them, taken to the projected coordinates of the survey.
+"""Convert poses in geocentric coordinates, as Metashape stores them, to the projected coordinates of the survey.
 
-The geocentric axes are those of the projection's own datum, so that no datum is changed: a point goes to longitude, latitude and
-ellipsoidal height (PROJ's `cart`), and these through the projection. An attitude is turned by the projection's Jacobian at the
-camera, of which the rotation is kept. A projection stretches the plane (UTM: by -4e-4 to 1e-3) and not the heights: poses and
-surfaces in projected coordinates agree with one another to that share of their distance.
+The geocentric axes are those of the projection's own datum, so that the datum does not change. A point is converted to longitude,
+latitude and ellipsoidal height (PROJ's `cart`), then projected. An attitude is turned by the rotation in the projection's
+Jacobian at the camera. A projection scales the plane (UTM: by -4e-4 to 1e-3) but not the heights; poses and surfaces in projected
+coordinates agree with each other to that share of their distance.
 """
 
 from __future__ import annotations
@@ -18,26 +18,28 @@ from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 
 _EARTH_M = 6.3e6, 6.45e6
-"""How far from the earth's centre cameras on and above its surface stand."""
+"""Range of distances from the Earth's centre of cameras on and above its surface, m."""
 _STEP_M = 10.0
-"""Over which the Jacobian's differences are taken."""
+"""Step of the finite differences for the Jacobian, m."""
 _REMEDY = "in Metashape convert the chunk's reference to a projected or local coordinate system in metres and export anew"
 
 
 def is_geocentric(position: FloatArray) -> bool:
-    """Whether a position (3,), m, is that of a camera near the earth's surface, counted from the earth's centre."""
+    """Whether a position (3,), m, is that of a camera near the Earth's surface, relative to the Earth's centre."""
     return bool(_EARTH_M[0] < np.linalg.norm(position) < _EARTH_M[1])
 
 
 @dataclass(frozen=True)
 class Projection:
-    """A projected coordinate system. text: in WKT, or as PROJ writes it; where: for errors."""
+    """A projected coordinate system. text: in WKT or as PROJ writes it; where: name of the file, for errors."""
 
     text: str
     where: str
 
     def pose(self, matrix: FloatArray) -> FloatArray:
-        """(4, 4) camera to easting, northing, ellipsoidal height, of one to geocentric; a scale stays."""
+        """Convert a (4, 4) pose, camera to geocentric coordinates, to camera to easting, northing and ellipsoidal height; a scale
+        is kept.
+        """
         position = matrix[:3, 3]
         shifted = position + _STEP_M * np.concatenate([np.eye(3), -np.eye(3)])
         projected = self.project(np.vstack([position, shifted]))
@@ -47,7 +49,7 @@ class Projection:
         return result
 
     def project(self, points: FloatArray) -> FloatArray:
-        """(n, 3) easting, northing, ellipsoidal height of geocentric points (n, 3), m."""
+        """Return the (n, 3) easting, northing and ellipsoidal height of geocentric points (n, 3), m."""
         crs = self._crs
         from pyproj import Proj, Transformer
 
@@ -59,25 +61,27 @@ class Projection:
 
     @cached_property
     def _crs(self) -> Any:
+        """The horizontal part of the coordinate system."""
         from pyproj import CRS
         from pyproj.exceptions import CRSError
 
         try:
             crs = CRS.from_user_input(self.text)
         except (CRSError, UnicodeError) as error:
-            problem = f"names a coordinate system that is not understood ({' '.join(str(error).split())[:100]})"
+            problem = f"names an unknown coordinate system ({' '.join(str(error).split())[:100]})"
             raise InputError(problem, where=self.where, remedy=_REMEDY) from None
         self._check(crs)
         return crs.sub_crs_list[0] if crs.is_compound else crs
 
     def _check(self, crs: Any) -> None:
+        """Raise InputError unless the system is projected, in metres, with ellipsoidal heights."""
         plane, *vertical = crs.sub_crs_list if crs.is_compound else [crs]
         problem = ""
         if not plane.is_projected:
-            problem = f"holds poses in geocentric coordinates, and its coordinate system '{crs.name}' has no plane"
+            problem = f"has poses in geocentric coordinates, but its coordinate system '{crs.name}' is not projected"
         elif any(axis.unit_conversion_factor != 1 for axis in plane.axis_info):
             problem = f"has the coordinate system '{crs.name}', whose unit is {plane.axis_info[0].unit_name}"
         elif any("ellipsoid" not in each.to_wkt().lower().split("cs[")[0] for each in vertical):
-            problem = f"has the coordinate system '{crs.name}' with heights above a geoid, which poses in the file are not"
+            problem = f"has the coordinate system '{crs.name}' with heights above a geoid, but its poses have ellipsoidal heights"
         if problem:
             raise InputError(problem, where=self.where, allowed="a projected coordinate system, m", remedy=_REMEDY)

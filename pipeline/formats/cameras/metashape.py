@@ -1,11 +1,12 @@
-"""Cameras and calibrations in Agisoft Metashape's XML, whose camera model is ours.
+"""Read and write cameras and calibrations in Agisoft Metashape's XML, whose camera model is the same as ours.
 
-Camera XML (File > Export > Export Cameras): a sensor may hold two calibrations, the one of class "adjusted" counts; missing tags
-are 0. A camera without a transform is not aligned. A transform is row-major, camera to chunk; the similarity (s, R, t) of the
-camera's component, or where that has none of the chunk, leads on: x_world = s R x_chunk + t. In a chunk with a projected
-coordinate system (the tag `reference`) that leads to geocentric coordinates, which are taken to the projected ones. A project
-(.psx) holds the same of its active chunk. What would change the rays and has no place in the camera model is refused: rolling
-shutter motion, and lens parameters beyond ours.
+Camera XML (File > Export > Export Cameras): a sensor may have two calibrations, of which the one of class "adjusted" counts;
+missing tags are 0. A camera without a transform is not aligned. A transform is row-major, camera to chunk. The similarity (s, R,
+t) of the camera's component, or of the chunk if the component has none, follows: x_world = s R x_chunk + t. In a chunk with a
+projected coordinate system (tag `reference`) the result is geocentric and is converted to projected coordinates. A project (.psx)
+holds the same of its active chunk. Whatever changes the rays but has no place in the camera model is refused: rolling shutter
+motion, and lens parameters beyond ours.
+
 Calibration XML (Tools > Camera Calibration > Save): one interior orientation.
 """
 
@@ -28,15 +29,16 @@ from scene.geometry.mesh import FloatArray
 from sensors.cameras.camera import Camera, checked_camera
 
 _TAGS = {"f": "f_px", "cx": "cx_px", "cy": "cy_px"} | {name: name for name in ("b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")}
+"""Name in our camera model of each calibration tag."""
 _PARAMETER = re.compile(r"[a-z]\d")
-"""What the tags of lens parameters look like: k5, p3, b3."""
+"""Pattern of lens parameter tags: k5, p3, b3."""
 _LARGEST = 1e12
-"""No coordinate, pixel or lens parameter is larger; products of such numbers stay finite."""
+"""Largest coordinate, pixel or lens parameter, so that products stay finite."""
 
 
 @dataclass(frozen=True)
 class MetashapeCameras:
-    """Cameras by label, world frame; the labels of those that were not aligned, and of those whose pose is that of a rig."""
+    """Cameras by label, world frame; labels of cameras that are not aligned, and of those whose pose is relative to a rig."""
 
     cameras: dict[str, Camera]
     unaligned: tuple[str, ...]
@@ -46,8 +48,8 @@ class MetashapeCameras:
 def read_metashape(path: Path) -> MetashapeCameras:
     """Read all frame cameras of a Metashape camera XML, or of a project's active chunk.
 
-    Raises InputError where the file is no such XML, a sensor of an aligned camera is not a frame camera with a calibration, and
-    where two cameras have one label.
+    Raises InputError if the file is no such XML, the sensor of an aligned camera is not a frame camera with a calibration, or two
+    cameras have the same label.
     """
     chunk = _chunk(path)
     sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors//sensor")}
@@ -71,7 +73,7 @@ def read_metashape(path: Path) -> MetashapeCameras:
             raise InputError(f"two cameras are labelled '{label}'", where=str(path), remedy="rename one of them in Metashape")
         sensor = sensors.get(element.get("sensor_id", ""))
         if sensor is None:
-            raise InputError(f"camera '{label}' names no sensor of the file", where=str(path))
+            raise InputError(f"the sensor of camera '{label}' is not in the file", where=str(path))
         in_chunk = _numbers(transform, 16, f"{path}: camera {label}").reshape(4, 4)
         pose = to_world.get(element.get("component_id", ""), default) @ in_chunk
         if projection is not None and is_geocentric(pose[:3, 3]):
@@ -81,7 +83,7 @@ def read_metashape(path: Path) -> MetashapeCameras:
 
 
 def write_metashape(path: Path, cameras: Mapping[str, Camera]) -> None:
-    """Write a camera XML that Metashape imports (File > Import > Import Cameras): cameras by label, in one metric component."""
+    """Write cameras by label as a camera XML for Metashape (File > Import > Import Cameras), in one metric component."""
     document = ElementTree.Element("document", version="2.0.0")
     chunk = ElementTree.SubElement(document, "chunk", label="scarpsim", enabled="true")
     sensors = ElementTree.SubElement(chunk, "sensors", next_id=str(len(cameras)))
@@ -104,10 +106,10 @@ def write_metashape(path: Path, cameras: Mapping[str, Camera]) -> None:
 
 
 def read_calibration(path: Path) -> Camera:
-    """Read a calibration XML; the camera stands at the origin."""
+    """Read a calibration XML; the camera is placed at the origin."""
     root = read_root(path)
     if root.tag != "calibration":
-        raise InputError(f"is no calibration XML of Metashape (its root is <{root.tag}>)", where=str(path))
+        raise InputError(f"is not a calibration XML of Metashape (its root is <{root.tag}>)", where=str(path))
     if (projection := root.findtext("projection", "frame")) != "frame":
         raise InputError(f"has the projection '{projection}'", where=str(path), allowed="frame")
     width, height = (_whole(root.findtext(tag, "0"), str(path)) for tag in ("width", "height"))
@@ -124,22 +126,23 @@ def write_calibration(path: Path, camera: Camera) -> None:
 
 
 def _chunk(path: Path) -> ElementTree.Element:
+    """Return the chunk of a camera XML, or the active chunk of a project."""
     if is_project(path):
         return active_chunk(path)
     root = read_root(path)
     chunk = root.find("chunk") if root.tag == "document" else None
     if chunk is None:
-        raise InputError("is no Metashape camera XML", where=str(path), remedy="export it with File > Export > Export Cameras")
+        raise InputError("is not a Metashape camera XML", where=str(path), remedy="export it with File > Export > Export Cameras")
     return chunk
 
 
 def _is_metric(reference: str) -> bool:
-    """Whether a chunk's coordinate system, in WKT, is one that transforms lead to: none, a local or a geocentric one."""
+    """Whether a chunk's coordinate system, in WKT, is already that of its transforms: none, a local or a geocentric one."""
     return not reference or reference.upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS", "GEOCCS"))
 
 
 def _similarity(element: ElementTree.Element, path: Path) -> FloatArray:
-    """(4, 4) the transform tag of a chunk or component, the identity where it has none."""
+    """Return the (4, 4) transform of a chunk or component, the identity if it has none."""
     matrix = np.eye(4)
     transform = element.find("transform")
     if transform is None:
@@ -154,7 +157,7 @@ def _similarity(element: ElementTree.Element, path: Path) -> FloatArray:
 
 
 def _sensor_camera(sensor: ElementTree.Element, pose: FloatArray, where: str) -> Camera:
-    """The camera of a sensor; pose: (4, 4) camera to world, which may hold a scale."""
+    """Return the camera of a sensor; pose: (4, 4) camera to world, possibly with a scale."""
     calibrations = sensor.findall("calibration")
     adjusted = [calibration for calibration in calibrations if calibration.get("class") == "adjusted"] or calibrations
     resolution = sensor.find("resolution")
@@ -168,23 +171,23 @@ def _sensor_camera(sensor: ElementTree.Element, pose: FloatArray, where: str) ->
 
 
 def _check_shutter(camera: ElementTree.Element, where: str) -> None:
-    """Raise InputError for a camera whose rows were exposed from different poses, as Metashape's shutter compensation found."""
+    """Raise InputError for a camera aligned with rolling shutter compensation, whose rows have different poses."""
     for motion in camera.iter("rolling_shutter"):
         if any(value != 0 for value in _numbers_of(motion.itertext())):
             raise InputError(
-                "was aligned with rolling shutter compensation: each row has a pose of its own, which the camera model has not",
+                "was aligned with rolling shutter compensation, so that each row has its own pose, which is not supported",
                 where=where,
-                allowed="one pose a picture",
-                remedy="switch the compensation off in Metashape's camera calibration, align again and export",
+                allowed="one pose for each picture",
+                remedy="switch off the compensation in Metashape's camera calibration, align again and export",
             )
 
 
 def _check_parameters(calibration: ElementTree.Element, where: str) -> None:
-    """Raise InputError for a lens parameter that is not zero and that the camera model has not, such as p3 of old versions."""
+    """Raise InputError for a non-zero lens parameter that our camera model lacks, such as p3 of old versions."""
     for child in calibration:
         unknown = child.tag not in _TAGS and _PARAMETER.fullmatch(child.tag) is not None
         if unknown and any(value != 0 for value in _numbers_of([child.text or ""])):
-            problem = f"has the lens parameter {child.tag} = {(child.text or '').strip()[:20]}, which would be left out"
+            problem = f"has the lens parameter {child.tag} = {(child.text or '').strip()[:20]}, which is not supported"
             allowed = ", ".join(_TAGS)
             raise InputError(
                 problem, where=where, allowed=allowed, remedy=f"fix {child.tag} at 0 in Metashape and optimise again"
@@ -192,7 +195,7 @@ def _check_parameters(calibration: ElementTree.Element, where: str) -> None:
 
 
 def _numbers_of(texts: Iterable[str]) -> list[float]:
-    """The numbers that stand in some texts; NaN for other words."""
+    """Return the numbers in some texts, with NaN for other words."""
     found = []
     for word in " ".join(texts).split():
         try:
@@ -203,34 +206,37 @@ def _numbers_of(texts: Iterable[str]) -> list[float]:
 
 
 def _camera(calibration: ElementTree.Element, size: tuple[int, int], pose: FloatArray, where: str) -> Camera:
+    """Return the camera of a calibration."""
     _check_parameters(calibration, where)
     interior = {name: float(_numbers(calibration.findtext(tag, "0"), 1, where)[0]) for tag, name in _TAGS.items()}
     if interior["f_px"] <= 0 or min(size) <= 0:
         raise InputError("has no frame size or no f", where=where, allowed="width, height and f greater than 0")
-    left, scales, right = np.linalg.svd(pose[:3, :3])  # the nearest rotation: takes out the similarity's scale
+    left, scales, right = np.linalg.svd(pose[:3, :3])  # the nearest rotation, without the similarity's scale
     if np.linalg.det(left @ right) < 0 or np.ptp(scales) > 1e-6 * scales[0]:
-        raise InputError("a camera's transform is no rotation with one scale", where=where)
+        raise InputError("a camera's transform is not a rotation with one scale", where=where)
     return checked_camera(where, size, interior, (pose[:3, 3], left @ right))
 
 
 def _write_interior(element: ElementTree.Element, camera: Camera) -> None:
-    """The calibration's tags; those that are zero are left out, as Metashape does."""
+    """Write the calibration's tags except those that are zero, as Metashape does."""
     values = {tag: float(getattr(camera, name)) for tag, name in _TAGS.items()}
     _texts(element, {tag: np.array([value]) for tag, value in values.items() if value != 0})
 
 
 def _texts(parent: ElementTree.Element, values: Mapping[str, FloatArray]) -> None:
-    """Children with numbers in row-major order, with all the digits that they have."""
+    """Add children with numbers in row-major order, with all their digits."""
     for tag, array in values.items():
         ElementTree.SubElement(parent, tag).text = " ".join(repr(float(number)) for number in array.ravel())
 
 
 def _write(path: Path, root: ElementTree.Element) -> None:
+    """Write an XML document."""
     ElementTree.indent(root)
     write_bytes(path, ElementTree.tostring(root, encoding="UTF-8", xml_declaration=True) + b"\n")
 
 
 def _whole(text: str, where: str) -> int:
+    """Parse a whole number."""
     value = float(_numbers(text, 1, where)[0])
     if value != int(value):
         raise InputError(f"expected a whole number of pixels, got '{text}'", where=where)
@@ -238,6 +244,7 @@ def _whole(text: str, where: str) -> int:
 
 
 def _numbers(text: str, count: int, where: str) -> FloatArray:
+    """Parse `count` finite numbers, or raise InputError."""
     try:
         values = np.array([float(word) for word in text.split()])
     except ValueError:

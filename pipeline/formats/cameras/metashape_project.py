@@ -1,10 +1,10 @@
-"""A Metashape project (.psx): a small XML that names an archive, that names the archives of its chunks.
+"""Read a Metashape project (.psx): a small XML that names an archive, which names the archives of its chunks.
 
     wall.psx                      <document path="{projectname}.files/project.zip"/>
     wall.files/project.zip        doc.xml: <chunks active_id="0"><chunk id="0" path="0/chunk.zip"/>
     wall.files/0/chunk.zip        doc.xml: <chunk> with sensors, components, cameras and transform, as in an exported camera XML
 
-The tags are those of projects of Metashape 1.2 to 2.3, as programs of others read and write them.
+The tags are those of projects of Metashape 1.2 to 2.3, as other programs read and write them.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ from scene.common.regular_file import MOST_TEXT_BYTES, check_file
 
 _DOCUMENT = "doc.xml"
 _DAMAGED = (OSError, zipfile.BadZipFile, KeyError, EOFError, zlib.error, lzma.LZMAError, RuntimeError, UnicodeDecodeError)
-"""What `zipfile` raises for a project that cannot be read: no permission, no archive, no doc.xml, a file that is cut off, a
-damaged stream, encryption or a compression that it does not know (both RuntimeError), names in no known encoding."""
+"""Exceptions of `zipfile` for a project that cannot be read: no permission, not an archive, no doc.xml, a truncated file, a
+damaged stream, encryption or an unknown compression (both RuntimeError), names in an unknown encoding.
+"""
 _EXPORT = "save the project in Metashape again, or export the cameras with File > Export > Export Cameras"
 
 
@@ -33,18 +34,18 @@ def is_project(path: Path) -> bool:
 
 
 def active_chunk(path: Path) -> ElementTree.Element:
-    """The chunk that was open when the project was saved, or its only one.
+    """Return the chunk that was open when the project was saved, or its only one.
 
-    Raises InputError where files of the project are missing or damaged, and where it has several chunks of which none is active.
+    Raises InputError if files of the project are missing or damaged, or it has several chunks of which none is active.
     """
     return _document(project_files(path)[-1], "chunk")
 
 
 def project_files(path: Path) -> list[Path]:
-    """The project, its archive, and that of its active chunk."""
+    """Return the project, its archive, and the archive of its active chunk."""
     root = read_root(path)
     if root.tag != "document" or root.get("path") is None:
-        raise InputError("is no Metashape project", where=str(path), remedy=_EXPORT)
+        raise InputError("is not a Metashape project", where=str(path), remedy=_EXPORT)
     project = inside(path.parent, str(root.get("path")).replace("{projectname}", path.stem), path)
     document = _document(project, "document")
     chunks, listed = document.findall("chunks/chunk"), document.find("chunks")
@@ -52,12 +53,12 @@ def project_files(path: Path) -> list[Path]:
     chosen = [chunk for chunk in chunks if chunk.get("id") == number] or chunks
     if len(chosen) != 1:
         remedy = "open the chunk in Metashape and save the project"
-        raise InputError(f"holds {len(chunks)} chunks, of which none is active", where=str(project), remedy=remedy)
+        raise InputError(f"has {len(chunks)} chunks, of which none is active", where=str(project), remedy=remedy)
     return [path, project, inside(project.parent, chosen[0].get("path"), project)]
 
 
 def _document(archive: Path, tag: str) -> ElementTree.Element:
-    """The root of an archive's doc.xml."""
+    """Return the root of an archive's doc.xml."""
     where = f"{archive}: {_DOCUMENT}"
     root = parsed(_unpacked(archive), where)
     if root.tag != tag:
@@ -66,14 +67,14 @@ def _document(archive: Path, tag: str) -> ElementTree.Element:
 
 
 def _unpacked(archive: Path) -> bytes:
-    """What stands in an archive's doc.xml."""
+    """Return the content of an archive's doc.xml."""
     check_file(archive)
     try:
         with zipfile.ZipFile(archive) as file:
             size = file.getinfo(_DOCUMENT).file_size
             text = file.read(_DOCUMENT) if size <= MOST_TEXT_BYTES else b""
     except _DAMAGED as error:
-        problem = f"is no archive of a Metashape project ({' '.join(str(error).split())[:200]})"
+        problem = f"is not an archive of a Metashape project ({' '.join(str(error).split())[:200]})"
         raise InputError(problem, where=str(archive), remedy=_EXPORT) from None
     if size > MOST_TEXT_BYTES:
         allowed = f"{MOST_TEXT_BYTES / 1e6:,.0f} MB"

@@ -1,11 +1,15 @@
-"""Calibrations in OpenCV's form: FileStorage (XML, YAML, JSON), and the plain text of width, height, camera matrix, distortion.
+"""Read and write calibrations in OpenCV's forms: FileStorage (XML, YAML, JSON), and plain text of size, camera matrix and
+distortion.
 
-OpenCV's distortion, with r2 = x^2 + y^2 (OpenCV 5 documentation, calib3d, detailed description):
+OpenCV's distortion, with r2 = x^2 + y^2 (OpenCV 5 documentation, calib3d, detailed description), is
+
     x' = x (1 + k1 r2 + k2 r2^2 + k3 r2^3) / (1 + k4 r2 + k5 r2^2 + k6 r2^3) + 2 p1 x y + p2 (r2 + 2 x^2) + s1 r2 + s2 r2^2
     y' = y (same)                                                           + p1 (r2 + 2 y^2) + 2 p2 x y + s3 r2 + s4 r2^2
     u  = fx x' + cx,   v = fy y' + cy,   the centre of the top-left pixel at (0, 0)
-Against Agisoft Metashape's: p1 and p2 change places, fx = f + b1, fy = f, and cx, cy are counted from the first pixel's centre.
-What only one of the two models has (b2 and k4 r^8 there; k4, k5, k6, s1..s4 and the tilts here) must be zero.
+
+Compared with Agisoft Metashape's model (ours), p1 and p2 are exchanged, fx = f + b1, fy = f, and cx, cy are relative to the
+centre of the first pixel. Parameters that only one of the models has (b2 and k4 r^8 in ours; k4, k5, k6, s1..s4 and the tilts in
+OpenCV's) must be zero.
 """
 
 from __future__ import annotations
@@ -26,21 +30,25 @@ from sensors.cameras.camera import INTERIOR, Camera, Pose, checked_camera
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 """OpenCV's distortion coefficients in their order; a file may end after 4, 5, 8, 12 or 14 of them."""
 _MOST_BYTES = 4_000_000
-"""Of a calibration, which has some thousand."""
+"""Largest size of a calibration file, which normally has some thousand bytes."""
 _LENGTHS = (4, 5, 8, 12, 14)
+"""Possible numbers of distortion coefficients."""
 _SHARED = ("k1", "k2", "k3", "p1", "p2")
+"""Coefficients that our camera model has too."""
 _NAMES = {
     "matrix": ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "M"),
     "distortion": ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D"),
     "width": ("image_width", "image_Width", "imageWidth", "width"),
     "height": ("image_height", "image_Height", "imageHeight", "height"),
 }
-"""What programs that write with FileStorage call these, OpenCV's own samples first."""
+"""Names of these values in files of different programs, OpenCV's own samples first."""
 
 
 @dataclass(frozen=True)
 class OpencvInterior:
-    """Interior orientation in OpenCV's terms, px; but cx, cy from the frame's corner, as COLMAP has them (OpenCV's plus 0.5)."""
+    """Interior orientation in OpenCV's terms, px, except that cx, cy are relative to the frame's corner, as in COLMAP (OpenCV's
+    plus 0.5).
+    """
 
     fx: float
     fy: float
@@ -54,7 +62,7 @@ class OpencvInterior:
 
     @classmethod
     def of(cls, camera: Camera, where: str) -> OpencvInterior:
-        """The interior orientation of `camera`; raises InputError that names a parameter which OpenCV's model does not have."""
+        """Convert the interior orientation of `camera`; raise InputError if OpenCV's model lacks one of its parameters."""
         for name, meaning in (("b2", "skew"), ("k4", "radial distortion, r^8")):
             if getattr(camera, name) != 0:
                 what = f"{name} = {getattr(camera, name):g} ({meaning}) has no counterpart in OpenCV's camera model"
@@ -66,14 +74,21 @@ class OpencvInterior:
         return cls(camera.f_px + camera.b1, camera.f_px, *principal, *radial, camera.p2, camera.p1, camera.k3)
 
     def camera(self, width: float, height: float, where: str, pose: Pose | None = None) -> Camera:
-        """The camera of this interior orientation; pose: in the world, else at the origin; where: what errors call it."""
+        """Convert to our camera model.
+
+        Parameters
+        ----------
+        width, height : Size of the frame, px.
+        where : Name of the file, for errors.
+        pose : Pose in the world; None: at the origin.
+        """
         interior = dict.fromkeys(INTERIOR, 0.0) | {"f_px": self.fy, "b1": self.fx - self.fy, "p1": self.p2, "p2": self.p1}
         interior |= {"cx_px": self.cx - width / 2, "cy_px": self.cy - height / 2, "k1": self.k1, "k2": self.k2, "k3": self.k3}
         return checked_camera(where, (width, height), interior, pose or (np.zeros(3), np.eye(3)))
 
 
 def shared_distortion(values: dict[str, float], where: str) -> dict[str, float]:
-    """The distortion coefficients that Metashape's model has too; raises InputError where another one is not zero."""
+    """Return the distortion coefficients that our model has too; raise InputError if another one is not zero."""
     for name, value in values.items():
         if name not in _SHARED and value != 0:
             what = f"{name} = {value:g} has no counterpart in Metashape's camera model"
@@ -82,31 +97,31 @@ def shared_distortion(values: dict[str, float], where: str) -> dict[str, float]:
 
 
 def read_opencv(path: Path) -> Camera:
-    """Read a calibration that FileStorage wrote; the camera stands at the origin.
+    """Read a calibration written by FileStorage; the camera is placed at the origin.
 
-    Raises InputError for a file that is not OpenCV's, lacks a part or holds a coefficient that our model does not have.
+    Raises InputError if the file is not OpenCV's, is incomplete, or has a coefficient that our model lacks.
     """
     check_file(path, most_bytes=_MOST_BYTES)
     try:
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
         parts = {part: _first(storage, names) for part, names in _NAMES.items()}
         storage.release()
-    except (cv2.error, SystemError):  # OpenCV 5 sets the one while it returns, so that Python raises the other
-        raise InputError("is no whole file of OpenCV's FileStorage", where=str(path)) from None
+    except (cv2.error, SystemError):  # OpenCV 5 may return with an error set, for which Python raises SystemError
+        raise InputError("is not a complete file of OpenCV's FileStorage", where=str(path)) from None
     for part, value in parts.items():
         if value is None:
             raise InputError(f"has no {part}", where=str(path), allowed=", ".join(_NAMES[part]))
     if np.ndim(parts["width"]) or np.ndim(parts["height"]):
-        raise InputError("width and height are no numbers", where=str(path))
+        raise InputError("width and height are not numbers", where=str(path))
     return _camera(
         (parts["width"], parts["height"]), np.asarray(parts["matrix"], float), np.ravel(parts["distortion"]), str(path)
     )
 
 
 def write_opencv(path: Path, camera: Camera) -> None:
-    """Write a calibration with FileStorage, in the format of the path's suffix (.xml, .yml, .yaml, .json); without the pose.
+    """Write a calibration, without the pose, with FileStorage in the format of the suffix (.xml, .yml, .yaml, .json).
 
-    Raises InputError where OpenCV's model lacks a parameter that is not zero (b2, k4).
+    Raises InputError if OpenCV's model lacks a parameter that is not zero (b2, k4).
     """
     interior = OpencvInterior.of(camera, str(path))
     matrix = np.array([[interior.fx, 0.0, interior.cx - 0.5], [0.0, interior.fy, interior.cy - 0.5], [0.0, 0.0, 1.0]])
@@ -120,21 +135,21 @@ def write_opencv(path: Path, camera: Camera) -> None:
 
 
 def read_opencv_text(path: Path) -> Camera:
-    """Read width, height, the nine elements of the camera matrix by rows and 4 to 14 distortion coefficients as plain numbers."""
+    """Read a calibration of plain numbers: width, height, the camera matrix by rows, and 4 to 14 distortion coefficients."""
     words = read_text(path, most_bytes=_MOST_BYTES).split()
     try:
         values = np.array([float(word) for word in words])
     except ValueError as error:
-        raise InputError(f"holds something that is no number ({error})", where=str(path)) from None
+        raise InputError(f"contains something that is not a number ({error})", where=str(path)) from None
     if len(values) < 15:
         raise InputError(
-            f"holds {len(values)} numbers", where=str(path), allowed="2 (size), 9 (camera matrix), 4 to 14 (distortion)"
+            f"has {len(values)} numbers", where=str(path), allowed="2 (size), 9 (camera matrix), 4 to 14 (distortion)"
         )
     return _camera((values[0], values[1]), values[2:11].reshape(3, 3), values[11:], str(path))
 
 
 def _first(storage: Any, names: tuple[str, ...]) -> Any:
-    """The first of the named nodes, as a matrix or a number; None where there is none."""
+    """Return the first of the named nodes that exists, as a matrix or a number; None if there is none."""
     nodes = (storage.getNode(name) for name in names)
     node = next((node for node in nodes if not node.empty()), None)
     if node is None:
@@ -143,12 +158,13 @@ def _first(storage: Any, names: tuple[str, ...]) -> Any:
 
 
 def _camera(size: tuple[float, float], matrix: FloatArray, distortion: FloatArray, where: str) -> Camera:
+    """Return the camera of a calibration."""
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or min(size) <= 0 or min(matrix[0, 0], matrix[1, 1]) <= 0:
-        raise InputError("holds no camera matrix with positive fx, fy and frame size", where=where)
+        raise InputError("has no camera matrix with positive fx, fy and frame size", where=where)
     if matrix[0, 1] != 0:
         raise InputError(f"the camera matrix has the skew {matrix[0, 1]:g}", where=where, allowed="0, as in OpenCV's own model")
     if len(distortion) not in _LENGTHS:
-        raise InputError(f"holds {len(distortion)} distortion coefficients", where=where, allowed="4, 5, 8, 12 or 14")
+        raise InputError(f"has {len(distortion)} distortion coefficients", where=where, allowed="4, 5, 8, 12 or 14")
     coefficients = dict(zip(DISTORTION, distortion.astype(float).tolist(), strict=False))
     fx, fy, cx, cy = (float(value) for value in matrix[[0, 1, 0, 1], [0, 1, 2, 2]])
     return OpencvInterior(fx, fy, cx + 0.5, cy + 0.5, **shared_distortion(coefficients, where)).camera(*size, where)

@@ -1,5 +1,5 @@
-"""Hold what all readers and writers share: atomic files, checksums, locks, safe XML and safe names.
+"""Write files safely: completely or not at all, by one writer at a time, in their own folder; checksums and XML of other
+programs.
 
-Nothing here knows what a file contains.
-Start with `atomic.py`: every product is written under a temporary name and then renamed.
+Formats themselves are in the other subfolders of `pipeline/formats`. Start with `atomic.py`.
 """

@@ -1,4 +1,4 @@
-"""Files that are either whole or absent: written under a temporary name in the same folder, then renamed."""
+"""Write files completely or not at all: under a temporary name in the same folder, then renamed."""
 
 from __future__ import annotations
 
@@ -22,22 +22,27 @@ _FULL = {
     errno.EDQUOT: "the disk quota is used up",
     errno.EFBIG: "the file exceeds the size limit",
 }
+"""Messages for errors of a full disk."""
 _FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
+"""Errors of missing permissions."""
 _NO_SUCH_PLACE = {errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.EEXIST, errno.ENOENT}
+"""Errors of impossible paths."""
 _ELSEWHERE = "choose another folder with --out"
 
 
 _noted: ContextVar[list[Path] | None] = ContextVar("noted", default=None)
+"""Files written in the innermost `noting` block."""
 
 
 @contextmanager
 def writing(path: Path) -> Iterator[Path]:
-    """Give a temporary path to write to; it becomes `path` when the block ends well and vanishes when it does not.
+    """Provide a temporary path to write to, which becomes `path` if the block succeeds and is removed if it fails.
 
-    Missing folders are made. The temporary lies in the folder of `path` and keeps its suffix, so that libraries that choose a
-    format by the suffix do so; it has one name per target, so that what a killed process left is overwritten by the next. The
-    bytes are on the disk before the name is, so that a power failure leaves no empty file with it.
-    Raises InputError for a full disk, a folder without permission to write and a path that cannot be a file.
+    Missing folders are created. The temporary file is in the folder of `path` and keeps its suffix, as libraries may choose a
+    format by it. Its name depends on the target only, so that the next run overwrites what a killed process left. The content is
+    on the disk before the name, so that a power failure leaves no empty file.
+
+    Raises InputError for a full disk, a folder without write permission, or a path that cannot be a file.
     """
     temporary = path.with_name(f".{path.stem}.part{path.suffix}")
     with _made_for(path.parent):
@@ -53,7 +58,9 @@ def writing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _made_for(folder: Path) -> Iterator[None]:
-    """A block that may make `folder` and those above it: where it fails, those that it made go again, if they are empty."""
+    """Allow the block to create `folder` and its parents; if it fails, those that it created are removed again if they
+    are empty.
+    """
     made = _missing(folder)
     try:
         yield
@@ -63,19 +70,20 @@ def _made_for(folder: Path) -> Iterator[None]:
 
 
 def _missing(folder: Path) -> list[Path]:
-    """`folder` and those above it that are not there, the inner ones first."""
+    """Return `folder` and those of its parents that do not exist, the inner ones first."""
     return [each for each in (folder, *folder.parents) if not os.path.lexists(each)]
 
 
 def _remove_empty(folders: list[Path]) -> None:
+    """Remove folders that are empty."""
     for each in folders:
-        with suppress(OSError, ValueError):  # is not there, holds something, or cannot be a name
+        with suppress(OSError, ValueError):  # does not exist, is not empty, or has an impossible name
             each.rmdir()
 
 
 @contextmanager
 def explained(path: Path) -> Iterator[None]:
-    """Turn an operating system's error about `path` that a person can mend into an InputError."""
+    """Turn an operating system's error about `path` that the user can solve into an InputError."""
     try:
         yield
     except OSError as error:
@@ -84,7 +92,7 @@ def explained(path: Path) -> Iterator[None]:
 
 @contextmanager
 def noting() -> Iterator[list[Path]]:
-    """A list of the files that get their names by `writing` in the block, in this thread; blocks may be nested."""
+    """Collect the files that `writing` completes in the block, in this thread; blocks may be nested."""
     outer, found = _noted.get(), list[Path]()
     token = _noted.set(found)
     try:
@@ -96,35 +104,35 @@ def noting() -> Iterator[list[Path]]:
 
 
 def note(path: Path) -> None:
-    """Add a file to the list of the `noting` around."""
+    """Add a file to the list of the surrounding `noting` block."""
     found = _noted.get()
     if found is not None:
         found.append(path)
 
 
 def remove_written(out: Path, written: list[Path]) -> None:
-    """Remove files (of a `noting`), and the folders in `out` that hold nothing else; what others put beside them stays."""
+    """Remove files collected by `noting`, and folders in `out` that are then empty; files of others stay."""
     for path in written:
-        with suppress(OSError):  # is gone: it was renamed with its folder
+        with suppress(OSError):  # was renamed with its folder
             path.unlink()
     folders = {folder for path in written for folder in path.parents if out in folder.parents}
     for folder in sorted(folders, reverse=True):  # the inner ones first
-        with suppress(OSError):  # is gone, or holds another's file
+        with suppress(OSError):  # does not exist, or contains files of others
             folder.rmdir()
 
 
 def give_name(temporary: Path, path: Path) -> None:
-    """Rename a file or folder to `path`, both on the disk: the bytes before, the name after."""
+    """Rename a file or folder to `path`, writing its content to the disk first and its name afterwards."""
     to_disk(temporary)
     temporary.replace(path)
     to_disk(path.parent)
 
 
 def to_disk(path: Path) -> None:
-    """Wait until a file's bytes, or a folder's names, are on the disk, as far as the file system can tell."""
+    """Wait until a file's content, or a folder's entries, are on the disk, as far as the file system can tell."""
     try:
         file = os.open(path, os.O_RDONLY)
-    except PermissionError:  # may be written and not read
+    except PermissionError:  # is writable but not readable
         return
     try:
         os.fsync(file)
@@ -136,14 +144,14 @@ def to_disk(path: Path) -> None:
 
 
 def new_folder(parent: Path, name: str) -> Path:
-    """A path under `parent` that is not there yet, called after `name` and the time."""
+    """Return a path under `parent` that does not exist yet, named after `name` and the time."""
     stem = f"{name}_{datetime.now():%Y%m%d_%H%M%S}"
     names = (stem if number == 1 else f"{stem}_{number}" for number in range(1, 1000))
     return next(parent / free for free in names if not (parent / free).exists())
 
 
 def empty_folder(out: Path, remedy: str = "choose another --out") -> Path:
-    """`out` itself, if it is new or empty; InputError, naming --out, where it is in use or cannot be made."""
+    """Return `out` if it is new or empty; raise InputError, naming --out, if it is in use or cannot be created."""
     check_place(out)
     if out.exists() and any(out.iterdir()):
         raise InputError("exists and is not an empty folder", where=f"--out {out}", remedy=remedy)
@@ -151,7 +159,7 @@ def empty_folder(out: Path, remedy: str = "choose another --out") -> Path:
 
 
 def check_place(out: Path) -> None:
-    """Raise InputError, naming --out, where `out` cannot be a folder that is written into; it is tried, and nothing stays."""
+    """Raise InputError, naming --out, if `out` cannot be a writable folder; it is created as a test and removed again."""
     made = _missing(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -159,16 +167,16 @@ def check_place(out: Path) -> None:
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     except (OSError, ValueError) as error:  # ValueError: a null character
         reason = getattr(error, "strerror", None) or "a null character in its name"
-        raise InputError(f"cannot be a folder to write into ({reason})", where=f"--out {out}", remedy=_ELSEWHERE) from None
+        raise InputError(f"cannot be used as a folder ({reason})", where=f"--out {out}", remedy=_ELSEWHERE) from None
     finally:
         _remove_empty(made)
 
 
 @contextmanager
 def filling(out: Path) -> Iterator[Path]:
-    """Give a temporary folder to fill; what is in it appears in `out` when the block ends well, and vanishes when it does not.
+    """Provide a temporary folder whose content moves to `out` if the block succeeds, and is removed if it fails.
 
-    Raises InputError where `out` is in use, and as `writing` does.
+    Raises InputError if `out` is in use, and as `writing` does.
     """
     empty_folder(out)
     temporary = out / ".part" if out.exists() else out.absolute().with_name(f".{out.absolute().name}.part")
@@ -187,26 +195,29 @@ def filling(out: Path) -> Iterator[Path]:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write `data`, whole or not at all."""
+    """Write `data`, completely or not at all."""
     with writing(path) as temporary:
         temporary.write_bytes(data)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write `text` as UTF-8 with the line ends it has, whole or not at all; what is no character, such as the bytes of a file's
-    name in another encoding, is written as \\udcf6."""
+    """Write `text` as UTF-8 with its own line ends, completely or not at all.
+
+    What is not a character, such as bytes of a file name in another encoding, is written as an escape sequence.
+    """
     write_bytes(path, text.encode(errors="backslashreplace"))
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON in the order of the keys; NumPy scalars and arrays become numbers and lists, paths become strings.
+    """Write JSON in the order of the keys; NumPy values become numbers and lists, paths become strings.
 
-    Raises ValueError for NaN and infinity, which JSON does not know: give None for a value that is not there.
+    Raises ValueError for NaN and infinity, which JSON does not have; use None for a missing value.
     """
     write_text(path, json.dumps(value, indent=2, allow_nan=False, default=_plain) + "\n")
 
 
 def _plain(value: Any) -> Any:
+    """Convert NumPy values and paths for JSON."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     if isinstance(value, Path):
@@ -215,34 +226,36 @@ def _plain(value: Any) -> Any:
 
 
 def _as_input_error(error: OSError, path: Path) -> Exception:
-    """What a person can mend, as an InputError; any other error as it is."""
+    """Return an error that the user can solve as an InputError, and any other error unchanged."""
     where, code = str(path), error.errno or _numpy_errno(error)
     if code in _FULL:
         free = shutil.disk_usage(_existing(path)).free / 1e6
         return InputError(f"{_FULL[code]}, {free:,.0f} MB are free", where=where, remedy=f"make room or {_ELSEWHERE}")
     if code in _FORBIDDEN:
-        return InputError(f"may not be written ({error.strerror})", where=where, remedy=f"change the permissions or {_ELSEWHERE}")
+        return InputError(f"cannot be written ({error.strerror})", where=where, remedy=f"change the permissions or {_ELSEWHERE}")
     if code in _NO_SUCH_PLACE:
         return InputError(f"cannot be a file ({error.strerror})", where=where, remedy=_ELSEWHERE)
     return error
 
 
 def _numpy_errno(error: OSError) -> int:
-    """ndarray.tofile, which tifffile uses, tells a full disk by its words alone: "1000 requested and 10 written"."""
+    """Return ENOSPC for the error of ndarray.tofile (used by tifffile), which describes a full disk only in words."""
     return errno.ENOSPC if "requested and" in str(error) else 0
 
 
 def _existing(path: Path) -> Path:
-    """The nearest folder above `path` that exists."""
+    """Return the nearest existing folder above `path`."""
     return next(folder for folder in path.absolute().parents if folder.exists())
 
 
 def _remove_folder(temporary: Path) -> None:
+    """Remove a folder with its content."""
     shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _remove(temporary: Path) -> None:
+    """Remove a file."""
     try:
         temporary.unlink(missing_ok=True)
-    except OSError:  # the folder cannot be written, so there is nothing of ours in it
+    except OSError:  # the folder is not writable, so it contains no temporary file
         return

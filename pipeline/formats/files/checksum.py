@@ -9,10 +9,11 @@ from scene.common.errors import InputError
 from scene.common.regular_file import check_file
 
 _MOST_BYTES = 16_000_000_000
+"""Largest size of a file; larger ones would take minutes."""
 
 
 def sha256(path: Path) -> str:
-    """The checksum of a file, in hexadecimal; raises InputError where it cannot be read, or is of a size that takes minutes."""
+    """Return the SHA-256 of a file in hexadecimal; raise InputError if it cannot be read or is too large."""
     check_file(path, most_bytes=_MOST_BYTES, smaller="cut it to the scene")
     try:
         with path.open("rb") as file:

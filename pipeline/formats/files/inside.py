@@ -1,4 +1,4 @@
-"""Names that come from a file: joined to a folder they stay in it."""
+"""Join file names from a file to a folder without leaving that folder."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from scene.common.errors import InputError
 
 
 def inside(folder: Path, name: Any, where: Path | str) -> Path:
-    """`folder / name`, for a name that the file `where` holds.
+    """Return `folder / name`, for a name that the file `where` contains.
 
-    Raises InputError for a name that leads out of the folder: an absolute one, one with `..`, or a link to elsewhere.
+    Raises InputError for a name that leads out of the folder: an absolute path, one with `..`, or a link to elsewhere.
     """
     if not isinstance(name, str) or not name.strip() or not name.isprintable():
         raise InputError(f"names a file {name!r:.80}", where=str(where), allowed="a file name")
@@ -19,12 +19,12 @@ def inside(folder: Path, name: Any, where: Path | str) -> Path:
     try:
         leads_out = pure.is_absolute() or ".." in pure.parts or not path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError) as error:  # too long, a loop of links
-        raise InputError(f"names the file '{name:.80}', which cannot be ({error})", where=str(where)) from None
+        raise InputError(f"names the file '{name:.80}', which is impossible ({error})", where=str(where)) from None
     if leads_out:
         raise InputError(
             f"names the file '{name:.80}', which lies outside of its folder",
             where=str(where),
             allowed=f"files in {folder}",
-            remedy="mend the name, or put the file there",
+            remedy="correct the name, or put the file there",
         )
     return path

@@ -1,4 +1,4 @@
-"""One writer to a folder: a lock file that the kernel releases with its process, however that ends."""
+"""Allow one writer at a time in a folder, by a lock file that the kernel releases with its process, however that ends."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ LOCK = ".lock"
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold `folder`, which is made where it is missing; at the end the lock's file goes, and folders made here that are empty.
+    """Hold the lock of `folder`, creating the folder if needed; afterwards, remove the lock file and created folders that are
+    empty.
 
-    Raises InputError where another process holds it, or where no folder can be.
+    Raises InputError if another process holds it, or the folder cannot be created.
     """
     if folder.exists() and not folder.is_dir():
         raise InputError("is a file", where=f"--out {folder}", remedy="choose a folder")
@@ -33,27 +34,27 @@ def locked(folder: Path) -> Iterator[None]:
         file.flush()
         yield
     finally:
-        path.unlink(missing_ok=True)  # before it is released: who waits for it looks whether the file is still there
+        path.unlink(missing_ok=True)  # removed before release: a waiting process checks whether the file still exists
         file.close()
         for each in missing:
-            with suppress(OSError):  # holds what was made
+            with suppress(OSError):  # is not empty
                 each.rmdir()
 
 
 def is_free(folder: Path) -> bool:
-    """Whether a folder holds nothing but a lock."""
+    """Whether a folder contains nothing but a lock."""
     return folder.is_dir() and all(path.name == LOCK for path in folder.iterdir())
 
 
 def _held(path: Path) -> TextIO:
-    """The open lock file, locked and empty."""
+    """Open and lock the lock file, and empty it."""
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.exists() and not path.is_file():
-            raise InputError("is no file", where=str(path), allowed="a lock file or none", remedy="remove it")
+            raise InputError("is not a file", where=str(path), allowed="a lock file or none", remedy="remove it")
         try:
             file = path.open("a+", encoding="utf-8")
-        except FileNotFoundError:  # the last holder has just removed the folder that it made
+        except FileNotFoundError:  # the last holder has just removed the folder that it created
             continue
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -68,4 +69,4 @@ def _held(path: Path) -> TextIO:
             if os.path.samestat(path.stat(), os.fstat(file.fileno())):
                 file.truncate(0)
                 return file
-        file.close()  # its holder removed it between our opening and our locking it
+        file.close()  # its holder removed it after we opened and before we locked it

@@ -1,4 +1,4 @@
-"""Folders that a command makes within its own: what else may stand in their places when it goes on."""
+"""Check folders that a command creates inside its own folder before it continues there."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from scene.common.errors import InputError
 
 
 def require_own_folder(path: Path) -> None:
-    """Raise InputError unless `path` is a folder or nothing: a file, a pipe (which `rmtree` waits at for ever), a link out."""
+    """Raise InputError unless `path` is a folder or does not exist; a file, a pipe (at which `rmtree` waits forever) and a link
+    are refused.
+    """
     if os.path.lexists(path) and (path.is_symlink() or not path.is_dir()):
-        raise InputError("is no folder", where=str(path), remedy="move it away, a folder of the command's own belongs there")
+        raise InputError("is not a folder", where=str(path), remedy="move it away, the command needs its own folder there")

@@ -1,4 +1,4 @@
-"""XML of other programs, read without the entities by which a small file fills the memory."""
+"""Read XML of other programs, without entities, by which a small file could fill the memory."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scene.common.regular_file import MOST_TEXT_BYTES, check_file
 
 
 def read_root(path: Path) -> ElementTree.Element:
-    """The root of an XML file; raises InputError for a file that is none, or that declares entities."""
+    """Return the root of an XML file; raise InputError if it is not XML or declares entities."""
     check_file(path, most_bytes=MOST_TEXT_BYTES)
     try:
         text = path.read_bytes()
@@ -20,7 +20,7 @@ def read_root(path: Path) -> ElementTree.Element:
 
 
 def parsed(text: bytes, where: str) -> ElementTree.Element:
-    """The root of what stands in an XML file."""
+    """Return the root of XML text."""
     if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
         raise InputError("declares entities, which could fill the memory", where=where, remedy="export it again without them")
     try:

@@ -1,6 +1,6 @@
-"""What a measurement must hold before it is used: points that are numbers, look at the reference and fit the pattern.
+"""Check a measurement before it is used: points must be finite, be near the reference, and fit the scan pattern.
 
-Rays with NaN or infinity never reach the ray tracer, and nothing here takes more than a sample of the points.
+Rays with NaN or infinity never reach the ray tracer. No check uses more than a sample of the points.
 """
 
 from __future__ import annotations
@@ -21,40 +21,52 @@ from sensors.effects.base import Sensor
 from sensors.signal_chain.polar import polar
 
 Sweep = tuple[float, float, float]
+"""Start, stop and step of an angle, rad."""
 _SAMPLE = 20_000
+"""Number of points in the sample."""
 _FEWEST_HITS, _FEWEST_NEAR = 0.01, 0.25
-"""Share of the points whose rays must meet the reference, and of these the share that must lie near it."""
+"""Smallest share of the points whose rays meet the reference, and smallest share of these that are near it."""
 _NEAR_M, _NEAR_SHARE = 1.0, {"tls": 0.02, "stereo": 0.06}
-"""A point is near the reference within this distance along its ray, or within this share of its range if that is more: a camera
-that is turned by 4 mrad more than is known moves what lies ten bases away by 4 %."""
+"""A point is near the reference within this distance along its ray, m, or within this share of its range if that is more: a
+camera that is rotated by 4 mrad moves what is ten bases away by 4 %.
+"""
 _FEWEST_INSIDE = 0.5
-"""Share of the points that must lie within the pattern's angles."""
+"""Smallest share of the points within the pattern's angles."""
 _PULSES_PER_POINT, _FEW_PULSES = 100.0, 1e6
-"""A pattern has no more pulses than so many for each point, or than so many in all."""
+"""A pattern has at most so many pulses for each point, or so many in total."""
 _POINTS_PER_PULSE = 4.0
-"""On average; more echoes than that come from no scene."""
+"""Largest mean number of points for each pulse; no scene gives more echoes."""
 _ONE_PLACE_M = 1e-6
+"""Points within this distance are at the same place, m."""
 _LINE_POINTS = 10
-"""So many points on one line are no chance."""
+"""Number of points from which lying on one line is not a coincidence."""
 _SHORTEST_BASE_M = 1e-3
+"""Shortest base of a stereo pair, m."""
 _FEWEST_SEEN = 0.05
-"""Share of the points that both cameras must see."""
+"""Smallest share of the points that both cameras see."""
 _LARGEST_POWER = 1e12
+"""Largest relative received power."""
 _MOST_OFF = 0.05
-"""Share of the frame's width that given pixels may lie off on the median: a registration moves points by some centimetres."""
+"""Largest median deviation of given pixels, as a share of the frame's width; a registration moves points by some centimetres."""
 _LEAST_SIGMA = {
     "tls": (1e-6, "m", "range_sigma_m"),
     "stereo": (2e-4, "px", "parallax_sigma_px"),
     "surface": (1e-7, "m", "point_sigma_m"),
 }
-"""By sensor, and of a surface without cameras: a smaller predicted spread is none; its unit; the key that says more."""
+"""Smallest predicted standard deviation by sensor, and of a surface without cameras; its unit, and the key that sets it."""
 
 
 @dataclass(frozen=True)
 class PointFit:
-    """How a sample of the points lies against the reference. hits: share whose rays meet it; near: of these, share near it;
-    off_m: median distance behind it along the rays (negative: before it), NaN without hits; reach: share of the range within
-    which a point is near."""
+    """How a sample of the points fits the reference.
+
+    Attributes
+    ----------
+    hits : Share of the points whose rays meet the reference.
+    near : Share of these that are near it.
+    off_m : Median distance behind it along the rays, m (negative: in front); NaN without hits.
+    reach : Share of the range within which a point is near.
+    """
 
     hits: float
     near: float
@@ -63,7 +75,7 @@ class PointFit:
 
     @classmethod
     def of(cls, points: FloatArray, origin: FloatArray, reference: RayCaster, sensor: Sensor) -> PointFit:
-        """points: (n, 3), origin: (3,) of the rays; wall frame, m."""
+        """Compare points (n, 3) with the reference along their rays from the origin (3,), wall frame, m."""
         reach = _NEAR_SHARE[sensor]
         away = points[:: max(len(points) // _SAMPLE, 1)] - origin
         length = np.linalg.norm(away, axis=1)
@@ -80,14 +92,14 @@ class PointFit:
 
     @property
     def good(self) -> bool:
-        """Whether the points are of this surface."""
+        """Whether the points belong to this surface."""
         return self.hits >= _FEWEST_HITS and self.near >= _FEWEST_NEAR
 
 
 def finite(cloud: PointCloud, where: str) -> PointCloud:
-    """The points whose coordinates and recorded values are numbers.
+    """Return the points whose coordinates and recorded values are finite.
 
-    Raises InputError where there are none, or all are one, or on one line.
+    Raises InputError if there are none, or all are at one place or on one line.
     """
     channels = [cloud.intensity, cloud.gps_time, *(cloud.extra.get(name) for name in ("pixel_x", "pixel_y"))]
     keep: NDArray[np.bool_] = np.all(np.isfinite(cloud.points), axis=1)
@@ -95,17 +107,17 @@ def finite(cloud: PointCloud, where: str) -> PointCloud:
         if channel is not None:
             keep = keep & np.isfinite(channel)
     if not keep.any():
-        problem = f"holds no point with finite values ({len(keep):,} are NaN or infinite)" if len(keep) else "holds no points"
+        problem = f"has no point with finite values ({len(keep):,} are NaN or infinite)" if len(keep) else "has no points"
         raise InputError(problem, where=where, remedy="export the points again")
     if keep.sum() > 1 and np.ptp(cloud.points[keep], axis=0).max() < _ONE_PLACE_M:
-        raise InputError(f"all {keep.sum():,} points are the same one", where=where, remedy="export the points again")
+        raise InputError(f"all {keep.sum():,} points are at the same place", where=where, remedy="export the points again")
     if keep.sum() >= _LINE_POINTS and _on_a_line(cloud.points[keep]):
         raise InputError(f"all {keep.sum():,} points lie on one line", where=where, remedy="give a scan of a surface")
     return cloud if keep.all() else cloud.part(keep)
 
 
 def _on_a_line(points: FloatArray) -> bool:
-    """Whether a sample of points (n, 3) departs from a line by no more than rounding does."""
+    """Whether a sample of points (n, 3) deviates from a line by no more than rounding."""
     away = points[:: max(len(points) // _SAMPLE, 1)]
     away = away - away[len(away) // 2]
     axis = away[np.argmax(np.einsum("ni,ni->n", away, away))]
@@ -114,28 +126,30 @@ def _on_a_line(points: FloatArray) -> bool:
 
 
 def check_frame(here: PointFit, other: PointFit | None, frame: str, where: str) -> None:
-    """Raise InputError where the points do not look at the reference, naming the frame in which they would.
+    """Raise InputError if the points do not fit the reference, naming the frame in which they would.
 
-    here: in the frame that the file names, other: in the one that it does not.
+    here: fit in the frame that the file states; other: fit in the other frame.
     """
     if here.good:
         return
     if other is not None and other.good:
         fits = "world" if frame == "scanner" else "scanner"
-        problem = f"the points are no points of the reference in `frame: {frame}`, but are in `frame: {fits}`"
+        problem = f"the points do not fit the reference in `frame: {frame}`, but do in `frame: {fits}`"
         raise InputError(problem, where=where, remedy=f"write `frame: {fits}`")
     if here.hits < _FEWEST_HITS:
-        problem = f"{100 * here.hits:.2g} % of the points lie in a direction in which the sensor sees the reference"
+        problem = f"only {100 * here.hits:.2g} % of the points lie in directions in which the sensor sees the reference"
         remedy = "check `frame`, the sensor's position and rotation, and the coordinate system of points and reference (m)"
-        raise InputError(problem, where=where, allowed=f"{100 * _FEWEST_HITS:g} % and more", remedy=remedy)
+        raise InputError(problem, where=where, allowed=f"{100 * _FEWEST_HITS:g} % or more", remedy=remedy)
 
 
 def check_seen(pair: CameraPair, points: FloatArray, where: str) -> float:
-    """The share of the points (n, 3) that both cameras see, all in one frame. Raises InputError where that is next to nothing,
-    or the pair has no base."""
+    """Return the share of the points (n, 3) that both cameras see, all in one frame.
+
+    Raises InputError if it is almost zero, or the pair has no base.
+    """
     if pair.base_m < _SHORTEST_BASE_M:
         raise InputError(
-            f"the two cameras stand {pair.base_m:.3g} m apart", where=where, allowed=f"{_SHORTEST_BASE_M:g} m and more",
+            f"the two cameras stand {pair.base_m:.3g} m apart", where=where, allowed=f"{_SHORTEST_BASE_M:g} m or more",
             remedy="check `position_m` of left and right",
         )  # fmt: skip
     both, front = np.ones(len(points), dtype=bool), np.ones(len(points), dtype=bool)
@@ -155,13 +169,15 @@ def check_seen(pair: CameraPair, points: FloatArray, where: str) -> float:
     if both.mean() < _FEWEST_SEEN:
         raise InputError(
             f"both cameras see {100 * both.mean():.2g} % of the points", where=where,
-            allowed=f"{100 * _FEWEST_SEEN:g} % and more", remedy="check that cameras and points are of one project",
+            allowed=f"{100 * _FEWEST_SEEN:g} % or more", remedy="check that cameras and points are of one project",
         )  # fmt: skip
     return float(both.mean())
 
 
 def check_pixels(left: Camera, cloud: PointCloud, where: str) -> None:
-    """Raise InputError where the pixels of a cloud's points, if it has them, are not those that the left camera sees them in."""
+    """Raise InputError if the pixels of a cloud's points, if it has them, are not those in which the left camera sees
+    the points.
+    """
     if not {"pixel_x", "pixel_y"} <= set(cloud.extra):
         return
     x, y, z = np.einsum("ji,nj->in", left.rotation, cloud.points - left.position)
@@ -170,41 +186,41 @@ def check_pixels(left: Camera, cloud: PointCloud, where: str) -> None:
     off = float(np.median(np.hypot(cloud.extra["pixel_x"][ahead] - u, cloud.extra["pixel_y"][ahead] - v)))
     if not off <= _MOST_OFF * left.width:
         raise InputError(
-            f"pixel_x and pixel_y lie {off:,.0f} px from where the left camera sees the points (median)", where=where,
+            f"pixel_x and pixel_y are {off:,.0f} px from where the left camera sees the points (median)", where=where,
             allowed=f"up to {100 * _MOST_OFF:.0f} % of its width",
-            remedy="check that they are of the left picture, or leave them out",
+            remedy="check that they belong to the left picture, or leave them out",
         )  # fmt: skip
 
 
 def check_power(cloud: PointCloud, where: str) -> PointCloud:
-    """The cloud, if its intensity can be a received power; InputError for values below 0 or beyond any."""
+    """Return the cloud if its intensity can be a received power; raise InputError for negative or huge values."""
     power = cloud.intensity
     if power is None or (power.min(initial=0.0) >= 0 and power.max(initial=0.0) <= _LARGEST_POWER):
         return cloud
     raise InputError(
         f"has intensities from {power.min():.3g} to {power.max():.3g}", where=where,
         allowed=f"0 to {_LARGEST_POWER:g}, relative received power",
-        remedy="convert decibels, as 10^(dB / 10), or leave the intensity out; `scarpsim measurement` does so of raw files",
+        remedy="convert decibels by 10^(dB / 10), or leave out the intensity; `scarpsim measurement` does this for raw files",
     )  # fmt: skip
 
 
 def check_different(clouds: Mapping[str, PointCloud]) -> None:
-    """Raise InputError where two epochs, by name, have the same coordinates: noise is never the same twice."""
+    """Raise InputError if two epochs, by name, have the same coordinates, which noise never has."""
     known: dict[bytes, str] = {}
     for name, cloud in clouds.items():
         digest = hashlib.sha256(cloud.points.tobytes()).digest()
         if digest in known:
-            problem = f"holds the same points as {known[digest]}"
-            raise InputError(problem, where=name, remedy="give each epoch's own file, once")
+            problem = f"has the same points as {known[digest]}"
+            raise InputError(problem, where=name, remedy="give one file for each epoch")
         known[digest] = name
 
 
 def check_near_rays(here: PointFit, where: str) -> None:
-    """Raise InputError where most points lie far from the reference along their rays."""
+    """Raise InputError if most points are far from the reference along their rays."""
     if here.good:
         return
     problem = (
-        f"the points lie {abs(here.off_m):.3g} m {'behind' if here.off_m > 0 else 'before'} the reference (median along the rays)"
+        f"the points are {abs(here.off_m):.3g} m {'behind' if here.off_m > 0 else 'before'} the reference (median along rays)"
     )
     allowed = f"a quarter of them within {_NEAR_M:g} m or {100 * here.reach:g} % of the range"
     remedy = "check the sensor's position, the unit (m) and that points and reference are of one wall"
@@ -212,39 +228,39 @@ def check_near_rays(here: PointFit, where: str) -> None:
 
 
 def check_pulses(azimuth: Sweep, zenith: Sweep, points: int, epochs: int, where: str) -> None:
-    """Raise InputError for a pattern (start, stop, step) of far more pulses than points, or of too few for them."""
+    """Raise InputError for a pattern (start, stop, step) with far more pulses than points, or too few for them."""
     pulses = float(np.prod([(stop - start) // step + 1 for start, stop, step in (azimuth, zenith)]))
     most = max(_PULSES_PER_POINT * points, _FEW_PULSES)
     if points > _POINTS_PER_PULSE * pulses * epochs:
         raise InputError(
             f"'pattern' has {pulses:,.0f} pulses, too few for {points:,} points", where=where,
             allowed=f"at least one for {_POINTS_PER_PULSE:g} points of an epoch",
-            remedy="check the steps (third value, rad), or leave `pattern` out",
+            remedy="check the steps (third value, rad), or remove `pattern`",
         )  # fmt: skip
     if pulses > most:
         raise InputError(
-            f"'pattern' has {pulses:.3g} pulses, for {points:,} points", where=where, allowed=f"at most {most:.3g}",
-            remedy="check the steps (third value, rad), or leave `pattern` out",
+            f"'pattern' has {pulses:.3g} pulses for {points:,} points", where=where, allowed=f"at most {most:.3g}",
+            remedy="check the steps (third value, rad), or remove `pattern`",
         )  # fmt: skip
 
 
 def check_inside(points: FloatArray, azimuth: Sweep, zenith: Sweep, where: str) -> None:
-    """Raise InputError where a pattern does not hold the points (n, 3), scanner frame."""
+    """Raise InputError if a pattern does not contain the points (n, 3), scanner frame."""
     _, around, down = polar(points)
     turned = np.mod(around - azimuth[0] + azimuth[2], 2 * np.pi)
     inside = turned <= azimuth[1] - azimuth[0] + 2 * azimuth[2]
     inside &= (down >= zenith[0] - zenith[2]) & (down <= zenith[1] + zenith[2])
     if inside.mean() < _FEWEST_INSIDE:
         raise InputError(
-            f"'pattern' holds {100 * inside.mean():.2g} % of the points", where=where,
-            allowed=f"{100 * _FEWEST_INSIDE:g} % and more",
-            remedy="azimuth is atan2(y, x), zenith counts from +z, both in the scanner frame, rad; or leave `pattern` out",
+            f"'pattern' contains {100 * inside.mean():.2g} % of the points", where=where,
+            allowed=f"{100 * _FEWEST_INSIDE:g} % or more",
+            remedy="azimuth is atan2(y, x), zenith is measured from +z, both in the scanner frame, rad; or remove `pattern`",
         )  # fmt: skip
 
 
 def check_noise(of: str, sigma: FloatArray) -> None:
-    """Raise InputError where the model predicts no spread (n,), against which no residual means anything."""
+    """Raise InputError if the model predicts almost no noise (n,), so that standardised residuals would be meaningless."""
     least, unit, key = _LEAST_SIGMA[of]
     if sigma.min(initial=np.inf) < least:
-        problem = f"the model predicts a spread of {sigma.min():.2g} {unit}"
-        raise InputError(problem, where="model.yaml: noise", allowed=f"{least:g} {unit} and more", remedy=f"state `{key}`")
+        problem = f"the model predicts a standard deviation of {sigma.min():.2g} {unit}"
+        raise InputError(problem, where="model.yaml: noise", allowed=f"{least:g} {unit} or more", remedy=f"set `{key}`")

@@ -1,4 +1,4 @@
-"""The file measurement.yaml: its keys and what they may hold."""
+"""The keys of measurement.yaml and their allowed values."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from pipeline.formats.measurements.scanner_poses import ScannerPose, ScannerScan
 from scene.common.config import Config
 
 MOST_EPOCHS = 1000
+"""Largest number of epochs."""
 
 
 class ScanPattern(Config):
-    """The nominal directions of a scan: start, stop and step of each angle."""
+    """Nominal directions of a scan: start, stop and step of each angle."""
 
     azimuth_rad: Sweep = Field(description="start, stop, step [rad]; or azimuth_deg")
     zenith_rad: Sweep = Field(description="start, stop, step [rad]; or zenith_deg")
@@ -25,6 +26,7 @@ class ScanPattern(Config):
     @model_validator(mode="before")
     @classmethod
     def _from_degrees(cls, values: Any) -> Any:
+        """Convert angles in degrees."""
         if not isinstance(values, dict):
             return values
         found = dict(values)
@@ -32,19 +34,19 @@ class ScanPattern(Config):
             sweep = found.get(f"{name}_deg")
             if isinstance(sweep, list | tuple) and all(isinstance(each, int | float) for each in sweep):
                 if f"{name}_rad" in found:
-                    raise ValueError(f"'{name}_deg' stands beside '{name}_rad'; give one of them")
+                    raise ValueError(f"'{name}_deg' and '{name}_rad' are both given; keep one")
                 found[f"{name}_rad"] = [math.radians(each) for each in found.pop(f"{name}_deg")]
         return found
 
     @field_validator("azimuth_rad", "zenith_rad")
     @classmethod
     def _forward(cls, sweep: Sweep) -> Sweep:
-        """A sweep of a scanner that turns the other way (step below 0) is the same directions from its other end."""
+        """Reverse the sweep of a scanner that turns the other way (step below 0): the directions are the same."""
         start, stop, step = sweep
         if step < 0 and stop < start:
             sweep = start + step * math.floor((stop - start) / step + 1e-6), start, -step
         if not (sweep[2] > 0 and sweep[1] > sweep[0]):
-            raise ValueError("needs start < stop and a step above 0, or start > stop and a step below 0")
+            raise ValueError("needs start < stop and a positive step, or start > stop and a negative step")
         if max(map(abs, sweep)) > 2 * math.pi:
             raise ValueError(
                 f"is beyond a full turn; angles are in radians: {sweep[1]:g} degrees are {math.radians(sweep[1]):.4g}"
@@ -54,64 +56,67 @@ class ScanPattern(Config):
     @field_validator("zenith_rad")
     @classmethod
     def _above_nadir(cls, sweep: Sweep) -> Sweep:
+        """Check that zenith angles are between 0 and pi."""
         if sweep[0] < -sweep[2] or sweep[1] > math.pi + sweep[2]:
             raise ValueError("zenith angles run from 0, straight up, to pi, straight down")
         return sweep
 
 
 class MeasurementConfig(Config):
-    """The file measurement.yaml."""
+    """Content of measurement.yaml."""
 
     sensor: Literal["tls", "stereo"]
-    reference: Path = Field(description="the surface as known, world frame, m")
+    reference: Path = Field(description="reference surface, world frame, m")
     points: Path | Annotated[list[Path], Field(max_length=MOST_EPOCHS)] = Field(description="point cloud; several epochs: a list")
-    frame: Literal["scanner", "world"] = Field("world", description="of the points")
+    frame: Literal["scanner", "world"] = Field("world", description="frame of the points")
     scanner: ScannerPose | None = None
     scanners: tuple[ScannerScan, ...] = Field(
-        (), description="instead of `scanner` where each file of `points` is a scan from a place or in a face of its own"
+        (), description="instead of `scanner`, if each file of `points` is a scan from its own position or in its own face"
     )
     pattern: ScanPattern | None = None
     cameras: Path | None = Field(
         None,
-        description="cameras.yaml or a Metashape XML: the nominal calibration (stereo); none: they are not known",
+        description="cameras.yaml or a Metashape XML: the nominal calibration (stereo); none: the cameras are unknown",
     )
     stable_areas: tuple[Area, ...] = Field(
         (), description="where nothing moved: boxes [x0, y0, x1, y1] or polygons [[x, y], ...], wall frame [m]"
     )
-    model: Path = Field(description="what the simulation believes about the sensor today")
+    model: Path = Field(description="current sensor model")
     incidence: Literal["triangles", "planes"] | None = Field(
         None,
-        description="what rays are inclined to: the triangle hit, or a plane through 24 vertices around it (tls); none: planes "
-        "where the vertices have noise of their own, as a scan's points have",
+        description="what incidence angles refer to: the triangle hit, or a plane through 24 vertices around it (tls); none: "
+        "planes if the vertices have noise, as points of a scan do",
     )
     reference_error_m: float | None = Field(
         None,
         ge=0,
         le=10,
-        description="standard deviation, along the rays, of the reference's vertices, each with an error of its own [m] (tls); "
-        "none: 0, or what they show where `incidence` is not stated either",
+        description="standard deviation of the reference's vertices along the rays, with independent errors [m] (tls); "
+        "none: 0, or as estimated from the vertices if `incidence` is not given either",
     )
     notes: tuple[str, ...] = Field(
-        (), description="what the report should say of the measurement, such as what a reference cannot show"
+        (), description="notes on the measurement for the report, such as what a reference cannot show"
     )
 
     @field_validator("points")
     @classmethod
     def _some(cls, points: Path | list[Path]) -> Path | list[Path]:
+        """Check that `points` names at least one file, and each file once."""
         if points == []:
-            raise ValueError("names no file; give a path, or a list of one path an epoch")
+            raise ValueError("names no file; give a path, or a list with one path for each epoch")
         if isinstance(points, list) and len(set(points)) < len(points):
-            raise ValueError("names a file twice; give a path of its own for each epoch")
+            raise ValueError("names a file twice; give a different path for each epoch")
         return points
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
+        """Check that keys fit the sensor and each other."""
         for name in ("incidence", "reference_error_m"):
             if self.sensor == "stereo" and getattr(self, name) is not None:
-                raise ValueError(f"'{name}' is of laser scans; leave it out")
+                raise ValueError(f"'{name}' is for laser scans only; remove it")
         files = [self.points] if isinstance(self.points, Path) else self.points
         if self.scanners and len(self.scanners) != len(files):
             raise ValueError(f"'scanners' has {len(self.scanners)} poses for {len(files)} files of points; give one for each")
         if self.scanners and (self.scanner is not None or self.pattern is not None):
-            raise ValueError("'scanners' stands instead of 'scanner', and without 'pattern'")
+            raise ValueError("'scanners' replaces 'scanner' and excludes 'pattern'")
         return self

@@ -1,4 +1,6 @@
-"""A measurement as `scarpsim gap` takes it: points, the surface as known, the instrument and what is believed about it."""
+"""The measurement that `scarpsim gap` analyses: points, reference surface, instrument and sensor model; reading it from
+a folder.
+"""
 
 from __future__ import annotations
 
@@ -56,19 +58,22 @@ FILE = "measurement.yaml"
 
 
 def _kind(values: Any) -> str:
+    """Return the sensor of a model."""
     return str(values.get("sensor") if isinstance(values, dict) else getattr(values, "sensor", None))
 
 
 class _ModelFile(Config):
+    """Content of model.yaml."""
+
     sensor: Annotated[Annotated[StereoModel, Tag("stereo")] | Annotated[TlsModel, Tag("tls")], Discriminator(_kind)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeasurementBase(ABC):
-    """What was measured, with everything that predicts it; what a laser scan and a stereo pair have in common.
+    """A measurement with everything that predicts it; base class of the three kinds.
 
-    cloud: points in the wall frame; reference: wall frame; frame: the wall frame; stable_areas: outside of which the scene may
-    have changed, everywhere where there are none; notes: what should be said of the files.
+    cloud: points, wall frame; reference: reference surface, wall frame; frame: the wall frame; stable_areas: where the scene did
+    not change (empty: everywhere); notes: on the files.
     """
 
     sensor: ClassVar[Sensor]
@@ -81,47 +86,47 @@ class MeasurementBase(ABC):
 
     @property
     def epochs(self) -> NDArray[np.int64]:
-        """(n,) the epoch of each point, from 0."""
+        """(n,) epoch of each point, from 0."""
         return np.asarray(self.cloud.extra.get("epoch", np.zeros(len(self.cloud.points))), dtype=np.int64)
 
     @property
     def stable(self) -> NDArray[np.bool_]:
-        """(n,) points in the areas where nothing moved; all where none are given."""
+        """(n,) whether each point is in a stable area."""
         x, y = self.cloud.points[:, :2].T
         return in_areas(self.stable_areas, x, y) if self.stable_areas else np.ones(len(x), dtype=bool)
 
     @cached_property
     def scene(self) -> RayCaster:
+        """The reference surface, for ray casting."""
         return RayCaster(self.reference)
 
     @property
     @abstractmethod
     def viewpoint(self) -> FloatArray:
-        """(3,) where the rays begin, wall frame, m: the scanner's centre, the left camera's."""
+        """(3,) origin of the rays, wall frame, m: centre of the scanner or of the left camera."""
 
     @property
     def fit(self) -> PointFit:
-        """How the points lie against the reference."""
+        """How the points fit the reference."""
         return PointFit.of(self.cloud.points, self.viewpoint, self.scene, self.sensor)
 
     def check_near(self, where: str) -> None:
-        """Raise InputError where most points lie far from the reference, so that no pose or effect explains it."""
+        """Raise InputError if most points are so far from the reference that no pose or effect explains it."""
         check_near_rays(self.fit, where)
 
     def changed(self, **values: Any) -> Self:
-        """The same with other points, cameras or pose, in front of the same ray caster."""
+        """Return a copy with other points, cameras or pose that keeps the ray caster."""
         other = replace(self, **values)
         other.__dict__["scene"] = self.scene  # where cached_property keeps it
         return other
 
     def part(self, rows: NDArray[np.int64]) -> Self:
-        """Some of the points."""
+        """Return a copy with some of the points."""
         return self.changed(cloud=self.cloud.part(rows))
 
     def moved(self, pose: FloatArray) -> Self:
-        """The measurement with its sensor shifted (m) and turned (rad) by a pose (6,) in the wall frame, and its points with it.
-
-        What the sensor recorded stays as it is. A pair of cameras turns about the left one.
+        """Shift (m) and rotate (rad) the sensor (a camera pair about its left camera) and its points by a pose (6,),
+        wall frame.
         """
         turn, centre = rotation_matrix(pose[3:]), self.viewpoint
         points = (self.cloud.points - centre) @ turn.T + centre + pose[:3]
@@ -129,19 +134,18 @@ class MeasurementBase(ABC):
 
     @abstractmethod
     def _moved_sensor(self, turn: FloatArray, shift: FloatArray) -> dict[str, Any]:
-        """The field that says where the sensor stands, with another value. turn: (3, 3), shift: (3,), wall frame, m."""
+        """Return the field with the sensor's pose after a rotation (3, 3) and a shift (3,), wall frame, m."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TlsMeasurement(MeasurementBase):
-    """A laser scan, or epochs of it.
+    """A laser scan, or several epochs of it.
 
-    station: scanner to wall frame, of the first scan where there are several; face: in which it was scanned; scans: of several,
-    whose numbers are the points' channel `scan`, empty where there is one; pattern: the nominal directions, None where not known;
-    pulses: (m,) those of the pattern that the points are a part of, None for all of them; order: each point's scan line and share
-    of the scan's duration (n,), None where not known, once they were counted (see `with_order`); planes: through the
-    reference's vertices, to which rays are inclined, None where they are to its triangles; reference_error_m: standard deviation
-    of each vertex along the rays.
+    station, face: pose of the first scan, scanner to wall frame, and its face; scans: each of several scans, whose numbers are
+    the points' channel `scan`; pattern: nominal directions, None if unknown; pulses: (m,) pulses of the pattern that the points
+    are part of, None for all; order: (n,) scan line and (n,) share of the scan's duration of each point, None if unknown (see
+    `with_order`); planes: planes through the reference's vertices to which incidence angles refer, None for triangles;
+    reference_error_m: standard deviation of each vertex along the rays, m.
     """
 
     sensor = "tls"
@@ -165,7 +169,7 @@ class TlsMeasurement(MeasurementBase):
         return np.asarray(self.cloud.extra.get(SCAN, np.zeros(len(self.cloud.points))), dtype=np.int64)
 
     def each_scan(self) -> Iterator[tuple[Scanned, NDArray[np.int64], Self]]:
-        """Of several scans each with its points' rows and its own measurement."""
+        """Yield each of several scans with its points' rows and its own measurement."""
         for number, scan in enumerate(self.scans):
             rows = np.flatnonzero(self.scan_of == number)
             yield scan, rows, self.part(rows).changed(station=scan.pose, face=scan.face, scans=())
@@ -177,7 +181,7 @@ class TlsMeasurement(MeasurementBase):
         return min(fits, key=lambda each: (each.good, each.near)) if fits else super().fit
 
     def moved(self, pose: FloatArray) -> Self:
-        """Of several scans each by the six values of its set-up: pose (6 k,)."""
+        """Move each of several scans by the six values of its set-up in the pose (6 k,)."""
         if not self.scans:
             return super().moved(pose)
         points, scans = self.cloud.points.copy(), []
@@ -198,11 +202,10 @@ class TlsMeasurement(MeasurementBase):
 
 @dataclass(frozen=True, kw_only=True)
 class StereoMeasurement(MeasurementBase):
-    """A surface that a stereo pair gave.
+    """A surface from a stereo pair.
 
-    cameras: the nominal calibration, world frame; shaped_px: (n,) what those of the model's effects that look at neighbouring
-    pixels add to each point's disparity, and surroundings: what lies about the places that the pixels see, each where that was
-    found once for cameras that stand about here, None where it was not.
+    cameras: nominal calibration, world frame; shaped_px: (n,) disparity that effects of neighbouring pixels add at each point,
+    and surroundings: the reference around the points, both for cameras near the present pose, None if not computed.
     """
 
     sensor = "stereo"
@@ -232,39 +235,36 @@ class StereoMeasurement(MeasurementBase):
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceMeasurement(MeasurementBase):
-    """A surface out of photographs whose cameras are not known: points and nothing else, in a datum of shift, turn and scale.
-
-    Its points are noisy in metres along the normal of the reference.
-    """
+    """A surface from photographs with unknown cameras: points with noise in metres, in a datum of shift, rotation and scale."""
 
     sensor = "stereo"
     model: StereoModel
 
     @property
     def centre(self) -> FloatArray:
-        """(3,) about which the cloud is turned and scaled, wall frame, m."""
+        """(3,) centre of rotation and scale of the cloud, wall frame, m."""
         return np.asarray(self.reference.bounds.mean(axis=0))
 
     @property
     def viewpoint(self) -> FloatArray:
-        """(3,) a place before the wall; nothing was seen from there."""
+        """(3,) a place in front of the wall; nothing was observed from there."""
         away = 2 * float(np.linalg.norm(np.ptp(self.reference.bounds, axis=0)))
         return np.asarray(self.centre + np.array([0.0, 0.0, away]))
 
     @cached_property
     def shape(self) -> ShapedSurface:
-        """The reference with what its vertices' neighbourhoods tell."""
+        """The reference with properties of its vertices' neighbourhoods."""
         return ShapedSurface(self.reference)
 
     @cached_property
     def datum(self) -> FloatArray:
-        """(7, k) the parts of the cloud's datum that the reference tells, of shift, turn and stretch."""
+        """(7, k) components of the cloud's datum (shift, rotation, scale) that the reference determines."""
         vertices = np.arange(len(self.reference.vertices))
         return told_datum(self.reference.vertices - self.centre, self.shape.normals(vertices))
 
     @property
     def surface_fit(self) -> SurfaceFit:
-        """How the points lie against the reference."""
+        """How the points fit the reference."""
         return SurfaceFit.of(self.cloud.points, self.reference)
 
     def check_near(self, where: str) -> None:
@@ -276,7 +276,7 @@ class SurfaceMeasurement(MeasurementBase):
         return other
 
     def moved(self, pose: FloatArray) -> Self:
-        """The points shifted (m), turned (rad) and stretched about the reference's middle by parts of the datum (k,)."""
+        """Shift (m), rotate (rad) and scale the points about the reference's centre by components of the datum (k,)."""
         whole = self.datum @ pose
         turn = (1 + whole[6]) * rotation_matrix(whole[3:6])
         points = (self.cloud.points - self.centre) @ turn.T + self.centre + whole[:3]
@@ -290,12 +290,12 @@ Measurement = TlsMeasurement | StereoMeasurement | SurfaceMeasurement
 
 
 def read_model(path: Path) -> TlsModel | StereoModel:
-    """A file model.yaml. Raises InputError with the key that is wrong."""
+    """Read a model.yaml; raise InputError that names the wrong key."""
     return sensor_model(load_yaml(path), str(path))
 
 
 def sensor_model(values: Any, where: str) -> TlsModel | StereoModel:
-    """The sensor model that a mapping of keys describes; where: what errors call it."""
+    """Return the sensor model of a mapping of keys; where: name of the file, for errors."""
     if not isinstance(values, dict) or values.get("sensor") not in ("tls", "stereo"):
         raise InputError("names no sensor", where=where, allowed="sensor: tls, sensor: stereo")
     return parse(_ModelFile, {"sensor": values}, where).sensor
@@ -303,8 +303,9 @@ def sensor_model(values: Any, where: str) -> TlsModel | StereoModel:
 
 @dataclass(frozen=True)
 class Material:
-    """What a measurement is made of. reference: world frame; notes: on it; points: clouds by their files' names, an epoch each,
-    in the frame that the config says; cameras: world frame, of a pair that is known."""
+    """The parts of a measurement: reference surface, world frame, and notes on it; clouds by file name, one for each epoch, in
+    the frame of the config; sensor model; stereo pair, world frame, if known.
+    """
 
     reference: TriangleMesh
     points: dict[str, PointCloud]
@@ -314,7 +315,7 @@ class Material:
 
 
 def read_measurement(folder: Path) -> Measurement:
-    """Read a folder with measurement.yaml. Raises InputError that names the file and the key."""
+    """Read a folder with measurement.yaml; raise InputError that names the file and the key."""
     path = folder / FILE if folder.is_dir() else folder
     if not path.is_file():
         raise InputError(f"there is no {FILE}", where=str(folder), remedy="name the folder of a measurement")
@@ -330,7 +331,7 @@ def read_measurement(folder: Path) -> Measurement:
 
 
 def _mended(config: MeasurementConfig, values: Any) -> tuple[str, ...]:
-    """A word where the scanner's rotation is not the one that the file's `values` state."""
+    """Return a note if the scanner's rotation was made orthonormal."""
     if config.scanner is None:
         return ()
     off = float(np.abs(np.array(config.scanner.rotation) - np.array(values["scanner"]["rotation"], dtype=float)).max())
@@ -338,9 +339,10 @@ def _mended(config: MeasurementConfig, values: Any) -> tuple[str, ...]:
 
 
 def assembled(config: MeasurementConfig, material: Material, reference: str, where: str) -> Measurement:
-    """A measurement out of what is in memory; its paths are not read. reference, where: what errors call mesh and config.
+    """Make a measurement from its parts in memory, ignoring the config's paths; reference, where: names of mesh and config, for
+    errors.
 
-    Raises InputError for whatever does not fit together.
+    Raises InputError if the parts do not fit together.
     """
     mesh, model, cameras = material.reference, material.model, material.cameras
     _check_sensor(config, model, where)
@@ -374,7 +376,7 @@ def assembled(config: MeasurementConfig, material: Material, reference: str, whe
 
 
 def _of_sensor(config: MeasurementConfig, material: Material, where: str, **shared: Any) -> Measurement:
-    """A laser scan or a pair's surface. shared: the fields that both have."""
+    """Make the measurement of the config's sensor. shared: fields that all kinds have."""
     if isinstance(material.model, StereoModel):
         if material.cameras is None:
             check_in_metres(material.model, where)
@@ -410,7 +412,7 @@ def _check_sensor(config: MeasurementConfig, model: TlsModel | StereoModel, wher
 
 
 def _check(found: Measurement, cloud: PointCloud, config: MeasurementConfig, where: str) -> None:
-    """Raise InputError where the points (`cloud`: as read) fit neither pattern nor reference."""
+    """Raise InputError if the points (`cloud`: as read) fit neither pattern nor reference."""
     if isinstance(found, SurfaceMeasurement):
         found.check_near(where)
         return
@@ -440,13 +442,13 @@ def _cameras(config: MeasurementConfig, base: Path) -> CameraPair | None:
 
 
 def nominal_pair(file: Path) -> CameraPair:
-    """The cameras of a file, world frame: cameras.yaml, or another one with two oriented cameras."""
+    """Read the cameras of a file, world frame: cameras.yaml, or another file with two oriented cameras."""
     found = read_oriented(file)
     return read_cameras_yaml(file) if found is None else stereo_pair(found, None, None, str(file))
 
 
 def _viewpoints(config: MeasurementConfig, material: Material, where: str) -> dict[str, FloatArray]:
-    """Where the sensors stand, by name, world frame; of a cloud without cameras a place before the reference."""
+    """Return the positions of the sensors by name, world frame; without cameras, a place in front of the reference."""
     cameras = material.cameras
     if cameras is not None:
         return {"left camera": cameras.left.position, "right camera": cameras.right.position}
@@ -457,7 +459,7 @@ def _viewpoints(config: MeasurementConfig, material: Material, where: str) -> di
 
 
 def _rounding(points: FloatArray, config: MeasurementConfig, material: Material, where: str) -> tuple[str, ...]:
-    """What to say of the rounding of a file's points (n, 3), against the noise along the lines of sight."""
+    """Return a note on the rounding of a file's points (n, 3), compared with the noise along the lines of sight."""
     points = points[np.isfinite(points).all(axis=1)]
     model, cameras = material.model, material.cameras
     if not len(points):
@@ -478,7 +480,7 @@ def _rounding(points: FloatArray, config: MeasurementConfig, material: Material,
 
 
 def _all_in_wall_frame(config: MeasurementConfig, clouds: list[PointCloud], joined: PointCloud, frame: WallFrame) -> PointCloud:
-    """The joined cloud, of which each scan may be in a frame of its own."""
+    """Return the joined cloud in the wall frame; each scan may have its own frame."""
     if not config.scanners:
         return _in_wall_frame(joined, config.frame, config.scanner, frame)
     parts = [_in_wall_frame(cloud, config.frame, pose, frame) for cloud, pose in zip(clouds, config.scanners, strict=True)]

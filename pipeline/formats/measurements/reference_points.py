@@ -1,4 +1,4 @@
-"""What a measurement's reference is made of: a surface that is known, or points of a scan with noise of their own."""
+"""Decide whether a measurement's reference is a known surface, or consists of points of a scan with their own noise."""
 
 from __future__ import annotations
 
@@ -9,13 +9,19 @@ from scene.geometry.mesh import FloatArray
 from scene.geometry.point_planes import PointPlanes, estimate_point_noise
 
 _NOTICED = 0.3
-"""Noise of the vertices over that of the ranges from which on it is carried along."""
+"""Noise of the vertices, as a share of that of the ranges, from which it is taken into account."""
 
 
 @dataclass(frozen=True)
 class ReferencePoints:
-    """planes: through the vertices, where rays are inclined to them; error_m: standard deviation of each vertex along the rays;
-    words: for the report, where these were not stated but found."""
+    """Error of a reference made of points.
+
+    Attributes
+    ----------
+    planes : Planes through the vertices to which incidence angles refer; None: triangles.
+    error_m : Standard deviation of each vertex along the rays, m.
+    words : Notes for the report if these were estimated.
+    """
 
     planes: PointPlanes | None = None
     error_m: float = 0.0
@@ -23,7 +29,15 @@ class ReferencePoints:
 
     @classmethod
     def of(cls, config: MeasurementConfig, vertices: FloatArray, viewpoint: FloatArray, range_sigma_m: float) -> ReferencePoints:
-        """By what measurement.yaml states, else by the vertices (n, 3), m, as seen from the scanner's place (3,)."""
+        """Take what measurement.yaml states, or estimate it from the vertices.
+
+        Parameters
+        ----------
+        config : Content of measurement.yaml.
+        vertices : (n, 3) vertices of the reference, m.
+        viewpoint : (3,) position of the scanner, m.
+        range_sigma_m : Range noise of the scanner, m.
+        """
         if config.incidence is not None or config.reference_error_m is not None:
             planes = PointPlanes.of(vertices, viewpoint) if config.incidence == "planes" else None
             return cls(planes, config.reference_error_m or 0.0)
@@ -31,7 +45,7 @@ class ReferencePoints:
         if noise is None or noise < _NOTICED * range_sigma_m:
             return cls()
         words = (
-            f"the reference's vertices scatter by {1e3 * noise:.2g} mm of their own, as a scan's points do: that is carried as "
-            "their error (reference_error_m), and rays are inclined to planes through them (incidence: planes)"
+            f"the reference's vertices scatter by {1e3 * noise:.2g} mm, as points of a scan do: that is used as their error "
+            "(reference_error_m), and incidence angles refer to planes through them (incidence: planes)"
         )
         return cls(PointPlanes.of(vertices, viewpoint), noise, (words,))

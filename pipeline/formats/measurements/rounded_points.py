@@ -1,4 +1,4 @@
-"""Points whose coordinates a file has rounded, against the noise that the model predicts."""
+"""Compare the rounding of coordinates in a file with the noise that the model predicts."""
 
 from __future__ import annotations
 
@@ -9,15 +9,26 @@ from scene.geometry.mesh import FloatArray
 from scene.meshes.rounding import rounded_axes
 
 _TOLD = 0.1
-"""Share of the model's noise from which the error of rounding is told: it adds a hundredth to the variance."""
+"""Rounding error, as a share of the model's noise, from which it is reported; it then adds 1 % to the variance."""
 
 
 def check_rounded_points(points: FloatArray, viewpoint: FloatArray, noise_m: float, where: str) -> tuple[str, ...]:
-    """What to say of the rounding of `points` (n, 3), finite, seen from `viewpoint` (3,), both m and in the file's frame.
+    """Return a note on the rounding of points, if it matters.
 
-    noise_m: standard deviation along the line of sight that the model predicts. Rounding to steps s errs by s / sqrt(12) along
-    each axis; what of it lies along the lines of sight looks like noise of the sensor. Raises InputError where it is larger than
-    the noise.
+    Rounding to steps s has an error of s / sqrt(12) along each axis; its component along the line of sight looks like sensor
+    noise.
+
+    Parameters
+    ----------
+    points : (n, 3) finite points, m, in the file's frame.
+    viewpoint : (3,) position of the sensor, m, in the same frame.
+    noise_m : Standard deviation along the line of sight that the model predicts, m.
+    where : Name of the file, for errors.
+
+    Raises
+    ------
+    InputError
+        If the rounding error is larger than the noise.
     """
     rounded = rounded_axes(points)
     if not rounded:
@@ -29,11 +40,11 @@ def check_rounded_points(points: FloatArray, viewpoint: FloatArray, noise_m: flo
     told = f"the coordinates are rounded, {', '.join(map(str, rounded))}: {1e3 * error:.2g} mm along the lines of sight"
     if error > noise_m:
         raise InputError(
-            f"{told}, more than the noise of the sensor that the model has",
+            f"{told}, more than the sensor noise in the model",
             where=where,
-            allowed=f"up to {1e3 * noise_m:.2g} mm, less than {1e2 * _TOLD:.0f} % of it is best",
+            allowed=f"up to {1e3 * noise_m:.2g} mm, best less than {1e2 * _TOLD:.0f} % of it",
             remedy="export the points in double precision or with more decimals",
         )
     if error < _TOLD * noise_m:
         return ()
-    return (f"{told}, where the model has a noise of {1e3 * noise_m:.2g} mm; what is named a noise may be the rounding",)
+    return (f"{told}, and the model has a noise of {1e3 * noise_m:.2g} mm; an effect named as noise may be the rounding",)

@@ -1,21 +1,21 @@
-"""The scanning pattern out of a raw scan: ranges, angles, scan lines, pulses and angular steps from points and their origin.
+"""Recover the scan pattern of a raw scan: ranges, angles, scan lines, pulses and angular steps, from the points and their origin.
 
-Points come in any order, with gaps and with several echoes of a pulse. Steps are the periods of the angles' histograms, found by
-Fourier transform (harmonics are told from the fundamental by being higher), then refined by least squares over all points once
-each point has its line and its place in the line.
+Points may be in any order, with gaps and several echoes of a pulse. Steps are the periods of the angles' histograms, found by
+Fourier transform (the fundamental is the lowest of the harmonics). They are refined by least squares over all points once each
+point has its line and its place in the line.
 
-Two patterns are tried. A *level* one has the contract's form in the given frame: azimuth = start + line step, zenith = start +
-pulse step. A *tilted* one is what instruments really deliver: the axis is off the frame's z, a line is not a meridian, since the
-head turns while the beam runs down, and each line begins at a zenith angle of its own:
+Two patterns are tried. A *level* pattern has in the given frame azimuth = start + line step, zenith = start + pulse step. A
+*tilted* pattern is what instruments really deliver: its axis differs from the frame's z. A line is not a meridian, because the
+head turns while the beam runs down. Each line begins at its own zenith angle:
 
     azimuth(line, z) = start + line step + d (z - pi/2) + c / sin z + t cot z        d head's turn, c collimation, t trunnion tilt
 
-with both angles about the true axis. Its seven unknowns follow by Gauss-Newton on the lines' phase, with the sine of the phase as
-influence, so that a start that is off by a line costs iterations, not the answer.
+with both angles about the true axis. Its seven unknowns are found by Gauss-Newton on the lines' phase. The sine of the phase is
+the influence function, so that an initial value that is off by a line costs iterations but does not change the result.
 
-Limits: one scan, a fixed position, 16 to 170,000 lines of 16 to 40,000 pulses; errors of the points' directions
-(rounded coordinates, a wrong origin) below a fifth of a step for at least half of the points. A scan of a flat wall
-keeps a pattern, bent, about an origin that is a metre off: `azimuth_rms` and `zenith_rms` then rise far above the points' noise.
+Limits: one scan, a fixed position, 16 to 170,000 lines of 16 to 40,000 pulses. Errors of the directions (rounded coordinates, a
+wrong origin) must be below a fifth of a step for at least half of the points. A scan of a flat wall keeps a bent pattern about an
+origin that is a metre off; `azimuth_rms` and `zenith_rms` are then far above the points' noise.
 """
 
 from __future__ import annotations
@@ -32,20 +32,24 @@ from scene.geometry.mesh import FloatArray, IntArray
 from sensors.signal_chain.polar import polar
 
 _FEWEST = 16
-"""Lines, and pulses of a line, below which no step is looked for."""
+"""Smallest number of lines, and of pulses in a line."""
 _BINS, _LINE_BINS = 1 << 19, 1 << 17
-"""Bins of a histogram of azimuths, and of one line's zenith angles: three or more for a step."""
+"""Bins of a histogram of azimuths, and of one line's zenith angles: at least three for each step."""
 _PADDING = 2
+"""Zero padding of the Fourier transform."""
 _NARROWEST_RAD = 1e-6
-"""Of a window of angles in which a step is looked for."""
+"""Narrowest range of angles in which a step can be found, rad."""
 _FEW, _SAMPLE = 10_000, 100_000
-"""Points with which the axis is found roughly, and with which it is refined."""
+"""Number of points for finding the axis roughly, and for refining it."""
 _TURNS = 60
+"""Largest number of iterations."""
 _LINES = 48
-"""Lines whose spectra are averaged."""
+"""Number of lines whose spectra are averaged."""
 _ON_GRID = 0.9
 _FOUND = 0.5
-"""Coherence (length of the mean phasor, 1: all points on the pattern) of a pattern that is taken as exact, and as one at all."""
+"""Coherence (length of the mean phasor; 1: all points on the pattern) from which a pattern is exact, and from which there
+is one.
+"""
 
 
 @dataclass(frozen=True)
@@ -58,22 +62,27 @@ class AngularGrid:
 
     @property
     def stop(self) -> float:
+        """Last angle, rad."""
         return self.start + self.step * (self.count - 1)
 
     def to_list(self) -> list[float]:
-        """[start, stop, step], as a measurement's `pattern` has it."""
+        """Return [start, stop, step], as in a measurement's `pattern`."""
         return [self.start, self.stop, self.step]
 
 
 @dataclass(frozen=True)
 class ScanGeometry:
-    """A raw scan in the terms of its scanner.
+    """A raw scan in terms of its scanner.
 
-    range_m, azimuth, zenith: (n,) m and rad, about the scan's own axis, azimuth without a jump within the scan; line, pulse: (n,)
-    int32, 0 at the grids' starts, equal for the echoes of one pulse; lines, pulses: the grids; rotation: (3, 3), frame of the
-    scan's axis to the scanner's frame (identity for a level scan); line_shape: (3,) d, c, t of the module's equation, rad;
-    synchronous: whether all lines begin on one zenith grid; azimuth_rms, zenith_rms: rad, of the far half's angles about the
-    pattern.
+    Attributes
+    ----------
+    range_m, azimuth, zenith : (n,) m and rad, about the scan's own axis; azimuth has no jump within the scan.
+    line, pulse : (n,) int32, 0 at the grids' starts; echoes of one pulse share them.
+    lines, pulses : The angular grids.
+    rotation : (3, 3) frame of the scan's axis to the scanner's frame (identity for a level scan).
+    line_shape : (3,) d, c, t of the module's equation, rad.
+    synchronous : Whether all lines begin on one zenith grid.
+    azimuth_rms, zenith_rms : RMS deviation of the far half's angles from the pattern, rad.
     """
 
     range_m: FloatArray
@@ -101,17 +110,17 @@ class ScanGeometry:
 
     @cached_property
     def returned(self) -> NDArray[np.bool_]:
-        """(lines, pulses) whether a direction of the pattern has a return."""
+        """(lines, pulses) whether each direction of the pattern has a return."""
         cells = np.zeros((self.lines.count, self.pulses.count), dtype=bool)
         cells[self.line, self.pulse] = True
         return cells
 
 
 def recover_pattern(points: FloatArray, position: FloatArray | None = None, rotation: FloatArray | None = None) -> ScanGeometry:
-    """The geometry of a raw scan.
+    """Recover the geometry of a raw scan; raise InputError if the points lie on no pattern.
 
-    points: (n, 3), m; position: (3,) m, the scanner's centre in the points' frame, and rotation: (3, 3), scanner to the points'
-    frame; by default the points are in the scanner's frame. Raises InputError where the points lie on no pattern.
+    points: (n, 3), m; position: (3,) scanner's centre in the points' frame, m; rotation: (3, 3), scanner to the points' frame.
+    Without them, the points are in the scanner's frame.
     """
     origin = np.zeros(3) if position is None else position
     local = points - origin if rotation is None else np.einsum("ij,ni->nj", rotation, points - origin)
@@ -121,17 +130,19 @@ def recover_pattern(points: FloatArray, position: FloatArray | None = None, rota
 
 
 def _check(local: FloatArray) -> None:
+    """Raise InputError for too few points, or coordinates that are not numbers."""
     if len(local) < _FEWEST**2:
         raise InputError(f"{len(local)} points are too few to find a pattern in", where="scan", allowed=f"at least {_FEWEST**2}")
     if not np.isfinite(local).all():
-        raise InputError("holds coordinates that are no numbers", where="scan", remedy="leave out the missing returns")
+        raise InputError("has coordinates that are not numbers", where="scan", remedy="leave out the missing returns")
 
 
 def _no_pattern(angle: str) -> InputError:
+    """Return the error for points without a pattern."""
     return InputError(
         f"the points lie on no regular pattern in {angle}",
         where="scan",
-        remedy="give the raw points of one scan, not thinned or merged, and the scanner's position and rotation",
+        remedy="use the raw points of one scan, not subsampled or merged, and the scanner's position and rotation",
     )
 
 
@@ -139,7 +150,7 @@ def _no_pattern(angle: str) -> InputError:
 
 
 def _level(local: FloatArray) -> ScanGeometry | None:
-    """The level pattern, or None where the points lie on none."""
+    """Return the level pattern; None if the points lie on none."""
     distance, azimuth, zenith = polar(local)
     far = distance >= np.median(distance)
     azimuth = _unrolled(azimuth)
@@ -155,7 +166,7 @@ def _level(local: FloatArray) -> ScanGeometry | None:
 
 
 def _tilted(local: FloatArray) -> ScanGeometry:
-    """The tilted pattern, from the likeliest of several first guesses of the axis."""
+    """Return the tilted pattern, from the best of several initial axes."""
     distance, _, _ = polar(local)
     far = distance >= np.median(distance)
     few, many = (local[far][:: max(1, int(far.sum()) // most)] for most in (_FEW, _SAMPLE))
@@ -189,15 +200,14 @@ def _with_pulses(
     rotation: FloatArray,
     shape: FloatArray,
 ) -> ScanGeometry | None:
-    """The geometry, once the lines are known; None where zenith angles have no step.
-
-    straight: (n,) azimuth without the line's shape.
+    """Return the geometry once the lines are known; None if zenith angles have no step. straight: (n,) azimuth without the line's
+    shape.
     """
     try:
         step = _period(_longest_lines(zenith[far], line[far]))
     except InputError:
         return None
-    for _ in range(3):  # one turn mends the step enough for the index to be right over a whole line
+    for _ in range(3):  # the first pass corrects the step enough for right indices over a whole line
         phase = _line_phases(zenith, line, far, step, lines.count)
         step = _refined_step(zenith, line, far, step, phase)
     phase = _line_phases(zenith, line, far, step, lines.count)
@@ -228,9 +238,9 @@ def _with_pulses(
 
 
 def _period(groups: list[FloatArray]) -> float:
-    """The step of the grid on which each group's angles lie, rad, good to a fraction of a step over the whole window.
+    """Return the step of the grid on which each group's angles lie, rad, accurate to a fraction of a step over the whole range.
 
-    The lowest of the strong peaks of the groups' mean amplitude spectrum. Raises InputError where none stands out.
+    It is the lowest of the strong peaks of the groups' mean amplitude spectrum. Raises InputError if none is significant.
     """
     low, high = min(group.min() for group in groups), max(group.max() for group in groups)
     if high - low < _NARROWEST_RAD:
@@ -255,14 +265,13 @@ def _period(groups: list[FloatArray]) -> float:
 
 
 def _phasor(values: FloatArray, step: float) -> complex:
-    """Mean of exp(2 pi i value / step): its length is 1 where all values lie on one grid."""
+    """Return the mean of exp(2 pi i value / step), whose length is 1 if all values lie on one grid."""
     return complex(np.mean(np.exp(2j * np.pi * values / step)))
 
 
 def _grid(values: FloatArray, step: float, far: NDArray[np.bool_]) -> tuple[AngularGrid, IntArray]:
-    """The grid on which the values lie, by least squares over the far ones, and each value's index on it.
-
-    Raises InputError where all far ones lie at one place of it.
+    """Return the grid of the values, by least squares over the far ones, and each value's index; raise InputError for a single
+    index.
     """
     start = float(np.angle(_phasor(values[far], step))) / (2 * np.pi) * step
     for _ in range(3):
@@ -282,21 +291,21 @@ def _grid(values: FloatArray, step: float, far: NDArray[np.bool_]) -> tuple[Angu
 
 
 def _longest_lines(zenith: FloatArray, line: IntArray) -> list[FloatArray]:
-    """The zenith angles of the lines with most points, each its own group."""
+    """Return the zenith angles of the lines with the most points, one group for each."""
     order = np.argsort(line, kind="stable")
     groups = np.split(zenith[order], np.flatnonzero(np.diff(line[order])) + 1)
     return sorted(groups, key=len, reverse=True)[:_LINES]
 
 
 def _line_phases(zenith: FloatArray, line: IntArray, far: NDArray[np.bool_], step: float, count: int) -> FloatArray:
-    """(count,) where each line's grid begins, in steps, modulo 1."""
+    """Return the (count,) start of each line's grid, in steps, modulo 1."""
     angle = 2 * np.pi * zenith[far] / step
     real, imaginary = (np.bincount(line[far], part(angle), minlength=count) for part in (np.cos, np.sin))
     return np.arctan2(imaginary, real) / (2 * np.pi)
 
 
 def _refined_step(zenith: FloatArray, line: IntArray, far: NDArray[np.bool_], step: float, phase: FloatArray) -> float:
-    """The step by least squares within lines, each with a phase of its own."""
+    """Return the step by least squares within lines, each with its own phase."""
     z, of = zenith[far], line[far]
     index = np.rint(z / step - phase[of])
     residual = z / step - phase[of] - index
@@ -310,7 +319,9 @@ def _refined_step(zenith: FloatArray, line: IntArray, far: NDArray[np.bool_], st
 
 @dataclass(frozen=True)
 class _AxisFit:
-    """rotation: scanner's frame to that of the axis; shape: d, c, t; cut: azimuth at which the scan begins; step: of azimuth."""
+    """Fit of the scan's axis. rotation: scanner's frame to that of the axis; shape: d, c, t; step: of azimuth; cut: azimuth at
+    the start.
+    """
 
     rotation: FloatArray
     shape: FloatArray
@@ -320,7 +331,7 @@ class _AxisFit:
 
 
 def _first_axes(local: FloatArray) -> list[FloatArray]:
-    """First guesses of the rotation to the axis: those that level the lower and the upper edge of the window, and none."""
+    """Return initial rotations to the axis: those that level the lower and the upper edge of the field of view, and none."""
     _, azimuth, zenith = polar(local)
     sector = np.floor((azimuth + np.pi) * (90 / np.pi)).astype(np.int64).clip(0, 179)
     present = np.unique(sector)
@@ -332,7 +343,7 @@ def _first_axes(local: FloatArray) -> list[FloatArray]:
 
 
 def _levelled(azimuth: FloatArray, edge: FloatArray) -> FloatArray:
-    """The rotation that makes zenith angles `edge` over azimuth constant: the axis leans by a cosine, fitted in the L1 norm."""
+    """Return the rotation that makes zenith angles `edge` constant over azimuth, from a cosine fitted in the L1 norm."""
     design = np.stack([np.ones_like(azimuth), np.cos(azimuth), np.sin(azimuth)], axis=1)
     weight = np.ones_like(azimuth)
     for _ in range(50):
@@ -342,7 +353,7 @@ def _levelled(azimuth: FloatArray, edge: FloatArray) -> FloatArray:
 
 
 def _fit_axis(local: FloatArray, rotation: FloatArray) -> _AxisFit | None:
-    """Fit axis, line shape and step to the azimuths of points in the scanner's frame; None where no step is found."""
+    """Fit axis, line shape and step to the azimuths of points in the scanner's frame; None if no step is found."""
     _, azimuth, _ = polar(np.einsum("ij,nj->ni", rotation, local))
     try:
         fit = _AxisFit(rotation, np.zeros(3), _period([_unrolled(azimuth)]), 0.0, 0.0)
@@ -356,7 +367,7 @@ def _fit_axis(local: FloatArray, rotation: FloatArray) -> _AxisFit | None:
 
 
 def _turn(local: FloatArray, fit: _AxisFit) -> _AxisFit:
-    """The fit after a fresh cut and a few Gauss-Newton steps."""
+    """Improve a fit: find the start of the scan again, then make a few Gauss-Newton steps."""
     rotation, shape = fit.rotation, fit.shape
     cut, step = _cut(local, rotation, shape, fit.step)
     for _ in range(6):
@@ -368,7 +379,7 @@ def _turn(local: FloatArray, fit: _AxisFit) -> _AxisFit:
 def _improved(
     local: FloatArray, rotation: FloatArray, shape: FloatArray, step: float, cut: float
 ) -> tuple[FloatArray, FloatArray, float]:
-    """One Gauss-Newton step for phase, step, axis (2) and the line's shape (3)."""
+    """Make one Gauss-Newton step for phase, step, axis (2) and line shape (3)."""
     straight, azimuth, zenith = _straight(local, rotation, shape, cut)
     phase = np.angle(_phasor(straight, step)) / (2 * np.pi)
     index = np.rint(straight / step - phase)
@@ -383,22 +394,22 @@ def _improved(
 def _straight(
     local: FloatArray, rotation: FloatArray, shape: FloatArray, cut: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Azimuth less the line's shape, from `cut` upwards; azimuth; zenith."""
+    """Return the azimuth without the line's shape, from `cut` upwards; azimuth; zenith angle."""
     _, azimuth, zenith = polar(np.einsum("ij,nj->ni", rotation, local))
     return np.mod(azimuth - _shape(zenith) @ shape - cut, 2 * np.pi) + cut, azimuth, zenith
 
 
 def _shape(zenith: FloatArray) -> FloatArray:
-    """(n, 3) the terms of a line's shape: z - pi/2, 1 / sin z, cot z."""
+    """Return the (n, 3) terms of a line's shape: z - pi/2, 1 / sin z, cot z."""
     return np.stack([zenith - np.pi / 2, 1 / np.sin(zenith), 1 / np.tan(zenith)], axis=1)
 
 
 def _seam(straight: FloatArray, step: float) -> tuple[float, float]:
-    """The azimuth at which the scan begins, and the step mended for it: where a cut brings most lines onto one grid.
+    """Find the azimuth at which the scan begins, and correct the step: the cut that puts most lines on one grid.
 
-    straight: (n,) rad, from -pi to pi. A full circle is no whole number of steps: the phase of the lines jumps where the last one
-    meets the first, and a step found across that jump is off by a fraction of a line per circle. Searched are the cuts at whole
-    degrees, with up to two lines per circle more or fewer; the cut is then moved to the best place for that step.
+    straight: (n,) rad, from -pi to pi. A full circle is not a whole number of steps: the lines' phase jumps between the last and
+    the first line, and a step found across that jump is off by a fraction of a line per circle. Cuts at whole degrees are tried
+    with up to two lines per circle more or fewer; the cut is then moved to the best place for that step.
     """
     place = np.floor((straight + np.pi) * (180 / np.pi)).astype(np.int64).clip(0, 359)
     phasors = np.exp(2j * np.pi * straight / step)
@@ -418,7 +429,7 @@ def _seam(straight: FloatArray, step: float) -> tuple[float, float]:
 
 
 def _cut(local: FloatArray, rotation: FloatArray, shape: FloatArray, step: float) -> tuple[float, float]:
-    """The azimuth at which the scan begins, within its widest gap or at its seam; and the step."""
+    """Return the azimuth at which the scan begins, in its widest gap or at its seam, and the step."""
     straight = _straight(local, rotation, shape, -np.pi)[0]
     ordered = np.sort(straight)
     gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
@@ -427,7 +438,7 @@ def _cut(local: FloatArray, rotation: FloatArray, shape: FloatArray, step: float
 
 
 def _unrolled(azimuth: FloatArray) -> FloatArray:
-    """Azimuths without a jump within the scan: they begin behind the widest gap."""
+    """Return azimuths without a jump within the scan: they begin behind the widest gap."""
     ordered = np.sort(azimuth)
     gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
     widest = int(np.argmax(gaps))
@@ -437,7 +448,7 @@ def _unrolled(azimuth: FloatArray) -> FloatArray:
 
 
 def _least_squares(design: FloatArray, values: FloatArray, weight: FloatArray | None) -> FloatArray:
-    """Weighted least squares through normal equations of scaled columns, summed in one order on any number of threads."""
+    """Solve weighted least squares by scaled normal equations, summed in a fixed order whatever the number of threads."""
     scale = np.sqrt(np.einsum("ni,ni->i", design, design)) + 1e-300
     scaled = design / scale
     weighted = scaled if weight is None else scaled * weight[:, None]

@@ -1,4 +1,4 @@
-"""Where a scanner stood: one place for all points, or one for each file of points, in either face."""
+"""The scanner's pose in measurement.yaml: one for all points, or one for each file of points, in either face."""
 
 from __future__ import annotations
 
@@ -16,12 +16,15 @@ from sensors.cameras.camera import Matrix3, Vector3, check_rotation
 Pose = tuple[FloatArray, FloatArray]
 """Position (3,) m and rotation (3, 3) of a sensor."""
 Face = Literal[1, 2]
+"""1, or 2 for the second face of the instrument."""
 _FEW_DIGITS, _ROUNDING = 0.005, 1e-9
-"""How far a rotation matrix may be from orthonormal for want of digits, and how far it is left as it stands."""
+"""Largest deviation of a rotation matrix from orthonormal that missing digits explain, and the deviation up to which it
+is kept.
+"""
 
 
 class ScannerPose(Config):
-    """Where the scanner stood, as surveyed."""
+    """Surveyed pose of the scanner."""
 
     position_m: Vector3 = Field(description="scanner's centre, world frame [m]")
     rotation: Matrix3 = Field(description="scanner to world; scanner z is the vertical axis")
@@ -29,7 +32,7 @@ class ScannerPose(Config):
     @field_validator("rotation")
     @classmethod
     def _orthonormal(cls, rotation: Matrix3) -> Matrix3:
-        """A rotation of few digits becomes the nearest one (`mended` says so); one that is none is refused."""
+        """Replace a rotation with few digits by the nearest one, and refuse a matrix that is not a rotation."""
         rows = np.array(rotation)
         if np.linalg.det(rows) <= 0 or np.abs(rows @ rows.T - np.eye(3)).max() > _FEW_DIGITS:
             return check_rotation(rotation)
@@ -40,14 +43,24 @@ class ScannerPose(Config):
 
 
 class ScannerScan(ScannerPose):
-    """Where the scanner stood for one file of points. Scans of the same pose are of one set-up, which is registered once."""
+    """Pose of the scanner for one file of points; scans with the same pose belong to one set-up, which is registered once."""
 
-    face: Face = Field(1, description="2: scanned in the second face, azimuth turned by pi, zenith angle 2 pi less")
+    face: Face = Field(
+        1,
+        description="2: scanned in the second face, with the azimuth turned by pi and the zenith angle reversed (2 pi minus it)",
+    )
 
 
 @dataclass(frozen=True)
 class Scanned:
-    """One of several scans. pose: scanner to wall frame; set_up: number of those that were not moved between them, from 0."""
+    """One of several scans.
+
+    Attributes
+    ----------
+    pose : Scanner to wall frame.
+    face : Face of the instrument.
+    set_up : Number of its set-up, from 0; scans between which the scanner was not moved share one.
+    """
 
     pose: Pose
     face: Face
@@ -55,7 +68,7 @@ class Scanned:
 
 
 def set_ups(scans: Sequence[ScannerScan]) -> list[int]:
-    """The number of each scan's set-up: the same for the same pose."""
+    """Return the number of each scan's set-up, the same for the same pose."""
     known: list[tuple[Vector3, Matrix3]] = []
     numbers = []
     for scan in scans:

@@ -1,6 +1,6 @@
-"""What a surface tells of a cloud's datum: shift, turn and scale move it off itself, but for what its shape does not show.
+"""Find which components of a cloud's datum (shift, rotation, scale) a surface determines.
 
-A plane shows one shift and two turns, a wall with relief all of them, and the scale by its relief alone.
+A plane determines one shift and two rotations; a wall with relief determines all of them, and the scale only by its relief.
 """
 
 from __future__ import annotations
@@ -10,21 +10,27 @@ import numpy as np
 from scene.geometry.mesh import FloatArray
 
 _SAMPLE = 5000
+"""Number of places in the sample."""
 _LEAST = 1e-3
-"""Root mean square of how far a surface moves off itself, below which a part of the datum is not fitted: per metre that it is
-moved, or that a turn or a stretch moves its ends. Noise of 4 mm in 500 places leaves such a part known to 0.2 m at best."""
+"""Smallest RMS displacement normal to the surface of a fitted component, per metre that it shifts the surface, or that a rotation
+or scale moves its ends. Noise of 4 mm at 500 places would leave smaller components uncertain by 0.2 m or more.
+"""
 
 
 def datum_columns(away: FloatArray, normal: FloatArray) -> FloatArray:
-    """(n, 7) by how much places (n, 3), m from the middle, with unit normals (n, 3) move along them by a shift (m), a turn (rad)
-    and a stretch of the surface."""
+    """Return the (n, 7) displacement along the normals per shift (m), rotation (rad) and scale.
+
+    away: (n, 3) places relative to the centre, m; normal: (n, 3) unit normals.
+    """
     columns = [normal, np.cross(away, normal), np.einsum("ni,ni->n", away, normal)[:, None]]
     return np.concatenate(columns, axis=1)
 
 
 def told_datum(away: FloatArray, normal: FloatArray) -> FloatArray:
-    """(7, k) the parts of a datum that a surface tells, of its places and normals (n, 3): unit vectors of the seven values where
-    it tells each of them, combinations where it does not."""
+    """Return the (7, k) components of the datum that a surface determines, from places and normals (n, 3).
+
+    They are unit vectors if it determines all seven values, else combinations of them.
+    """
     some = slice(None, None, max(len(away) // _SAMPLE, 1))
     reach = np.sqrt(np.mean(np.sum(away[some] ** 2, axis=1)))
     scale = np.array([1.0, 1.0, 1.0, *(4 * [reach])])

@@ -1,4 +1,4 @@
-"""How a cloud whose cameras are not known lies against the reference: by the nearest places, since there are no rays."""
+"""Compare a cloud with unknown cameras with the reference, by nearest points, since it has no rays."""
 
 from __future__ import annotations
 
@@ -12,16 +12,23 @@ from sensors.effects.base import Stage
 from sensors.models.sensor_model import StereoModel
 
 _SAMPLE = 20_000
+"""Number of points in the sample."""
 _FEWEST_NEAR = 0.25
-"""Share of the points that must lie near the reference."""
+"""Smallest share of the points that are near the reference."""
 NEAR_SHARE = 0.05
-"""Of the reference's extent, within which a point is near it."""
+"""Distance up to which a point is near the reference, as a share of the reference's extent."""
 
 
 @dataclass(frozen=True)
 class SurfaceFit:
-    """near: share of a sample of points that lie near the reference; off_m: median distance from it; reach_m: within which a
-    point is near."""
+    """How a sample of points fits the reference.
+
+    Attributes
+    ----------
+    near : Share of the points that are near.
+    off_m : Median distance, m.
+    reach_m : Distance up to which a point is near, m.
+    """
 
     near: float
     off_m: float
@@ -29,7 +36,7 @@ class SurfaceFit:
 
     @classmethod
     def of(cls, points: FloatArray, reference: TriangleMesh) -> SurfaceFit:
-        """points: (n, 3), m, in the reference's frame."""
+        """Compare points (n, 3), m, with the reference, in the same frame."""
         from scipy.spatial import cKDTree
 
         reach = near_m(reference)
@@ -39,29 +46,29 @@ class SurfaceFit:
 
     @property
     def good(self) -> bool:
-        """Whether the points are of this surface."""
+        """Whether the points belong to this surface."""
         return self.near >= _FEWEST_NEAR
 
     def check(self, where: str) -> None:
-        """Raise InputError where they are not."""
+        """Raise InputError if they do not."""
         if self.good:
             return
         raise InputError(
-            f"{100 * self.near:.2g} % of the points lie near the reference; half lie {self.off_m:.3g} m and more from it",
-            where=where, allowed=f"{100 * _FEWEST_NEAR:g} % and more within {self.reach_m:.3g} m",
-            remedy="export both in one coordinate system and unit, and check that they are of one wall",
+            f"{100 * self.near:.2g} % of the points lie near the reference; half lie {self.off_m:.3g} m or more from it",
+            where=where, allowed=f"{100 * _FEWEST_NEAR:g} % or more within {self.reach_m:.3g} m",
+            remedy="export both in one coordinate system and unit, and check that they show the same wall",
         )  # fmt: skip
 
 
 def near_m(reference: TriangleMesh) -> float:
-    """Distance from a vertex of the reference up to which a point is one of its surface, m."""
+    """Return the distance from a vertex of the reference up to which a point belongs to its surface, m."""
     extent = float(np.linalg.norm(np.ptp(reference.bounds, axis=0)))
     corners = reference.corners()
     return NEAR_SHARE * extent + float(np.median(np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)))
 
 
 def air_side(mesh: TriangleMesh) -> FloatArray:
-    """(3,) a place before the middle of a surface, on the side to which its triangles are wound, in its frame, m."""
+    """Return a (3,) place in front of the middle of a surface, on the side that its triangles face, in its frame, m."""
     local = mesh.vertices - mesh.vertices.mean(axis=0)
     normal = np.linalg.eigh(np.einsum("ni,nj->ij", local, local))[1][:, 0]
     corners = mesh.corners()
@@ -72,16 +79,16 @@ def air_side(mesh: TriangleMesh) -> FloatArray:
 
 
 def check_in_metres(model: StereoModel, where: str) -> None:
-    """Raise InputError for a model of a pair that says nothing of points in metres, or holds effects of cameras."""
+    """Raise InputError if a stereo model has no noise in metres, or has effects of cameras."""
     of_cameras = [effect.name for effect in model.effects if effect.stage != Stage.POINT]
     if of_cameras:
         raise InputError(
-            f"the model holds {', '.join(of_cameras)}, and the measurement no `cameras`", where=where,
-            remedy="name cameras.yaml or a Metashape XML, or take them out of the model",
+            f"the model has {', '.join(of_cameras)}, but the measurement has no `cameras`", where=where,
+            remedy="add `cameras` (cameras.yaml or a Metashape XML), or remove them from the model",
         )  # fmt: skip
     if not model.noise.of_points.sigma_m and not model.noise.of_points.shared_sigma_m:
         raise InputError(
             "a stereo measurement needs `cameras`, or a model whose noise is in metres", where=where,
-            remedy="name cameras.yaml or a Metashape XML, or state noise: point_sigma_m in the model; "
-            "scarpsim measurement --photographs finds it",
+            remedy="add `cameras` (cameras.yaml or a Metashape XML), or set noise: point_sigma_m in the model; "
+            "scarpsim measurement --photographs estimates it",
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What the reference is like about the places that the pixels of a stereo pair see."""
+"""The reference surface around the places that the pixels of a stereo pair see."""
 
 from __future__ import annotations
 
@@ -13,9 +13,14 @@ from scene.geometry.mesh import FloatArray
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Of n pixels. point: (n, 3) the place that each sees, wall frame, m, NaN where that is not known; edge_px: (n,) departure of
-    the reference from its tangent plane there within some pixels, px of disparity; hidden: (n,) whether the right camera does not
-    see it."""
+    """The reference at n pixels.
+
+    Attributes
+    ----------
+    point : (n, 3) place that each pixel sees, wall frame, m; NaN if unknown.
+    edge_px : (n,) largest deviation of the reference from its tangent plane within some pixels, px of disparity.
+    hidden : (n,) whether the right camera does not see the place.
+    """
 
     point: FloatArray
     edge_px: FloatArray
@@ -23,15 +28,15 @@ class Surroundings:
 
     @classmethod
     def nowhere(cls, count: int) -> Surroundings:
-        """Of pixels that are not known to see anything."""
+        """Return the surroundings of pixels that are not known to see anything."""
         return cls(np.full((count, 3), np.nan), np.zeros(count), np.zeros(count, dtype=bool))
 
     def part(self, rows: Any) -> Surroundings:
-        """Those of some of the pixels, a mask or indices."""
+        """Return those of some of the pixels, by a mask or indices."""
         return Surroundings(self.point[rows], self.edge_px[rows], self.hidden[rows])
 
     def changed(self, rows: NDArray[np.int64], other: Surroundings) -> Surroundings:
-        """With others at some of the pixels."""
+        """Return a copy with other surroundings at some of the pixels."""
         found = Surroundings(self.point.copy(), self.edge_px.copy(), self.hidden.copy())
         found.point[rows], found.edge_px[rows], found.hidden[rows] = other.point, other.edge_px, other.hidden
         return found

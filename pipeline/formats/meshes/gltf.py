@@ -1,4 +1,4 @@
-"""Meshes as binary glTF, for slides and web pages."""
+"""Write meshes as binary glTF, for slides and web pages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from scene.geometry.mesh import TriangleMesh
 
 @dataclass(frozen=True)
 class GltfPart:
-    """A mesh with a name of its own. colours: (n, 4) RGBA of its vertices."""
+    """A named mesh with (n, 4) RGBA colours of its vertices."""
 
     name: str
     mesh: TriangleMesh
@@ -24,12 +24,12 @@ class GltfPart:
 
 
 def write_gltf(path: Path, parts: Sequence[GltfPart]) -> None:
-    """Write a .glb file, each part a node of its name. The wall frame's axes are glTF's: x right, y up, z to the viewer.
+    """Write a .glb file with one named node for each part; the wall frame's axes are glTF's: x right, y up, z towards the viewer.
 
-    Positions are float32, as glTF has them: 4 micrometres at 60 m. Raises InputError for another suffix.
+    Positions are float32, as glTF requires: 4 micrometres at 60 m. Raises InputError for another suffix.
     """
     if path.suffix.lower() != ".glb":
-        raise InputError(f"is of an unknown format '{path.suffix}'", where=str(path), allowed=".glb")
+        raise InputError(f"unknown format '{path.suffix}'", where=str(path), allowed=".glb")
     import trimesh
 
     scene = trimesh.Scene()

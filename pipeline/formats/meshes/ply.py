@@ -1,4 +1,4 @@
-"""PLY meshes and point clouds: binary and ASCII read, binary little-endian written."""
+"""Read and write PLY meshes and point clouds; binary and ASCII are read, binary little-endian is written."""
 
 from __future__ import annotations
 
@@ -19,25 +19,27 @@ from scene.meshes.ply import Columns, header_remarks, read_elements
 _CHUNK = 1_000_000
 """Records in memory at a time while writing."""
 _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
+"""PLY's name of each NumPy type."""
 _FACE_LISTS = ("vertex_indices", "vertex_index")
+"""Names of the list of a face's vertices."""
 _SCALAR = "scalar_"
-"""Before the names of channels: beside coordinates and intensity CloudCompare loads only properties that have it."""
+"""Prefix of channel names. CloudCompare loads only properties with it, besides coordinates and intensity."""
 _FIELDS = {"Intensity": "intensity", "GpsTime": "gps_time", "Gps_Time": "gps_time"}
-"""CloudCompare's names of channels that have a place of their own here."""
+"""CloudCompare's names of channels that have their own field here."""
 
 
 def write_ply(path: Path, mesh: TriangleMesh) -> None:
-    """Write a mesh: vertices as double, albedo as float, blocks as int where the mesh has them."""
+    """Write a mesh: vertices as double, albedo as float, blocks as int if the mesh has them."""
     vertex = _xyz(mesh.vertices) | _present(albedo=mesh.vertex_albedo, block=mesh.vertex_block)
     face = {"vertex_indices": mesh.faces} | _present(block=mesh.face_block)
     _write(path, {"vertex": vertex, "face": face})
 
 
 def write_ply_points(path: Path, cloud: PointCloud) -> None:
-    """Write a point cloud: x, y, z as double, the other channels in the type they have, or PLY's nearest (`_storable`).
+    """Write a point cloud: x, y, z as double, the other channels in their own type or PLY's nearest (`_storable`).
 
-    Channels other than the intensity are called `scalar_...`, for CloudCompare. Raises InputError for a channel that no type of
-    PLY holds without loss.
+    Channels other than intensity are named `scalar_...` for CloudCompare. Raises InputError for a channel that no type of PLY can
+    hold without loss.
     """
     channels = _present(intensity=cloud.intensity, gps_time=cloud.gps_time) | cloud.extra
     names = {name: name if name == "intensity" else _SCALAR + name for name in channels}
@@ -46,9 +48,9 @@ def write_ply_points(path: Path, cloud: PointCloud) -> None:
 
 
 def read_ply(path: Path) -> TriangleMesh:
-    """Read a mesh of triangles; properties other than ours are left out.
+    """Read a mesh of triangles; properties other than ours are ignored.
 
-    Raises InputError for a missing or damaged file, faces that are not triangles and indices of vertices that are not there.
+    Raises InputError for a missing or damaged file, faces that are not triangles, or indices of vertices that do not exist.
     """
     elements = read_elements(path)
     vertex, face = elements.get("vertex"), elements.get("face")
@@ -70,7 +72,7 @@ def read_ply(path: Path) -> TriangleMesh:
 
 
 def read_ply_points(path: Path) -> PointCloud:
-    """Read the vertices of any PLY file with all their scalar properties, by their names without `scalar_`.
+    """Read the vertices of any PLY file with all scalar properties, by their names without `scalar_`.
 
     Raises InputError for a missing or damaged file.
     """
@@ -88,29 +90,33 @@ def read_ply_points(path: Path) -> PointCloud:
 
 
 _PLACE = re.compile(r"unit|feet|foot|epsg|crs|projection|offset|shift|scale|translat", re.IGNORECASE)
-"""Words of comments that may say where the points are and in which unit; PLY itself has no place for it."""
+"""Words of comments that may state where the points are and in which unit; PLY itself has no field for it."""
 
 
 def _channel(name: str, vertex: Columns) -> str:
-    """What a property is called here: a field of CloudCompare by its own name, where no other property has it."""
+    """Return the channel name of a property: CloudCompare's fields by their own name, unless another property has it."""
     plain = name.removeprefix(_SCALAR)
     known = _FIELDS.get(plain, plain) if name.startswith(_SCALAR) else name
     return name if known in vertex else known
 
 
 def _others(extra: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return the channels without their own field."""
     return {name: channel for name, channel in extra.items() if name not in ("intensity", "gps_time")}
 
 
 def _xyz(points: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
+    """Return coordinates as columns."""
     return {name: points[:, axis] for axis, name in enumerate("xyz")}
 
 
 def _present(**columns: NDArray[Any] | None) -> dict[str, NDArray[Any]]:
+    """Return the columns that exist."""
     return {name: column for name, column in columns.items() if column is not None}
 
 
 def _points(vertex: Columns, path: Path) -> NDArray[np.float64]:
+    """Return the coordinates of the vertices."""
     missing = [name for name in "xyz" if name not in vertex]
     if missing:
         raise InputError(f"has vertices without {', '.join(missing)}", where=str(path))
@@ -121,16 +127,17 @@ def _points(vertex: Columns, path: Path) -> NDArray[np.float64]:
 
 
 def _column(columns: Columns, name: str, dtype: Any = None) -> NDArray[Any] | None:
+    """Return a column as an array; None if it does not exist."""
     return np.array(columns[name], dtype=dtype) if name in columns else None
 
 
 def _native(column: NDArray[Any]) -> NDArray[Any]:
-    """A contiguous copy in the machine's byte order."""
+    """Return a contiguous copy in the machine's byte order."""
     return np.array(column, dtype=column.dtype.newbyteorder("="))
 
 
 def _storable(column: NDArray[Any], where: str) -> NDArray[Any]:
-    """The column in a type that PLY has: no truth values, no integers of 64 bits, floats of 32 and 64 bits only."""
+    """Convert a column to a type that PLY has: it lacks truth values, 64-bit integers, and floats other than 32 and 64 bits."""
     if column.dtype.str[1:] in _NAMES:
         return column
     for kind in {"b": ("u1",), "f": ("f4", "f8")}.get(column.dtype.kind, ("i4", "u4", "f8")):
@@ -153,15 +160,17 @@ def _write(path: Path, elements: Mapping[str, Columns]) -> None:
 
 
 def _write_rows(file: BinaryIO, columns: Columns, record: np.dtype[Any], rows: slice) -> None:
+    """Write some rows of an element."""
     block = np.empty(rows.stop - rows.start, dtype=record)
     for name, column in columns.items():
         block[name] = column[rows]
         if column.ndim == 2:
             block[f"count {name}"] = column.shape[1]
-    file.write(block.data)  # not ndarray.tofile, which hides why a write fails
+    file.write(block.data)  # ndarray.tofile would hide why a write fails
 
 
 def _header_text(elements: Mapping[str, Columns]) -> str:
+    """Return the header."""
     lines = ["ply", "format binary_little_endian 1.0"]
     for element, columns in elements.items():
         lines.append(f"element {element} {len(next(iter(columns.values())))}")
@@ -172,6 +181,7 @@ def _header_text(elements: Mapping[str, Columns]) -> str:
 
 
 def _record_type(columns: Columns) -> np.dtype[Any]:
+    """Return the NumPy type of one record."""
     fields: list[Any] = []
     for name, column in columns.items():
         kind = f"<{column.dtype.str[1:]}"

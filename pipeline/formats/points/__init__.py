@@ -1,5 +1,5 @@
 """Read and write point clouds: LAS and LAZ, COPC, E57, PCD, PTX and text.
 
-PLY files, which may also hold a mesh, are in `pipeline/formats/meshes`.
-Start with `points.py`, which picks the reader; each reader returns the `PointCloud` of `pipeline/formats/point_cloud.py`.
+PLY files, which may also contain a mesh, are in `pipeline/formats/meshes`. Start with `points.py`, which chooses the reader; each
+reader returns the `PointCloud` of `pipeline/formats/point_cloud.py`.
 """

@@ -1,4 +1,4 @@
-"""What the columns of a text file are called, and in which unit: words above them, as programs write them, and their meaning."""
+"""Interpret the column names of a text file, as programs write them, and the units in them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scene.common.errors import InputError
 
 _AXES = ("x", "y", "z")
 SKIPPED = "-"
-"""A column of this name is left out."""
+"""A column with this name is left out."""
 _SYNONYMS = {
     "x": ("e", "east", "easting", "xcoord", "xcoordinate", "coordx", "coordinatex", "posx", "pointx", "utme", "utmeasting",
           "rechtswert", "ostwert", "ost", "est", "este", "leste"),
@@ -25,15 +25,21 @@ _SYNONYMS = {
     "red": ("scalarred",), "green": ("scalargreen",), "blue": ("scalarblue",),
     "gps_time": ("time", "gpstime", "timestamp", "scalargpstime"),
 }  # fmt: skip
-"""Names of columns here, and words for them, in lower case without spaces and punctuation."""
+"""Our column names, and other words for them, in lower case without spaces and punctuation."""
 _MEANING = {word: name for name, words in _SYNONYMS.items() for word in (*words, name.replace("_", ""))}
+"""Our column name of each word."""
 _DEGREES = {"lat", "latitude", "lon", "long", "lng", "longitude", "breite", "länge", "laenge"}
+"""Names of geographic coordinates."""
 _ANGLES = {"deg": math.pi / 180, "degree": math.pi / 180, "degrees": math.pi / 180, "°": math.pi / 180, "rad": 1.0, "mrad": 1e-3,
            "gon": math.pi / 200, "grad": math.pi / 200}  # fmt: skip
+"""Length of each unit of angle, rad."""
 _TIMES = {"s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9,
           "min": 60.0}  # fmt: skip
+"""Length of each unit of time, s."""
 _BRACKETS = re.compile(r"^(?P<name>.*?)[\s_]*[\[({<]\s*(?P<unit>[^\])}>]*?)\s*[\])}>]$")
+"""A name with its unit in brackets."""
 _SUFFIX = re.compile(r"^(?P<name>[^\s_]+)[\s_/]+(?P<unit>[^\s_]+)$")
+"""A name with its unit after a space, slash or underscore."""
 _NAME = re.compile(r"[^\s\[({]+(?:\s*[\[({][^\])}]*[\])}])?")
 """A name between white space, with its unit in brackets."""
 _PROJECT = "project the points to a coordinate system in metres, such as UTM, and export them again"
@@ -42,8 +48,15 @@ _HOW = "name the columns x, y, z in the file, or with --columns where a command 
 
 @dataclass(frozen=True)
 class Column:
-    """name: of the channel here; unit: as the file has it, "" without one; factor: by which values are multiplied; decibels:
-    whether they are tenths of the logarithm of a power."""
+    """One column of a text file.
+
+    Attributes
+    ----------
+    name : Our name of the channel.
+    unit : Unit as the file states it; "": none.
+    factor : Factor that converts values to SI units.
+    decibels : Whether values are decibels of a power.
+    """
 
     name: str
     unit: str = ""
@@ -53,19 +66,19 @@ class Column:
 
 @dataclass(frozen=True)
 class NamedColumns:
-    """columns: of the file, none where it does not name them; notes: what was passed over."""
+    """The columns that a file names, empty if it names none, and notes on lines that were ignored."""
 
     columns: tuple[Column, ...] = ()
     notes: tuple[str, ...] = ()
 
 
 def named_columns(layout: TextLayout, where: str) -> NamedColumns:
-    """The columns by the lines above them: the last line that names x, y and z, by these or by other words.
+    """Interpret the last line above the points that names x, y and z, by these or other words.
 
     Raises
     ------
     InputError
-        For names of degrees, for more or fewer names than columns, and for names without x, y and z.
+        If names are of degrees, do not match the number of columns, or lack x, y or z.
     """
     header = _with_unit_line(layout)
     for line, words in reversed(header):
@@ -77,16 +90,16 @@ def named_columns(layout: TextLayout, where: str) -> NamedColumns:
             return NamedColumns(_checked(columns, words, line, layout, where))
         if len(words) == layout.form.columns and (not line.comment or len(axes) == 2):
             named = ", ".join(f"'{word}'" for word in words)
-            problem = f"names its columns {named:.200}, of which not all of x, y and z are understood"
+            problem = f"names its columns {named:.200}, which do not include x, y and z"
             raise InputError(
                 problem, where=f"{where}, line {line.number:,}", allowed="x y z, easting northing height", remedy=_HOW
             )
-    passed = [f"line {line.number} is passed over: '{line.text:.60}'" for line, _ in header if not line.comment]
+    passed = [f"line {line.number} is ignored: '{line.text:.60}'" for line, _ in header if not line.comment]
     return NamedColumns((), tuple(passed))
 
 
 def with_stated_units(columns: Sequence[Column], layout: TextLayout, where: str) -> tuple[Column, ...]:
-    """Columns that the user names, with the units that a line of names in the file has at their places."""
+    """Return columns that the user names, with the units that a line of names in the file has for them."""
     for line, words in reversed(_with_unit_line(layout)):
         if len(words) == len(columns):
             units = [_parts(word)[1] for word in words]
@@ -97,7 +110,7 @@ def with_stated_units(columns: Sequence[Column], layout: TextLayout, where: str)
 
 
 def _with_unit_line(layout: TextLayout) -> list[tuple[HeaderLine, list[str]]]:
-    """The lines before the points with their names; a line of nothing but units goes to the names above it."""
+    """Return the lines before the points with their names; a line of units only is merged into the names above it."""
     lines = [(line, _split(line, layout)) for line in layout.header]
     if len(lines) < 2:
         return lines
@@ -111,13 +124,13 @@ def _with_unit_line(layout: TextLayout) -> list[tuple[HeaderLine, list[str]]]:
 
 
 def _is_prose(words: Sequence[str], layout: TextLayout) -> bool:
-    """Whether a line is a sentence: it has no name for each column, and most of its words are none."""
+    """Whether a line is a sentence: its words do not match the number of columns, and most are not names."""
     names = sum(_key(_parts(word)[0]) in _MEANING for word in words)
     return len(words) != layout.form.columns and names <= len(words) / 2
 
 
 def _split(line: HeaderLine, layout: TextLayout) -> list[str]:
-    """The names in a line, at the separator of the file; at another where that alone gives a name for each column."""
+    """Split a line into names at the file's separator, or at another one if only that gives a name for each column."""
     ways = [re.split(re.escape(mark), line.text) for mark in (layout.form.separator, ";", "\t", ",", "|") if mark]
     ways.insert(0 if layout.form.separator is None else 1, _NAME.findall(line.text.replace(",", " ")))
     cleaned = [[word.strip().strip("\"'").strip() for word in words] for words in ways]
@@ -128,18 +141,19 @@ def _split(line: HeaderLine, layout: TextLayout) -> list[str]:
 def _checked(
     columns: tuple[Column, ...], words: Sequence[str], line: HeaderLine, layout: TextLayout, where: str
 ) -> tuple[Column, ...]:
+    """Return the columns, or raise InputError if their number differs from the rows'."""
     if len(columns) == layout.form.columns:
         return columns
     raise InputError(
-        f"names {len(columns)} columns ({', '.join(words):.200}), and the rows have {layout.form.columns}",
+        f"names {len(columns)} columns ({', '.join(words):.200}), but the rows have {layout.form.columns}",
         where=f"{where}, line {line.number:,}", allowed="a name for each column", remedy=_HOW,
     )  # fmt: skip
 
 
 def understood(words: Sequence[str], where: str) -> tuple[Column, ...]:
-    """Columns by the words above them. A column that is called by its name here goes before one that another word stands for.
+    """Interpret column names; a column with one of our names takes precedence over one with a synonym.
 
-    Raises InputError for coordinates in degrees, and for a unit of coordinates that is not known.
+    Raises InputError for coordinates in degrees or in an unknown unit.
     """
     parts = [_parts(word) for word in words]
     names: list[str | None] = [name if name in _MEANING.values() else None for name in (part[0] for part in parts)]
@@ -159,7 +173,7 @@ def understood(words: Sequence[str], where: str) -> tuple[Column, ...]:
 
 
 def _colours(names: list[str | None], parts: Sequence[tuple[str, str]]) -> list[str | None]:
-    """R, G and B are colours where all three are there; r alone may be a range."""
+    """Interpret r, g and b as colours if all three exist; r alone may be a range."""
     letters = [name for name, _ in parts]
     if not all(letter in letters for letter in "rgb"):
         return names
@@ -168,7 +182,7 @@ def _colours(names: list[str | None], parts: Sequence[tuple[str, str]]) -> list[
 
 
 def _parts(word: str) -> tuple[str, str]:
-    """The name, in lower case, and the unit in a word; a unit behind an underscore or a space only of coordinates."""
+    """Return the name, in lower case, and the unit in a word; units after an underscore or space count only for coordinates."""
     text = word.strip().lower()
     if match := _BRACKETS.match(text):
         return match["name"].strip(), match["unit"]
@@ -180,10 +194,12 @@ def _parts(word: str) -> tuple[str, str]:
 
 
 def _key(name: str) -> str:
+    """Return a name without punctuation, for look-up."""
     return re.sub(r"[^\w°]|_", "", name)
 
 
 def _column(meaning: str | None, name: str, unit: str, word: str, where: str) -> Column:
+    """Interpret one column."""
     if meaning in _AXES:
         return _coordinate(str(meaning), unit, word, where)
     if _key(name) in _DEGREES:
@@ -198,17 +214,18 @@ def _column(meaning: str | None, name: str, unit: str, word: str, where: str) ->
 
 
 def _coordinate(axis: str, unit: str, word: str, where: str) -> Column:
+    """Interpret a column of coordinates."""
     metres = metres_of_word(unit) if unit else 1.0
     if metres is not None:
         return Column(axis, unit, metres)
     if unit in _ANGLES:
         raise InputError(f"names a column '{word}': coordinates in degrees", where=where, allowed="metres", remedy=_PROJECT)
-    problem = f"names a column '{word}', with a unit that is not known: '{unit}'"
+    problem = f"names a column '{word}' with an unknown unit '{unit}'"
     raise InputError(problem, where=where, allowed="m, cm, mm, km, ft, us-ft", remedy="correct the name, or remove the unit")
 
 
 def _further(name: str, unit: str, word: str) -> Column:
-    """A column of its own name: lengths in metres, angles in radians and times in seconds, as the name then says."""
+    """Return another column; lengths, angles and times are converted to m, rad and s, which then end the name."""
     for factor, si in ((metres_of_word(unit), "m"), (_ANGLES.get(unit), "rad"), (_TIMES.get(unit), "s")):
         if unit and factor is not None:
             return Column(f"{name}_{si}", unit, factor)

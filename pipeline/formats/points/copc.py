@@ -1,4 +1,4 @@
-"""COPC: LAZ whose chunks are the nodes of an octree, so that a viewer fetches only what it shows (copc.io, version 1.0)."""
+"""Write COPC: LAZ whose chunks are the nodes of an octree, so that a viewer fetches only what it shows (copc.io, version 1.0)."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from scene.common.errors import InputError
 SUFFIX = ".copc.laz"
 _PLAIN, _USUAL = PulseChannels(), LazHeader()
 _CELLS_LOG2 = 7
-"""A node's cube is divided into 128^3 cells, of each of which it takes one point."""
+"""A node's cube has 128^3 cells; the node takes one point of each."""
 _WHOLE = 4**_CELLS_LOG2
-"""Points of which a node takes all: as many as a flat wall has cells, so that no tiny chunks arise."""
+"""Number of points up to which a node takes all of its points: as many as a flat wall has cells, which avoids tiny chunks."""
 _FINEST = 20
-"""Level of the finest cells, whose three numbers fit 60 bits."""
+"""Level of the finest cells, whose three indices fit into 60 bits."""
 _DEEPEST = _FINEST - _CELLS_LOG2
 _SPREAD = (
     (32, 0x001F00000000FFFF),
@@ -34,17 +34,26 @@ _SPREAD = (
     (4, 0x10C30C30C30C30C3),
     (2, 0x1249249249249249),
 )
-"""Shifts and masks that move the bits of a number two places apart (Morton 1966)."""
+"""Shifts and masks that spread the bits of a number to every third place (Morton 1966)."""
 _BATCH = 1_000_000
+"""Number of points compressed at a time."""
 _USER, _INFO, _HIERARCHY = "copc", 1, 1000
 _INFO_BYTES, _PAD = 160, 88
 _NODE = np.dtype([("key", "<i4", 4), ("offset", "<u8"), ("bytes", "<i4"), ("points", "<i4")])
+"""Entry of the hierarchy."""
 
 
 @dataclass(frozen=True)
 class Octree:
-    """low: (3,) and side: the root cube, in the coordinates' steps; keys: (m, 4) level, x, y, z of the nodes; counts: (m,)
-    points of each; order: (n,) the points node by node, within a node as they were given."""
+    """Points sorted into the nodes of an octree.
+
+    Attributes
+    ----------
+    low, side : (3,) corner and side of the root cube, in the coordinates' steps.
+    keys : (m, 4) level, x, y, z of the nodes.
+    counts : (m,) number of points in each node.
+    order : (n,) points by node, in their given order within a node.
+    """
 
     low: NDArray[np.int64]
     side: int
@@ -54,10 +63,10 @@ class Octree:
 
 
 def write_copc(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, header: LazHeader = _USUAL) -> None:
-    """Write a point cloud as `write_laz` does, in the order of an octree; equal arguments give equal bytes.
+    """Write a point cloud like `write_laz`, in the order of an octree; equal arguments give equal bytes.
 
-    Level k holds a point for each cell of side / (128 * 2^k), beside those of the levels above it; a node with at most 16,384
-    points left holds all of them. Raises InputError for a cloud without points, and where the file cannot be written.
+    Level k has one point for each cell of side / (128 * 2^k), in addition to the levels above. A node with at most 16,384
+    remaining points takes all of them. Raises InputError for an empty cloud, or if the file cannot be written.
     """
     if not len(cloud.points):
         raise InputError("has no points to write", where=str(path), remedy="write LAZ")
@@ -68,7 +77,7 @@ def write_copc(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, he
 
 
 def octree(steps: NDArray[np.integer]) -> Octree:
-    """The octree of points at integer coordinates (n, 3)."""
+    """Build the octree of points at integer coordinates (n, 3)."""
     low = steps.min(axis=0).astype(np.int64)
     from_low = steps - low
     side = max(int(from_low.max()), 1)
@@ -90,7 +99,9 @@ def octree(steps: NDArray[np.integer]) -> Octree:
 
 
 def _taken(curve: NDArray[np.int64], level: int) -> NDArray[np.bool_]:
-    """(n,) whether a level takes the point, of those left in the curve's order: the first of each cell, or all of its node."""
+    """Return the (n,) mask of points that a level takes, of those left in the curve's order: the first of each cell, or all of a
+    node.
+    """
     if level == _DEEPEST:
         return np.ones(len(curve), dtype=bool)
     starts = _starts(_at_level(curve, level))
@@ -101,17 +112,17 @@ def _taken(curve: NDArray[np.int64], level: int) -> NDArray[np.bool_]:
 
 
 def _starts(values: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Where runs of equal values begin."""
+    """Return where runs of equal values begin."""
     return np.flatnonzero(np.diff(values, prepend=-1))
 
 
 def _at_level(curve: NDArray[np.int64], level: int) -> NDArray[np.int64]:
-    """The cubes of a level, numbered along the curve."""
+    """Return the number of each point's cube at a level."""
     return curve >> 3 * (_FINEST - level)
 
 
 def _morton(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(n,) the places of cells (n, 3) on the Z-order curve: the bits of x, y, z by turns."""
+    """Return the (n,) places of cells (n, 3) on the Z-order curve, which interleaves the bits of x, y and z."""
     curve = np.zeros(len(cells), dtype=np.int64)
     for axis in range(3):
         spread = cells[:, axis]
@@ -122,6 +133,7 @@ def _morton(cells: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _write(file: BinaryIO, stored: StoredCloud, tree: Octree) -> None:
+    """Write header, chunks and hierarchy."""
     las = stored.header
     packer = lazrs.LazVlr.new_for_compression(las.point_format.id, las.point_format.num_extra_bytes, True)
     las.vlrs.insert(0, laspy.VLR(_USER, _INFO, "COPC info VLR", bytes(_INFO_BYTES)))
@@ -145,7 +157,7 @@ def _write(file: BinaryIO, stored: StoredCloud, tree: Octree) -> None:
 
 
 def _batches(stored: StoredCloud, tree: Octree) -> Iterator[tuple[laspy.ScaleAwarePointRecord, NDArray[np.int64]]]:
-    """The points of whole nodes, about a million at a time, and how many of them each node has."""
+    """Yield the points of complete nodes, about a million at a time, with the number of points of each node."""
     ends = np.cumsum(tree.counts)
     start = 0
     while start < len(ends):
@@ -156,12 +168,12 @@ def _batches(stored: StoredCloud, tree: Octree) -> Iterator[tuple[laspy.ScaleAwa
 
 
 def _chunks(array: NDArray[Any], sizes: NDArray[np.int64]) -> list[NDArray[np.uint8]]:
-    """The bytes of consecutive rows, by their numbers."""
+    """Split rows into the bytes of consecutive chunks."""
     return [np.frombuffer(part, np.uint8) for part in np.split(array, np.cumsum(sizes)[:-1])]
 
 
 def _nodes(file: BinaryIO, las: laspy.LasHeader, packer: Any, tree: Octree) -> NDArray[np.void]:
-    """The hierarchy's entries: nodes with the places of their chunks, which the file's table of chunks knows."""
+    """Return the hierarchy's entries, with the places of the nodes' chunks from the file's chunk table."""
     file.seek(las.offset_to_point_data)
     table = np.array(lazrs.read_chunk_table(file, packer))[: len(tree.counts)]
     nodes = np.empty(len(tree.counts), dtype=_NODE)
@@ -171,7 +183,7 @@ def _nodes(file: BinaryIO, las: laspy.LasHeader, packer: Any, tree: Octree) -> N
 
 
 def _info(las: laspy.LasHeader, tree: Octree, place: int, size: int, time: NDArray[np.floating] | None) -> bytes:
-    """The info record: root cube, spacing of its points, place of the hierarchy, first and last time."""
+    """Return the info record: root cube, spacing of its points, place of the hierarchy, first and last time."""
     scale = float(las.scales[0])
     half = 0.5 * tree.side * scale
     centre = tree.low * scale + las.offsets + half

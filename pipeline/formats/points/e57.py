@@ -1,7 +1,7 @@
-"""E57 point clouds (ASTM E2807): scans with their grid and pose, through libE57Format (pye57).
+"""Read and write E57 point clouds (ASTM E2807), scans with their grid and pose, by libE57Format (pye57).
 
-Read are Cartesian and spherical scans; written are Cartesian ones in double precision, the points in the scanner's frame and the
-pose beside them. What E57 has no field for (channels of truth) is not written.
+Cartesian and spherical scans are read. Cartesian scans in double precision are written, with points in the scanner's frame and
+the pose. Channels for which E57 has no field (channels of truth) are not written.
 """
 
 from __future__ import annotations
@@ -27,29 +27,36 @@ from scene.geometry.mesh import FloatArray
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _INVALID = ("cartesianInvalidState", "sphericalInvalidState")
-"""1: the direction is valid, the distance is not; 2: nothing is."""
+"""Fields that mark invalid records: 1, the direction is valid but not the distance; 2, nothing is."""
 _INVALID_INTENSITY = "isIntensityInvalid"
 _SIGNATURE, _HEADER_BYTES, _LENGTH_AT = b"ASTM-E57", 48, 16
-"""Of the header: its first bytes, its length, and where the length of the whole file stands."""
+"""First bytes of the header, its length, and the offset of the file's length in it."""
 _TYPES = {
     "intensity": "f", "timeStamp": "d", "rowIndex": "q", "columnIndex": "q", "returnIndex": "q", "returnCount": "q",
     "colorRed": "H", "colorGreen": "H", "colorBlue": "H",
 }  # fmt: skip
+"""Type of each field."""
 _NAMES = {
     "rowIndex": "row", "columnIndex": "column", "returnIndex": "return_index", "returnCount": "return_count",
     "colorRed": "red", "colorGreen": "green", "colorBlue": "blue",
 }  # fmt: skip
 """E57's fields that become extra channels, and the channels' names."""
 _PIECE = 1_000_000
-"""Points in memory at a time while reading, beside those that are read."""
+"""Points read at a time."""
 _GUIDS = uuid.UUID("7f5c9a52-9f0e-4f3c-9c2b-2f1f5e6f7c11")
+"""Name space of the identifiers."""
 
 
 @dataclass(frozen=True)
 class E57Scan:
-    """One scan of a file. cloud: points in the scanner's frame, m; row and column of the scan's grid are extra channels.
+    """One scan of a file.
 
-    position: (3,) m and rotation: (3, 3), scanner to the file's frame.
+    Attributes
+    ----------
+    name : Name of the scan.
+    cloud : Points in the scanner's frame, m; extra channels have row and column of the scan's grid.
+    position : (3,) position of the scanner, m.
+    rotation : (3, 3) scanner to the file's frame.
     """
 
     name: str
@@ -67,7 +74,7 @@ class E57Scan:
 def write_e57(path: Path, scans: Sequence[E57Scan]) -> None:
     """Write scans; extra channels `row` and `column` (integers from 0) become the scan's grid, others are left out.
 
-    Equal arguments give equal bytes. Raises InputError where the file cannot be written, ValueError for a scan without points.
+    Equal arguments give equal bytes. Raises InputError if the file cannot be written, ValueError for a scan without points.
     """
     with writing(path) as temporary:
         image = libe57.ImageFile(str(temporary), "w")
@@ -80,9 +87,9 @@ def write_e57(path: Path, scans: Sequence[E57Scan]) -> None:
 
 
 def read_e57(path: Path) -> list[E57Scan]:
-    """Read all scans; records that their scan marks as invalid are left out.
+    """Read all scans without the records that they mark as invalid.
 
-    Raises InputError for a missing or damaged file, one without points, and a coordinate system that is not in metres.
+    Raises InputError for a missing or damaged file, one without points, or a coordinate system that is not in metres.
     """
     where = str(check_file(path))
     _check_length(path)
@@ -99,9 +106,9 @@ def read_e57(path: Path) -> list[E57Scan]:
         if isinstance(error, InputError):
             raise
         problem = f"is damaged: its {_part_of(error)} cannot be read"
-        raise InputError(problem, where=where, remedy="copy the file again from where it is whole, or export it again") from None
+        raise InputError(problem, where=where, remedy="copy the complete file again, or export it again") from None
     if not any(len(scan.cloud.points) for scan in scans):
-        problem = "holds no scans" if not scans else "holds no points: all records are marked as invalid, or there are none"
+        problem = "has no scans" if not scans else "has no points: all records are marked as invalid, or there are none"
         raise InputError(problem, where=where, remedy="export it again, with its points")
     return [replace(scan, cloud=scan.cloud.noted(*notes)) for scan in scans]
 
@@ -110,24 +117,23 @@ def read_e57(path: Path) -> list[E57Scan]:
 
 
 def _check_length(path: Path) -> None:
-    """Raise InputError for a file that is no E57, or shorter than its header states."""
+    """Raise InputError for a file that is not E57, or is shorter than its header states."""
     with path.open("rb") as file:
         start = file.read(_HEADER_BYTES)
     size, where = path.stat().st_size, str(path)
     if not start.startswith(_SIGNATURE):
         begins = f"begins with {start[:8]!r}, not with {_SIGNATURE!r}" if start else "is empty"
-        problem = f"is not a whole E57 file: it {begins}"
+        problem = f"is not a complete E57 file: it {begins}"
         raise InputError(problem, where=where, remedy="export it as E57, or give it the suffix of its format")
     stated = struct.unpack_from("<Q", start, _LENGTH_AT)[0] if len(start) == _HEADER_BYTES else _HEADER_BYTES
     if size < stated:
-        problem = f"is not a whole E57 file: its header states {stated:,} bytes, and it has {size:,}"
+        problem = f"is not a complete E57 file: its header states {stated:,} bytes, but it has {size:,}"
         raise InputError(problem, where=where, remedy="the file was cut off: copy or export it again")
 
 
 def _check_metres(root: Any, where: str) -> tuple[str, ...]:
-    """A note on a coordinate system that is not understood.
-
-    Raises InputError where its unit is none that E57 has: the standard's lengths are metres.
+    """Return a note on a coordinate system that is not understood; raise InputError if its unit is not the metre, which E57
+    requires.
     """
     text = root["coordinateMetadata"].value().strip() if root.isDefined("coordinateMetadata") else ""
     if not text:
@@ -138,20 +144,21 @@ def _check_metres(root: Any, where: str) -> tuple[str, ...]:
     units = units_of_crs(crs, where)
     if units is not None and not units.in_metres:
         raise InputError(
-            f"states {units.source}, whose unit is {units.name}, and E57 files hold metres", where=where,
-            remedy="export it with a coordinate system in metres, or as LAS with the one it has",
+            f"states {units.source}, whose unit is {units.name}, but E57 files are in metres", where=where,
+            remedy="export it with a coordinate system in metres, or as LAS with its present one",
         )  # fmt: skip
     return ()
 
 
 def _part_of(error: Exception) -> str:
-    """Which part of the file is damaged, by libE57Format's words."""
+    """Return which part of the file is damaged, from libE57Format's message."""
     text = str(error).lower()
     parts = {"checksum": "pages (a checksum does not agree)", "crc": "pages (a checksum does not agree)", "xml": "header in XML"}
     return next((part for word, part in parts.items() if word in text), "points")
 
 
 def _read_scan(image: Any, node: Any, number: int, where: str) -> E57Scan:
+    """Read one scan."""
     name = node["name"].value() if node.isDefined("name") else f"scan {number}"
     columns, unread = _read_columns(image, node["points"], f"{where} ({number + 1}: {name})")
     valid = np.ones(len(next(iter(columns.values()), ())), dtype=bool)
@@ -173,7 +180,7 @@ def _read_scan(image: Any, node: Any, number: int, where: str) -> E57Scan:
 
 
 def _intensity(columns: dict[str, NDArray[Any]]) -> NDArray[Any] | None:
-    """The intensity, NaN where the file marks it as invalid; None where it does so throughout."""
+    """Return the intensity, NaN where the file marks it as invalid; None if all of it is."""
     intensity, invalid = columns.get("intensity"), columns.pop(_INVALID_INTENSITY, None)
     if intensity is None or invalid is None or not invalid.any():
         return intensity
@@ -181,9 +188,10 @@ def _intensity(columns: dict[str, NDArray[Any]]) -> NDArray[Any] | None:
 
 
 def _read_columns(image: Any, points: Any, where: str) -> tuple[dict[str, NDArray[Any]], list[str]]:
-    """The fields of a scan's points, and the names of those that are not read.
+    """Read the fields of a scan's points, and the names of unknown fields.
 
-    They are read in pieces: memory is taken for what is there, not for what is said to be. Raises InputError where that differs.
+    Points are read in pieces, so that memory is used for what exists, not for what the file claims. Raises InputError if these
+    differ.
     """
     count = points.childCount()
     prototype = libe57.StructureNode(points.prototype())
@@ -202,14 +210,14 @@ def _read_columns(image: Any, points: Any, where: str) -> tuple[dict[str, NDArra
     found = sum(len(next(iter(each.values()), ())) for each in pieces)
     if found != count:
         raise InputError(
-            f"holds {found:,} points, where it says {count:,}", where=where,
-            remedy="copy the file again from where it is whole, or export it again",
+            f"has {found:,} points but states {count:,}", where=where,
+            remedy="copy the complete file again, or export it again",
         )  # fmt: skip
     return {name: np.concatenate([each[name] for each in pieces]) for name in columns}, unread
 
 
 def _points(columns: dict[str, NDArray[Any]], where: str) -> FloatArray:
-    """(n, 3) Cartesian points, m; spherical ones have an elevation above the horizon, not a zenith angle."""
+    """Return (n, 3) Cartesian points, m; spherical ones have an elevation above the horizon instead of a zenith angle."""
     if all(name in columns for name in _CARTESIAN):
         return np.stack([columns[name] for name in _CARTESIAN], axis=1)
     if not all(name in columns for name in _SPHERICAL):
@@ -221,6 +229,7 @@ def _points(columns: dict[str, NDArray[Any]], where: str) -> FloatArray:
 
 
 def _pose(node: Any) -> tuple[FloatArray, FloatArray]:
+    """Return position and rotation of a scan."""
     from scipy.spatial.transform import Rotation
 
     if not node.isDefined("pose"):
@@ -238,7 +247,7 @@ def _pose(node: Any) -> tuple[FloatArray, FloatArray]:
 
 
 def _write_header(image: Any) -> Any:
-    """The file's own fields; returns the list of scans."""
+    """Write the file's own fields, and return the list of scans."""
     image.extensionsAdd("", libe57.E57_V1_0_URI)
     root = image.root()
     root.set("formatName", libe57.StringNode(image, "ASTM E57 3D Imaging Data File"))
@@ -254,6 +263,7 @@ def _write_header(image: Any) -> Any:
 
 
 def _write_scan(image: Any, data: Any, scan: E57Scan, number: int) -> None:
+    """Write one scan."""
     from scipy.spatial.transform import Rotation
 
     columns = _columns(scan.cloud)
@@ -281,7 +291,7 @@ def _write_scan(image: Any, data: Any, scan: E57Scan, number: int) -> None:
 
 
 def _columns(cloud: PointCloud) -> dict[str, NDArray[Any]]:
-    """The fields of the file in the types that libE57 takes."""
+    """Return the fields of the file in the types that libE57 takes."""
     if not len(cloud.points):
         raise ValueError("a scan without points cannot be written")
     present: dict[str, Any] = dict(zip(_CARTESIAN, cloud.points.T, strict=True))
@@ -293,6 +303,7 @@ def _columns(cloud: PointCloud) -> dict[str, NDArray[Any]]:
 
 
 def _field(image: Any, column: NDArray[Any]) -> Any:
+    """Return the prototype of a field."""
     low, high = column.min().item(), column.max().item()
     if column.dtype.kind == "f":
         return libe57.FloatNode(image, low, libe57.E57_SINGLE if column.itemsize == 4 else libe57.E57_DOUBLE, low, high)
@@ -300,11 +311,13 @@ def _field(image: Any, column: NDArray[Any]) -> Any:
 
 
 def _bounds(image: Any, columns: dict[str, NDArray[Any]]) -> Any:
+    """Return the minimum and maximum of columns as a node."""
     limits = {f"{name}{end}": value for name, c in columns.items() for end, value in (("Minimum", c.min()), ("Maximum", c.max()))}
     return _structure(image, **{name: value.item() for name, value in limits.items()})
 
 
 def _structure(image: Any, **values: Any) -> Any:
+    """Return values as a structure node."""
     node = libe57.StructureNode(image)
     for name, value in values.items():
         kind = libe57.IntegerNode if isinstance(value, int) else libe57.FloatNode
@@ -313,11 +326,12 @@ def _structure(image: Any, **values: Any) -> Any:
 
 
 def _xyz(vector: FloatArray) -> dict[str, float]:
+    """Return a vector's components by axis."""
     return {axis: float(value) for axis, value in zip("xyz", vector, strict=True)}
 
 
 def _buffers(image: Any, columns: dict[str, NDArray[Any]], count: int) -> Any:
-    """The columns as buffers to read into or write from; a buffer does not keep its column alive."""
+    """Return buffers for reading into or writing from the columns; a buffer does not keep its column alive."""
     buffers = libe57.VectorSourceDestBuffer()
     for name, column in columns.items():
         buffers.append(libe57.SourceDestBuffer(image, name, column, count, True, True))

@@ -1,4 +1,4 @@
-"""Records that stand for no return: points at 0 0 0, or at one other place that far too many share."""
+"""Remove records that stand for a missing return: points at 0 0 0, or at one other place that too many share."""
 
 from __future__ import annotations
 
@@ -10,28 +10,31 @@ from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 
 _SAMPLE = 4096
+"""Number of points in the sample."""
 _ALIKE_IN_SAMPLE = 8
-"""Points of the sample at one place from which on it is taken for a filler: 2 records in 1,000, where a scan rounded to
-centimetres has a few at most."""
+"""Number of sampled points at one place from which it is a filler: 2 in 1,000 records. A scan rounded to centimetres has only a
+few.
+"""
 _GOLDEN = 0.6180339887498949
+"""Golden ratio, which spreads the sample over the file."""
 
 
 def without_fillers(cloud: PointCloud, where: str, *, grid: bool = False) -> PointCloud:
-    """The cloud without records that stand for no return, with a note on them.
+    """Remove records that stand for a missing return, and add a note on them.
 
-    Programs write 0 0 0, or one other place, for the pulses of a scan's grid that did not come back. A single record at 0 0 0 is
-    left out where it lies outside of all others, and wherever it lies in the formats that have such grids.
+    Programs write 0 0 0, or another fixed place, for pulses of a scan's grid without a return. A single record at 0 0 0 is
+    removed if it is outside of all other points, and in formats with grids always.
 
     Parameters
     ----------
-    cloud : points in the frame and the unit in which the file has them
-    where : what errors call the file
-    grid : whether the format holds cells of a scan's grid, as E57 and PTX do
+    cloud : Points in the frame and the unit of the file.
+    where : Name of the file, for errors.
+    grid : Whether the format has cells of a scan's grid, like E57 and PTX.
 
     Raises
     ------
     InputError
-        Where all records are 0 0 0.
+        If all records are 0 0 0.
     """
     points = cloud.points
     at_zero: NDArray[np.bool_] = np.asarray(~points.any(axis=1))
@@ -49,17 +52,18 @@ def without_fillers(cloud: PointCloud, where: str, *, grid: bool = False) -> Poi
 
 
 def _left_out(cloud: PointCloud, rows: NDArray[np.bool_], place: str) -> PointCloud:
+    """Return the cloud without some rows, with a note."""
     return cloud.part(~rows).noted(f"{int(rows.sum()):,} records at {place}, which stand for no return, are left out")
 
 
 def _outside(others: FloatArray) -> bool:
-    """Whether 0 0 0 lies outside of the box about the other points (n, 3)."""
+    """Whether 0 0 0 is outside of the bounding box of the other points (n, 3)."""
     known = others[np.isfinite(others).all(axis=1)]
     return bool(len(known) and ((known.min(axis=0) > 0) | (known.max(axis=0) < 0)).any())
 
 
 def _shared_place(points: FloatArray) -> FloatArray | None:
-    """(3,) the place that far too many of the points (n, 3) share, None where there is none; by a sample spread over the file."""
+    """Return the (3,) place that too many of the points (n, 3) share, judged from a sample; None if there is none."""
     count = min(len(points), _SAMPLE)
     if not count:
         return None

@@ -1,4 +1,4 @@
-"""What a LAS file says of itself: coordinate system, counts, box about the points; held against the points that are there."""
+"""Read what a LAS file states (coordinate system, counts, bounding box), and compare it with its points."""
 
 from __future__ import annotations
 
@@ -14,24 +14,26 @@ from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 
 _OUTSIDE = 0.01
-"""So far, in the file's unit, points may lie outside of the header's box, whose numbers programs round."""
+"""Distance, in the file's unit, by which points may be outside of the header's bounding box, whose numbers programs round."""
 _MUCH_LARGER = 1.5
-"""Times the points' extent: a header's box that is larger is told of."""
+"""Ratio of the header's box to the points' extent above which a note is added."""
 _MODEL, _GEOGRAPHIC, _PROJECTED, _LINEAR_UNIT, _VERTICAL, _VERTICAL_UNIT = 1024, 2048, 3072, 3076, 4096, 4099
 """GeoTIFF keys: kind of the coordinates, codes of their systems, codes of their units."""
 _IN_DEGREES, _GEOCENTRIC = 2, 3
+"""Values of the key for the kind of coordinates."""
 _USER_DEFINED = 32767
+"""Code of a user-defined system or unit."""
 _OLDER_COUNT_AT = 107
-"""Place of the number of points up to LAS 1.3, which later versions leave 0 or repeat."""
+"""Offset of the number of points in versions up to LAS 1.3; later versions leave it 0 or repeat the number."""
 _NOISE = (7, 18)
 """Classes of LAS 1.4: low and high noise."""
 _PROJECT = "project the points to a coordinate system in metres, such as UTM, and export them again"
 
 
 def stated_units(header: laspy.LasHeader, where: str) -> tuple[AxisUnits | None, tuple[str, ...]]:
-    """The unit of the coordinates by the file's WKT or GeoTIFF keys, and notes; None where neither states one.
+    """Return the unit of the coordinates by the file's WKT or GeoTIFF keys, or None, and notes.
 
-    Raises InputError for coordinates in degrees, and where WKT and keys state different units.
+    Raises InputError for coordinates in degrees, or if WKT and keys state different units.
     """
     by_wkt, notes = _by_wkt(header, where)
     by_keys = _by_keys(header, where)
@@ -44,10 +46,12 @@ def stated_units(header: laspy.LasHeader, where: str) -> tuple[AxisUnits | None,
 
 
 def _records(header: laspy.LasHeader, kind: type) -> list[Any]:
+    """Return the variable-length records of a kind."""
     return [record for record in (*header.vlrs, *(header.evlrs or ())) if isinstance(record, kind)]
 
 
 def _by_wkt(header: laspy.LasHeader, where: str) -> tuple[AxisUnits | None, tuple[str, ...]]:
+    """Return the unit by WKT, and notes."""
     for record in _records(header, laspy.vlrs.known.WktCoordinateSystemVlr):
         text = record.string.strip("\0 \n")
         if text:
@@ -57,7 +61,7 @@ def _by_wkt(header: laspy.LasHeader, where: str) -> tuple[AxisUnits | None, tupl
 
 
 def _by_keys(header: laspy.LasHeader, where: str) -> AxisUnits | None:
-    """By GeoTIFF keys: the codes of coordinate systems, before them the codes of units."""
+    """Return the unit by GeoTIFF keys: codes of coordinate systems first, then codes of units."""
     keys: dict[int, int] = {}
     for record in _records(header, laspy.vlrs.known.GeoKeyDirectoryVlr):
         keys |= {key.id: key.value_offset for key in record.geo_keys if key.tiff_tag_location == 0}
@@ -77,7 +81,7 @@ def _by_keys(header: laspy.LasHeader, where: str) -> AxisUnits | None:
 
 
 def _of_code(code: int | None, where: str) -> float | None:
-    """Metres of the unit of a projected or vertical coordinate system by its EPSG code; None where there is no such system."""
+    """Return the unit, m, of a projected or vertical coordinate system by its EPSG code; None if there is no such system."""
     crs = None if code is None else understood_crs(f"EPSG:{code}")
     if crs is None:
         return None
@@ -88,7 +92,7 @@ def _of_code(code: int | None, where: str) -> float | None:
 
 
 def _agreed(by_system: float | None, unit_code: int | None, what: str, where: str) -> float | None:
-    """The unit by a coordinate system and by a unit's own key. Raises InputError where the two differ."""
+    """Return the unit by the coordinate system and by the unit's own key; raise InputError if they differ."""
     by_unit = None if not unit_code or unit_code >= _USER_DEFINED else metres_of_epsg_unit(unit_code)
     if by_system is not None and by_unit is not None and not np.isclose(by_system, by_unit, rtol=1e-8, atol=0):
         units = f"{by_system:.10g} m by the coordinate system, {by_unit:.10g} m by the unit"
@@ -98,9 +102,9 @@ def _agreed(by_system: float | None, unit_code: int | None, what: str, where: st
 
 
 def check_box(header: laspy.LasHeader, points: FloatArray, where: str) -> tuple[str, ...]:
-    """A note where the header's box is much larger than the points (n, 3), in the file's unit.
+    """Return a note if the header's bounding box is much larger than the points (n, 3), in the file's unit.
 
-    Raises InputError where points lie outside of it. A box of zeros, or turned inside out, states nothing.
+    Raises InputError if points are outside of it. A box of zeros, or turned inside out, states nothing.
     """
     low, high = np.array(header.mins), np.array(header.maxs)
     if not len(points) or not np.isfinite([low, high]).all() or (low > high).any() or not (low.any() or high.any()):
@@ -113,18 +117,19 @@ def check_box(header: laspy.LasHeader, points: FloatArray, where: str) -> tuple[
     if ((found_low < low - reach) | (found_high > high + reach)).any():
         raise InputError(
             f"states {said}", where=where,
-            remedy="its scale, offset or box is wrong: export it again, or mend the header, as LAStools' lasinfo -repair_bb does",
+            remedy="its scale, offset or box is wrong: export it again, or repair the header with LAStools' lasinfo -repair_bb",
         )  # fmt: skip
     larger = np.linalg.norm(high - low) > _MUCH_LARGER * np.linalg.norm(found_high - found_low) + 1
-    return (f"the file states {said}: a part of a larger one, or a wrong scale",) if larger else ()
+    return (f"the file states {said}: it is part of a larger file, or its scale is wrong",) if larger else ()
 
 
 def _place(values: FloatArray) -> str:
+    """Format a position."""
     return f"({', '.join(f'{value:.10g}' for value in values)})"
 
 
 def check_counts(header: laspy.LasHeader, path: Path) -> None:
-    """Raise InputError where a header states two counts, and where an uncompressed file has not the room that it states."""
+    """Raise InputError if a header states two numbers of points, or an uncompressed file does not have the size for them."""
     with path.open("rb") as file:
         (older,) = struct.unpack_from("<I", file.read(_OLDER_COUNT_AT + 4), _OLDER_COUNT_AT)
     if older and older != header.point_count:
@@ -138,13 +143,13 @@ def check_counts(header: laspy.LasHeader, path: Path) -> None:
     room = size // header.point_format.size
     if room != header.point_count:
         raise InputError(
-            f"states {header.point_count:,} points and has room for {room:,}", where=str(path),
-            remedy="the file was cut off, or its header was not brought up to date: copy or export it again",
+            f"states {header.point_count:,} points but has room for {room:,}", where=str(path),
+            remedy="the file was cut off, or its header is out of date: copy or export it again",
         )  # fmt: skip
 
 
 def flagged(las: Any) -> tuple[np.ndarray[Any, np.dtype[np.bool_]], tuple[str, ...]]:
-    """(n,) points that the file takes out of use, withheld and synthetic ones and those classified as noise; and notes."""
+    """Return the (n,) mask of points that the file takes out of use (withheld, synthetic, classified as noise), and notes."""
     out = np.zeros(len(las.points), dtype=bool)
     notes = []
     classes = np.asarray(las.classification)
@@ -154,8 +159,8 @@ def flagged(las: Any) -> tuple[np.ndarray[Any, np.dtype[np.bool_]], tuple[str, .
         ("classified as noise", np.isin(classes, _NOISE)),
     ):
         if rows.all():
-            notes.append(f"all points are {what}: they are kept")
+            notes.append(f"all points are {what} and are kept")
         elif count := int((rows & ~out).sum()):
-            notes.append(f"{count:,} points that the file has {what} are left out")
+            notes.append(f"{count:,} points {what} in the file are left out")
             out |= rows
     return out, tuple(notes)

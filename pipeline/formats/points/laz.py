@@ -1,4 +1,4 @@
-"""LAS and LAZ point clouds: LAS 1.4, point format 6, compressed by lazrs."""
+"""Read and write LAS and LAZ point clouds; written is LAS 1.4, point format 6, compressed by lazrs."""
 
 from __future__ import annotations
 
@@ -24,30 +24,40 @@ from scene.common.regular_file import check_file
 from scene.geometry.mesh import FloatArray
 
 _CHUNK = 1_000_000
-"""Points in memory at a time while writing; a multiple of the 50,000 of a LAZ chunk."""
+"""Points in memory at a time while writing; a multiple of the 50,000 points of a LAZ chunk."""
 _COUNTS = 65535
+"""Largest stored intensity."""
 _LARGEST = 2**31 - 1
+"""Largest stored coordinate."""
 _USER, _FULL_SCALE_RECORD = "scarpsim", 1
 _MOST_RETURNS = 15
+"""Largest number of returns of a pulse."""
 _SCAN_ANGLE_STEP = math.radians(0.006)
+"""Step of stored scan angles, rad."""
 _FURTHER = ("classification", "user_data", "point_source_id", "scanner_channel", "red", "green", "blue", "nir")
-"""Fields of LAS that are kept as channels, where any point has one above zero."""
-_COPY = "copy the file again from where it is whole, or export it again"
+"""Fields of LAS that become channels if any point has a value above zero."""
+_COPY = "copy the complete file again, or export it again"
 EXACT_INTENSITY = "intensity_relative"
-"""An extra dimension of this name is read as the intensity, in place of the 16-bit field."""
+"""Extra dimension that is read as the intensity, instead of the 16-bit field."""
 
 
 _HEADER_BYTES = 375
+"""Length of a header."""
 _CHUNK_SIZE_AT, _LARGEST_CHUNK, _VARIABLE_CHUNKS = 12, 10_000_000, 2**32 - 1
-"""Of a LAZ file: place of the chunks' size in LASzip's record, the largest that is believed, points, and what stands for any."""
+"""In a LAZ file: offset of the chunk size in LASzip's record, the largest accepted one, points, and the value for
+variable sizes.
+"""
 
 
 @dataclass(frozen=True)
 class PulseChannels:
-    """What LAS has places of its own for, beside intensity and time.
+    """Values for which LAS has its own fields, besides intensity and time.
 
-    return_number, number_of_returns: (n,), 1 to 15, none: 1 of 1; scan_angle_rad: (n,) angle of the emitted direction from
-    straight down, as LAS has it (for a scanner pi - zenith).
+    Attributes
+    ----------
+    return_number, number_of_returns : (n,), 1 to 15; None: 1 of 1.
+    scan_angle_rad : (n,) angle of the emitted direction from straight down, rad, as in LAS (for a scanner, pi minus zenith
+        angle).
     """
 
     return_number: NDArray[np.integer] | None = None
@@ -57,8 +67,7 @@ class PulseChannels:
 
 @dataclass(frozen=True)
 class LazHeader:
-    """scale_m: coordinates are stored as int32 multiples of it; date: of the file; wkt: of the coordinate system, where it is
-    known."""
+    """Header values. scale_m: step of the stored coordinates; date: of the file; wkt: coordinate system, if known."""
 
     scale_m: float = 1e-6
     date: datetime.date = datetime.date(2000, 1, 1)
@@ -70,7 +79,7 @@ _PLAIN, _USUAL = PulseChannels(), LazHeader()
 
 @dataclass(frozen=True)
 class StoredCloud:
-    """A cloud as LAS stores it: the header with its records, as yet of no points, and the fields of the points by name."""
+    """A cloud as LAS stores it: header with records, points, fields of the points by name, and the power of 65535 counts."""
 
     header: laspy.LasHeader
     cloud: PointCloud
@@ -79,7 +88,9 @@ class StoredCloud:
 
     @classmethod
     def of(cls, cloud: PointCloud, pulses: PulseChannels, header: LazHeader) -> StoredCloud:
-        """As `write_laz` writes it. Raises ValueError for points that are not finite, and for return numbers unknown to LAS."""
+        """Prepare a cloud for writing; raise ValueError for points that are not finite, or return numbers that LAS
+        cannot store.
+        """
         fields = {"bit_fields": _return_bits(pulses.return_number, pulses.number_of_returns), "gps_time": cloud.gps_time}
         if pulses.scan_angle_rad is not None:
             fields["scan_angle"] = np.rint(pulses.scan_angle_rad / _SCAN_ANGLE_STEP)
@@ -89,11 +100,11 @@ class StoredCloud:
         return cls(las, cloud, present | dict(cloud.extra), full_scale)
 
     def steps(self) -> NDArray[np.int64]:
-        """(n, 3) the coordinates as they are stored: in steps of the header's scale from its offset."""
+        """Return the (n, 3) coordinates as stored: in steps of the header's scale from its offset."""
         return np.rint((self.cloud.points - self.header.offsets) / self.header.scales).astype(np.int64)
 
     def records(self, rows: slice | NDArray[np.integer]) -> laspy.ScaleAwarePointRecord:
-        """The points in these rows."""
+        """Return the points of these rows as LAS records."""
         places, intensity = self.cloud.points[rows], self.cloud.intensity
         record = laspy.ScaleAwarePointRecord.zeros(len(places), header=self.header)
         _fill(record.array, self.header, places)
@@ -105,12 +116,19 @@ class StoredCloud:
 
 
 def write_laz(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, header: LazHeader = _USUAL) -> None:
-    """Write a point cloud as LAZ, or as LAS where `path` ends in .las; equal arguments give equal bytes.
+    """Write a point cloud as LAZ, or as LAS if `path` ends in .las; equal arguments give equal bytes.
 
-    cloud: finite points; its intensity, at least 0, is stored in 16 bits (see `_full_scale`), its extra channels as extra
-    dimensions in the type they have; scan angles are stored in steps of 0.006 degrees. Coordinates count from an offset in whole
-    metres at the middle of the cloud; a cloud wider than 4295 m takes the next power of ten of the scale. Raises InputError where
-    the file cannot be written.
+    Coordinates are stored relative to an offset in whole metres at the middle of the cloud. A cloud wider than 4295 m uses the
+    next power of ten of the scale. Raises InputError if the file cannot be written.
+
+    Parameters
+    ----------
+    path : File to write.
+    cloud : Finite points. Its intensity, at least 0, is stored in 16 bits (see `_full_scale`), its extra channels as extra
+        dimensions in
+        their own type.
+    pulses : Returns and scan angles; the latter are stored in steps of 0.006 degrees.
+    header : Header values.
     """
     stored = StoredCloud.of(cloud, pulses, header)
     with writing(path) as temporary, temporary.open("wb") as file, _writer(file, stored.header, path.suffix != ".las") as writer:
@@ -121,11 +139,12 @@ def write_laz(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, hea
 def read_laz(path: Path) -> PointCloud:
     """Read a LAS or LAZ file of any version.
 
-    Intensity is relative received power: of files of ours on the scale they hold, of others as counts / 65535. Intensity and
-    GPS time that are zero throughout count as not recorded. Where there are several returns of a pulse, or scan angles, the extra
-    channels `return_number` and `number_of_returns`, or `scan_angle_rad` (from straight down), hold them. Points that the file
-    has withheld or classified as noise are left out, with a note; `stated_units` is what its coordinate system says. Raises
-    InputError for a missing, truncated or foreign file, and a header that the points contradict.
+    Intensity is relative received power: in our files on their stored scale, in others counts / 65535. Intensity and GPS time
+    that are zero throughout count as not recorded. Extra channels `return_number` and `number_of_returns` exist if pulses have
+    several returns, `scan_angle_rad` (from straight down) if there are scan angles. Points that the file marks as withheld or
+    noise are left out, with a note; `stated_units` comes from its coordinate system.
+
+    Raises InputError for a missing, truncated or other file, or a header that contradicts the points.
     """
     where = str(check_file(path))
     try:
@@ -138,7 +157,7 @@ def read_laz(path: Path) -> PointCloud:
     except (laspy.LaspyException, LazrsError, ValueError, struct.error, MemoryError, OverflowError) as error:
         raise _damaged(path, error) from None
     if len(las.points) < las.header.point_count:
-        problem = f"holds {len(las.points):,} of the {las.header.point_count:,} points it announces"
+        problem = f"has {len(las.points):,} of the {las.header.point_count:,} points that it states"
         raise InputError(problem, where=where, remedy=_COPY)
     _check_quantisation(las.header, path)
     units, notes = stated_units(las.header, where)
@@ -160,19 +179,19 @@ def read_laz(path: Path) -> PointCloud:
 
 
 def _damaged(path: Path, error: BaseException) -> InputError:
-    """The error for a file that laspy or lazrs cannot read: what of it is wrong, in place of the library's words."""
+    """Return the error for a file that laspy or lazrs cannot read, in our own words."""
     with path.open("rb") as file:
         start = file.read(4)
     if start != b"LASF":
-        problem = f"is no LAS or LAZ file: it begins with {start!r}, not with b'LASF'" if start else "is empty"
+        problem = f"is not a LAS or LAZ file: it begins with {start!r}, not with b'LASF'" if start else "is empty"
         return InputError(problem, where=str(path), remedy="export it as LAS or LAZ, or give it the suffix of its format")
     told = f" ({error})" if type(error) is ValueError else ""
-    problem = f"is not a whole LAS or LAZ file{told}: its header is there, and what it announces is not, or is damaged"
+    problem = f"is not a complete LAS or LAZ file{told}: what its header states is missing or damaged"
     return InputError(problem, where=str(path), remedy=_COPY)
 
 
 def _check_quantisation(header: laspy.LasHeader, path: Path) -> None:
-    """Raise InputError for scales and offsets that make no coordinates out of the file's integers."""
+    """Raise InputError for scales and offsets that cannot give coordinates."""
     scales, offsets = np.asarray(header.scales), np.asarray(header.offsets)
     if not (np.isfinite(scales).all() and (scales > 0).all() and np.isfinite(offsets).all()):
         problem = f"has scale factors {scales.tolist()} and offsets {offsets.tolist()}"
@@ -180,7 +199,7 @@ def _check_quantisation(header: laspy.LasHeader, path: Path) -> None:
 
 
 def _standard_channels(las: Any) -> dict[str, NDArray[Any]]:
-    """Returns, scan angles and the like, where any were recorded; point formats below 6 hold angles in degrees."""
+    """Return recorded returns, scan angles and similar fields; point formats below 6 have angles in degrees."""
     channels: dict[str, NDArray[Any]] = {}
     for field in _FURTHER:
         if field in las.point_format.dimension_names and np.any(values := np.asarray(las[field])):
@@ -194,7 +213,7 @@ def _standard_channels(las: Any) -> dict[str, NDArray[Any]]:
 
 
 def _check_extent(path: Path) -> None:
-    """Raise ValueError for a file cut off in its header, or whose table of LAZ chunks is absurd (lazrs would abort on it)."""
+    """Raise ValueError for a file cut off in its header, or with an absurd LAZ chunk table, at which lazrs would abort."""
     with path.open("rb") as file:
         _check_records(file.read(_HEADER_BYTES), path.stat().st_size)
         file.seek(0)
@@ -207,7 +226,7 @@ def _check_extent(path: Path) -> None:
         chunk = _check_chunk_size(header)
         file.seek(header.offset_to_point_data)
         (table,) = struct.unpack("<q", file.read(8))
-        if table < 0:  # written as a stream: the place of the table stands at the end
+        if table < 0:  # written as a stream: the table's offset is at the end
             file.seek(-8, os.SEEK_END)
             (table,) = struct.unpack("<q", file.read(8))
         file.seek(table + 4)
@@ -217,7 +236,7 @@ def _check_extent(path: Path) -> None:
 
 
 def _check_records(start: bytes, size: int) -> None:
-    """Raise ValueError for more variable-length records than the file has room for: laspy would look for each of them."""
+    """Raise ValueError for more variable-length records than fit into the file; laspy would look for each of them."""
     (count,) = struct.unpack_from("<I", start, 100)
     (extended,) = struct.unpack_from("<I", start, 243) if start[25] >= 4 and len(start) == _HEADER_BYTES else (0,)
     if 54 * count + 60 * extended > size:
@@ -225,9 +244,9 @@ def _check_records(start: bytes, size: int) -> None:
 
 
 def _check_chunk_size(header: laspy.LasHeader) -> int:
-    """The points of a chunk, 0 where that varies or is not said.
+    """Return the points of a chunk, 0 if that varies or is unknown.
 
-    Raises ValueError for chunks far larger than any program makes: lazrs takes the memory of a whole one, or aborts.
+    Raises ValueError for chunks far larger than any program makes: lazrs would allocate a complete one, or abort.
     """
     for record in header.vlrs.get("LasZipVlr"):
         (size,) = struct.unpack_from("<I", record.record_data, _CHUNK_SIZE_AT)
@@ -238,12 +257,13 @@ def _check_chunk_size(header: laspy.LasHeader) -> int:
 
 
 def _header(cloud: PointCloud, given: LazHeader, full_scale: float) -> laspy.LasHeader:
+    """Return the header of a file to write."""
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.generating_software, header.system_identifier, header.creation_date = "scarpsim", "scarpsim", given.date
-    header.global_encoding.wkt = True  # point formats 6 and up know no other form of coordinate system
+    header.global_encoding.wkt = True  # required for point formats from 6
     header.add_extra_dims([laspy.ExtraBytesParams(name, channel.dtype) for name, channel in cloud.extra.items()])
     for record in header.vlrs.get("ExtraBytesVlr"):
-        for dimension in record.extra_bytes_structs:  # no extremes: laspy takes the first point of each piece for them
+        for dimension in record.extra_bytes_structs:  # without extremes, which laspy takes from the first point of each piece
             dimension.options &= ~(dimension.MIN_BIT_MASK | dimension.MAX_BIT_MASK)
     header.scales, header.offsets = _quantisation(cloud.points, given.scale_m)
     if given.wkt:
@@ -254,12 +274,12 @@ def _header(cloud: PointCloud, given: LazHeader, full_scale: float) -> laspy.Las
 
 
 def _writer(file: BinaryIO, header: laspy.LasHeader, compress: bool) -> laspy.LasWriter:
-    """The parallel back end gives the same bytes as the serial one, whatever the number of threads."""
+    """Return a writer; the parallel back end gives the same bytes as the serial one, with any number of threads."""
     return laspy.LasWriter(file, header, do_compress=compress, laz_backend=laspy.LazBackend.LazrsParallel, closefd=False)
 
 
 def _quantisation(points: FloatArray, scale_m: float) -> tuple[FloatArray, FloatArray]:
-    """(3,) scales and (3,) offsets, m, with which the coordinates fit int32."""
+    """Return (3,) scales and (3,) offsets, m, with which the coordinates fit into int32."""
     if len(points) == 0:
         return np.full(3, scale_m), np.zeros(3)
     low, high = (np.array([extreme(column) for column in points.T]) for extreme in (np.min, np.max))
@@ -273,6 +293,7 @@ def _quantisation(points: FloatArray, scale_m: float) -> tuple[FloatArray, Float
 
 
 def _fill(record: NDArray[np.void], header: laspy.LasHeader, points: FloatArray) -> None:
+    """Store the coordinates of points."""
     for name, coordinate, offset, scale in zip("XYZ", points.T, header.offsets, header.scales, strict=True):
         counts = coordinate - offset
         counts /= scale
@@ -280,7 +301,7 @@ def _fill(record: NDArray[np.void], header: laspy.LasHeader, points: FloatArray)
 
 
 def _return_bits(number: NDArray[np.integer] | None, count: NDArray[np.integer] | None) -> NDArray[np.uint8]:
-    """Return number and number of returns in the two half-bytes of point format 6, (n,) or one for all points."""
+    """Return return number and number of returns in the two half-bytes of point format 6, (n,) or one for all points."""
     first, last = (np.asarray(1 if given is None else given) for given in (number, count))
     if first.size and (first.min() < 1 or np.any(first > last) or last.max() > _MOST_RETURNS):
         raise ValueError(f"return numbers run from 1 to the number of returns, at most {_MOST_RETURNS}")
@@ -288,12 +309,13 @@ def _return_bits(number: NDArray[np.integer] | None, count: NDArray[np.integer] 
 
 
 def _full_scale(intensity: NDArray[np.floating] | None) -> float:
-    """The power that is stored as 65535 counts: the smallest power of two that no point exceeds."""
+    """Return the power stored as 65535 counts: the smallest power of two that no point exceeds."""
     brightest = float(np.max(intensity)) if intensity is not None and len(intensity) else 1.0
     return float(2.0 ** np.ceil(np.log2(brightest))) if brightest > 0 else 1.0
 
 
 def _stored_full_scale(header: laspy.LasHeader) -> float:
+    """Return the power of 65535 counts in a file."""
     for record in header.vlrs:
         if record.user_id == _USER and record.record_id == _FULL_SCALE_RECORD:
             return float(struct.unpack("<d", record.record_data)[0])

@@ -1,4 +1,4 @@
-"""PCD, the point files of the Point Cloud Library: binary, version 0.7."""
+"""Write PCD, the point files of the Point Cloud Library: binary, version 0.7."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from pipeline.formats.point_cloud import PointCloud
 from scene.common.errors import InputError
 
 _LETTERS = {"f": "F", "i": "I", "u": "U"}
+"""PCD's letter for each kind of number."""
 _FAR_M = 1e3
-"""From here on single precision leaves more than a thirtieth of a millimetre, and coordinates are written in double."""
+"""Size of coordinates, m, from which they are written in double precision; single precision would be worse than 0.03 mm."""
 
 
 def write_pcd(path: Path, cloud: PointCloud) -> None:
-    """Write x, y, z, m, then intensity, gps_time and the other channels by their names, in the types that they have.
+    """Write x, y, z, m, then intensity, gps_time and the other channels by name, in their own types.
 
-    Coordinates are float32, as PCL takes them; float64 (Open3D and CloudCompare read it) where they are so large that it shows,
-    as those of a survey. Raises InputError for a channel that is no number.
+    Coordinates are float32, as PCL takes them, or float64 (read by Open3D and CloudCompare) if they are large, such as survey
+    coordinates. Raises InputError for a channel that is not a number.
     """
     wide = bool(len(cloud.points)) and float(np.abs(cloud.points).max()) >= _FAR_M
     columns: dict[str, NDArray[Any]] = {
@@ -38,15 +39,17 @@ def write_pcd(path: Path, cloud: PointCloud) -> None:
 
 
 def _stored(column: NDArray[Any], where: str) -> NDArray[Any]:
+    """Return a channel in a type of PCD."""
     if column.dtype.kind == "b":
         return column.astype("<u1")
     if column.dtype.kind not in _LETTERS or column.ndim != 1:
-        raise InputError(f"is of the type {column.dtype}", where=where, allowed="one number a point")
+        raise InputError(f"has the type {column.dtype}", where=where, allowed="one number for each point")
     little = column.dtype.newbyteorder("<")
     return column.astype("<f4") if column.dtype.itemsize == 2 and column.dtype.kind == "f" else column.astype(little)
 
 
 def _header(kind: np.dtype[Any], count: int) -> str:
+    """Return the header."""
     types = [kind[name] for name in kind.names or ()]
     return "\n".join([
         "# .PCD v0.7 - Point Cloud Data file format",

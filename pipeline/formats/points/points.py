@@ -1,4 +1,4 @@
-"""Point clouds of any format, told by the file's suffix: the one door through which every command and function reads points."""
+"""Read point clouds of any format, by the file's suffix; all commands and functions read points through this module."""
 
 from __future__ import annotations
 
@@ -21,17 +21,26 @@ from scene.common.regular_file import check_file
 from scene.geometry.mesh import FloatArray
 
 PLUG_INS = "scarpsim.readers"
-"""The group of entry points by which other packages add readers: named like the suffix, without its dot."""
+"""Group of entry points by which other packages add readers, named like the suffix without its dot."""
 TEXT = (".xyz", ".txt", ".asc", ".csv", ".pts")
+"""Suffixes of text files."""
 SUFFIXES = (".laz", ".las", ".ply", ".e57", ".ptx", *TEXT)
+"""Suffixes of all formats."""
 _LARGEST_M = 1e8
-"""No coordinate system of a survey reaches farther, not even one with its origin in the middle of the Earth."""
+"""Largest coordinate, m; no survey's coordinate system reaches farther, even with its origin at the centre of the Earth."""
 
 
 @dataclass(frozen=True)
 class PlacedScan:
-    """One scan of a file. cloud: points in the file's frame; position: (3,) and rotation: (3, 3), scanner to the file's frame,
-    None where the file does not say."""
+    """One scan of a file.
+
+    Attributes
+    ----------
+    name : Name of the scan.
+    cloud : Points in the file's frame.
+    position : (3,) position of the scanner; None if the file does not state it.
+    rotation : (3, 3) scanner to the file's frame; None if the file does not state it.
+    """
 
     name: str
     cloud: PointCloud
@@ -39,7 +48,7 @@ class PlacedScan:
     rotation: FloatArray | None = None
 
     def in_metres(self, units: AxisUnits) -> PlacedScan:
-        """The scan out of a file with these units."""
+        """Return the scan converted to metres from these units."""
         if units.in_metres:
             return replace(self, cloud=replace(self.cloud, stated_units=None))
         factors = units.factors()
@@ -50,10 +59,10 @@ class PlacedScan:
 
 
 def read_points(path: Path) -> PointCloud:
-    """Read a point cloud; the points of E57 and PTX files are put into the file's frame by the poses in it.
+    """Read a point cloud; points of E57 and PTX files are converted to the file's frame by their poses.
 
-    A file of several scans gives one cloud, with the number of the scan as extra channel `scan`. Points may be NaN or
-    infinite, as some programs write what did not return. Raises InputError as `read_placed_scans` does.
+    Several scans give one cloud, with the number of the scan in the extra channel `scan`. Points may be NaN or infinite, as some
+    programs write missing returns. Raises InputError as `read_placed_scans` does.
     """
     return joined([scan.cloud for scan in read_placed_scans(path)])
 
@@ -61,25 +70,24 @@ def read_points(path: Path) -> PointCloud:
 def read_placed_scans(
     path: Path, unit: str | None = None, columns: Sequence[str] = (), option: str = "--unit"
 ) -> list[PlacedScan]:
-    """Read all scans of a file, in metres and without the records that stand for no return.
+    """Read all scans of a file, in metres and without records that stand for a missing return.
 
     Parameters
     ----------
-    path : of a format in SUFFIXES, or one that another package reads
-    unit : of the coordinates, a key of METRES; None: as the file states, metres where it states none
-    columns : a name for each column of a text file, in place of the file's own
-    option : by which the user gives the unit, for errors
+    path : File of a format in SUFFIXES, or of one that another package reads.
+    unit : Unit of the coordinates, a key of METRES; None: as the file states, or metres.
+    columns : Names of a text file's columns, instead of the file's own.
+    option : Command-line option that gives the unit, for errors.
 
     Raises
     ------
     InputError
-        For a format that is not known, whatever is wrong in the file, a unit that the file contradicts, and coordinates that are
-        none.
+        If the format is unknown, the file is wrong or contradicts the unit, or coordinates are impossible.
     """
     where = str(check_file(path))
     scans = _read(path, columns)
     if not any(len(scan.cloud.points) for scan in scans):
-        raise InputError("holds no points", where=where, remedy="export it again, with its points")
+        raise InputError("has no points", where=where, remedy="export it again, with its points")
     found = []
     for scan in scans:
         units = agreed_units(scan.cloud.stated_units, unit, where, option)
@@ -89,7 +97,7 @@ def read_placed_scans(
 
 
 def check_reach(points: FloatArray, where: str) -> None:
-    """Raise InputError where coordinates (n, 3) are no coordinates of a survey; NaN and infinity are let through."""
+    """Raise InputError if coordinates (n, 3) are too large for a survey; NaN and infinity pass."""
     known = np.where(np.isfinite(points), np.abs(points), 0.0)
     far = np.flatnonzero((known > _LARGEST_M).any(axis=1))
     if len(far):
@@ -100,7 +108,7 @@ def check_reach(points: FloatArray, where: str) -> None:
 
 
 def _read(path: Path, columns: Sequence[str]) -> list[PlacedScan]:
-    """The scans in the file's unit, without fillers."""
+    """Return the scans in the file's unit, without fillers."""
     suffix, where = path.suffix.lower(), str(path)
     if suffix == ".e57":
         return _read_e57(path)
@@ -118,27 +126,28 @@ def _read(path: Path, columns: Sequence[str]) -> list[PlacedScan]:
 
 
 def _read_plugged(path: Path) -> PointCloud:
-    """A cloud of a format that another package reads."""
+    """Read a cloud by another package's reader."""
     further = load_plug_ins(PLUG_INS, "a function of a path that returns a PointCloud", callable, [each[1:] for each in SUFFIXES])
     reader = further.get(path.suffix.lower()[1:])
     if reader is None:
         allowed = " ".join([*SUFFIXES, *(f".{name}" for name in further)])
-        raise InputError(f"is of an unknown format '{path.suffix}'", where=str(path), allowed=allowed)
+        raise InputError(f"unknown format '{path.suffix}'", where=str(path), allowed=allowed)
     cloud = reader(path)
     if not isinstance(cloud, PointCloud):
-        raise InputError(f"reading it gave a {type(cloud).__name__}", where=str(path), allowed="a PointCloud, from its reader")
+        raise InputError(f"its reader returned a {type(cloud).__name__}", where=str(path), allowed="a PointCloud")
     return cloud
 
 
 def _read_e57(path: Path) -> list[PlacedScan]:
+    """Read the scans of an E57 file."""
     from pipeline.formats.points.e57 import read_e57  # the library takes a tenth of a second to load
 
     found = []
     for number, scan in enumerate(read_e57(path), start=1):
         name = f"{path.name} ({number}: {scan.name})"
         scan = replace(scan, cloud=without_fillers(scan.cloud, name, grid=True))
-        if not scan.position.any() and np.array_equal(scan.rotation, np.eye(3)):  # what programs write that know no pose
-            found.append(PlacedScan(name, scan.cloud.noted("its header holds no pose, or that of the file's own frame")))
+        if not scan.position.any() and np.array_equal(scan.rotation, np.eye(3)):  # programs write this if they know no pose
+            found.append(PlacedScan(name, scan.cloud.noted("its header has no pose, or that of the file's own frame")))
         else:
             cloud = scan.placed.noted("position and rotation are from the E57 header")
             found.append(PlacedScan(name, cloud, scan.position, scan.rotation))
@@ -146,6 +155,7 @@ def _read_e57(path: Path) -> list[PlacedScan]:
 
 
 def _read_ptx(path: Path) -> list[PlacedScan]:
+    """Read the scans of a PTX file."""
     found = []
     for number, scan in enumerate(read_ptx(path), start=1):
         rotation, words = orthonormal(scan.rotation, f"{path.name}, scan {number}")
@@ -157,7 +167,7 @@ def _read_ptx(path: Path) -> list[PlacedScan]:
 
 
 def joined(clouds: list[PointCloud]) -> PointCloud:
-    """The scans of one file as one cloud."""
+    """Join the scans of one file."""
     if len(clouds) == 1:
         return clouds[0]
     shared = set.intersection(*(set(cloud.extra) for cloud in clouds))

@@ -1,7 +1,7 @@
-"""PTX text (Leica): scans as grids in the scanner's frame, each with the pose of its scanner.
+"""Read PTX text (Leica): scans as grids in the scanner's frame, each with the pose of its scanner.
 
-A scan is ten lines of header (columns, rows, the scanner's position, its three axes, a 4 x 4 matrix whose rows multiply from the
-left: world = [x y z 1] M) and a line `x y z intensity [r g b]` for each cell, column after column; `0 0 0` is a missing return.
+A scan has ten lines of header: columns, rows, the scanner's position, its three axes, and a 4 x 4 matrix for row vectors, world =
+[x y z 1] M. A line `x y z intensity [r g b]` for each cell follows, column after column; `0 0 0` is a missing return.
 """
 
 from __future__ import annotations
@@ -25,14 +25,20 @@ _LINES_BEFORE_POINTS = 10
 _LONGEST_LINE = 4096
 _CHANNELS = ("red", "green", "blue")
 _ALIKE_M, _ALIKE = 0.01, 1e-3
-"""Places, and axes, this near to each other are one pose with few digits."""
-_EXPORT = "copy or export the file again, whole"
+"""Positions (m) and axes up to this difference are one pose with few digits."""
+_EXPORT = "copy or export the complete file again"
 
 
 @dataclass(frozen=True)
 class PtxScan:
-    """One scan. cloud: points in the scanner's frame, m, with `row` and `column` of the grid as extra channels; position: (3,) m
-    and rotation: (3, 3) as the file has it, scanner to world, not orthonormal beyond the file's digits."""
+    """One scan.
+
+    Attributes
+    ----------
+    cloud : Points in the scanner's frame, m; extra channels `row` and `column` of the grid.
+    position : (3,) position of the scanner, m.
+    rotation : (3, 3) scanner to world, orthonormal only to the file's digits.
+    """
 
     cloud: PointCloud
     position: FloatArray
@@ -41,25 +47,27 @@ class PtxScan:
 
 @dataclass
 class _Lines:
-    """The open file and the number of lines that were read from it."""
+    """The open file and the number of lines read from it."""
 
     file: TextIO
     where: str
     number: int = 0
 
     def next(self) -> str:
+        """Read the next line."""
         self.number += 1
         return self.file.readline(_LONGEST_LINE).strip()
 
     @property
     def here(self) -> str:
+        """Place of the last line, for errors."""
         return f"{self.where}, line {self.number:,}"
 
 
 def read_ptx(path: Path) -> list[PtxScan]:
     """Read all scans without their missing returns.
 
-    Raises InputError for a missing or truncated file, a grid that the lines do not fill, and a pose that contradicts itself.
+    Raises InputError for a missing or truncated file, a grid that the lines do not fill, or a contradictory pose.
     """
     where = str(check_file(path))
     try:
@@ -68,34 +76,35 @@ def read_ptx(path: Path) -> list[PtxScan]:
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=where, remedy="check the path") from None
     if not scans:
-        raise InputError("holds no scans", where=where, remedy="export it again, with its points")
+        raise InputError("has no scans", where=where, remedy="export it again, with its points")
     if not any(len(scan.cloud.points) for scan in scans):
-        raise InputError("holds no points: all cells are missing returns", where=where, remedy="export it again, with its points")
+        raise InputError("has no points: all cells are missing returns", where=where, remedy="export it again, with its points")
     return scans
 
 
 def orthonormal(rotation: FloatArray, where: str) -> tuple[FloatArray, tuple[str, ...]]:
-    """Replace a matrix by the nearest rotation, and add a note where that changes it by more than the rounding of its digits.
+    """Return the nearest rotation to a matrix, with a note if that changes it by more than rounding.
 
-    Raises InputError where it is off by more than a hundredth, or turns left into right.
+    Raises InputError if it deviates by more than a hundredth, or is a reflection.
     """
     off = float(np.abs(rotation @ rotation.T - np.eye(3)).max()) if np.abs(rotation).max() < 2 else np.inf
     if off > 0.02 or np.linalg.det(rotation) < 0:
         remedy = "rows must be orthonormal, determinant +1; give more digits"
-        raise InputError("the rotation is no rotation matrix", where=where, remedy=remedy)
+        raise InputError("the rotation is not a rotation matrix", where=where, remedy=remedy)
     left, _, right = np.linalg.svd(rotation)
-    words = (f"the rotation was off from orthonormal by {off:.1g} and is made so",) if off > 1e-6 else ()
+    words = (f"the rotation deviated from orthonormal by {off:.1g} and was corrected",) if off > 1e-6 else ()
     return np.asarray(left @ right), words
 
 
 def _scans(lines: _Lines) -> Iterator[PtxScan]:
+    """Yield the scans of the file."""
     count = 0
     while first := lines.next():
         count += 1
         columns, rows = _grid_size(first, lines, count), _grid_size(lines.next(), lines, count)
         if columns < 1 or rows < 1:
             problem = f"has a grid of {columns} x {rows}"
-            raise InputError(problem, where=lines.here, allowed="1 x 1 and more", remedy=_EXPORT)
+            raise InputError(problem, where=lines.here, allowed="1 x 1 or more", remedy=_EXPORT)
         stated = np.array([_row(lines, 3) for _ in range(4)])
         matrix = np.array([_row(lines, 4) for _ in range(4)])
         _check_pose(stated, matrix, f"{lines.where}, scan {count}")
@@ -103,27 +112,27 @@ def _scans(lines: _Lines) -> Iterator[PtxScan]:
 
 
 def _grid_size(text: str, lines: _Lines, count: int) -> int:
-    """A number of columns or rows. What stands in its place behind a scan is a cell too many."""
+    """Parse a number of columns or rows; anything else after a scan is a surplus cell."""
     if text.isdecimal():
         return int(text)
     if count > 1:
-        problem = f"has more lines than the grid of scan {count - 1} has cells: '{text:.60}' is no header of a further scan"
+        problem = f"has more lines than the grid of scan {count - 1} has cells: '{text:.60}' does not begin another scan"
         raise InputError(problem, where=lines.here, remedy=_EXPORT)
-    problem = f"begins with '{text:.60}', where a PTX file has its number of columns, and rows"
+    problem = f"begins with '{text:.60}', but a PTX file begins with its numbers of columns and rows"
     raise InputError(problem, where=lines.here, remedy="export it as PTX, or give it the suffix of its format")
 
 
 def _row(lines: _Lines, count: int) -> list[float]:
-    """A line of so many numbers of the header."""
+    """Read a header line of `count` numbers."""
     text = lines.next()
     values, _ = read_rows([text or "-"], RowForm(None, "," in text, count, lines.number), lines.where)
     return [float(value) for value in values[0]]
 
 
 def _check_pose(stated: FloatArray, matrix: FloatArray, where: str) -> None:
-    """Raise InputError where the scanner's place and axes (4, 3) are not those of the matrix (4, 4): the header says both.
+    """Raise InputError if the scanner's position and axes (4, 3) contradict the matrix (4, 4), since the header has both.
 
-    Some programs leave one of the two at its default, the origin and the identity, which states nothing.
+    Some programs leave one of them at its default, origin and identity, which states nothing.
     """
     default = np.vstack([np.zeros(3), np.eye(3)])
     other = np.vstack([matrix[3, :3], matrix[:3, :3]])
@@ -132,12 +141,14 @@ def _check_pose(stated: FloatArray, matrix: FloatArray, where: str) -> None:
     place, axes = np.abs(stated[0] - other[0]).max(), np.abs(stated[1:] - other[1:]).max()
     if place > _ALIKE_M or axes > _ALIKE:
         there, here = (" ".join(f"{value:.6g}" for value in each[0]) for each in (stated, other))
-        problem = f"states two poses of the scanner: its place is {there} in lines 3 to 6 of the header and {here} in its matrix"
+        problem = (
+            f"states two poses of the scanner: its position is {there} in lines 3 to 6 of the header but {here} in the matrix"
+        )
         raise InputError(problem, where=where, allowed="the same pose in both", remedy="export it again, registered")
 
 
 def _table(lines: _Lines, columns: int, rows: int, count: int) -> FloatArray:
-    """(columns * rows, k) the cells of a scan."""
+    """Return the (columns * rows, k) cells of a scan."""
     cells, start, before = columns * rows, lines.file.tell(), lines.number
     first = lines.next()
     form = form_of([first], lines.number, lines.where) if first else RowForm(None, False, 4)
@@ -153,7 +164,7 @@ def _table(lines: _Lines, columns: int, rows: int, count: int) -> FloatArray:
     lines.number = before + cells
     if len(table) < cells:
         raise InputError(
-            f"scan {count} states {columns:,} x {rows:,} = {cells:,} cells and has {len(table):,} lines", where=lines.where,
+            f"scan {count} states {columns:,} x {rows:,} = {cells:,} cells but has {len(table):,} lines", where=lines.where,
             remedy="the file was cut off, or its numbers of columns and rows are wrong: copy or export it again",
         )  # fmt: skip
     if table.shape[1] < 4:
@@ -163,16 +174,17 @@ def _table(lines: _Lines, columns: int, rows: int, count: int) -> FloatArray:
 
 
 def _cells(lines: _Lines, cells: int, count: int) -> Iterator[str]:
-    """The lines of a scan's cells; a line with one number is the header of the next scan, which comes too early."""
+    """Yield the lines of a scan's cells; a line with one number is the header of the next scan, which comes too early."""
     for number, line in enumerate(bounded_lines(lines.file, cells)):
         words = split_row(line, None)
         if len(words) == 1 and words[0].isdecimal():
-            problem = f"scan {count} states {cells:,} cells and has {number:,} lines before the next scan begins"
+            problem = f"scan {count} states {cells:,} cells but has {number:,} lines before the next scan begins"
             raise InputError(problem, where=lines.where, remedy=_EXPORT)
         yield line
 
 
 def _scan(table: FloatArray, rows: int, matrix: FloatArray) -> PtxScan:
+    """Return the scan of a table of cells."""
     cell = np.flatnonzero(np.any(table[:, :3] != 0, axis=1))
     extra: dict[str, NDArray[Any]] = {"row": (cell % rows).astype(np.int32), "column": (cell // rows).astype(np.int32)}
     further = table[cell, 4:].T

@@ -1,6 +1,6 @@
-"""How a text file of points is written: encoding, lines before the points, separator, decimal mark, counts.
+"""Detect how a text file of points is written: encoding, lines before the points, separator, decimal mark, counts.
 
-Every reader of points in text asks here, so that XYZ, CSV, PTS and PTX understand the same files.
+All readers of points in text use this module, so that XYZ, CSV, PTS and PTX accept the same files.
 """
 
 from __future__ import annotations
@@ -16,29 +16,33 @@ from scene.common.errors import InputError
 from scene.common.number_rows import COMMENTS, GROUPED, RowForm, is_grouped, is_number, split_row
 
 _HEADER_LINES = 1000
+"""Largest number of lines before the points."""
 _SAMPLE_LINES = 200
+"""Number of rows from which the layout is detected."""
 LONGEST_LINE = 65_536
+"""Largest length of a line, bytes."""
 _BYTE_ORDER_MARKS = (
     (codecs.BOM_UTF32_LE, "utf-32"), (codecs.BOM_UTF32_BE, "utf-32"), (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"),
 )  # fmt: skip
-"""Each with the codec that takes it off; the mark of UTF-32 begins with that of UTF-16."""
+"""Byte-order marks, each with the codec that removes it; that of UTF-32 begins with that of UTF-16."""
 _HEAD_BYTES = 4096
+"""Number of bytes from which the encoding is detected."""
 _SEPARATORS = (";", "\t", "|")
 _DECIMAL_COMMA = re.compile(r"[+-]?(\d+,\d*|\d*,\d+)([eE][+-]?\d+)?")
 _THREE_DIGITS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
-"""A number that may have three decimals behind a comma, or a comma between thousands."""
+"""A number in which a comma may be a decimal mark or separate thousands."""
 _GRID = ("ncols", "nrows", "xllcorner", "xllcenter")
-"""What the header of a grid of heights begins with."""
+"""Words with which the header of a grid of heights begins."""
 _SEVERAL_GROUPS = re.compile(r"[+-]?\d{1,3}(,\d{3}){2}")
 _FEW = 0.05
-"""Share of a column's values from which whole numbers beside ones with a comma tell that the comma is no decimal mark."""
-_ROWS = "one point a line, x y z and what else there is, separated by spaces, tabs, commas or semicolons"
+"""Share of whole numbers in a column, besides numbers with a comma, above which the comma is not a decimal mark."""
+_ROWS = "one point in each line, x y z and other values, separated by spaces, tabs, commas or semicolons"
 
 
 @dataclass(frozen=True)
 class HeaderLine:
-    """A line before the points. number: from 1; text: without the marks of a comment; comment: whether it had them."""
+    """A line before the points. number: from 1; text: without comment marks; comment: whether it had them."""
 
     number: int
     text: str
@@ -47,8 +51,15 @@ class HeaderLine:
 
 @dataclass(frozen=True)
 class TextLayout:
-    """How a file is written. encoding: a codec of Python; header: lines before the first point that are neither empty nor a
-    count; stated: the number of points that such a count states, None without one; form: of the rows."""
+    """How a file is written.
+
+    Attributes
+    ----------
+    encoding : A codec of Python.
+    header : Lines before the first point that are neither empty nor a count.
+    form : Form of the rows.
+    stated : Number of points that a count in the header states; None without one.
+    """
 
     encoding: str
     header: tuple[HeaderLine, ...]
@@ -57,18 +68,19 @@ class TextLayout:
 
 
 _BINARY_KINDS = {b"LASF": ("a LAS or LAZ file", ".laz"), b"ASTM-E57": ("an E57 file", ".e57"), b"glTF": ("a glTF file", ".glb")}
+"""First bytes of binary files, with their kind and suffix."""
 
 
 def encoding_of(path: Path) -> str:
-    """The codec of a text: as its byte-order mark says, UTF-16 by its null bytes, else UTF-8 or Western European.
+    """Detect the codec of a text: by its byte-order mark, UTF-16 by its null bytes, else UTF-8 or Western European.
 
-    Raises InputError for a file that holds other null bytes, which no text does.
+    Raises InputError for a file with other null bytes, which is not text.
     """
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
     for start, (kind, suffix) in _BINARY_KINDS.items():
         if head.startswith(start):
-            problem, remedy = f"is {kind} by its first bytes, no text", f"give it the suffix {suffix}"
+            problem, remedy = f"is {kind} by its first bytes, not text", f"give it the suffix {suffix}"
             raise InputError(problem, where=str(path), allowed=_ROWS, remedy=remedy)
     for mark, name in _BYTE_ORDER_MARKS:
         if head.startswith(mark):
@@ -84,13 +96,13 @@ def encoding_of(path: Path) -> str:
     even, odd = head[::2].count(0), head[1::2].count(0)
     if max(even, odd) > 0.8 * len(head) / 2 and min(even, odd) < 0.1 * len(head) / 2:
         return "utf-16-be" if even > odd else "utf-16-le"
-    raise InputError("holds null bytes, as binary files do", where=str(path), allowed=_ROWS, remedy="export it as text")
+    raise InputError("contains null bytes, like binary files", where=str(path), allowed=_ROWS, remedy="export it as text")
 
 
 def layout_of(path: Path) -> TextLayout:
-    """How a file of points is written, by its first lines.
+    """Detect how a file of points is written, by its first lines.
 
-    Raises InputError where no line of numbers is among them, and where digits are grouped by thousands separators.
+    Raises InputError if they contain no line of numbers, or thousands separators.
     """
     encoding = encoding_of(path)
     with path.open(encoding=encoding, errors="replace") as file:
@@ -106,7 +118,7 @@ def layout_of(path: Path) -> TextLayout:
 
 
 def _check_kind(lines: Sequence[str], where: str) -> None:
-    """Raise InputError for files of other kinds that also hold rows of numbers."""
+    """Raise InputError for files of other kinds that also contain rows of numbers."""
     start = lines[0].strip().lower() if lines else ""
     problem, remedy = "", ""
     if start == "ply":
@@ -114,16 +126,15 @@ def _check_kind(lines: Sequence[str], where: str) -> None:
     elif start.startswith("# .pcd"):
         problem, remedy = "is a PCD file by its first line", "convert it to PLY or LAS"
     elif any(line.lower().startswith(_GRID) for line in lines[:_HEADER_LINES]):
-        problem = "is a grid of heights (ESRI ASCII), no list of points"
-        remedy = "convert it to a GeoTIFF, as gdal_translate does, and give that as an elevation model"
+        problem = "is a grid of heights (ESRI ASCII), not a list of points"
+        remedy = "convert it to a GeoTIFF, for example with gdal_translate, and use that as an elevation model"
     if problem:
         raise InputError(problem, where=where, allowed=_ROWS, remedy=remedy)
 
 
 def form_of(sample: Sequence[str], first_line: int, where: str) -> RowForm:
-    """How rows are written, by some of them. first_line: number of the first of them.
-
-    Raises InputError for thousands separators.
+    """Detect how rows are written from a sample; first_line: number of its first line. Raises InputError for thousands
+    separators.
     """
     separator, decimal_comma = _separator(sample)
     rows = [split_row(line, separator) for line in sample]
@@ -139,7 +150,7 @@ def form_of(sample: Sequence[str], first_line: int, where: str) -> RowForm:
 
 
 def _separator(sample: Sequence[str]) -> tuple[str | None, bool]:
-    """The separator of rows, and whether commas between digits are decimal marks beside white space."""
+    """Return the separator of rows, and whether commas between digits are decimal marks beside white space."""
     for mark in _SEPARATORS:
         if all(mark in line.strip(" \r\n") for line in sample):
             several = mark == "\t" and any(re.search(r"\d\s+[+-]?\d", word) for line in sample for word in split_row(line, mark))
@@ -148,7 +159,7 @@ def _separator(sample: Sequence[str]) -> tuple[str | None, bool]:
         return None, False
     apart = [split_row(line, None) for line in sample]
     if all(len(words) >= 3 for words in apart) and any(_SEVERAL_GROUPS.match(word) for words in apart for word in words):
-        return None, False  # which the check of the grouping then names
+        return None, False  # reported later as thousands separators
     if all(len(words) >= 3 and any(map(_DECIMAL_COMMA.fullmatch, words)) for words in apart):
         inside = all("," not in word or re.fullmatch(r"[^,]*\d,\d[^,]*", word) for words in apart for word in words)
         if inside:
@@ -157,6 +168,7 @@ def _separator(sample: Sequence[str]) -> tuple[str | None, bool]:
 
 
 def _check_grouping(rows: Sequence[Sequence[str]], decimal_comma: bool, first_line: int, where: str) -> None:
+    """Raise InputError for thousands separators."""
     for number, row in enumerate(rows, start=first_line):
         for word in row:
             if is_grouped(word, decimal_comma=decimal_comma):
@@ -171,14 +183,15 @@ def _check_grouping(rows: Sequence[Sequence[str]], decimal_comma: bool, first_li
 
 
 def _grouped(word: str, number: int, where: str) -> InputError:
+    """Return the error for thousands separators."""
     return InputError(
         f"'{word:.40}': {GROUPED}", where=f"{where}, line {number:,}", allowed="plain numbers",
-        remedy="export the numbers without thousands separators, as 6389450.123",
+        remedy="export the numbers without thousands separators, such as 6389450.123",
     )  # fmt: skip
 
 
 def _is_row(line: str) -> bool:
-    """Whether a line begins with three numbers, whatever separates them and their digits; behind a name, if no space does."""
+    """Whether a line begins with three numbers, with any separators and digits, possibly after a name that no space ends."""
     text = line.strip(" \t\r\n,;|")
     if text.startswith(COMMENTS):
         return False
@@ -189,12 +202,13 @@ def _is_row(line: str) -> bool:
 
 
 def _is_number(word: str) -> bool:
+    """Whether a word, possibly in quotes, is a number."""
     plain = word.strip("\"'")
     return bool(plain) and is_number(plain)
 
 
 def _header(lines: Sequence[str]) -> tuple[tuple[HeaderLine, ...], int | None]:
-    """The lines before the points, and the count among them."""
+    """Return the lines before the points, and a count among them."""
     header, stated = [], None
     for number, line in enumerate(lines, start=1):
         text = line.strip()
@@ -207,8 +221,9 @@ def _header(lines: Sequence[str]) -> tuple[tuple[HeaderLine, ...], int | None]:
 
 
 def _no_rows(lines: Sequence[str], where: str) -> InputError:
+    """Return the error for a file without rows."""
     if not any(line.strip() for line in lines):
-        return InputError("holds no points, no line of numbers", where=where, allowed=_ROWS, remedy="export it again")
+        return InputError("has no points and no line of numbers", where=where, allowed=_ROWS, remedy="export it again")
     first = next(line.strip() for line in lines if line.strip())
     problem = f"has no line of numbers, at least x y z, among its first {_HEADER_LINES} lines (it begins with '{first:.60}')"
-    return InputError(problem, where=where, allowed=_ROWS, remedy="give a file of points, or remove the lines before them")
+    return InputError(problem, where=where, allowed=_ROWS, remedy="use a file of points, or remove the lines before them")

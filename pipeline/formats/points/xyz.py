@@ -1,4 +1,4 @@
-"""XYZ text, PTS and CSV: one point a line, columns x y z [intensity ...], with or without a line of column names."""
+"""Read and write XYZ text, PTS and CSV: one point in each line, columns x y z [intensity ...], with or without column names."""
 
 from __future__ import annotations
 
@@ -23,16 +23,17 @@ from scene.geometry.mesh import FloatArray
 _CHUNK = 200_000
 """Points in memory as text at a time while writing."""
 _SAMPLE = 10_000
+"""Number of rows from which columns are guessed."""
 _FEWEST_ALIKE = 50
-"""Rows with one number of decimals from which on that is no chance."""
+"""Number of rows from which equal numbers of decimals are no coincidence."""
 _AXES = ("x", "y", "z")
 _COLOURS = ["red", "green", "blue"]
 
 
 def write_xyz(path: Path, cloud: PointCloud, *, decimals: int = 6) -> None:
-    """Write a line of column names (behind `//`, as CloudCompare has it) and a line per point.
+    """Write a line of column names (after `//`, as in CloudCompare) and a line for each point.
 
-    Coordinates get `decimals` places, m; the other channels as many digits as give back their value.
+    Coordinates, m, get `decimals` decimals; other channels get as many digits as their value needs.
     """
     columns = dict(zip("xyz", cloud.points.T, strict=True))
     columns |= {"intensity": cloud.intensity, "gps_time": cloud.gps_time, **cloud.extra}
@@ -49,24 +50,24 @@ def write_xyz(path: Path, cloud: PointCloud, *, decimals: int = 6) -> None:
 def read_xyz(path: Path, columns: Sequence[str] = ()) -> PointCloud:
     """Read the points of a text file.
 
-    Encoding, separator, decimal mark and the names of the columns are found in the file (`layout_of`, `named_columns`). Without
-    names a fourth column is the intensity, of more whole numbers from 0 to 255 in threes are colours, and what is left alone
-    beside them is the intensity; others are `column_4`, `column_5` ...
+    Encoding, separator, decimal mark and column names are detected (`layout_of`, `named_columns`). Without names, a fourth column
+    is the intensity. Of more columns, three with whole numbers from 0 to 255 are colours, and a single remaining one is the
+    intensity; others are `column_4`, `column_5` ...
 
     Parameters
     ----------
-    path : .xyz, .txt, .asc, .csv or .pts
-    columns : a name for each column, x, y and z among them, in place of the file's own
+    path : .xyz, .txt, .asc, .csv or .pts file.
+    columns : Names of the columns, including x, y and z, instead of the file's own.
 
     Returns
     -------
-    The points in the file's unit, which `stated_units` holds where the names of the columns state it; `notes` say what was
-    guessed, converted and left out.
+    The points in the file's unit. `stated_units` is set if the column names state it; `notes` say what was guessed, converted and
+    left out.
 
     Raises
     ------
     InputError
-        For a missing file, a line that is no row of numbers, a count that the rows do not agree with, and names that do not fit.
+        If the file is missing, a line is not a row of numbers, a count differs from the rows, or names do not fit.
     """
     where = str(check_file(path))
     try:
@@ -80,14 +81,14 @@ def read_xyz(path: Path, columns: Sequence[str] = ()) -> PointCloud:
     given, notes = _without_words(*_columns(layout, values, columns, where), layout, where)
     _check_present(values, given, where)
     if found.missing:
-        notes = (*notes, f"{found.missing:,} values are empty or no numbers")
+        notes = (*notes, f"{found.missing:,} values are empty or not numbers")
     if layout.form.decimal_comma:
-        notes = (*notes, "commas in numbers are taken as decimal marks")
+        notes = (*notes, "commas in numbers are read as decimal marks")
     return _cloud(values, given, notes)
 
 
 def _values(path: Path, layout: TextLayout) -> tuple[FloatArray, RowsFound]:
-    """The numbers of a file: by NumPy where it is plain, else line by line, which says where it is wrong."""
+    """Return the numbers of a file, by NumPy if possible, else line by line, which can say where it is wrong."""
     form, before = layout.form, layout.form.first_line - 1
     if not form.decimal_comma and not form.words:
         try:
@@ -96,13 +97,13 @@ def _values(path: Path, layout: TextLayout) -> tuple[FloatArray, RowsFound]:
             if values.shape[1] == form.columns:
                 return values, RowsFound()
         except ValueError:
-            pass  # its words are about NumPy, not about the file
+            pass  # its message would be about NumPy, not about the file
     with path.open(encoding=layout.encoding, errors="replace") as file:
         return read_rows(itertools.islice(file, before, None), form, str(path))
 
 
 def _check_end(path: Path, layout: TextLayout) -> None:
-    """Raise InputError where the file ends within a number: its last value has fewer decimals than all those above it."""
+    """Raise InputError if the file ends within a number: its last value has fewer decimals than all values above it."""
     if layout.encoding.startswith(("utf-16", "utf-32")):
         return
     with path.open("rb") as file:
@@ -115,26 +116,26 @@ def _check_end(path: Path, layout: TextLayout) -> None:
     *others, end = (len(word.partition(mark)[2]) for words in last for word in words or [""])
     if len(others) > _FEWEST_ALIKE and len(set(others)) == 1 and end < others[0]:
         raise InputError(
-            f"ends within a number: '{last[-1][0]}', where all numbers above have {others[0]} decimals", where=str(path),
+            f"ends within a number: '{last[-1][0]}', while all numbers above have {others[0]} decimals", where=str(path),
             remedy="the file was cut off: copy or export it again; or end its last line",
         )  # fmt: skip
 
 
 def _check_counts(rows: int, layout: TextLayout, found: RowsFound, where: str) -> None:
-    """Raise InputError where a count in the file is not the number of rows behind it."""
+    """Raise InputError if a count in the file differs from the number of rows after it."""
     first = rows - sum(count for _, count, _ in found.blocks)
     for stated, count, place in ((layout.stated, first, where), *((s, n, f"{where}, line {at:,}") for s, n, at in found.blocks)):
         if stated is not None and stated != count:
             raise InputError(
-                f"states {stated:,} points and holds {count:,}", where=place,
-                remedy="the file was cut off or changed: copy or export it again; or correct or remove the line with the count",
+                f"states {stated:,} points but has {count:,}", where=place,
+                remedy="the file was cut off or changed: copy or export it again, or correct or remove the line with the count",
             )  # fmt: skip
 
 
 def _columns(
     layout: TextLayout, values: FloatArray, given: Sequence[str], where: str
 ) -> tuple[tuple[Column, ...], tuple[str, ...]]:
-    """What the columns are: as given, as the file names them, or guessed; and notes on it."""
+    """Return the columns as given, as the file names them, or as guessed, and notes."""
     count = values.shape[1]
     if given:
         columns = understood(given, "--columns")
@@ -153,40 +154,37 @@ def _columns(
     guessed = _guessed_names(np.delete(values, layout.form.words, axis=1))
     for index in layout.form.words:
         guessed.insert(index, f"column_{index + 1}")
-    note = f"the columns have no names and were taken for {', '.join(guessed)} (else: --columns)"
+    note = f"the columns have no names and were read as {', '.join(guessed)} (to change: --columns)"
     return tuple(map(Column, guessed)), (note, *found.notes)
 
 
 def _without_words(
     columns: tuple[Column, ...], notes: tuple[str, ...], layout: TextLayout, where: str
 ) -> tuple[tuple[Column, ...], tuple[str, ...]]:
-    """The columns without those that hold words in place of numbers, and notes with them.
-
-    Raises InputError where one of them is called x, y or z.
-    """
+    """Remove columns that contain words instead of numbers, with notes; raise InputError if one of them is x, y or z."""
     found, said = list(columns), list(notes)
     for index in layout.form.words:
         if found[index].name in _AXES:
-            problem, allowed = f"column {index + 1}, called {found[index].name}, holds words", "numbers"
+            problem, allowed = f"column {index + 1}, called {found[index].name}, contains words", "numbers"
             raise InputError(
                 problem, where=where, allowed=allowed, remedy="name the columns as they are, in the file or with --columns"
             )
         if found[index].name != SKIPPED:
-            said.append(f"column {index + 1} ({found[index].name}) holds words and is left out")
+            said.append(f"column {index + 1} ({found[index].name}) contains words and is left out")
         found[index] = Column(SKIPPED)
     return tuple(found), tuple(said)
 
 
 def _check_present(values: FloatArray, columns: Sequence[Column], where: str) -> None:
-    """Raise InputError where one coordinate is missing in every row and others are not."""
+    """Raise InputError if a coordinate is missing in every row while others exist."""
     empty = [index for index, column in enumerate(columns) if column.name in _AXES and np.isnan(values[:, index]).all()]
     if 0 < len(empty) < 3:
-        problem = f"column {empty[0] + 1}, taken for {columns[empty[0]].name}, is empty in all {len(values):,} rows"
+        problem = f"column {empty[0] + 1}, read as {columns[empty[0]].name}, is empty in all {len(values):,} rows"
         raise InputError(problem, where=where, remedy="export it again, or name the columns with --columns as they are")
 
 
 def _cloud(values: FloatArray, columns: Sequence[Column], notes: tuple[str, ...]) -> PointCloud:
-    """The cloud of a table: coordinates in the file's unit, other channels in the SI unit that the names state."""
+    """Return the cloud of a table: coordinates in the file's unit, other channels in the SI unit that the names state."""
     channels = {column.name: _in_si(values[:, index], column) for index, column in enumerate(columns) if column.name != SKIPPED}
     points = np.stack([channels.pop(name) for name in "xyz"], axis=1)
     converted = [column for column in columns if column.name not in _AXES and (column.factor != 1 or column.decibels)]
@@ -197,15 +195,16 @@ def _cloud(values: FloatArray, columns: Sequence[Column], notes: tuple[str, ...]
 
 
 def _in_si(values: FloatArray, column: Column) -> FloatArray:
+    """Convert a column to SI units."""
     if column.name in _AXES:
-        return values  # in metres with the pose and the user's word, by `read_placed_scans`
+        return values  # converted to metres by `read_placed_scans`, with the pose and the user's unit
     if column.decibels:
         return np.asarray(10 ** (values / 10))
     return np.ascontiguousarray(values) if column.factor == 1 else values * column.factor
 
 
 def _units(columns: Sequence[Column]) -> AxisUnits | None:
-    """The unit that the names of x, y and z state, None where none does; an axis without one has that of the first with one."""
+    """Return the unit that the names of x, y and z state, or None; an axis without one has that of the first with one."""
     axes = {column.name: column for column in columns if column.name in _AXES}
     stated = [axes[name] for name in "xyz" if axes[name].unit]
     if not stated:
@@ -215,25 +214,25 @@ def _units(columns: Sequence[Column]) -> AxisUnits | None:
 
 
 def _check_lines(path: Path) -> None:
-    """Raise InputError for a line so long that it cannot be one point: a reader would take it into memory as a whole."""
+    """Raise InputError for a line too long for one point, which a reader would load completely."""
     with path.open("rb") as file:
         while len(part := file.read(LONGEST_LINE)) == LONGEST_LINE:
             if b"\n" not in part and b"\r" not in part:
                 raise InputError(
-                    f"has a line of more than {LONGEST_LINE:,} bytes", where=str(path), allowed="one point a line",
-                    remedy="give a file of points in text",
+                    f"has a line of more than {LONGEST_LINE:,} bytes", where=str(path), allowed="one point in each line",
+                    remedy="use a text file of points",
                 )  # fmt: skip
 
 
 def _guessed_names(values: FloatArray) -> list[str]:
-    """Names for the columns (n, k) of a file that has none."""
+    """Guess the names of the columns (n, k) of a file without names."""
     count = values.shape[1]
     if count == 4:
         return [*"xyz", "intensity"]
     names = [*"xyz", *(f"column_{number}" for number in range(4, count + 1))]
     sample = values[:: max(len(values) // _SAMPLE, 1)]
     bytes_alike = [bool(np.all((column == np.rint(column)) & (column >= 0) & (column <= 255))) for column in sample.T]
-    for first in (count - 3, 3):  # behind the intensity, or before it
+    for first in (count - 3, 3):  # after the intensity, or before it
         if 3 <= first <= count - 3 and all(bytes_alike[first : first + 3]):
             names[first : first + 3] = _COLOURS
             rest = [index for index in range(3, count) if names[index] not in _COLOURS]
@@ -244,6 +243,7 @@ def _guessed_names(values: FloatArray) -> list[str]:
 
 
 def _form(name: str, column: NDArray[Any], decimals: int) -> str:
+    """Return the format of a column."""
     if name in _AXES:
         return f"%.{decimals}f"
     return "%d" if column.dtype.kind in "iub" else "%.9g" if column.dtype == np.float32 else "%.17g"

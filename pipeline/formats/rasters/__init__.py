@@ -1,5 +1,4 @@
-"""Read and write rasters as TIFF and GeoTIFF, and the style with which QGIS shows them.
+"""Read and write rasters as TIFF and GeoTIFF, and the style in which QGIS shows them.
 
-Difference maps are computed in `pipeline/change`.
-Start with `geotiff.py`.
+Difference maps are computed in `pipeline/change`. Start with `geotiff.py`.
 """

@@ -1,6 +1,6 @@
-"""Read where a TIFF's pixels lie and in which units, from the tags of GeoTIFF 1.1 and of GDAL.
+"""Read the position and the units of a TIFF's pixels, from the tags of GeoTIFF 1.1 and of GDAL.
 
-The tie point of GeoTIFF belongs to the outer corner of a pixel, or to its centre where the file says that a pixel is a point.
+The tie point of GeoTIFF is at the outer corner of a pixel, or at its centre if the file says that a pixel is a point.
 """
 
 from __future__ import annotations
@@ -22,18 +22,22 @@ MODEL_TYPE, RASTER_TYPE, LINEAR_UNITS, VERTICAL_UNITS = 1024, 1025, 3076, 4099
 _PROJECTED, _USER_DEFINED = 3072, 32767
 _GEOGRAPHIC, _PIXEL_IS_POINT = 2, 2
 _SIDES_M, _FARTHEST_M = (1e-6, 1e6), 1e8
-"""Sides of a pixel, and how far from its origin any coordinate system of a survey reaches."""
+"""Allowed sides of a pixel, and largest coordinate of a survey, m."""
 _SQUARE = 1e-9
+"""Relative difference of the sides up to which a pixel is square."""
 _TIES_AGREE = 0.01
-"""Share of a pixel by which tie points may differ."""
+"""Largest difference of tie points, as a share of a pixel."""
 
 
 @dataclass(frozen=True)
 class Georeference:
-    """What a file says of its pixels.
+    """What a file states of its pixels.
 
-    grid: in metres, None where the file has no place; flipped: the first row of the file is the southernmost; linear_m,
-    vertical_m: metres of the stated units of coordinates and heights, None where the file states none.
+    Attributes
+    ----------
+    grid : In metres; None if the file has no place.
+    flipped : Whether the first row of the file is the southernmost.
+    linear_m, vertical_m : Length of the stated units of coordinates and heights, m; None if the file states none.
     """
 
     grid: Grid | None
@@ -61,7 +65,7 @@ def georeference(tags: dict[int, Any], shape: tuple[int, int], path: Path) -> Ge
     Raises
     ------
     InputError
-        For geographic coordinates, unknown units, pixels that are not square or not along the axes, and a place that is none.
+        For geographic coordinates, unknown units, pixels that are not square or not along the axes, or an impossible place.
     """
     keys = _geo_keys(tags, path)
     linear, vertical = (_unit(keys, key, path) for key in (LINEAR_UNITS, VERTICAL_UNITS))
@@ -85,9 +89,9 @@ def georeference(tags: dict[int, Any], shape: tuple[int, int], path: Path) -> Ge
 
 
 def _affine(tags: dict[int, Any], path: Path) -> tuple[float, float, float, float] | None:
-    """Return how columns and rows become coordinates: step of x, step of y, and x and y of the first pixel, in the file's unit.
+    """Return step of x, step of y, and x and y of the first pixel, in the file's unit; None if the file states no place.
 
-    A negative step of y means that the first row is the northernmost. None where the file states no place.
+    A negative step of y means that the first row is the northernmost.
     """
     scale, tie, matrix = tags.get(PIXEL_SCALE), tags.get(TIEPOINT), tags.get(TRANSFORMATION)
     if scale is not None and tie is not None and len(tie) >= 6:
@@ -98,12 +102,14 @@ def _affine(tags: dict[int, Any], path: Path) -> tuple[float, float, float, floa
         step_x, step_y, x, y = (float(matrix[place]) for place in (0, 5, 3, 7))
         turned = max(abs(float(matrix[1])), abs(float(matrix[4]))) > _SQUARE * abs(step_x)
     elif tie is not None:
-        problem = f"states {len(tie) // 6} tie points and no size of its pixels"
+        problem = f"states {len(tie) // 6} tie points but no size of its pixels"
         raise InputError(problem, where=str(path), remedy="resample it to square pixels along the axes (gdalwarp)")
     else:
         return None
     if turned or not step_x > 0 or not np.isclose(step_x, abs(step_y), rtol=_SQUARE, atol=0):
-        problem = "its pixels are turned against the axes" if turned else f"its pixels are {step_x:g} x {abs(step_y):g} units"
+        problem = (
+            "its pixels are rotated relative to the axes" if turned else f"its pixels are {step_x:g} x {abs(step_y):g} units"
+        )
         remedy = "resample it to square pixels along the axes (gdalwarp)"
         raise InputError(problem, where=str(path), allowed="square pixels, columns towards larger x", remedy=remedy)
     return step_x, step_y, x, y
@@ -112,7 +118,7 @@ def _affine(tags: dict[int, Any], path: Path) -> tuple[float, float, float, floa
 def _corner(ties: FloatArray, step_x: float, step_y: float, path: Path) -> tuple[float, float]:
     """Return x and y of the first pixel, in the file's unit, from tie points of (column, row, 0, x, y, height) each.
 
-    Raises InputError where tie points disagree by more than a hundredth of a pixel: the raster is warped.
+    Raises InputError if tie points disagree by more than a hundredth of a pixel, that is, if the raster is warped.
     """
     column, row, _, x, y, _ = ties[: len(ties) // 6 * 6].reshape(-1, 6).T
     corners = np.column_stack([x - column * step_x, y - row * step_y])
@@ -127,31 +133,33 @@ def _corner(ties: FloatArray, step_x: float, step_y: float, path: Path) -> tuple
 
 
 def _geo_keys(tags: dict[int, Any], path: Path) -> dict[int, int]:
-    """The GeoTIFF keys whose value is a number of 16 bits."""
+    """Return the GeoTIFF keys whose value is a 16-bit number."""
     values = tags.get(GEO_KEYS)
     if values is None:
         return {}
     rows = list(zip(*(tuple(values)[4 + part :: 4] for part in range(4)), strict=False))
     if len(values) < 4 or len(rows) < values[3]:
-        problem = f"states {values[3] if len(values) > 3 else 0} GeoTIFF keys and holds {len(rows)}"
+        problem = f"states {values[3] if len(values) > 3 else 0} GeoTIFF keys but has {len(rows)}"
         raise InputError(problem, where=str(path), remedy="export it again")
     return {int(key): int(value) for key, location, _, value in rows if location == 0}
 
 
 def _unit(keys: dict[int, int], key: int, path: Path) -> float | None:
-    """Metres of the unit that a key states; None where the file has no such key, or a unit of the user's own."""
+    """Return the length of the unit that a key states, m; None without the key, or for a user-defined unit."""
     code = keys.get(key)
     if code is None or code == _USER_DEFINED:
         return None
     metres = metres_of_epsg_unit(code)
     if metres is None:
-        problem = f"states the unit EPSG {code}, which is no length"
+        problem = f"states the unit EPSG {code}, which is not a length"
         raise InputError(problem, where=str(path), allowed="a unit of length", remedy="export it in metres")
     return metres
 
 
 def _unit_of_code(keys: dict[int, int], path: Path) -> float | None:
-    """Metres of the unit of the projected coordinate system that the file names by its EPSG code; None without one."""
+    """Return the length of the unit of the projected coordinate system that the file names by its EPSG code, m; None
+    without one.
+    """
     code = keys.get(_PROJECTED)
     crs = None if code in (None, _USER_DEFINED) else understood_crs(f"EPSG:{code}")
     units = None if crs is None else units_of_crs(crs, str(path))
@@ -159,7 +167,7 @@ def _unit_of_code(keys: dict[int, int], path: Path) -> float | None:
 
 
 def scale_and_offset(tags: dict[int, Any], path: Path) -> tuple[float, float]:
-    """Scale and offset of the stored values, from GDAL's metadata."""
+    """Return scale and offset of the stored values, from GDAL's metadata."""
     found = {"scale": 1.0, "offset": 0.0}
     text = tags.get(GDAL_METADATA)
     if not text or "role=" not in str(text):
@@ -168,5 +176,7 @@ def scale_and_offset(tags: dict[int, Any], path: Path) -> tuple[float, float]:
     try:
         found |= {str(item.get("role")): float(item.text or "") for item in items if item.get("role") in found}
     except ValueError:
-        raise InputError("its scale or offset is no number", where=f"{path}: GDAL_METADATA", remedy="export it again") from None
+        raise InputError(
+            "its scale or offset is not a number", where=f"{path}: GDAL_METADATA", remedy="export it again"
+        ) from None
     return found["scale"], found["offset"]

@@ -1,6 +1,6 @@
 """Read and write rasters: float32 TIFF, and GeoTIFF georeferenced to the wall frame.
 
-Written uncompressed: on a noisy difference map deflate saves a fifth and takes forty times as long.
+Files are written uncompressed: on a noisy difference map, deflate saves a fifth but takes forty times as long.
 """
 
 from __future__ import annotations
@@ -35,16 +35,17 @@ from scene.common.errors import InputError
 from scene.common.regular_file import READ_LIMIT, check_file, read_limit_gb
 from scene.geometry.grid import Grid
 
-logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # its complaints come as exceptions too
+logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # its warnings are also raised as exceptions
 _GEO_ASCII, _NODATA = 34737, 42113
 _ASCII, _SHORT, _DOUBLE = 2, 3, 12
 _MASK_PAGE = 4
 """TIFF's NewSubfileType of a transparency mask."""
 MOST_PIXELS = 250_000_000
-"""Of an image that is read, 1 GB as float32: a small compressed file can claim any size."""
+"""Largest number of pixels of an image to read, 1 GB as float32; a small compressed file can claim any size."""
 _LARGEST = 1e9
+"""Largest value of a pixel."""
 _USUAL_NODATA = tuple(np.float32(value) for value in (-9999, -99999, -32768, -32767, -3.4028235e38, 3.4028235e38, -1e30, 1e20))
-"""Values that programs write where there are no data (ESRI, SRTM, float32's largest)."""
+"""Values that programs write for missing data (ESRI, SRTM, largest float32)."""
 _DAMAGE = (
     ValueError,
     IndexError,
@@ -56,11 +57,11 @@ _DAMAGE = (
     RuntimeError,
     MemoryError,
 )
-"""What tifffile raises where tags are none, do not fit one another, or ask for what is not installed."""
+"""Exceptions of tifffile for invalid or inconsistent tags, or libraries that are not installed."""
 _DECOMPRESSORS: dict[int, Callable[[], Any]] = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
-"""Of the kinds of compression by which some bytes become gigabytes."""
+"""Kinds of compression by which few bytes can become gigabytes."""
 _SLACK = 65_536
-"""Bytes that a compressed part of an image may be larger than a plain one."""
+"""Bytes by which a compressed part of an image may exceed an uncompressed one."""
 _CITATION = "wall frame: x along the wall, y up the wall, z towards the sensors, metres"
 _CITATION_KEY = 1026
 _USER_DEFINED, _PIXEL_IS_AREA, _METRE = 32767, 1, 9001
@@ -69,10 +70,17 @@ _USER_DEFINED, _PIXEL_IS_AREA, _METRE = 32767, 1, 9001
 def write_geotiff(
     path: Path, raster: NDArray[np.floating], grid: Grid, *, description: str = "", with_mask: bool = False
 ) -> None:
-    """Write a raster (h, w), m, NaN where there is no data, as float32 at the place and scale of `grid` in the wall frame.
+    """Write a raster as float32 GeoTIFF in the wall frame.
 
-    The coordinate system is a local one in metres (GeoTIFF 1.1, user-defined model, pixel is area). description: ASCII;
-    with_mask: a second page says which pixels have data, a TIFF transparency mask of one bit a pixel, as GDAL reads it.
+    The coordinate system is a local one in metres (GeoTIFF 1.1, user-defined model, pixel is area).
+
+    Parameters
+    ----------
+    path : File to write.
+    raster : (h, w) values, m; NaN without data.
+    grid : Place and scale of the pixels.
+    description : ASCII text.
+    with_mask : Whether to add a second page with a transparency mask, one bit for each pixel with data, as GDAL reads it.
     """
     if raster.shape != grid.shape:
         raise ValueError(f"expected a raster of shape {grid.shape}, got {raster.shape}")
@@ -80,7 +88,7 @@ def write_geotiff(
 
 
 def wall_frame_wkt() -> str:
-    """The coordinate system of the GeoTIFFs as GDAL reads it: local, metres."""
+    """Return the coordinate system of the GeoTIFFs as GDAL reads it: local, metres."""
     axes = 'AXIS["Easting",EAST],AXIS["Northing",NORTH]'
     return f'LOCAL_CS["{_CITATION}",UNIT["metre",1,AUTHORITY["EPSG","{_METRE}"]],{axes}]'
 
@@ -92,10 +100,13 @@ def write_tiff(path: Path, image: NDArray[np.floating], *, description: str = ""
 
 @dataclass(frozen=True)
 class Raster:
-    """A raster as a file holds it.
+    """A raster as a file contains it.
 
-    values: (h, w) float32, north up, NaN where there is no data, in the file's unit of heights; place: where its pixels lie;
-    notes: what the user should know of how it was read, in words.
+    Attributes
+    ----------
+    values : (h, w) float32, north up, NaN without data, in the file's unit of heights.
+    place : Position and units of its pixels.
+    notes : What the user should know about how it was read.
     """
 
     values: NDArray[np.float32]
@@ -104,9 +115,9 @@ class Raster:
 
 
 def read_raster(path: Path) -> Raster:
-    """Read a raster of one band with all that the file says of it.
+    """Read a raster of one band with everything that the file states.
 
-    Raises InputError for a damaged file, one beyond `most_pixels`, and a place or unit that cannot be used.
+    Raises InputError for a damaged file, one beyond `most_pixels`, or an unusable place or unit.
     """
     values, tags, notes = _measured(path)
     place = georeference(tags, (values.shape[0], values.shape[1]), path)
@@ -114,28 +125,28 @@ def read_raster(path: Path) -> Raster:
 
 
 def read_geotiff(path: Path) -> tuple[NDArray[np.float32], Grid]:
-    """Read a raster of one band, (h, w) float32, m, NaN where there is no data, and the grid of its pixels, m.
+    """Read a raster of one band, (h, w) float32, m, NaN without data, and the grid of its pixels, m.
 
     Stated units are converted. Raises InputError as `read_raster` does, and for a file without a place.
     """
     raster = read_raster(path)
     if raster.place.grid is None:
-        raise InputError("has no place: pixel scale and one tie point are needed", where=str(path), remedy="export a GeoTIFF")
+        raise InputError("has no pixel scale and tie point", where=str(path), remedy="export a GeoTIFF")
     metres = raster.place.vertical_m or 1.0
     return (raster.values if metres == 1.0 else raster.values * np.float32(metres)), raster.place.grid
 
 
 def read_tiff(path: Path) -> NDArray[np.float32]:
-    """Read an image of one band, (h, w) float32, NaN where there is no data, rows as in the file.
+    """Read an image of one band, (h, w) float32, NaN without data, with rows as in the file.
 
-    Where the pixels lie in the world is not looked at. TensorFlow reads images in threads of its own, in which PROJ, which knows
-    the coordinate systems, crashes. Raises InputError for a damaged or too large file.
+    The place of the pixels is not read: TensorFlow reads images in its own threads, where PROJ, which knows the coordinate
+    systems, crashes. Raises InputError for a damaged or too large file.
     """
     return _measured(path)[0]
 
 
 def _measured(path: Path) -> tuple[NDArray[np.float32], dict[int, Any], tuple[str, ...]]:
-    """Read the values (h, w) in the file's unit, NaN where there is no data, the first page's tags, and notes."""
+    """Read the values (h, w) in the file's unit, NaN without data; the first page's tags; notes."""
     values, tags, masked = _read(path)
     stated = _nodata(tags, path)
     absent = values == stated if not np.isnan(stated) else np.zeros(values.shape, dtype=bool)
@@ -150,6 +161,7 @@ def _measured(path: Path) -> tuple[NDArray[np.float32], dict[int, Any], tuple[st
 
 
 def _georeference(grid: Grid) -> list[tuple[int, int, int, Any, bool]]:
+    """Return the GeoTIFF tags of a grid."""
     citation = f"{_CITATION}|"
     keys = [
         (1, 1, 1, 4),  # version 1, revision 1.1, four keys
@@ -175,7 +187,7 @@ def _write(
     *,
     with_mask: bool = False,
 ) -> None:
-    """Without metadata of tifffile's, software and date: equal rasters give equal bytes."""
+    """Write a TIFF without tifffile's metadata, software and date, so that equal rasters give equal bytes."""
     data = np.ascontiguousarray(raster, dtype=np.float32)
     plain: dict[str, Any] = {"metadata": None, "software": False}
     with writing(path) as temporary, tifffile.TiffWriter(temporary) as file:
@@ -185,7 +197,7 @@ def _write(
 
 
 def _read(path: Path) -> tuple[NDArray[np.float32], dict[int, Any], NDArray[np.bool_]]:
-    """Stored values (h, w), the first page's tags, and which pixels a transparency mask leaves out."""
+    """Read stored values (h, w), the first page's tags, and the pixels that a transparency mask leaves out."""
     check_file(path)
     try:
         with tifffile.TiffFile(path) as file:
@@ -204,7 +216,7 @@ def _read(path: Path) -> tuple[NDArray[np.float32], dict[int, Any], NDArray[np.b
     if raster.ndim != 2 or raster.dtype.kind not in "fiub":
         problem = f"has the shape {raster.shape} and values of type {raster.dtype}"
         raise InputError(problem, where=str(path), allowed="one band of numbers", remedy="export it as float32")
-    with np.errstate(over="ignore"):  # becomes infinite, which is looked for later
+    with np.errstate(over="ignore"):  # becomes infinite, which is checked later
         values = raster.astype(np.float32, copy=False)
     masked = masks[0] == 0 if masks else np.zeros(values.shape, dtype=bool)
     return values, tags, masked
@@ -216,21 +228,18 @@ def _is_mask(page: Any, image: Any) -> bool:
 
 
 def _unreadable(path: Path, problem: str) -> InputError:
-    """The error for a file that tifffile cannot read: a compression that it does not know is no damage."""
+    """Return the error for a file that tifffile cannot read; an unknown compression is not damage."""
     if "imagecodecs" in problem or "not supported" in problem or "not a known COMPRESSION" in problem:
         allowed = "no compression, deflate, LZW, PackBits, LZMA, Zstandard, LERC, JPEG"
         remedy = "save it with deflate or without compression"
-        return InputError(
-            f"is compressed in a way that cannot be read ({problem})", where=str(path), allowed=allowed, remedy=remedy
-        )
-    return InputError(f"is not a whole TIFF file ({problem})", where=str(path), remedy="export it again")
+        return InputError(f"uses a compression that cannot be read ({problem})", where=str(path), allowed=allowed, remedy=remedy)
+    return InputError(f"is not a complete TIFF file ({problem})", where=str(path), remedy="export it again")
 
 
 def _unstated_nodata(values: NDArray[np.float32], absent: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
-    """Pixels of a value that programs write for no data, where the file does not say so, and a note on them.
+    """Find pixels with a usual value for missing data that the file does not state, with a note.
 
-    A value counts where no other value of the raster comes half as far from zero: -9999 among heights of 100 to 900 m is no
-    height.
+    A value counts if no other value of the raster is half as far from zero: among heights of 100 to 900 m, -9999 is not a height.
     """
     for usual in _USUAL_NODATA:
         found = (values == usual) & ~absent
@@ -239,39 +248,39 @@ def _unstated_nodata(values: NDArray[np.float32], absent: NDArray[np.bool_]) -> 
         others = values[~found & ~absent]
         if not len(others) or np.abs(others).max() > abs(float(usual)) / 2:
             continue
-        return found, (
-            f"{int(found.sum()):,} pixels of {usual:g} are taken for pixels without data, though the file does not say so",
-        )
+        return found, (f"{int(found.sum()):,} pixels of {usual:g} are read as missing data, although the file does not say so",)
     return np.zeros(values.shape, dtype=bool), ()
 
 
 def _nodata(tags: dict[int, Any], path: Path) -> np.float32:
-    """The value that stands for no data, NaN where none is stated."""
+    """Return the value that stands for missing data, NaN if none is stated."""
     text = str(tags.get(_NODATA, "nan")).strip("\0 ") or "nan"
     try:
         return np.float32(text)
     except ValueError:
         raise InputError(
-            f"states '{text[:40]}' for no data", where=str(path), allowed="a number", remedy="export it again"
+            f"states '{text[:40]}' for missing data", where=str(path), allowed="a number", remedy="export it again"
         ) from None
 
 
 def _check_values(raster: NDArray[np.float32], path: Path) -> None:
-    """Raise InputError for infinite and huge values, with which some programs mark pixels without data."""
+    """Raise InputError for infinite and huge values, by which some programs mark missing data."""
     known = np.isnan(raster) | (np.abs(raster) <= _LARGEST)
     if not known.all():
         problem = f"has {int((~known).sum()):,} pixels of infinite or huge values, such as {raster[~known][0]:g}"
-        remedy = "write NaN where there are no data, or name the value in the tag GDAL_NODATA"
+        remedy = "write NaN for missing data, or state the value in the tag GDAL_NODATA"
         raise InputError(problem, where=str(path), allowed=f"up to {_LARGEST:g}", remedy=remedy)
 
 
 def most_pixels() -> int:
-    """Of an image: MOST_PIXELS, or as many as the variable READ_LIMIT allows, of four bytes each."""
+    """Return the largest number of pixels of an image: MOST_PIXELS, or more if the variable READ_LIMIT allows it, with four bytes
+    each.
+    """
     return max(MOST_PIXELS, int(read_limit_gb() * 1e9 / 4))
 
 
 def _check_size(page: tifffile.TiffPage, path: Path) -> None:
-    """Raise InputError for an image that is too large, before any memory is taken for it."""
+    """Raise InputError for an image that is too large, before memory is allocated."""
     pixels, depth = math.prod(page.shape), page.dtype.itemsize if page.dtype else 4
     if pixels > (most := most_pixels()):
         size = " x ".join(map(str, page.shape))
@@ -284,7 +293,7 @@ def _check_size(page: tifffile.TiffPage, path: Path) -> None:
 
 
 def _check_parts(file: tifffile.TiffFile, page: tifffile.TiffPage) -> None:
-    """Raise ValueError for tiles or strips that hold more than their pixels, before any memory is taken for it."""
+    """Raise ValueError for tiles or strips larger than their pixels, before memory is allocated."""
     most = math.prod(page.chunks) * (page.dtype.itemsize if page.dtype else 1)
     begin = _DECOMPRESSORS.get(int(page.compression))
     for offset, count in zip(page.dataoffsets, page.databytecounts, strict=False):

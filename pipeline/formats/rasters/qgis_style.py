@@ -1,4 +1,4 @@
-"""QGIS styles (.qml): a raster opens with the colours of the reports where the file lies beside it under the same name."""
+"""Write QGIS styles (.qml): with such a file beside it, a raster opens in the colours of the reports."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _NO_DATA = "181,181,181,255"
 
 @dataclass(frozen=True)
 class Stop:
-    """A colour at a value of the raster, and what the legend says there. colour: #rrggbb."""
+    """A colour (#rrggbb) at a value of the raster, and its label in the legend."""
 
     value: float
     colour: str
@@ -23,8 +23,10 @@ class Stop:
 
 
 def write_style(raster: Path, stops: Sequence[Stop]) -> None:
-    """Write the style of a raster's one band beside it: colours between the stops, by rising value, are interpolated; values
-    beyond them have the last colour."""
+    """Write the style of a one-band raster beside it.
+
+    Colours are interpolated between the stops, which are in rising order; values beyond them have the last colour.
+    """
     low, high = (f"{stops[place].value:.9g}" for place in (0, -1))
     root = ElementTree.Element("qgis", {"version": "3.28.0", "styleCategories": "Symbology"})
     renderer = ElementTree.SubElement(

@@ -1,5 +1,5 @@
-"""Read and write the records beside the data: COCO annotations, run.json, gap.json and the files of a run folder.
+"""Read and write records: COCO annotations, run.json, gap.json, the files of a run folder, and GeoPackage tables.
 
-What the numbers in them mean is decided where they are computed.
-Start with `coco.py` for annotations or `run_files.py` for a run folder.
+What their numbers mean is decided where they are computed. Start with `coco.py` for annotations or `run_files.py` for a run
+folder.
 """

@@ -1,7 +1,7 @@
-"""COCO's JSON, annotations and detections: the one reader of all commands that take such files.
+"""Read COCO's JSON, annotations and detections, for all commands that take such files.
 
-What it gives is checked and complete: each image, annotation and detection is COCO's entry with all its keys, also those of other
-programs, its `segmentation` in compressed run lengths, and `bbox`, `area` and `iscrowd` filled in.
+The result is checked and complete: each image, annotation and detection is a COCO entry with all its keys, including those of
+other programs, with `segmentation` as compressed run lengths, and with `bbox`, `area` and `iscrowd`.
 """
 
 from __future__ import annotations
@@ -21,32 +21,40 @@ from scene.common.config import Config, parse
 from scene.common.errors import InputError
 from scene.common.regular_file import read_json
 
-_REMEDY = "give the folder of a split, such as my_set/train, of a run, or a COCO file"
+_REMEDY = "name the folder of a split, such as my_set/train, or of a run, or a COCO file"
 Id = Annotated[int, Field(ge=0, lt=2**63)]
 Entry = dict[str, Any]
 
 
 class _Entry(Config):
-    """COCO lets entries have keys of anyone's own."""
+    """An entry of COCO, which may have additional keys."""
 
     model_config = ConfigDict(extra="allow", strict=True)
 
 
 class _Category(_Entry):
+    """A category."""
+
     id: Id
 
 
 class _NamedImage(_Entry):
+    """An image, as detections list it."""
+
     id: Id
     file_name: str = Field(min_length=1)
 
 
 class _Image(_NamedImage):
+    """An image with its size, px."""
+
     width: int = Field(ge=1)
     height: int = Field(ge=1)
 
 
 class _Annotation(_Entry):
+    """An annotated block."""
+
     id: Id
     image_id: Id
     category_id: Id
@@ -57,7 +65,9 @@ class _Annotation(_Entry):
 
 
 class _Detection(_Annotation):
-    id: Id | None = None  # type: ignore[assignment]  # COCO's results have none
+    """A detection."""
+
+    id: Id | None = None  # type: ignore[assignment]  # COCO's results have no id
     score: float = Field(ge=0, le=1)
 
 
@@ -66,31 +76,39 @@ EntryT = TypeVar("EntryT", bound=_Entry)
 
 @dataclass(frozen=True)
 class Coco:
-    """A data set as COCO holds it, checked; in the order of the file."""
+    """A checked COCO data set, in the order of the file."""
 
     images: list[Entry]
     annotations: list[Entry]
     categories: list[Entry]
 
     def to_dict(self) -> dict[str, list[Entry]]:
-        """As pycocotools takes it."""
+        """Return the content as pycocotools takes it."""
         return {"images": self.images, "annotations": self.annotations, "categories": self.categories}
 
 
 def read_coco(path: Path, *, masks: bool = True) -> Coco:
-    """Read COCO annotations. masks: without one an annotation is wrong; else it needs a mask or a box.
+    """Read COCO annotations.
 
-    Raises InputError, naming the annotation, for wrong types and numbers, ids that are there twice or belong to nothing, images
-    of more than `most_pixels`, boxes and polygons outside their image, and run lengths that are not its image's.
+    Parameters
+    ----------
+    path : The JSON file.
+    masks : Whether each annotation must have a mask; otherwise it needs a mask or a box.
+
+    Raises
+    ------
+    InputError
+        Naming the annotation, for wrong types and numbers, ids that are repeated or refer to nothing, images of more than
+        `most_pixels`, boxes and polygons outside their image, and run lengths that do not fit their image.
     """
     content = read_json(path, remedy=_REMEDY)
     if not isinstance(content, Mapping):
-        raise _no_coco(path, "it is no mapping")
+        raise _no_coco(path, "it is not a mapping")
     for name in ("images", "annotations", "categories"):
         if not isinstance(content.get(name), list):
-            raise _no_coco(path, f"'{name}' is {'no list' if name in content else 'missing'}")
+            raise _no_coco(path, f"'{name}' is {'not a list' if name in content else 'missing'}")
     if not content["images"]:
-        raise InputError("names no image", where=str(path), remedy="give the annotations of the maps that are meant")
+        raise InputError("its list 'images' is empty", where=str(path), remedy="give the annotations of the maps that are meant")
     images = [entry for entry, _ in _parsed(_Image, content["images"], "image", path)]
     for image in images:
         _check_pixels(image, path)
@@ -104,21 +122,31 @@ def read_coco(path: Path, *, masks: bool = True) -> Coco:
 def read_detections(path: Path, truth: Coco, *, masks: bool = True) -> list[Entry]:
     """Read COCO detections in the images of `truth`, whose image ids they get.
 
-    Detections that list their images are joined by file name, others (pycocotools' plain list) by image id. Raises InputError as
-    `read_coco` does, and for scores that are no numbers from 0 to 1, and images that the truth does not have.
+    Detections with a list of images are joined by file name, others (pycocotools' plain list) by image id.
+
+    Parameters
+    ----------
+    path : The JSON file.
+    truth : The annotations.
+    masks : Whether each detection must have a mask.
+
+    Raises
+    ------
+    InputError
+        As `read_coco` does, and for scores outside 0 to 1, and images that the truth does not have.
     """
     content = read_json(path, remedy=_REMEDY)
     entries = content.get("annotations") if isinstance(content, Mapping) else content
     if not isinstance(entries, list):
-        raise InputError("is no list of COCO detections", where=str(path), remedy="give a detections.json of scarpsim detect")
+        raise InputError("is not a list of COCO detections", where=str(path), remedy="use a detections.json of scarpsim detect")
     if any(isinstance(entry, Mapping) and "score" not in entry for entry in entries):
-        raise InputError("has annotations without a score", where=str(path), remedy="give detections, not the truth")
+        raise InputError("has annotations without a score", where=str(path), remedy="use detections, not the truth")
     ids = {image["id"]: image["id"] for image in truth.images}
     if isinstance(content, Mapping):
         known = {image["file_name"]: image["id"] for image in truth.images}
         listed = content.get("images")
         if not isinstance(listed, list):
-            raise _no_coco(path, f"'images' is {'no list' if 'images' in content else 'missing'}")
+            raise _no_coco(path, f"'images' is {'not a list' if 'images' in content else 'missing'}")
         named = [entry for entry, _ in _parsed(_NamedImage, listed, "image", path)]
         _unique(named, "file_name", "image", path)
         ids = {image["id"]: known[image["file_name"]] for image in named if image["file_name"] in known}
@@ -133,24 +161,24 @@ def read_detections(path: Path, truth: Coco, *, masks: bool = True) -> list[Entr
 
 @dataclass(frozen=True)
 class _Masks:
-    """Completes entries. images: by id; categories: ids that are known; needed: an entry without a mask is wrong."""
+    """Completes entries. images: by id; categories: known ids; needed: whether an entry without a mask is wrong."""
 
     images: Mapping[int, Entry]
     categories: set[int]
     needed: bool
 
     def complete(self, entry: Entry, where: str) -> Entry:
-        """The entry with its mask in run lengths, its box and the mask's area, px; the box's where there is no mask."""
+        """Return the entry with its mask as run lengths, its box, and the area of the mask, px, or of the box without a mask."""
         image = self.images.get(entry["image_id"])
         if image is None:
             allowed = f"the id of one of the {len(self.images)} images"
             raise InputError(
-                f"is of image {entry['image_id']}, which is not there", where=where, allowed=allowed, remedy="leave it out"
+                f"refers to image {entry['image_id']}, which does not exist", where=where, allowed=allowed, remedy="leave it out"
             )
         if entry["category_id"] not in self.categories:
             problem = f"its category {entry['category_id']} is not listed"
             allowed = ", ".join(map(str, sorted(self.categories)[:20])) or "none, as the list is empty"
-            raise InputError(problem, where=where, allowed=allowed, remedy="list it, or give the category that is meant")
+            raise InputError(problem, where=where, allowed=allowed, remedy="list it, or use the right category")
         height, width = image["height"], image["width"]
         box, segmentation = entry.get("bbox"), entry.get("segmentation")
         if box is not None:
@@ -166,14 +194,15 @@ class _Masks:
 
 
 def _no_coco(path: Path, problem: str) -> InputError:
+    """Return the error for a file that is not COCO."""
     allowed = "lists of images, annotations and categories"
-    return InputError(f"is no COCO annotation file ({problem})", where=str(path), allowed=allowed, remedy="make it again")
+    return InputError(f"is not a COCO annotation file ({problem})", where=str(path), allowed=allowed, remedy="make it again")
 
 
 def _parsed(model: type[EntryT], entries: Sequence[Any], kind: str, path: Path) -> Iterable[tuple[Entry, str]]:
-    """Each entry, of the right types and with an id of its own, and what it is called in a message.
+    """Yield each entry, with checked types and a unique id, and its name in messages.
 
-    NaN and infinity in keys that are not COCO's become null: they have no place in what is written.
+    NaN and infinity in keys that are not COCO's become null, as they cannot be written.
     """
     seen: set[int] = set()
     for number, entry in enumerate(entries):
@@ -185,9 +214,9 @@ def _parsed(model: type[EntryT], entries: Sequence[Any], kind: str, path: Path) 
         try:
             parse(model, entry, where)
         except InputError as error:
-            raise InputError(error.what, where=where, allowed=_allowed(model), remedy="mend it, or leave it out") from None
+            raise InputError(error.what, where=where, allowed=_allowed(model), remedy="correct it, or leave it out") from None
         if own in seen:
-            raise InputError("its id is there twice", where=where, allowed="one of its own", remedy="number them anew")
+            raise InputError("its id occurs twice", where=where, allowed="a unique id", remedy="number them again")
         if own is not None:
             seen.add(own)
         others = {key: without_nan(value) for key, value in entry.items() if key not in model.model_fields}
@@ -195,7 +224,7 @@ def _parsed(model: type[EntryT], entries: Sequence[Any], kind: str, path: Path) 
 
 
 def _allowed(model: type[_Entry]) -> str:
-    """What the fields of an entry may be, in words."""
+    """Describe the allowed fields of an entry."""
     if issubclass(model, _Annotation):
         score = ", a score from 0 to 1" if issubclass(model, _Detection) else ""
         return f"whole numbers as ids, a bbox of 4 finite numbers{score}"
@@ -205,15 +234,17 @@ def _allowed(model: type[_Entry]) -> str:
 
 
 def _unique(entries: Sequence[Entry], key: str, kind: str, path: Path) -> None:
+    """Raise InputError if a value of a key occurs twice."""
     seen: set[Any] = set()
     for entry in entries:
         if entry[key] in seen:
             where = f"{path}: {kind} {entry['id']}"
-            raise InputError(f"its {key} '{entry[key]}' is there twice", where=where, remedy="leave one of the two out")
+            raise InputError(f"its {key} '{entry[key]}' occurs twice", where=where, remedy="leave out one of the two")
         seen.add(entry[key])
 
 
 def _check_pixels(image: Entry, path: Path) -> None:
+    """Raise InputError for an image that is too large."""
     height, width = image["height"], image["width"]
     if height * width > (most := most_pixels()):
         allowed = f"at most {most:,} px"
@@ -222,8 +253,9 @@ def _check_pixels(image: Entry, path: Path) -> None:
 
 
 def _check_box(box: Sequence[float], height: int, width: int, where: str) -> None:
+    """Raise InputError for a box outside its image."""
     x, y, across, down = box
     inside = min(x, y) >= -BEYOND_PX and x + across <= width + BEYOND_PX and y + down <= height + BEYOND_PX
     if min(across, down) < 0 or not inside:
         allowed = f"x, y, width, height inside the image of {width} x {height} px"
-        raise InputError(f"its bbox is {list(box)}", where=where, allowed=allowed, remedy="give the corner, then the lengths")
+        raise InputError(f"its bbox is {list(box)}", where=where, allowed=allowed, remedy="write the corner, then the lengths")

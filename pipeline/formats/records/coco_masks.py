@@ -1,6 +1,6 @@
-"""Masks as COCO writes them, polygons or run lengths, read as compressed run lengths.
+"""Read masks in COCO's forms, polygons or run lengths, as compressed run lengths.
 
-All is checked before pycocotools' C code sees it, which reads and writes past its memory where run lengths do not fit the image.
+Everything is checked before pycocotools' C code, which accesses invalid memory if run lengths do not fit the image.
 """
 
 from __future__ import annotations
@@ -16,15 +16,24 @@ from scene.common.errors import InputError
 
 FORMS = "polygons [[x, y, x, y, x, y, ...], ...] or run lengths {size, counts}"
 BEYOND_PX = 1.0
-"""What points and boxes may lie outside their image, px: some programs count the last pixel's far edge from one."""
+"""Distance by which points and boxes may be outside their image, px: some programs count the last pixel's far edge from one."""
 _LONGEST_NUMBER = 7
-"""Characters, of 5 bits each, of a run length."""
+"""Largest number of characters, of 5 bits each, of a run length."""
 
 
 def run_lengths(segmentation: Any, height: int, width: int, where: str) -> dict[str, Any]:
-    """The mask of an image (height, width), px, as {size, counts}, with `counts` as pycocotools compresses them.
+    """Return the mask of an image as {size, counts}, with `counts` as compressed by pycocotools.
 
-    Raises InputError, with `where` at its front, for what is no mask of that image.
+    Parameters
+    ----------
+    segmentation : Polygons or run lengths.
+    height, width : Size of the image, px.
+    where : Name of the annotation, for errors.
+
+    Raises
+    ------
+    InputError
+        If it is not a mask of that image.
     """
     if isinstance(segmentation, Mapping):
         return _checked(segmentation, height, width, where)
@@ -34,6 +43,7 @@ def run_lengths(segmentation: Any, height: int, width: int, where: str) -> dict[
 
 
 def _of_polygons(polygons: Sequence[Any], height: int, width: int, where: str) -> dict[str, Any]:
+    """Draw polygons as a mask."""
     if not polygons:
         raise InputError("its segmentation has no polygon", where=where, allowed=FORMS, remedy="leave the annotation out")
     remedy = "draw the outline again, in pixels from the image's top-left corner"
@@ -41,7 +51,7 @@ def _of_polygons(polygons: Sequence[Any], height: int, width: int, where: str) -
         points = _numbers(polygon)
         if points is None or points.size < 6 or points.size % 2 or not np.isfinite(points).all():
             allowed = "x, y, x, y, ... of at least 3 points, finite numbers"
-            raise InputError(f"polygon {number} of its segmentation is none", where=where, allowed=allowed, remedy=remedy)
+            raise InputError(f"polygon {number} of its segmentation is invalid", where=where, allowed=allowed, remedy=remedy)
         beyond = points.reshape(-1, 2) - (width, height)
         if points.min() < -BEYOND_PX or beyond.max() > BEYOND_PX:
             allowed = f"x from 0 to {width}, y from 0 to {height}"
@@ -52,10 +62,11 @@ def _of_polygons(polygons: Sequence[Any], height: int, width: int, where: str) -
 
 
 def _checked(segmentation: Mapping[str, Any], height: int, width: int, where: str) -> dict[str, Any]:
+    """Check run lengths and compress them."""
     size, counts = segmentation.get("size"), segmentation.get("counts")
     if size != [height, width]:
         allowed = f"[{height}, {width}], the image's height and width"
-        remedy = "give the masks and the images of one data set"
+        remedy = "use masks and images of the same data set"
         raise InputError(f"the size of its run lengths is {_kind(size)}", where=where, allowed=allowed, remedy=remedy)
     lengths = _decompressed(counts) if isinstance(counts, str) else _plain(counts)
     if lengths is None or (lengths < 0).any() or lengths.sum() != height * width:
@@ -67,10 +78,11 @@ def _checked(segmentation: Mapping[str, Any], height: int, width: int, where: st
 
 
 def _decompressed(counts: str) -> NDArray[np.int64] | None:
-    """The run lengths behind pycocotools' string, None where it is none.
+    """Return the run lengths in pycocotools' string; None if it is invalid.
 
-    Characters hold 5 bits each, the lowest first, and a sixth that says that the number goes on; the fifth of the last is the
-    sign. From the fourth number on they are differences to the last but one (`rleFrString` of pycocotools' maskApi.c).
+    A character has 5 bits of a number, the lowest first, and a sixth bit that says that the number continues; the fifth bit of
+    the last character is the sign. From the fourth number on, they are differences to the last but one (`rleFrString` of
+    pycocotools' maskApi.c).
     """
     codes = np.frombuffer(counts.encode("utf-8"), np.uint8).astype(np.int64) - 48
     if not codes.size or codes.min() < 0 or codes.max() > 63 or codes[-1] & 32:
@@ -89,12 +101,13 @@ def _decompressed(counts: str) -> NDArray[np.int64] | None:
 
 
 def _plain(counts: Any) -> NDArray[np.int64] | None:
+    """Return a list of run lengths as an array; None if it is invalid."""
     values = _numbers(counts)
     return values.astype(np.int64) if values is not None and values.dtype.kind == "i" else None
 
 
 def _numbers(values: Any) -> NDArray[Any] | None:
-    """A list of numbers as an array (n,), None where it is none."""
+    """Return a list of numbers as an array (n,); None if it is not one."""
     if not isinstance(values, list) or not all(isinstance(value, int | float) for value in values):
         return None
     try:
@@ -105,6 +118,6 @@ def _numbers(values: Any) -> NDArray[Any] | None:
 
 
 def _kind(value: Any) -> str:
-    """A value as a message shows it."""
+    """Return a value as a message shows it."""
     text = "missing" if value is None else repr(value)
     return text if len(text) <= 40 else f"{text[:37]}..."

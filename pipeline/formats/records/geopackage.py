@@ -1,4 +1,4 @@
-"""Write polygons with a table as a GeoPackage (OGC 12-128r19), which GIS programs open, by SQLite alone."""
+"""Write polygons with a table as a GeoPackage (OGC 12-128r19) for GIS programs, with SQLite only."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def write_geopackage(
 
 
 def _geometry(rings: Rings, system: int) -> bytes:
-    """One outline as the standard's binary: its header without an envelope, then well-known binary."""
+    """Encode one outline in the standard's binary form: its header without an envelope, then well-known binary."""
     head = b"GP" + struct.pack("<BBi", 0, _LITTLE_ENDIAN, system)
     parts = [
         struct.pack("<BIII", _LITTLE_ENDIAN, _POLYGON_Z, 1, len(ring)) + np.asarray(ring, dtype="<f8").tobytes() for ring in rings

@@ -1,4 +1,4 @@
-"""Surfaces and points of a run's folder as commands read them again: not empty, of numbers, near enough to be a survey's."""
+"""Read surfaces and points of a run's folder, with checks: not empty, finite, and within a survey's coordinates."""
 
 from __future__ import annotations
 
@@ -17,24 +17,25 @@ _REMEDY = "make the run again"
 
 
 def read_surface(path: Path) -> TriangleMesh:
-    """A surface (PLY); raises InputError as `read_ply` does, and for none and coordinates that are no survey's."""
+    """Read a surface (PLY); raise InputError as `read_ply` does, and for an empty one or impossible coordinates."""
     mesh = read_ply(path)
     if not len(mesh.faces):
-        raise InputError("holds no triangle", where=str(path), remedy=_REMEDY)
+        raise InputError("has no triangles", where=str(path), remedy=_REMEDY)
     _check(mesh.vertices, "vertices", path)
     return mesh
 
 
 def read_own_points(path: Path) -> PointCloud:
-    """Points (LAZ); raises InputError as `read_laz` does, and for none and coordinates that are no survey's."""
+    """Read points (LAZ); raise InputError as `read_laz` does, and for an empty file or impossible coordinates."""
     cloud = read_laz(path)
     if not len(cloud.points):
-        raise InputError("holds no points", where=str(path), remedy=_REMEDY)
+        raise InputError("has no points", where=str(path), remedy=_REMEDY)
     _check(cloud.points, "points", path)
     return cloud
 
 
 def _check(places: FloatArray, what: str, path: Path) -> None:
+    """Raise InputError for coordinates that are not finite or too large."""
     if not np.isfinite(places).all():
-        raise InputError(f"has {what} that are no numbers", where=str(path), remedy=_REMEDY)
+        raise InputError(f"has {what} with coordinates that are not numbers", where=str(path), remedy=_REMEDY)
     check_reach(places, str(path))

@@ -1,4 +1,4 @@
-"""run.json and gap.json as commands read them: of the right types, as far as they are used."""
+"""Read run.json and gap.json, with checks of the types of everything that commands use."""
 
 from __future__ import annotations
 
@@ -13,22 +13,23 @@ from scene.common.regular_file import read_json
 
 RUN_FILE, GAP_FILE = "run.json", "gap.json"
 _FARTHEST_M, _FEW_DIGITS = 1e8, 1e-6
-"""No coordinate system of a survey reaches farther; and how far a rotation may be from orthonormal."""
+"""Largest coordinate of a survey, m, and largest deviation of a rotation from orthonormal."""
 _Coordinate = Annotated[float, Field(ge=-_FARTHEST_M, le=_FARTHEST_M)]
 _Box = Annotated[list[_Coordinate], Field(min_length=6, max_length=6)]
 _Vector = Annotated[list[_Coordinate], Field(min_length=3, max_length=3)]
 
 
 class _Record(BaseModel):
-    """Part of a file that holds more."""
+    """A part of a file that may have more keys."""
 
     model_config = ConfigDict(extra="allow", allow_inf_nan=False, strict=True)
 
 
 def _orthonormal(rotation: list[list[float]]) -> list[list[float]]:
+    """Raise ValueError if a matrix is not a rotation."""
     rows = np.array(rotation)
     if np.abs(rows @ rows.T - np.eye(3)).max() > _FEW_DIGITS or np.linalg.det(rows) < 0:
-        raise ValueError("is no rotation matrix")
+        raise ValueError("is not a rotation matrix")
     return rotation
 
 
@@ -37,13 +38,15 @@ _Row = Annotated[list[_Coordinate], Field(min_length=4, max_length=4)]
 
 
 class _Registration(_Record):
+    """Registration of an epoch."""
+
     rotation: _Rotation
     translation_m: _Vector
     rms_m: float | None = None
 
 
 class _Differences(_Record):
-    """None: of no pixel."""
+    """Statistics of pixels; None if there are none."""
 
     count: int
     median_m: float | None
@@ -51,11 +54,15 @@ class _Differences(_Record):
 
 
 class _Statistics(_Record):
+    """Statistics of an epoch."""
+
     sigma_m: float = Field(gt=0, le=_FARTHEST_M)
     outside_blocks: _Differences | None = None
 
 
 class _Block(_Record):
+    """A fallen block."""
+
     label: int
     shape: str
     size_m: _Vector
@@ -69,12 +76,16 @@ class _Block(_Record):
 
 
 class _WallFrame(_Record):
+    """The wall frame."""
+
     matrix_world_to_wall: Annotated[list[_Row], Field(min_length=4, max_length=4)]
     rotation: _Rotation
     origin_m: _Vector
 
 
 class _EpochRecord(_Record):
+    """An epoch."""
+
     epoch: int = Field(ge=0, le=9999)
     points: int = Field(0, ge=0)
     registration: _Registration | None = None
@@ -83,19 +94,25 @@ class _EpochRecord(_Record):
 
 
 class _Wall(_Record):
+    """The wall."""
+
     name: str
 
 
 class _Products(_Record):
+    """Settings of the written files."""
+
     crs: str | None = None
 
 
 class _Config(_Record):
+    """The parts of the config that are used."""
+
     products: _Products | None = None
 
 
 class _RunRecord(_Record):
-    """schema: of the file; products: checksums of each finished epoch's files."""
+    """Content of run.json. products: checksums of each finished epoch's files."""
 
     sensor: Literal["stereo", "tls"]
     config: _Config
@@ -106,30 +123,42 @@ class _RunRecord(_Record):
 
 
 class _RunImage(_Record):
+    """An image of a run's annotations."""
+
     id: int
     epoch: int
 
 
 class _RunAnnotation(_Record):
+    """An annotation of a run."""
+
     image_id: int
     block: int
 
 
 class _RunAnnotations(_Record):
+    """Content of a run's annotations.json."""
+
     images: list[_RunImage]
     annotations: list[_RunAnnotation]
 
 
 class _Change(_Record):
+    """A change of the scene."""
+
     bbox_m: _Box
     volume_m3: float
 
 
 class _Effect(_Record):
+    """A named effect."""
+
     name: str
 
 
 class _Gap(_Record):
+    """Content of gap.json."""
+
     sensor: Literal["stereo", "tls"]
     verdict: str
     scene_changes: list[_Change] = Field([], max_length=10_000)
@@ -137,9 +166,9 @@ class _Gap(_Record):
 
 
 def read_run(path: Path, remedy: str) -> dict[str, Any]:
-    """The record of a run, finished or not; an epoch without a list of blocks has none, and what is null is not there.
+    """Read the record of a run, finished or not; missing lists of blocks become empty, and null values are left out.
 
-    Raises InputError, which ends with `remedy`, for a file that is none.
+    Raises InputError, which ends with `remedy`, if the file is not such a record.
     """
     values = read_json(path, remedy=remedy)
     parse(_RunRecord, values, str(path))
@@ -148,18 +177,19 @@ def read_run(path: Path, remedy: str) -> dict[str, Any]:
 
 
 def read_annotations(path: Path) -> dict[str, Any]:
-    """annotations.json of a run, whose images know their epoch and annotations their block; raises InputError for others."""
+    """Read annotations.json of a run, whose images have an epoch and annotations a block; raise InputError for other files."""
     values = read_json(path, remedy="make the run again")
     parse(_RunAnnotations, values, str(path))
     return dict(values)
 
 
 def _without_null(values: dict[str, Any], *names: str) -> dict[str, Any]:
+    """Leave out some keys if they are null."""
     return {key: value for key, value in values.items() if key not in names or value is not None}
 
 
 def read_gap(path: Path) -> dict[str, Any]:
-    """The record of a diagnosis; raises InputError for a file that is none."""
+    """Read the record of a diagnosis; raise InputError if the file is not one."""
     values = read_json(path, remedy="run scarpsim gap again")
     parse(_Gap, values, str(path))
     return dict(values)

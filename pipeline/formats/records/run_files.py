@@ -1,4 +1,4 @@
-"""The files of a run's folder, by what they hold."""
+"""Read the files of a run's folder."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from scene.common.errors import InputError
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import TriangleMesh
 
-RESUME = "go on with it by simulate --resume"
+RESUME = "continue it with simulate --resume"
 
 
 def epoch_folder(run: Path, number: int) -> Path:
-    """The folder of an epoch's own files in that of a run."""
+    """Return the folder of an epoch's own files in a run's folder."""
     return run / f"epoch_{number:03d}"
 
 
 @dataclass(frozen=True)
 class RunFiles:
-    """A run's folder, read and checked when it is asked for. Raises InputError there for what is no run or was not written."""
+    """A run's folder; files are read and checked on request, with InputError if they are not a run's or were not written."""
 
     folder: Path
 
@@ -39,17 +39,17 @@ class RunFiles:
         return read_run(self.folder / RUN_FILE, RESUME)
 
     def surface(self, number: int, name: str = "surface") -> TriangleMesh:
-        """The measured surface of an epoch, wall frame; with the name `truth` the wall as it really is."""
+        """Read the measured surface of an epoch, wall frame, or, with the name `truth`, the true wall."""
         return read_surface(self._written(number, f"{name}.ply"))
 
     def points(self, number: int) -> PointCloud:
-        """The sensor's points of an epoch, wall frame."""
+        """Read the sensor's points of an epoch, wall frame."""
         return read_own_points(self._written(number, "points.laz"))
 
     def survey_points(self, number: int) -> tuple[PointCloud, str]:
-        """The points of an epoch, and the WKT of their coordinates, "" where the config names none.
+        """Read the points of an epoch, and the WKT of their coordinate system, "" if the config names none.
 
-        In the wall's own coordinates where the run wrote those, else in the wall frame.
+        They are in the wall's own coordinates if the run wrote those, else in the wall frame.
         """
         world = epoch_folder(self.folder, number) / "points_world.laz"
         if not world.is_file():
@@ -58,10 +58,11 @@ class RunFiles:
         return read_own_points(world), wkt_of(crs, "products.crs") if crs else ""
 
     def difference(self, number: int) -> tuple[NDArray[np.float32], Grid]:
-        """(h, w) reference minus epoch, m, and its grid."""
+        """Read the (h, w) difference map of an epoch, reference minus epoch, m, and its grid."""
         return read_geotiff(self.folder / f"difference_{number:03d}.tif")
 
     def _written(self, number: int, name: str) -> Path:
+        """Return the path of an epoch's file; raise InputError if the run did not write it."""
         path = epoch_folder(self.folder, number) / name
         if not path.is_file():
             raise InputError(f"the run did not write {name}", where=str(path.parent), remedy="see `products` in the config")

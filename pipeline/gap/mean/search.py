@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import (
     HARMONIC_ORDERS,
     HARMONIC_SERIES,
@@ -23,6 +22,7 @@ from pipeline.gap.mean.mean_model import MeanFit
 from pipeline.gap.mean.null_distribution import NullDistribution
 from pipeline.gap.mean.selection import EffectSet, FamilyScore, ForwardSelection, SelectedEffect
 from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 
@@ -92,7 +92,7 @@ class MeanSearch:
             best = int(np.argmax(ratios))
             candidate = families.plain[rows[best]] if best < len(rows) else families.sine(sines[best - len(rows)])
             ratio = float(ratios[best])
-            negligible = ratio < decided().mean.practical_share * alone.get((candidate.name, candidate.empirical), 0.0)
+            negligible = ratio < thresholds().mean.least_relative_gain * alone.get((candidate.name, candidate.empirical), 0.0)
             found.append(
                 FamilyScore(candidate.name, candidate.empirical, ratio - self._null.penalty(name), ratio, candidate, negligible)
             )
@@ -162,7 +162,7 @@ class MeanSearch:
         covariates = {name: values for name, values in found.items() if np.ptp(values) > 0}
         parts = form.name.split(" and ")
         correlation = np.abs(np.corrcoef([*covariates.values(), *(covariates[part] for part in parts)])[:, -len(parts) :])
-        return {name for name, row in zip(covariates, correlation, strict=False) if row.max() > decided().mean.kin}
+        return {name for name, row in zip(covariates, correlation, strict=False) if row.max() > thresholds().mean.same_covariate}
 
     def with_harmonics(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
         """Return the simplest form of a periodic term beside some effects.
@@ -184,7 +184,7 @@ class MeanSearch:
             for each in self.score_families(members)
             if each.candidate.form.startswith(LINE_PATTERN) and each.name == form.name
         ]
-        good = [each for each in patterns if each.score > form.score - decided().mean.free_margin]
+        good = [each for each in patterns if each.score > form.score - thresholds().mean.nonparametric_margin]
         return min(good, key=lambda each: each.candidate.period)
 
     def _wave_instead(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
@@ -214,7 +214,7 @@ class MeanSearch:
             return replace(form, candidate=both, log_likelihood_ratio=form.log_likelihood_ratio + ratio, score=form.score + score)
 
         best = max(map(with_overtones, HARMONIC_ORDERS), key=lambda each: each.score)
-        return best if best.score >= form.score + decided().mean.free_margin else form
+        return best if best.score >= form.score + thresholds().mean.nonparametric_margin else form
 
     def may_be_reference_error(self, members: EffectSet, form: FamilyScore) -> bool:
         """Tell whether a wave is no larger than the reference's error, which may contain just such a wave.
@@ -224,9 +224,9 @@ class MeanSearch:
         if form.candidate.form != "wave":
             return False
         size, fit = self._fitted_std_and_fit(form, members)
-        most = decided().nodes.reference_error / float(np.median(self.design.residuals.unit_m))
+        most = thresholds().grid_noise.reference_error / float(np.median(self.design.residuals.unit_m))
         error = min(float(np.sqrt(fit.cell_covariance.variance_ratio)) * self.design.model.typical_sigma, most)
-        return size < decided().mean.wave_sigmas * error
+        return size < thresholds().mean.least_wave_sigmas * error
 
     def fitted_std(self, item: FamilyScore) -> float:
         """Return the standard deviation of what an explanation alone describes, in the unit of the observable."""
@@ -247,7 +247,7 @@ class MeanSearch:
         ratios = fixed[:, 0] - plain[0]
         found = [(ratio, each) for ratio, each in zip(ratios, self.design.families.plain, strict=True) if not each.empirical]
         ranked = sorted(found, key=lambda item: -item[0])
-        least = max(decided().mean.leading_share * ranked[0][0], decided().mean.leading_gain) if ranked else 0.0
+        least = max(thresholds().mean.refit_share * ranked[0][0], thresholds().mean.refit_gain) if ranked else 0.0
         return [each for ratio, each in ranked if ratio >= least][:_MOST_LEADING]
 
     def selected_alone(self, candidate: Candidate) -> SelectedEffect:

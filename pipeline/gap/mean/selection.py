@@ -12,8 +12,8 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
-from pipeline.gap.decisions import decided
 from pipeline.gap.mean.candidates import POLYNOMIAL, SPATIAL_NULL, Candidate
+from pipeline.gap.thresholds import thresholds
 from sensors.effects.range_offset import RangeOffset
 
 _BEAM_WIDTH = 5
@@ -113,9 +113,9 @@ class _Set:
         ]
         found = [item for item in terms if _beats_spatial_null(item, null_score)]
         one_covariate = next((item for item in found if item.candidate.form != POLYNOMIAL), None)
-        by = decided().mean
+        by = thresholds().mean
         if one_covariate is None or found[0].score > max(
-            one_covariate.score + by.free_margin, by.surface_ratio * one_covariate.score
+            one_covariate.score + by.nonparametric_margin, by.surface_ratio * one_covariate.score
         ):
             return found[0] if found else None
         return one_covariate
@@ -127,7 +127,7 @@ def equivalence_margin(log_likelihood_ratio: float) -> float:
     It is at least `mean.class_margin` and grows with the log-likelihood ratio, because signatures are only exact to a share of
     it.
     """
-    return max(decided().mean.class_margin, decided().mean.class_share * log_likelihood_ratio)
+    return max(thresholds().mean.class_margin, thresholds().mean.class_share * log_likelihood_ratio)
 
 
 def _replacements(names: frozenset[str], name: str, margin: float, scores: SetScores) -> list[str]:
@@ -139,15 +139,15 @@ def _replacements(names: frozenset[str], name: str, margin: float, scores: SetSc
 
 def _unreported_score(form: FamilyScore | None) -> float:
     """Score of a non-parametric term that is too weak to be reported, which a weak effect must still beat; else 0."""
-    return form.score if form is not None and form.score < decided().mean.least_free_score else 0.0
+    return form.score if form is not None and form.score < thresholds().mean.least_nonparametric_score else 0.0
 
 
 def _beats_spatial_null(item: FamilyScore, null_score: float) -> bool:
     """Tell whether a non-parametric term clearly beats the best spatial null candidate, whose score is `null_score`."""
-    by = decided().mean
+    by = thresholds().mean
     if item.candidate.form == POLYNOMIAL:
-        return item.score > max(null_score + by.free_margin, by.least_surface_score)
-    least = (by.wave_ratio if item.candidate.form == "wave" else 1.0) * null_score + by.free_margin
+        return item.score > max(null_score + by.nonparametric_margin, by.least_surface_score)
+    least = (by.null_wave_ratio if item.candidate.form == "wave" else 1.0) * null_score + by.nonparametric_margin
     return item.name in _NOT_SPATIAL or item.score > least
 
 
@@ -193,7 +193,7 @@ class ForwardSelection:
         """
         empty = _Set((), 0.0, self.search.score_families(()))
         levels, scores = [[empty]], SetScores()
-        while len(levels) <= decided().mean.most_effects:
+        while len(levels) <= thresholds().mean.most_effects:
             grown, of_sets = self._grow(levels[-1])
             if not grown or not self._significant(grown[0].score - levels[-1][0].score):
                 break
@@ -216,7 +216,7 @@ class ForwardSelection:
             )
             return chosen, self.search.score_families((*members, form))
         best, chosen = self._drop_below_spatial_null(best, scores)
-        nearly = (1 - decided().mean.practical_share) * empty.spatial_null_score
+        nearly = (1 - thresholds().mean.least_relative_gain) * empty.spatial_null_score
         if best.score <= max(nearly, _unreported_score(empty.nonparametric)):  # no effect of the catalogue explains it as well
             return [], empty.family_scores
         return chosen, best.family_scores
@@ -251,7 +251,7 @@ class ForwardSelection:
         best, empty = levels[-1][0], levels[0][0]
         if (
             best.nonparametric is not None
-            and best.nonparametric.score >= decided().mean.least_free_score
+            and best.nonparametric.score >= thresholds().mean.least_nonparametric_score
             and self._significant(best.nonparametric.score)
         ):
             found: tuple[_Set, FamilyScore] | None = None
@@ -269,7 +269,11 @@ class ForwardSelection:
         if not best.members or alone is None:
             return None
         score = max(best.score, self.search.joint_score(best.members))
-        margin = max(decided().mean.free_margin, decided().mean.practical_share * score) if len(best.members) < 2 else 0.0
+        margin = (
+            max(thresholds().mean.nonparametric_margin, thresholds().mean.least_relative_gain * score)
+            if len(best.members) < 2
+            else 0.0
+        )
         if alone.score > score + margin:
             return (), alone
         return None
@@ -316,4 +320,4 @@ class ForwardSelection:
 
     def _significant(self, score: float) -> bool:
         """Tell whether a score is large enough and significant."""
-        return score >= decided().mean.least_score and self.search.p_value(score) <= decided().mean.significance
+        return score >= thresholds().mean.least_score and self.search.p_value(score) <= thresholds().mean.significance

@@ -1,7 +1,7 @@
-"""The verdict, and what may be said beside it: both follow from the same numbers, so that words never contradict them.
+"""Decide the verdict, and write the sentences beside it; both use the same numbers, so that they never contradict each other.
 
-`no_gap` says that the model is not rejected: the gap before is within its uncertainty of the floor, and what remains is no more
-than chance would give. A number that was not drawn speaks for nothing.
+`no_gap` says that the model is not rejected: the gap before is within its uncertainty of the floor, and the residual misfit is no
+larger than chance would give. A number that was not computed counts for nothing.
 """
 
 from __future__ import annotations
@@ -9,47 +9,53 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.gap.decisions import decided
-from pipeline.gap.naming.entries import Named
-from pipeline.gap.naming.verify import Gap
+from pipeline.gap.naming.gap_score import Gap
+from pipeline.gap.naming.named_effects import NamedEffect
+from pipeline.gap.thresholds import thresholds
 from sensors.models.sensor_model import StereoModel, TlsModel
 
 VERDICTS = {
-    "no_gap": "The measurement agrees with the model: nothing was found that the model does not hold.",
+    "no_gap": "The measurement agrees with the model: no missing effect was found.",
     "named": "One effect explains where measurement and model disagree.",
     "several": "More than one effect is needed to explain where measurement and model disagree.",
-    "ambiguous": "An effect is there, but this measurement cannot tell it from others that would look the same.",
+    "ambiguous": "An effect was found, but this measurement cannot tell it from others that would look the same.",
     "unknown": "The model is rejected, and no effect of the catalogue passes its own test; an empirical term describes it.",
-    "insufficient_data": "There are too few points on smooth parts of the reference to say anything.",
+    "insufficient_data": "There are too few points on smooth parts of the reference for a diagnosis.",
 }
+"""Each verdict in a sentence."""
 _NOISES = ("range_sigma_m", "range_ppm", "angle_sigma_rad", "parallax_sigma_px", "regularization_sigma_px",
            "point_sigma_m", "point_shared_sigma_m")  # fmt: skip
+"""Keys of the models' noise that are lowered together."""
 STILL_OPEN = (
     "Effects were named, but most of the gap stays open: the model is rejected with them too, and nothing else explains it."
 )
-STILL_WIDE = (
-    "Effects were named, but with them too the residuals spread far more than the model predicts, and nothing explains that."
+STILL_OVERDISPERSED = (
+    "Effects were named, but with them the residuals still vary far more than the model predicts, and nothing explains it."
 )
 STILL_REJECTED = (
     "Effects were named, but the model is rejected with them too, and the gap is too small to show that they close any of it."
 )
-UNSUPPORTED = "Effects were named, but with them the gap is no smaller, and what remains was not tested: nothing speaks for them."
-PARTLY = (
-    "The model is rejected: effects of the catalogue explain a part of what is missing, and an empirical term describes more."
+UNSUPPORTED = "Effects were named, but the gap is no smaller with them, and the misfit was not tested: nothing supports them."
+PARTLY_EXPLAINED = (
+    "The model is rejected: effects of the catalogue explain part of the misfit, and an empirical term describes more of it."
 )
-NOT_DESCRIBED = "The model is rejected, and nothing that was tried describes what is missing."
-MUCH_MOVED = "Much of the wall is not where the reference has it: of what is left nothing can be said of the sensor."
-TOO_NOISY = "No effect was found to be missing, but the model's noise is too large."
+NOT_DESCRIBED = "The model is rejected, and nothing that was tried describes the misfit."
+MUCH_MOVED = "Much of the wall is not where the reference has it, so nothing can be said about the sensor."
+TOO_NOISY = "No missing effect was found, but the model's noise is too large."
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """The numbers that a verdict rests on.
+    """The numbers that the verdict is decided by.
 
-    gap: on held-out points, None where there are too few; p_value: of what remains, None where it was not drawn; spread: share of
-    the predicted standard deviation that the residuals have where that is clearly less, else 1; far: share of points far out all
-    over the wall, 0 where they are as few as noise leaves; moved: of points that lie off the reference together with their
-    neighbours, where that was asked; wide: how many predicted sigmas the residuals spread where no effect explains that, else 1.
+    Attributes
+    ----------
+    gap : scores on validation points, None where there are too few.
+    p_value : p-value of the residual misfit (goodness of fit), None where it was not computed.
+    spread : observed over predicted standard deviation where it is clearly below 1, else 1.
+    far : share of outliers if these lie all over the wall, 0 where they are as few as noise makes.
+    moved : share of points that lie off the reference together with their neighbours, 0 where it was not computed.
+    wide : observed over predicted standard deviation where no noise term explains it, else 1.
     """
 
     gap: Gap | None
@@ -61,30 +67,33 @@ class Evidence:
 
     @property
     def much_moved(self) -> bool:
-        """Whether too much of the wall is not where the reference has it for anything to be said of the sensor."""
-        return self.moved >= decided().changes.moved_share
+        """Whether too much of the wall moved to say anything about the sensor."""
+        return self.moved >= thresholds().changes.moved_share
 
     @property
     def rejects(self) -> bool:
-        """Whether what remains is more than chance would give."""
-        return self.p_value is not None and self.p_value <= decided().verdict.least_p
+        """Whether the residual misfit is larger than chance would give."""
+        return self.p_value is not None and self.p_value <= thresholds().verdict.rejection_p
 
     @property
-    def too_wide(self) -> bool:
-        """Whether the residuals spread so much more than predicted that the model is rejected, whatever else says."""
-        return self.wide >= decided().verdict.most_wide
+    def is_overdispersed(self) -> bool:
+        """Whether the residuals have so much more variance than predicted that the model is rejected in any case."""
+        return self.wide >= thresholds().verdict.overdispersion
 
     @property
     def agrees(self) -> bool:
-        """Whether the model without any effect is not rejected: by the gap on held-out points, by what remains, and by how much
-        the residuals spread."""
+        """Whether the model without any effect is accepted: by the gap on validation points, the misfit, the tails and the
+        noise."""
         measured = self.gap is not None and not self.gap.above_floor and self.p_value is not None
-        return measured and not (self.rejects or self.far or self.too_wide)
+        return measured and not (self.rejects or self.far or self.is_overdispersed)
 
     @property
     def stays_open(self) -> bool:
-        """Whether the gap with the named effects is above the floor, and most of what it was, by more than its uncertainty; or no
-        smaller than without them while more remains than chance would leave."""
+        """Whether the named effects leave most of the gap open.
+
+        The score after must exceed the floor, and most of the gap must be left, both by more than their uncertainty. It also
+        counts if the score is no better with the effects and the misfit is larger than chance would give.
+        """
         gap = self.gap
         if gap is not None and gap.after > gap.before and self.rejects:
             return True
@@ -92,54 +101,54 @@ class Evidence:
 
     @property
     def stays_rejected(self) -> bool:
-        """Whether more remains beside the named effects than chance would leave, and no gap tells what they are worth."""
+        """Whether a misfit is left beside the named effects, and the gap is too small to show what they are worth."""
         return self.rejects and self.gap is not None and self.gap.closed is None
 
     @property
     def supports_nothing(self) -> bool:
-        """Whether the gap is no smaller with the named effects, and what remains beside them was not drawn."""
+        """Whether the score is no better with the named effects, and the misfit beside them was not computed."""
         return self.gap is not None and self.gap.after > self.gap.before and self.p_value is None
 
     @property
     def closes_little(self) -> bool:
-        """Whether the gap with the named effects is most of what it was, by more than its uncertainty, or not known at all."""
+        """Whether clearly most of the gap is left with the named effects, or the gap is not known."""
         gap = self.gap
-        by = decided().verdict
+        by = thresholds().verdict
         if gap is None or gap.closed is None:
             return True
         return gap.before - gap.after + by.gap_sigmas * gap.error < by.least_closed * (gap.before - gap.floor)
 
-    def only_too_noisy(self, named: Sequence[Named]) -> bool:
-        """Whether the model's noise is too large and nothing else was found to be wrong: with a lower one the floor is met."""
-        open_still = self.gap is not None and self.gap.left_open and not self.agrees
-        return self.spread < 1.0 and not (named or self.rejects or self.far or self.too_wide or open_still)
+    def only_too_noisy(self, named: Sequence[NamedEffect]) -> bool:
+        """Whether the only fault of the model is that its noise is too large: with a lower one the floor is reached."""
+        still_open = self.gap is not None and self.gap.left_open and not self.agrees
+        return self.spread < 1.0 and not (named or self.rejects or self.far or self.is_overdispersed or still_open)
 
 
-def verdict_of(named: Sequence[Named], evidence: Evidence) -> str:
-    """What the effects that were named, and the numbers, come to."""
+def verdict_of(named: Sequence[NamedEffect], evidence: Evidence) -> str:
+    """Return the verdict for the named effects and the evidence: a key of `VERDICTS`."""
     if evidence.much_moved:
         return "insufficient_data"
     if not named:
         if evidence.gap is None and not evidence.rejects:
             return "insufficient_data"
         return "no_gap" if evidence.agrees else "unknown"
-    unsaid = evidence.stays_open or evidence.supports_nothing or evidence.stays_rejected or evidence.too_wide
-    if unsaid or any(item.kind == "empirical" for item in named):
+    unsupported = evidence.stays_open or evidence.supports_nothing or evidence.stays_rejected or evidence.is_overdispersed
+    if unsupported or any(item.kind == "empirical" for item in named):
         return "unknown"
     if len(named) > 1:
         return "several"
     return "ambiguous" if named[0].alike else "named"
 
 
-def in_a_sentence(verdict: str, named: Sequence[Named], evidence: Evidence) -> str:
-    """A verdict in words."""
+def verdict_sentence(verdict: str, named: Sequence[NamedEffect], evidence: Evidence) -> str:
+    """Return the verdict as a sentence."""
     if evidence.much_moved:
         return MUCH_MOVED
     if verdict in ("no_gap", "unknown") and evidence.only_too_noisy(named):
         return TOO_NOISY
     kinds = {item.kind for item in named}
     if verdict == "unknown" and len(kinds) > 1:
-        return PARTLY
+        return PARTLY_EXPLAINED
     if verdict == "unknown" and "empirical" not in kinds:
         if not named:
             return NOT_DESCRIBED
@@ -147,31 +156,31 @@ def in_a_sentence(verdict: str, named: Sequence[Named], evidence: Evidence) -> s
             return STILL_OPEN
         if evidence.supports_nothing:
             return UNSUPPORTED
-        return STILL_REJECTED if evidence.stays_rejected else STILL_WIDE
+        return STILL_REJECTED if evidence.stays_rejected else STILL_OVERDISPERSED
     return VERDICTS[verdict]
 
 
-def left_over(named: Sequence[Named], evidence: Evidence) -> str:
-    """Words for what is left beside what was named, "" where that may be chance."""
+def describe_misfit(named: Sequence[NamedEffect], evidence: Evidence) -> str:
+    """Return a sentence on the misfit beside the named effects; "" where it may be chance."""
     if not named or not evidence.rejects:
         return ""
-    return f"That does not explain all of it: what remains has a p-value of {evidence.p_value:.2g}."
+    return f"That does not explain everything: the remaining misfit has a p-value of {evidence.p_value:.2g}."
 
 
-def closing(gap: Gap, mended: bool) -> str:
-    """How far the gap closes, in words. mended: whether the model after is another one than before."""
+def describe_closing(gap: Gap, model_changed: bool) -> str:
+    """Return in words how much of the gap closes. model_changed: whether the model after differs from the model before."""
     if gap.closed is None:
         return "before and floor differ by no more than their uncertainty"
-    if not mended:
-        return "before is above the floor by more than its uncertainty, and nothing closes that"
+    if not model_changed:
+        return "before exceeds the floor by more than its uncertainty, and nothing closes the gap"
     share = round(100 * gap.closed)
     return f"{share} % of the gap is closed" if share > 0 else "none of the gap is closed"
 
 
-def lower_noise(model: TlsModel | StereoModel, spread: float) -> dict[str, float]:
-    """The noise that a model would need for the residuals' spread, all of it lowered alike; empty where it fits.
+def reduced_noise(model: TlsModel | StereoModel, spread: float) -> dict[str, float]:
+    """Return the noise values that fit the residuals, all lowered by the same factor; empty where the noise fits already.
 
-    spread: share of the model's own standard deviation.
+    spread: observed over predicted standard deviation.
     """
     if spread >= 1.0:
         return {}
@@ -179,33 +188,36 @@ def lower_noise(model: TlsModel | StereoModel, spread: float) -> dict[str, float
     return {key: float(f"{spread * value:.3g}") for key, value in values.items() if value > 0}
 
 
-def much_moved(evidence: Evidence, stable_areas: bool) -> list[str]:
-    """Words for a wall much of which moved, with what to do. stable_areas: whether the measurement names some."""
+def note_moved_wall(evidence: Evidence, stable_areas: bool) -> list[str]:
+    """Return a note on a wall of which much moved, with the remedy. stable_areas: whether the measurement names some."""
     if not evidence.much_moved:
         return []
-    by = decided().changes
+    by = thresholds().changes
     said = (
         f"{100 * evidence.moved:.0f} % of the points lie off the reference together with their neighbours, by more than "
-        f"{by.moved_sigmas:g} predicted sigmas and {1e3 * by.smallest:g} mm: rock moved, or the reference is of another place or "
-        "time"
+        f"{by.moved_sigmas:g} predicted standard deviations and {1e3 * by.smallest_departure:g} mm: rock moved, or the reference "
+        "shows another place or time"
     )
-    remedy = "the stable_areas that were given are not stable" if stable_areas else "name stable_areas where nothing moved"
-    return [f"{said}; {remedy}, or bring a reference of the same time"]
+    remedy = "the given stable_areas are not stable" if stable_areas else "add stable_areas where nothing moved"
+    return [f"{said}; {remedy}, or use a reference of the same time"]
 
 
-def unexplained(evidence: Evidence, notes: Sequence[str]) -> list[str]:
-    """Words for residuals that spread more than predicted, where no note says more of that already."""
-    if not evidence.too_wide or any("the residuals spread" in note for note in notes):
+def note_overdispersion(evidence: Evidence, notes: Sequence[str]) -> list[str]:
+    """Return a note on residuals with more variance than predicted, unless another note says so already."""
+    if not evidence.is_overdispersed or any("the predicted standard deviation" in note for note in notes):
         return []
-    return [f"the residuals spread {evidence.wide:.2g} times what the model predicts, and nothing that was tried explains that"]
+    return [
+        f"the residuals have {evidence.wide:.2g} times the predicted standard deviation, and nothing that was tried explains that"
+    ]
 
 
-def too_noisy(spread: float, lower: dict[str, float]) -> list[str]:
-    """Words for a model that predicts more spread than there is."""
+def note_excess_noise(spread: float, lower: dict[str, float]) -> list[str]:
+    """Return a note on a model with too much noise. lower: noise values that would fit."""
     if spread >= 1.0:
         return []
     said = (
-        f"the residuals spread {100 * spread:.0f} % of what the model predicts: its noise is too large, which no effect can mend"
+        f"the residuals have {100 * spread:.0f} % of the predicted standard deviation: the model's noise is too large, "
+        "and no effect lowers it"
     )
     proposed = ", ".join(f"{key} {value:g}" for key, value in lower.items())
-    return [f"{said}; a noise that fits: {proposed}"] if proposed else [said]
+    return [f"{said}; noise that fits: {proposed}"] if proposed else [said]

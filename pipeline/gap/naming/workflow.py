@@ -1,4 +1,4 @@
-"""The four steps of `scarpsim gap`: locate, name, add, show."""
+"""The workflow of `scarpsim gap`: compute residuals, name effects, validate them, and measure the gap before and after."""
 
 from __future__ import annotations
 
@@ -13,58 +13,83 @@ from threadpoolctl import threadpool_limits
 
 from pipeline.formats.measurements.checks import check_noise
 from pipeline.formats.measurements.measurement import FILE, Measurement, StereoMeasurement, TlsMeasurement
-from pipeline.gap.decisions import Decisions, decided, deciding
 from pipeline.gap.mean.selection import FamilyScore
-from pipeline.gap.naming.attempts import Starts, State, attempt, few, thinned_rows
-from pipeline.gap.naming.entries import (
-    Named,
-    from_missing,
-    from_shape,
-    from_tails,
+from pipeline.gap.naming.candidate_families import model_has
+from pipeline.gap.naming.effect_selection import NONPARAMETRIC_TERMS, SelectionResult
+from pipeline.gap.naming.gap_score import Gap
+from pipeline.gap.naming.named_effects import (
+    NamedEffect,
+    aligned_with,
+    effect_from_edges,
+    effect_from_losses,
+    effect_from_tails,
     only_within_bounds,
-    settled_with,
 )
-from pipeline.gap.naming.families import believes
-from pipeline.gap.naming.held_out import Scored, score_effects, weakness
-from pipeline.gap.naming.naming import FREE_FORMS, Naming
-from pipeline.gap.naming.splitting import with_splits
-from pipeline.gap.naming.verdict import Evidence, lower_noise, much_moved, too_noisy, unexplained, verdict_of
-from pipeline.gap.naming.verification import Showing, Shown
-from pipeline.gap.naming.verify import Gap
-from pipeline.gap.other.missing import LOSSES, MissingFound, find_missing, isolated
-from pipeline.gap.other.spread import SpreadTried, Tails, find_tails
+from pipeline.gap.naming.selection_passes import PassInput, PassInputs, best_pass, subsample, subsample_rows
+from pipeline.gap.naming.separating_measurements import with_separating_measurements
+from pipeline.gap.naming.validation import Validation, ValidationResult
+from pipeline.gap.naming.validation_scores import ValidatedEffects, describe_weakness, validate_effects
+from pipeline.gap.naming.verdict import (
+    Evidence,
+    note_excess_noise,
+    note_moved_wall,
+    note_overdispersion,
+    reduced_noise,
+    verdict_of,
+)
+from pipeline.gap.noise_and_edges.missing_returns import (
+    LOSS_EFFECTS,
+    LossExplanation,
+    count_isolated_returns,
+    explain_missing_returns,
+)
+from pipeline.gap.noise_and_edges.variance_model import HeavyTails, VarianceScore, find_heavy_tails
 from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.scene_changes import SceneChange, moved_share
 from pipeline.gap.residuals.sensor_view import SensorView
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals, with_surroundings
-from pipeline.gap.residuals.subsampling import subsample
+from pipeline.gap.residuals.subsampling import subsample_measurement
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals, find_expected_pulses, with_scan_order
 from pipeline.gap.residuals.wall_blocks import WallCells, in_validation_blocks, wall_block_numbers
+from pipeline.gap.thresholds import Thresholds, thresholds, use_thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.occlusion_fill import OcclusionFill
 from sensors.models.sensor_model import StereoModel, TlsModel
 
-STEPS = {"residuals": 3.0, "naming": 14.0, "verification": 2.0}
-"""The steps of `diagnose` and about what each takes, s."""
-_USUAL = Decisions()
-_LEAST_SHARE = 0.1
-"""Of its standard deviation that a model keeps where the reference's error explains all of the spread."""
+STEPS = {"residuals": 3.0, "naming": 14.0, "validation": 2.0}
+"""Steps of `diagnose`, and roughly how long each takes, s."""
+_DEFAULTS = Thresholds()
+_LEAST_MODEL_SHARE = 0.1
+"""Least share of its standard deviation that a model keeps where the reference error explains all of the noise."""
 
 
 @dataclass(frozen=True)
 class GapDiagnosis:
-    """What was found.
+    """Result of a diagnosis.
 
-    held_out: (n,) points never used in naming; before, after: (n,) residuals with registration taken off, in the observable's
-    unit; pose: (6 k,) shift (m) and turn (rad) of the sensor in k set-ups, wall frame; timings: s by step; decisions: what was
-    decided by.
+    Attributes
+    ----------
+    verdict : key of `naming.verdict.VERDICTS`.
+    effects : named effects, sorted by gain.
+    changes : regions where the scene itself changed.
+    residuals : residuals of the n points that were compared.
+    held_out : (n,) validation points.
+    before, after : (n,) registered residuals without and with the named effects, in the observable's unit.
+    pose : (6 k,) shift (m) and rotation (rad) of the sensor in k set-ups, wall frame.
+    model_after : model with the named effects.
+    gap : scores before and after, None where too few points could be scored.
+    tried, variance_tried : systematic effects and noise terms that were tried.
+    remaining : entry `remaining` of gap.json.
+    identifiability : cosines of the signatures, and the share of each that the pose fit leaves.
+    seconds, timings : duration in all and of each step, s.
+    thresholds : thresholds that were used.
     """
 
     verdict: str
-    effects: tuple[Named, ...]
+    effects: tuple[NamedEffect, ...]
     changes: tuple[SceneChange, ...]
     residuals: Residuals
     held_out: BoolArray
@@ -74,22 +99,22 @@ class GapDiagnosis:
     model_after: TlsModel | StereoModel
     gap: Gap | None
     tried: tuple[FamilyScore, ...]
-    spread_tried: tuple[SpreadTried, ...]
+    variance_tried: tuple[VarianceScore, ...]
     remaining: dict[str, Any]
     identifiability: dict[str, Any]
     seconds: float
     timings: dict[str, float]
-    decisions: Decisions = _USUAL
+    thresholds: Thresholds = _DEFAULTS
 
     @property
     def evidence(self) -> Evidence:
-        """The numbers that the verdict and its words rest on."""
+        """The numbers that the verdict is decided by."""
         numbers = {name: self.remaining[name] for name in ("p_value", "spread", "far", "moved", "wide")}
         return Evidence(self.gap, **numbers)
 
     @property
-    def mended(self) -> bool:
-        """Whether the model after is another one than before."""
+    def model_changed(self) -> bool:
+        """Whether the model after differs from the model before."""
         return bool(self.effects or self.remaining["lower_noise"])
 
 
@@ -97,220 +122,254 @@ def diagnose(
     measurement: Measurement,
     seed: int = 1,
     progress: Callable[[str], None] | None = None,
-    decisions: Decisions = _USUAL,
+    thresholds: Thresholds = _DEFAULTS,
 ) -> GapDiagnosis:
-    """Find what separates the measurement from its model, name it, add it and measure the gap again.
+    """Find where a measurement disagrees with its model, name the effects that explain it, and measure the gap before and after.
 
-    progress: called with the name of each step of `STEPS` that is done; decisions: the thresholds to decide by.
+    Parameters
+    ----------
+    measurement : measurement to diagnose.
+    seed : seed of the null distributions, the ensembles and the subsampling.
+    progress : called with the name of each step of `STEPS` that is done.
+    thresholds : thresholds to use.
+
+    Returns
+    -------
+    GapDiagnosis : verdict, effects and everything that the report shows.
     """
     clock, random = _Clock(progress), KeyedRandom(seed, ("gap",))
-    # the same sums on any number of threads, and none that wait for each other
-    with deciding(decisions), threadpool_limits(1, "blas"):
+    # one BLAS thread: results do not depend on the number of threads, and no threads wait for each other
+    with use_thresholds(thresholds), threadpool_limits(1, "blas"):
         ordered = with_scan_order(measurement) if isinstance(measurement, TlsMeasurement) else measurement
-        part, rows = subsample(ordered, random.child("thinned"))
+        part, rows = subsample_measurement(ordered, random.child("thinned"))
         found = _diagnose(part, clock, random)
     return replace(found, residuals=replace(found.residuals, index=rows[found.residuals.index]))
 
 
 def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> GapDiagnosis:
+    """Run the steps of the workflow on the subsampled measurement."""
     measurement.check_near(FILE)
-    first = compute_residuals(measurement)
-    check_noise("surface" if isinstance(first, SurfaceResiduals) else first.sensor, first.sigma)
-    held_points = np.zeros(len(measurement.cloud.points), dtype=bool)
-    held_points[first.index] = in_validation_blocks(first.wall_xy, WallCells.over(first.wall_xy).side_m)
-    held_points |= _held_epoch(measurement.epochs)
-    there, plain, surveyed = align(measurement, first.index[~held_points[first.index]], first)
-    if isinstance(there, StereoMeasurement) and isinstance(plain, StereoResiduals):
-        there = with_surroundings(there, plain)
-    if isinstance(there, TlsMeasurement) and isinstance(plain, TlsResiduals):
-        plain = replace(plain, expected_pulses=find_expected_pulses(there, plain))
+    initial = compute_residuals(measurement)
+    check_noise("surface" if isinstance(initial, SurfaceResiduals) else initial.sensor, initial.sigma)
+    held_out_points = np.zeros(len(measurement.cloud.points), dtype=bool)
+    held_out_points[initial.index] = in_validation_blocks(initial.wall_xy, WallCells.over(initial.wall_xy).side_m)
+    held_out_points |= _in_validation_epoch(measurement.epochs)
+    aligned, plain, surveyed = align(measurement, initial.index[~held_out_points[initial.index]], initial)
+    if isinstance(aligned, StereoMeasurement) and isinstance(plain, StereoResiduals):
+        aligned = with_surroundings(aligned, plain)
+    if isinstance(aligned, TlsMeasurement) and isinstance(plain, TlsResiduals):
+        plain = replace(plain, expected_pulses=find_expected_pulses(aligned, plain))
     clock.lap("residuals")
-    if plain.usable.sum() < decided().points.fewest:
-        return _insufficient(measurement, plain, clock)
-    held = _held(Starts(there, plain, held_points), random)
-    state, naming = held.state, held.naming
+    if plain.usable.sum() < thresholds().points.fewest:
+        return _insufficient_data(measurement, plain, clock)
+    validated = _select_and_validate(PassInputs(aligned, plain, held_out_points), random)
+    given, selection = validated.given, validated.selection
     clock.lap("naming")
-    showing = Showing(
-        measurement=there,
+    validation = Validation(
+        measurement=aligned,
         residuals=plain,
-        chosen=state.chosen,
-        tested=state.shown & state.held_out,
-        learned=state.shown & ~state.held_out,
-        losses=held.losses,
-        reference_sigma=naming.reference_sigma,
-        largest=decided().points.outlier * state.scale,
+        registration_rows=given.training_rows,
+        tested=given.measurable & given.held_out,
+        training=given.measurable & ~given.held_out,
+        losses=validated.losses,
+        reference_sigma=selection.reference_sigma,
+        most_sigmas=thresholds().points.outlier_sigmas * given.noise_ratio,
         random=random,
-        lower=lower_noise(there.model, _of_model(naming.times.share, plain)),
+        reduced_noise=reduced_noise(aligned.model, _share_of_model_noise(selection.unexplained_noise.at_most_one, plain)),
     )
-    shown, harmful = showing.show(held.named)
-    notes = [*naming.notes, *too_noisy(naming.times.share, showing.lower), *held.words, *harmful]
-    far = held.tails.share if held.tails is not None and held.tails.even else 0.0
-    wide = 1.0 if any(item.spreads for item in shown.named) else naming.times.value
-    evidence = Evidence(shown.gap, naming.p_beside(shown.named), naming.times.share, far, wide=wide)
-    notes = [*notes, *unexplained(evidence, notes)]
-    evidence = _with_moved(evidence, there, state, shown)
+    result, harmful = validation.validate(validated.named)
+    notes = [
+        *selection.notes,
+        *note_excess_noise(selection.unexplained_noise.at_most_one, validation.reduced_noise),
+        *validated.words,
+        *harmful,
+    ]
+    far = validated.tails.share if validated.tails is not None and validated.tails.uniform else 0.0
+    wide = 1.0 if any(item.adds_variance for item in result.named) else selection.unexplained_noise.value
+    evidence = Evidence(result.gap, selection.p_beside(result.named), selection.unexplained_noise.at_most_one, far, wide=wide)
+    notes = [*notes, *note_overdispersion(evidence, notes)]
+    evidence = _with_moved_share(evidence, aligned, given, result)
     if evidence.much_moved:
-        shown, _ = replace(showing, lower={}).show([])
-        notes = [*much_moved(evidence, bool(there.stable_areas)), *naming.notes]
-    value = plain.value - plain.pose_jacobian @ showing.pose
-    clock.lap("verification")
+        result, _ = replace(validation, reduced_noise={}).validate([])
+        notes = [*note_moved_wall(evidence, bool(aligned.stable_areas)), *selection.notes]
+    value = plain.value - plain.pose_jacobian @ validation.pose
+    clock.lap("validation")
     return GapDiagnosis(
-        verdict=verdict_of(shown.named, evidence),
-        effects=tuple(shown.named),
-        changes=tuple(state.changes),
-        residuals=replace(plain, usable=state.residuals.usable),
-        held_out=state.held_out,
+        verdict=verdict_of(result.named, evidence),
+        effects=tuple(result.named),
+        changes=tuple(given.changes),
+        residuals=replace(plain, usable=given.residuals.usable),
+        held_out=given.held_out,
         before=value,
-        after=np.where(np.isfinite(shown.value), shown.value, value),
-        pose=surveyed + shown.pose,
-        model_after=shown.model,
-        gap=shown.gap,
-        tried=naming.tried,
-        spread_tried=naming.spread_tried,
-        remaining=_remaining(evidence, _found_first(notes, plain.notes), shown.lower),
-        identifiability=naming.identifiability,
+        after=np.where(np.isfinite(result.value), result.value, value),
+        pose=surveyed + result.pose,
+        model_after=result.model,
+        gap=result.gap,
+        tried=selection.tried,
+        variance_tried=selection.variance_tried,
+        remaining=_remaining_entry(evidence, _findings_first(notes, plain.notes), result.reduced_noise),
+        identifiability=selection.identifiability,
         seconds=clock.total,
         timings=clock.laps,
-        decisions=decided(),
+        thresholds=thresholds(),
     )
 
 
-def _of_model(share: float, residuals: Residuals) -> float:
-    """A share of the predicted standard deviation as one of the model's, whose part is what the reference's error leaves."""
+def _share_of_model_noise(share: float, residuals: Residuals) -> float:
+    """Convert a ratio of the predicted standard deviation to one of the model's own, which excludes the reference error."""
     if not isinstance(residuals, TlsResiduals) or not residuals.reference_error_m:
         return share
     whole, reference = float(np.median(residuals.sigma**2)), float(np.median(residuals.reference_variance))
-    own = max(whole - reference, _LEAST_SHARE**2 * whole)
-    return float(np.sqrt(max(share**2 * whole - reference, _LEAST_SHARE**2 * own) / own))
+    own = max(whole - reference, _LEAST_MODEL_SHARE**2 * whole)
+    return float(np.sqrt(max(share**2 * whole - reference, _LEAST_MODEL_SHARE**2 * own) / own))
 
 
-def _with_moved(evidence: Evidence, there: Measurement, state: State, shown: Shown) -> Evidence:
-    """With the share of the wall that moved, where that may be why nothing was named that closes the gap, or why a noise was.
+def _with_moved_share(evidence: Evidence, aligned: Measurement, given: PassInput, result: ValidationResult) -> Evidence:
+    """Add the share of the wall that moved, if that may be why nothing closes the gap, or why a noise term was named.
 
-    A noise closes some of any gap, but takes no neighbours along: with the true one in the model next to nothing moved.
+    A noise term closes part of any gap, but it does not move neighbours together: beside a true noise next to nothing moved.
     """
-    noisy = any(item.spreads for item in shown.named)
-    unexplained_yet = verdict_of(shown.named, evidence) == "unknown" and (not shown.named or evidence.closes_little)
-    if not (noisy or unexplained_yet):
+    noisy = any(item.adds_variance for item in result.named)
+    still_unexplained = verdict_of(result.named, evidence) == "unknown" and (not result.named or evidence.closes_little)
+    if not (noisy or still_unexplained):
         return evidence
-    after = replace(state.residuals, value=shown.value)
-    sight = SensorView.of(there, after)
-    moved = moved_share(after, sight, state.fit)
-    if noisy and not unexplained_yet and moved >= decided().changes.moved_share:
-        found = compute_residuals(there.changed(model=shown.model))
+    after = replace(given.residuals, value=result.value)
+    sight = SensorView.of(aligned, after)
+    moved = moved_share(after, sight, given.stable)
+    if noisy and not still_unexplained and moved >= thresholds().changes.moved_share:
+        found = compute_residuals(aligned.changed(model=result.model))
         sigma = found.values_at(found.sigma, after.index)
-        beside = moved_share(replace(after, sigma=np.where(np.isfinite(sigma), sigma, after.sigma)), sight, state.fit)
-        moved = moved if beside >= decided().changes.moved_beside_noise else 0.0
+        beside = moved_share(replace(after, sigma=np.where(np.isfinite(sigma), sigma, after.sigma)), sight, given.stable)
+        moved = moved if beside >= thresholds().changes.moved_share_beside_noise else 0.0
     return replace(evidence, moved=moved)
 
 
-def _held_epoch(epochs: NDArray[np.int64]) -> BoolArray:
-    """(n,) points of the last epoch where there are enough to learn from without it."""
+def _in_validation_epoch(epochs: NDArray[np.int64]) -> BoolArray:
+    """(n,) points of the last epoch, if there are enough epochs to keep it for validation."""
     last = int(epochs.max(initial=0))
-    return epochs == last if last + 1 >= decided().points.fewest_epochs else np.zeros(len(epochs), dtype=bool)
+    return epochs == last if last + 1 >= thresholds().points.fewest_epochs else np.zeros(len(epochs), dtype=bool)
 
 
 @dataclass(frozen=True)
-class _Held:
-    """What naming started from, the effects that hold on held-out blocks, heavy tails, and words for the other effects.
+class _ValidatedSelection:
+    """The chosen selection pass with the effects that passed validation.
 
-    losses: the effect on the returns, and the pulses that it was not fitted to.
+    Attributes
+    ----------
+    given : input of the pass.
+    selection : what the selection left beside the effects.
+    losses : explanation of the missing returns, and the pulses that it was not fitted to.
+    named : accepted effects, with the measurement that would separate each class.
+    tails : heavy tails of the residuals, if any.
+    words : notes on dropped effects.
     """
 
-    state: State
-    naming: Naming
-    losses: tuple[MissingFound, BoolArray] | None
-    named: list[Named]
-    tails: Tails | None
+    given: PassInput
+    selection: SelectionResult
+    losses: tuple[LossExplanation, BoolArray] | None
+    named: list[NamedEffect]
+    tails: HeavyTails | None
     words: list[str]
 
 
-def _held(starts: Starts, random: KeyedRandom, left_out: frozenset[tuple[str, bool]] = frozenset()) -> _Held:
-    """What is named and holds on held-out blocks; where a free form does not, what is named without any. The effects come with
-    what would split each class."""
-    first, there, plain = attempt(starts, random, left_out), starts.there, starts.plain
-    state, naming = first.state, first.naming
-    losses = _missing(there, state)
-    lost = [from_missing(losses[0], there.cloud.intensity)] if losses else []
-    named = sorted([*first.named, *map(from_shape, state.shapes), *lost], key=lambda item: -item.gain)
-    named, words = only_within_bounds(there.model, named)
-    scored = _scored(there, state, named, naming.reference_sigma)
-    words += [f"{item.name} dropped: it does not hold on blocks that were held out" for item in scored.failed]
+def _select_and_validate(
+    inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple[str, bool]] = frozenset()
+) -> _ValidatedSelection:
+    """Select effects and validate them. If an empirical term fails, the selection is repeated without empirical terms."""
+    best, aligned, plain = best_pass(inputs, random, excluded), inputs.measurement, inputs.plain
+    given, selection = best.pass_input, best.selection
+    losses = _explain_losses(aligned, given)
+    lost = [effect_from_losses(losses[0], aligned.cloud.intensity)] if losses else []
+    named = sorted([*best.named, *map(effect_from_edges, given.edge_effects), *lost], key=lambda item: -item.gain)
+    named, words = only_within_bounds(aligned.model, named)
+    scored = _validate(aligned, given, named, selection.reference_sigma)
+    words += [f"{item.name} dropped: it does not improve the validation blocks" for item in scored.failed]
     nameable = any(not each.empirical for each in plain.candidates)
-    if nameable and FREE_FORMS not in left_out and any(item.kind == "empirical" and not item.spreads for item in scored.failed):
-        again = _held(starts, random, left_out | {FREE_FORMS})
+    if (
+        nameable
+        and NONPARAMETRIC_TERMS not in excluded
+        and any(item.kind == "empirical" and not item.adds_variance for item in scored.failed)
+    ):
+        again = _select_and_validate(inputs, random, excluded | {NONPARAMETRIC_TERMS})
         if again.named:
             return replace(again, words=[*words, *(each for each in again.words if each not in words)])
-    words += [f"{item.name} only mentioned: beside the others {weakness(item)}" for item in scored.weak]
+    words += [f"{item.name} mentioned but not named: beside the other effects {describe_weakness(item)}" for item in scored.weak]
     described = [item.gain for item in scored.named if item.name.endswith("_empirical")]
-    least = decided().held_out.left_over * max(described, default=0.0)
-    left = [item for item in scored.named if item.spreads and item.gain < least]
-    words += [f"{item.name} dropped: so much is left over by the empirical term" for item in left]
-    steady = thinned_rows(np.flatnonzero(state.fit & ~state.held_out))
+    least = thresholds().validation.leftover_share * max(described, default=0.0)
+    left = [item for item in scored.named if item.adds_variance and item.gain < least]
+    words += [f"{item.name} dropped: it only describes the misfit of the empirical term" for item in left]
+    rows_of_tails = subsample_rows(np.flatnonzero(given.stable & ~given.held_out))
     kept = [item for item in scored.named if item not in left]
-    found, tails = _with_tails(*few(there, state.residuals, steady), kept, state.cells.side_m)
-    words += [tails.words] if tails else []
-    return _Held(state, naming, losses, with_splits(there, found), tails, words)
+    found, tails = _with_heavy_tails(*subsample(aligned, given.residuals, rows_of_tails), kept, given.cells.side_m)
+    words += [tails.note] if tails else []
+    return _ValidatedSelection(given, selection, losses, with_separating_measurements(aligned, found), tails, words)
 
 
-def _scored(there: Measurement, state: State, named: list[Named], reference_sigma: float) -> Scored:
-    """The effects on held-out blocks."""
-    tested = thinned_rows(np.flatnonzero(state.fit & state.held_out))
-    rows = np.concatenate([state.chosen, tested])
-    trained = np.arange(len(rows)) < len(state.chosen)
-    return score_effects(*few(there, state.residuals, rows), named, trained, reference_sigma)
+def _validate(aligned: Measurement, given: PassInput, named: list[NamedEffect], reference_sigma: float) -> ValidatedEffects:
+    """Score the effects on the validation points."""
+    tested = subsample_rows(np.flatnonzero(given.stable & given.held_out))
+    rows = np.concatenate([given.training_rows, tested])
+    training = np.arange(len(rows)) < len(given.training_rows)
+    return validate_effects(*subsample(aligned, given.residuals, rows), named, training, reference_sigma)
 
 
-def _with_tails(
-    measurement: Measurement, residuals: Residuals, named: list[Named], side_m: float
-) -> tuple[list[Named], Tails | None]:
-    """With heavy tails where those are all over the wall, which no effect of the catalogue makes but two: strips that are filled
-    are also cells that had no match by chance, and drops return early. An effect on the spread stays beside them where the
-    middle of the residuals is wider too."""
+def _with_heavy_tails(
+    measurement: Measurement, residuals: Residuals, named: list[NamedEffect], side_m: float
+) -> tuple[list[NamedEffect], HeavyTails | None]:
+    """Add heavy tails to the named effects if outliers lie all over the wall.
+
+    Only two effects of the catalogue make such tails, and then nothing is added: filled occlusions, whose strips include cells
+    without a match, and drops that return early. A noise term is kept beside heavy tails if the core of the residuals has more
+    variance than predicted.
+    """
     if any(item.effect is OcclusionFill or item.entry.get("early_share") for item in named):
         return named, None
-    part, value, scale = _smooth_with(measurement, named)
-    tails = find_tails(value / part.sigma / scale, wall_block_numbers(part.wall_xy, side_m))
-    if tails is None or not tails.even or not tails.sigma:
+    part, value, scale = _smooth_residuals_with(measurement, named)
+    tails = find_heavy_tails(value / part.sigma / scale, wall_block_numbers(part.wall_xy, side_m))
+    if tails is None or not tails.uniform or not tails.sigma:
         return named, tails
-    steady = [item for item in named if not item.spreads]
-    if len(steady) < len(named):
-        _, _, middle = _smooth_with(measurement, steady)
-        if middle**2 - 1 > decided().spread.core_excess:
+    rows_of_tails = [item for item in named if not item.adds_variance]
+    if len(rows_of_tails) < len(named):
+        _, _, middle = _smooth_residuals_with(measurement, rows_of_tails)
+        if middle**2 - 1 > thresholds().variance.core_excess:
             return named, tails
-    heavy = from_tails(part, tails.sigma * float(np.median(part.sigma)), tails.gain)
-    return [*steady, *only_within_bounds(measurement.model, [heavy])[0]], tails
+    heavy = effect_from_tails(part, tails.sigma * float(np.median(part.sigma)), tails.gain)
+    return [*rows_of_tails, *only_within_bounds(measurement.model, [heavy])[0]], tails
 
 
-def _smooth_with(measurement: Measurement, named: list[Named]) -> tuple[Residuals, FloatArray, float]:
-    """Residuals on smooth rock against the model with some effects, registered ones (n,), and how many sigmas they spread."""
-    found = settled_with(measurement, named).residuals
+def _smooth_residuals_with(measurement: Measurement, named: list[NamedEffect]) -> tuple[Residuals, FloatArray, float]:
+    """Residuals on smooth rock with some effects in the model, the registered ones (n,), and their noise over the predicted
+    one."""
+    found = aligned_with(measurement, named).residuals
     part = found.part(np.flatnonzero(found.usable))
     value, _, scale = fit_pose_robustly(part)
     return part, value, scale
 
 
 class _Clock:
-    def __init__(self, told: Callable[[str], None] | None) -> None:
+    """Measures how long each step takes, and reports the steps that are done."""
+
+    def __init__(self, report: Callable[[str], None] | None) -> None:
         self._start = self._last = time.perf_counter()
-        self._told = told
+        self._report = report
         self.laps: dict[str, float] = {}
 
     def lap(self, name: str) -> None:
+        """End a step."""
         now = time.perf_counter()
         self.laps[name], self._last = now - self._last, now
-        if self._told is not None:
-            self._told(name)
+        if self._report is not None:
+            self._report(name)
 
     @property
     def total(self) -> float:
+        """Time since the start, s."""
         return time.perf_counter() - self._start
 
 
-def _remaining(evidence: Evidence, notes: list[str], lower_noise: dict[str, float]) -> dict[str, Any]:
-    """As gap.json holds it. spread: share of the predicted one that the residuals have where that is clearly less; far: share of
-    points far out all over the wall; moved: of points off the reference with their neighbours, 0 where that was not asked; wide:
-    how many predicted sigmas they spread where no effect explains that."""
+def _remaining_entry(evidence: Evidence, notes: list[str], lower_noise: dict[str, float]) -> dict[str, Any]:
+    """Return the entry `remaining` of gap.json; its numbers are those of `Evidence`, and lower_noise holds noise values that
+    fit."""
     return {
         "p_value": evidence.p_value,
         "note": "; ".join(notes),
@@ -322,35 +381,39 @@ def _remaining(evidence: Evidence, notes: list[str], lower_noise: dict[str, floa
     }
 
 
-def _found_first(notes: list[str], of_data: Sequence[str]) -> list[str]:
-    """What was found before what the data cannot show."""
-    return [*(each for each in notes if each not in of_data), *(each for each in notes if each in of_data)]
+def _findings_first(notes: list[str], about_data: Sequence[str]) -> list[str]:
+    """Order notes: findings first, then what the data cannot show."""
+    return [*(each for each in notes if each not in about_data), *(each for each in notes if each in about_data)]
 
 
-def _insufficient(measurement: Measurement, residuals: Residuals, clock: _Clock) -> GapDiagnosis:
-    count, least = int(residuals.usable.sum()), decided().points.fewest
-    note = f"{count} points on smooth parts of the reference and stable ground, {least} are needed"
+def _insufficient_data(measurement: Measurement, residuals: Residuals, clock: _Clock) -> GapDiagnosis:
+    """Return the diagnosis of a measurement with too few points."""
+    count, least = int(residuals.usable.sum()), thresholds().points.fewest
+    note = f"{count} points on smooth parts of the reference and stable ground, but {least} are needed"
     empty = np.zeros(len(residuals))
     pose = np.zeros(residuals.pose_jacobian.shape[1] if isinstance(residuals, SurfaceResiduals) else 6)
     return GapDiagnosis(
         "insufficient_data", (), (), residuals, empty > 1, residuals.value, residuals.value, pose, measurement.model,
-        None, (), (), _remaining(Evidence(None, None), [note], {}), {"names": [], "cosines": [], "survival": []},
-        clock.total, clock.laps, decided(),
+        None, (), (), _remaining_entry(Evidence(None, None), [note], {}), {"names": [], "cosines": [], "survival": []},
+        clock.total, clock.laps, thresholds(),
     )  # fmt: skip
 
 
-def _missing(measurement: Measurement, state: State) -> tuple[MissingFound, BoolArray] | None:
-    """The effect on the returns, and the pulses that it was not fitted to."""
-    residuals = state.residuals
+def _explain_losses(measurement: Measurement, given: PassInput) -> tuple[LossExplanation, BoolArray] | None:
+    """Explain the missing returns, with the pulses that the explanation was not fitted to."""
+    residuals = given.residuals
     missing = residuals.expected_pulses
-    if missing is None or any(believes(measurement, name) for name in LOSSES):
+    if missing is None or any(model_has(measurement, name) for name in LOSS_EFFECTS):
         return None
-    held_out = in_validation_blocks(missing.wall_xy, state.cells.side_m)
+    held_out = in_validation_blocks(missing.wall_xy, given.cells.side_m)
     early = (
         residuals.usable
-        & ~state.changed
-        & (state.rough < -np.maximum(decided().losses.early_sigmas * residuals.sigma, decided().losses.early))
+        & ~given.changed
+        & (
+            given.registered_residuals
+            < -np.maximum(thresholds().missing_returns.early_sigmas * residuals.sigma, thresholds().missing_returns.early_m)
+        )
     )
-    drops = isolated(residuals.wall_xy, early)
-    found = find_missing(missing, ~held_out, drops, len(residuals), measurement.cloud.intensity)
+    drops = count_isolated_returns(residuals.wall_xy, early)
+    found = explain_missing_returns(missing, ~held_out, drops, len(residuals), measurement.cloud.intensity)
     return None if found is None else (found, held_out)

@@ -1,4 +1,4 @@
-"""How much of the residuals each named effect accounts for by itself: what a viewer switches on and off."""
+"""Compute how much of the residuals each named effect explains alone, for viewers that switch effects on and off."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import Measurement, TlsMeasurement
-from pipeline.gap.naming.entries import settled_with
+from pipeline.gap.naming.named_effects import aligned_with
 from pipeline.gap.naming.workflow import GapDiagnosis
 from pipeline.gap.residuals.alignment import fit_pose
 from pipeline.gap.residuals.tls_residuals import with_scan_order
@@ -14,22 +14,34 @@ from scene.geometry.mesh import FloatArray
 
 
 def contributions(found: GapDiagnosis, measurement: Measurement) -> FloatArray:
-    """(k, n) by how much the residuals fall with each of the k effects alone in the model, each registered for itself, in the
-    observable's unit; 0 where a ray then misses the reference.
+    """Return by how much the residuals fall with each effect alone in the model, each registered separately.
 
-    Of one effect that is `before - after`. Of several it costs a simulation each; their sum is `before - after` as far as the
-    effects do not share what the registration takes up.
+    Several effects cost one simulation each. Their sum is `before - after`, except for what the registration absorbs of several
+    effects in common.
+
+    Parameters
+    ----------
+    found : diagnosis.
+    measurement : measurement that was diagnosed.
+
+    Returns
+    -------
+    FloatArray : (k, n) in the observable's unit, for k effects; 0 where a ray misses the reference.
     """
     if len(found.effects) < 2:
         return np.array([found.before - found.after for _ in found.effects]).reshape(-1, len(found.before))
     there = with_scan_order(measurement) if isinstance(measurement, TlsMeasurement) else measurement
-    there, trusted = there.part(found.residuals.index), np.flatnonzero(found.residuals.usable & ~found.held_out)
-    return np.stack([found.before - _alone(found, there, number, trusted) for number in range(len(found.effects))])
+    there, registration_rows = there.part(found.residuals.index), np.flatnonzero(found.residuals.usable & ~found.held_out)
+    return np.stack(
+        [found.before - _residuals_with_one(found, there, number, registration_rows) for number in range(len(found.effects))]
+    )
 
 
-def _alone(found: GapDiagnosis, measurement: Measurement, number: int, trusted: NDArray[np.int64]) -> FloatArray:
-    """(n,) residuals with one effect in the model, those before where there are none. measurement: of these points alone."""
-    _, residuals, _ = settled_with(measurement, [found.effects[number]], trusted)
-    rest = fit_pose(residuals, residuals.usable & np.isin(residuals.index, trusted))
+def _residuals_with_one(
+    found: GapDiagnosis, measurement: Measurement, number: int, registration_rows: NDArray[np.int64]
+) -> FloatArray:
+    """(n,) residuals with one effect in the model, or those before where a ray misses. measurement: of these points alone."""
+    _, residuals, _ = aligned_with(measurement, [found.effects[number]], registration_rows)
+    rest = fit_pose(residuals, residuals.usable & np.isin(residuals.index, registration_rows))
     value = residuals.values_at(residuals.value - residuals.pose_jacobian @ rest, np.arange(len(found.before)))
     return np.where(np.isfinite(value), value, found.before)

@@ -1,4 +1,4 @@
-"""The pictures of a diagnosis: maps and profiles before and after, the gap as a bar, the identifiability matrix; PNG bytes."""
+"""Figures of a diagnosis as PNG: maps and profiles before and after, the gap as a bar, the identifiability matrix."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
-from pipeline.gap.naming.verify import Gap
+from pipeline.gap.naming.gap_score import Gap
 from pipeline.gap.naming.workflow import GapDiagnosis
-from pipeline.gap.report.covariate_ranking import bins, standardised, steady
-from pipeline.gap.report.in_words import with_unit
+from pipeline.gap.report.covariate_ranking import inliers, quantile_bins, standardised_by_covariate
+from pipeline.gap.report.wording import covariate_with_unit
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, predicted_sigma
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from pipeline.report.figures import COLOURS, dress_map
+from pipeline.report.figures import COLOURS, label_map_axes
 from pipeline.report.pictures import png
 from pipeline.report.plain_text import power_of_ten
 from scene.geometry.mesh import FloatArray
@@ -30,39 +30,41 @@ _POINTS_PER_PIXEL = 8.0
 _BEFORE, _AFTER, _NAMED = "#D55E00", "#0072B2", "black"
 DEPTH_LABEL = "surface deeper than predicted, mm; missing rock positive"
 _MOST_NMAD = 6.0
-"""Of a map's values, beyond which those that are more have no say in its colours."""
+"""Times the NMAD of a map's values beyond which they do not influence its colours."""
 _PLATE = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
 _COLUMNS = 3
-_CROWDED = ("edge_step",)
-"""Covariates of which most values lie near zero, the rest over decades."""
+_LOGARITHMIC = ("edge_step",)
+"""Covariates with a logarithmic axis: most of their values are near zero, the rest are spread over decades."""
 _MOST_PIXELS = 400
-"""Of a map, each way, of points however narrow a strip they fill."""
-_MANY = 300.0
-"""Span of a logarithmic axis from which on it has a number per decade, else two."""
+"""Most pixels of a map in each direction, for points in a narrow strip."""
+_MANY_DECADES = 300.0
+"""Ratio of the ends of a logarithmic axis from which on it has one number per decade, else two."""
 
 
 def maps_figure(found: GapDiagnosis) -> bytes:
-    """Residuals before and after on one scale: means of small pixels, and their spread over what each model predicts."""
-    unit, pixels = 1e3 * found.residuals.depth_m, _Pixels(found)
+    """Draw maps of the residuals before and after on one scale: means of small pixels, and their noise over the predicted one."""
+    unit, pixels = 1e3 * found.residuals.depth_m, _PixelGrid(found)
     left, right, low, high = pixels.extent
     figure = Figure(figsize=(11.5, float(np.clip(10.0 * (high - low) / (right - left), 4.0, 12.0)) + 2.2), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True, sharey=True)
     means = [pixels.mean(values * unit) for values in (found.before, found.after)]
-    limit = _limit(means[0])
+    limit = _colour_limit(means[0])
     sigmas = found.residuals.sigma, sigma_after(found)
-    spreads = [pixels.spread(values / sigma) for values, sigma in zip((found.before, found.after), sigmas, strict=True)]
+    ratios = [
+        pixels.standard_deviation(values / sigma) for values, sigma in zip((found.before, found.after), sigmas, strict=True)
+    ]
     for panel, values, title in zip(panels[0], means, ("before", "after"), strict=True):
         image = panel.imshow(values, cmap=COLOURS, vmin=-limit, vmax=limit, extent=pixels.extent, origin="lower")
         panel.set_title(f"mean residual, {title}", fontsize=10)
-    _bar(figure, image, panels[0], DEPTH_LABEL)
-    for panel, values, title in zip(panels[1], spreads, ("before", "after"), strict=True):
+    _colour_bar(figure, image, panels[0], DEPTH_LABEL)
+    for panel, values, title in zip(panels[1], ratios, ("before", "after"), strict=True):
         image = panel.imshow(values, cmap="PuOr_r", vmin=0.4, vmax=1.6, extent=pixels.extent, origin="lower")
-        panel.set_title(f"spread over the predicted one, {title}", fontsize=10)
-    _bar(figure, image, panels[1], "1: as predicted")
+        panel.set_title(f"standard deviation over the predicted one, {title}", fontsize=10)
+    _colour_bar(figure, image, panels[1], "1: as predicted")
     for panel in panels.ravel():
         panel.set_facecolor("0.85")
-        panel.set_anchor("N")  # in the middle of its place the title of a low map may end above the figure
-        dress_map(panel, pixels.extent[0], pixels.extent[2])
+        panel.set_anchor("N")  # if centred, the title of a low map could lie outside of the figure
+        label_map_axes(panel, pixels.extent[0], pixels.extent[2])
         panel.label_outer()
         for change in found.changes:
             corner, opposite = change.bounds[:, :2]
@@ -70,21 +72,21 @@ def maps_figure(found: GapDiagnosis) -> bytes:
     return png(figure)
 
 
-def _limit(means: FloatArray) -> float:
-    """Where the colours of a map end: at the 98 % quantile of its values, or sooner where some lie far beyond all others."""
+def _colour_limit(means: FloatArray) -> float:
+    """End of a map's colours: the 98 % quantile of its values, or less where a few are far larger than all others."""
     known = np.abs(means[np.isfinite(means)])
     usual = _MOST_NMAD * nmad(known, 0.0) if known.size else 0.0
     top = float(np.quantile(known, 0.98)) if known.size else 0.0
     return (min(top, usual) if usual > 0 else top) or 1.0
 
 
-def _bar(figure: Figure, image: AxesImage, panels: NDArray[np.object_], label: str) -> None:
-    """A colour bar beneath a row of maps, where the label has room however low the maps are."""
+def _colour_bar(figure: Figure, image: AxesImage, panels: NDArray[np.object_], label: str) -> None:
+    """Draw a colour bar below a row of maps, where its label has room even if the maps are low."""
     figure.colorbar(image, ax=panels, label=label, extend="both", location="bottom", shrink=0.6, aspect=45)
 
 
 def sigma_after(found: GapDiagnosis) -> FloatArray:
-    """(n,) spread that the model with the named effects predicts, in the observable's unit."""
+    """(n,) standard deviation that the model with the named effects predicts, in the observable's unit."""
     match found.model_after, found.residuals:
         case TlsModel() as model, TlsResiduals(geometry=rays) as ranges:
             return np.asarray(np.sqrt(model.variance(rays) + ranges.reference_variance))
@@ -96,22 +98,22 @@ def sigma_after(found: GapDiagnosis) -> FloatArray:
 
 
 def profiles_figure(found: GapDiagnosis) -> bytes:
-    """Means and spreads against each covariate, with two standard errors, and what the named effects explain on top."""
-    names = [name for name, _, _ in standardised(found)]
+    """Draw means and standard deviations against each covariate, with two standard errors, and what the named effects explain."""
+    names = [name for name, _, _ in standardised_by_covariate(found)]
     rows = max((len(names) + _COLUMNS - 1) // _COLUMNS, 1)
     figure = Figure(figsize=(11.5, 4.0 * rows))
     panels = np.atleast_2d(figure.subplots(2 * rows, _COLUMNS, height_ratios=[1.4, 1.0] * rows))
-    # margins of so many inches: all panels are alike, and a layout that is worked out takes as long as the drawing
+    # fixed margins in inches: a computed layout takes as long as the drawing
     figure.subplots_adjust(0.055, 0.3 / (4.0 * rows), 0.99, 1 - 0.3 / (4.0 * rows), wspace=0.22, hspace=0.33)
-    kept = steady(found)
-    unit = 1e3 * found.residuals.depth_m[kept]
-    before, after = found.before[kept] * unit, found.after[kept] * unit
-    predicted = found.residuals.sigma[kept] * np.abs(unit), sigma_after(found)[kept] * np.abs(unit)
+    used = inliers(found)
+    unit = 1e3 * found.residuals.depth_m[used]
+    before, after = found.before[used] * unit, found.after[used] * unit
+    predicted = found.residuals.sigma[used] * np.abs(unit), sigma_after(found)[used] * np.abs(unit)
     for number, name in enumerate(names):
         row, column = divmod(number, _COLUMNS)
         upper, lower = panels[2 * row, column], panels[2 * row + 1, column]
-        x = found.residuals.covariates[name][kept]
-        edges, group = bins(x, _BINS)
+        x = found.residuals.covariates[name][used]
+        edges, group = quantile_bins(x, _BINS)
         if len(edges) < 3:
             upper.set_visible(False)
             lower.set_visible(False)
@@ -119,18 +121,18 @@ def profiles_figure(found: GapDiagnosis) -> bytes:
         middle = (edges[1:] + edges[:-1]) / 2
         for values, colour, label in ((before, _BEFORE, "before"), (after, _AFTER, "after")):
             _mean_band(upper, middle, group, values, colour, label)
-            _spread_band(lower, middle, group, values, colour)
+            _std_band(lower, middle, group, values, colour)
         if found.effects:
             upper.plot(middle, _means(group, before - after, len(middle)), color=_NAMED, linewidth=1.4, label="named effects")
         for sigma, colour in zip(predicted, (_BEFORE, _AFTER), strict=True):
             lower.plot(middle, np.sqrt(_means(group, sigma**2, len(middle))), color=colour, linestyle="--", linewidth=1.0)
         upper.axhline(0.0, color="0.7", linewidth=0.6, zorder=0)
-        upper.set_title(with_unit(name, found.residuals.sensor), fontsize=9)
+        upper.set_title(covariate_with_unit(name, found.residuals.sensor), fontsize=9)
         upper.set_ylabel("mean depth, mm", fontsize=8)
-        lower.set_ylabel("spread, mm", fontsize=8)
+        lower.set_ylabel("standard deviation, mm", fontsize=8)
         for panel in (upper, lower):
             panel.tick_params(labelsize=7)
-            if name in _CROWDED:
+            if name in _LOGARITHMIC:
                 _log_axis(panel)
         if number == 0:
             upper.legend(fontsize=7)
@@ -141,17 +143,17 @@ def profiles_figure(found: GapDiagnosis) -> bytes:
 
 
 def _log_axis(panel: Axes) -> None:
-    """Few and plain numbers along x."""
+    """Use a logarithmic x axis with few and plain numbers."""
     panel.set_xscale("log")
     low, high = panel.get_xlim()
-    panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if high < _MANY * low else (1.0,)))
+    panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if high < _MANY_DECADES * low else (1.0,)))
     panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value)))
     panel.xaxis.set_minor_formatter(NullFormatter())
 
 
 def gap_figure(gap: Gap) -> bytes:
-    """One bar from the floor over the score after to the score before."""
-    factor, unit = gap.shown
+    """Draw the gap as one bar, from the floor over the score after to the score before."""
+    factor, unit = gap.display_unit
     floor, after, before = (factor * value for value in (gap.floor, gap.after, gap.before))
     figure = Figure(figsize=(9.0, 2.0), layout="constrained")
     panel = figure.add_subplot()
@@ -169,14 +171,15 @@ def gap_figure(gap: Gap) -> bytes:
     panel.set_xlim(min(scores) - room, max(scores) + room)
     panel.set_ylim(-0.75, 1.1)
     panel.set_yticks([])
-    what = f"score of what was held out, {unit} (whiskers: two standard errors of the differences)"
+    what = f"score on validation points, {unit} (whiskers: two standard errors of the differences)"
     panel.set_xlabel(what, fontsize=8)
     panel.tick_params(labelsize=8)
     return png(figure)
 
 
 def matrix_figure(names: list[str], cosines: FloatArray, survival: FloatArray) -> bytes:
-    """Absolute cosines of the signatures after the pose fit, and beside them the share of each that survives it."""
+    """Draw the absolute cosines of the signatures after the pose fit, and beside them the share of each that the pose fit
+    leaves."""
     short, count = [name.partition(".")[2] for name in names], len(names)
     figure = Figure(figsize=(2.8 + 0.62 * count, 1.9 + 0.44 * count), layout="constrained")
     matrix, bars = figure.subplots(1, 2, width_ratios=[count, 3.0], sharey=True)
@@ -190,14 +193,14 @@ def matrix_figure(names: list[str], cosines: FloatArray, survival: FloatArray) -
     matrix.set_title("cosine of the signatures after the pose fit", fontsize=9)
     figure.colorbar(image, ax=matrix, shrink=0.7)
     bars.barh(range(count), 100 * survival, color=_AFTER)
-    bars.set_title("survives the pose, %", fontsize=9)
+    bars.set_title("left by the pose fit, %", fontsize=9)
     bars.set_xlim(0, 100)
     bars.tick_params(labelsize=8)
     return png(figure)
 
 
-class _Pixels:
-    """Square pixels over the smooth points, with some points in each."""
+class _PixelGrid:
+    """Square pixels over the smooth points, with about eight points in each."""
 
     def __init__(self, found: GapDiagnosis) -> None:
         residuals = found.residuals
@@ -216,8 +219,8 @@ class _Pixels:
         total = np.bincount(self._pixel, values[self._kept], len(self._count))
         return np.where(self._count > 0, total / np.maximum(self._count, 1), np.nan).reshape(self._shape)
 
-    def spread(self, values: FloatArray) -> FloatArray:
-        """(rows, columns) standard deviation about the pixel's mean, free of bias, NaN for fewer than three points."""
+    def standard_deviation(self, values: FloatArray) -> FloatArray:
+        """(rows, columns) standard deviation about the pixel's mean, unbiased, NaN for fewer than three points."""
         mean = self.mean(values).ravel()
         square = np.bincount(self._pixel, (values[self._kept] - mean[self._pixel]) ** 2, len(self._count))
         found = np.sqrt(square / np.maximum(self._count - 1, 1))
@@ -225,10 +228,12 @@ class _Pixels:
 
 
 def _means(group: Any, values: FloatArray, size: int) -> FloatArray:
+    """Mean of the values of each group."""
     return np.asarray(np.bincount(group, values, size) / np.maximum(np.bincount(group, minlength=size), 1))
 
 
 def _mean_band(panel: Any, middle: FloatArray, group: Any, values: FloatArray, colour: str, label: str) -> None:
+    """Draw the mean of each bin with a band of two standard errors."""
     mean = _means(group, values, len(middle))
     count = np.maximum(np.bincount(group, minlength=len(middle)), 1)
     error = 2 * np.sqrt(np.maximum(_means(group, values**2, len(middle)) - mean**2, 0) / count)
@@ -236,7 +241,8 @@ def _mean_band(panel: Any, middle: FloatArray, group: Any, values: FloatArray, c
     panel.fill_between(middle, mean - error, mean + error, color=colour, alpha=0.25, linewidth=0)
 
 
-def _spread_band(panel: Any, middle: FloatArray, group: Any, values: FloatArray, colour: str) -> None:
+def _std_band(panel: Any, middle: FloatArray, group: Any, values: FloatArray, colour: str) -> None:
+    """Draw the standard deviation of each bin with a band of two standard errors."""
     mean = _means(group, values, len(middle))
     spread = np.sqrt(np.maximum(_means(group, values**2, len(middle)) - mean**2, 0))
     error = 2 * spread / np.sqrt(2 * np.maximum(np.bincount(group, minlength=len(middle)), 1))

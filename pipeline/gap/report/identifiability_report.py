@@ -1,4 +1,5 @@
-"""The files of an identifiability analysis: identifiability.json, report.html and a picture of the matrix for each sensor."""
+"""Write the files of an identifiability analysis: identifiability.json, report.html and a figure of the matrix for each
+sensor."""
 
 from __future__ import annotations
 
@@ -11,21 +12,21 @@ import numpy as np
 
 from pipeline.formats.files.atomic import write_json, write_text, writing
 from pipeline.gap.report.figures import matrix_figure
-from pipeline.gap.report.in_words import listed, number
+from pipeline.gap.report.wording import format_number, join_words
 from pipeline.gap.survey.identifiability import NAMING_SNR, SIMILAR_COSINE, Identifiability
 from pipeline.gap.survey.survey_design import DETECTION_SNR, REFERENCE_LENGTH_M
 from pipeline.report.page import template
 from pipeline.report.provenance import versions
 
 _INSTRUMENTS = {"stereo": "Stereo pair", "tls": "Laser scanner"}
-_HELPS = 0.8
-"""A further measurement is worth naming where it lowers the value that is named to this share."""
+_WORTHWHILE_RATIO = 0.8
+"""An additional measurement is shown if it lowers the size from which an effect can be named to this share."""
 _NEVER = "never"
 
 
 @dataclass(frozen=True)
 class _Row:
-    """One effect of the page's table."""
+    """One row of the page's table of effects."""
 
     name: str
     parameter: str
@@ -37,7 +38,7 @@ class _Row:
 
 
 def write_identifiability(out: Path, found: Sequence[Identifiability]) -> Path:
-    """Write the files of one analysis per sensor into `out`; returns report.html."""
+    """Write the files of one analysis per sensor into `out` and return the path of report.html."""
     record = {"schema": 1, "surveys": [each.to_dict() for each in found], "versions": versions()}
     write_json(out / "identifiability.json", record)
     pictures = {each.sensor: matrix_figure(list(each.names), each.cosines, each.survival) for each in found}
@@ -55,32 +56,33 @@ def write_identifiability(out: Path, found: Sequence[Identifiability]) -> Path:
     return out / "report.html"
 
 
-def in_words(found: Identifiability) -> str:
-    """What the analysis says, in plain words."""
+def summarise(found: Identifiability) -> str:
+    """Return what the analysis says, as a paragraph."""
     weak = [name for name, share in zip(found.names, found.survival, strict=True) if share < 0.1]
     pairs = found.pairs()
     parts = [f"{_INSTRUMENTS[found.sensor]}, {found.points:,} points on smooth parts of the wall."]
     if weak:
-        parts.append(f"A shift or turn of the sensor takes up more than 90 % of {listed(weak)}.")
+        parts.append(f"A shift or rotation of the sensor absorbs more than 90 % of {join_words(weak)}.")
     if pairs:
         a, b = pairs[0]
         parts.append(
             f"{len(pairs)} pairs of effects look alike (cosine of at least {SIMILAR_COSINE:g}), most of all {found.names[a]} and"
-            f" {found.names[b]} ({found.cosines[a, b]:.3f}): from this survey alone the two cannot be named apart."
+            f" {found.names[b]} ({found.cosines[a, b]:.3f}): this survey alone cannot tell the two apart."
         )
         counts = {e.name: sum(bool(e.cosines[pair] < SIMILAR_COSINE) for pair in pairs) for e in found.extensions}
         best = max(counts, key=lambda name: counts[name])
-        verb = f"would part {counts[best]} of the {len(pairs)}" if counts[best] else "would part any of them"
+        verb = f"would separate {counts[best]} of the {len(pairs)}" if counts[best] else "would separate any of them"
         parts.append(f"{'None of the further measurements' if not counts[best] else best.capitalize()} {verb}.")
     else:
-        parts.append("No two effects on the mean look alike.")
+        parts.append("No two systematic effects look alike.")
     return " ".join(parts)
 
 
 def _part(found: Identifiability, picture: bytes) -> dict[str, Any]:
+    """What the template shows of one analysis."""
     return {
         "instrument": _INSTRUMENTS[found.sensor],
-        "words": in_words(found),
+        "words": summarise(found),
         "picture": picture,
         "rows": [_row(found, row) for row in range(len(found.names))],
         "extensions": [extension.name for extension in found.extensions],
@@ -88,24 +90,26 @@ def _part(found: Identifiability, picture: bytes) -> dict[str, Any]:
             (found.names[a], found.names[b], found.cosines[a, b], [e.cosines[a, b] for e in found.extensions])
             for a, b in found.pairs()
         ],
-        "others": [(each, _value(each.parameter, each.seen_from)) for each in found.others],
+        "others": [(each, _format_value(each.parameter, each.seen_from)) for each in found.others],
         "reference_error_m": found.reference_error_m,
     }
 
 
 def _row(found: Identifiability, row: int) -> _Row:
+    """The table's row of one effect."""
     best, named = found.best_extension(row), found.named_from[row]
-    helps = best.named_from[row] < _HELPS * named
+    helps = best.named_from[row] < _WORTHWHILE_RATIO * named
     return _Row(
         name=found.names[row] + (f" ({found.shown[row]})" if found.shown[row] else ""),
         parameter=found.parameters[row],
         survival=f"{100 * found.survival[row]:.1f} %",
-        seen_from=_value("", found.seen_from[row]),
-        named_from=_value("", named),
+        seen_from=_format_value("", found.seen_from[row]),
+        named_from=_format_value("", named),
         alike=", ".join(f"{found.names[other].partition('.')[2]} {found.cosines[row, other]:.2f}" for other in found.alike(row)),
-        extension=f"{_value('', best.named_from[row])} with {best.name}" if helps else "",
+        extension=f"{_format_value('', best.named_from[row])} with {best.name}" if helps else "",
     )
 
 
-def _value(parameter: str, value: float) -> str:
-    return f"{parameter} {number(value, 2) if np.isfinite(value) else _NEVER}".strip()
+def _format_value(parameter: str, value: float) -> str:
+    """Format a parameter's value; "never" where it is infinite."""
+    return f"{parameter} {format_number(value, 2) if np.isfinite(value) else _NEVER}".strip()

@@ -1,4 +1,4 @@
-"""Parameters as people read them: a value and its standard deviation in a unit that suits them, with no digit too many."""
+"""Format parameters for readers: value and standard deviation in a suitable unit, without insignificant digits."""
 
 from __future__ import annotations
 
@@ -10,53 +10,62 @@ _UNITS = {
     "px": (("px", 1.0, 1e-4),),
     "ppm": (("ppm", 1.0, 1e-2),),
 }
-"""By the suffix of a key: units, the smallest first, how many go into the key's own, and the finest step that is printed."""
-_LARGEST = 1000.0
-"""From so many of a unit on the next larger one serves."""
+"""By the suffix of a key: units from the smallest, their number in one of the key's unit, and the smallest step that is
+printed."""
+_LARGEST_NUMBER = 1000.0
+"""From this number on the next larger unit is used."""
 _DIGITS = 5
 """Significant digits of a value without a unit of its own."""
 
 
-def with_std(key: str, value: float, std: float | None = None) -> str:
-    """`4.02 ± 0.05 mm`: a parameter, in the unit that the suffix of its key names, and its standard deviation.
+def format_with_std(key: str, value: float, std: float | None = None) -> str:
+    """Format a parameter with its standard deviation, such as `4.02 ± 0.05 mm`.
 
-    The deviation has one significant digit, two where the first is 1, and the value ends where it does; a deviation below the
-    finest step that is printed is `< 0.001 mm`. Without a deviation a value has four significant digits.
+    The standard deviation has one significant digit, two where the first is 1, and the value ends at the same digit. A standard
+    deviation below the smallest step that is printed becomes `< 0.001 mm`. Without one, the value has four significant digits.
+
+    Parameters
+    ----------
+    key : key of the parameter, whose suffix names its unit.
+    value : value in that unit.
+    std : standard deviation in that unit, if known.
     """
-    unit, factor, step = _unit(key, value, std)
+    unit, factor, step = _choose_unit(key, value, std)
     value *= factor
     if not std or not math.isfinite(std):
-        return _joined(f"{float(f'{value:.4g}'):g}", unit)
+        return _join_unit(f"{float(f'{value:.4g}'):g}", unit)
     std *= factor
     if step is None:
         step = 10.0 ** (_exponent(value) - _DIGITS + 1) if value else 0.0
     if std < step / 2:
-        return _joined(f"{_to_step(value, step)} \N{PLUS-MINUS SIGN} < {_to_step(step, step)}", unit)
+        return _join_unit(f"{_round_to_step(value, step)} \N{PLUS-MINUS SIGN} < {_round_to_step(step, step)}", unit)
     leading, exponent = f"{std:.1e}".split("e")
     last = max(10.0 ** (int(exponent) - leading.startswith("1")), step)
-    return _joined(f"{_to_step(value, last)} \N{PLUS-MINUS SIGN} {_to_step(std, last)}", unit)
+    return _join_unit(f"{_round_to_step(value, last)} \N{PLUS-MINUS SIGN} {_round_to_step(std, last)}", unit)
 
 
-def _unit(key: str, value: float, std: float | None) -> tuple[str, float, float | None]:
-    """Name of a unit, how many go into the key's own, and the finest step in it; None: by the value's digits."""
+def _choose_unit(key: str, value: float, std: float | None) -> tuple[str, float, float | None]:
+    """Name of a unit, its number in one of the key's unit, and the smallest step in it; None for the step: by the digits of the
+    value."""
     choice = _UNITS.get(key.rpartition("_")[2])
     if choice is None:
         return "", 1.0, None
     largest = max(abs(value), abs(std or 0.0))
-    return next((each for each in choice if largest * each[1] < _LARGEST), choice[-1])
+    return next((each for each in choice if largest * each[1] < _LARGEST_NUMBER), choice[-1])
 
 
-def _to_step(value: float, step: float) -> str:
-    """A value rounded to a step that is a power of ten."""
+def _round_to_step(value: float, step: float) -> str:
+    """Format a value rounded to a step that is a power of ten."""
     digits = -_exponent(step)
     text = f"{round(value, digits) + 0.0:.{max(digits, 0)}f}"
     return text if len(text.lstrip("-")) < 12 else f"{value:.{_DIGITS}g}"
 
 
 def _exponent(value: float) -> int:
-    """Of the first significant digit."""
+    """Decimal exponent of the first significant digit."""
     return int(f"{abs(value):e}".partition("e")[2])
 
 
-def _joined(text: str, unit: str) -> str:
+def _join_unit(text: str, unit: str) -> str:
+    """Append a unit, if there is one."""
     return f"{text} {unit}" if unit else text

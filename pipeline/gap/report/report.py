@@ -1,4 +1,4 @@
-"""The files of a diagnosis: gap.json, the model after, points before and after, report and pictures."""
+"""Write the files of a diagnosis: gap.json, the model after, points before and after, report and figures."""
 
 from __future__ import annotations
 
@@ -12,38 +12,39 @@ from pipeline.formats.files.atomic import write_json, write_text, writing
 from pipeline.formats.measurements.measurement import Measurement
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points.laz import write_laz
-from pipeline.gap.decisions import deciding
-from pipeline.gap.naming.verdict import closing
+from pipeline.gap.naming.verdict import describe_closing
 from pipeline.gap.naming.workflow import GapDiagnosis
-from pipeline.gap.report.advice import advice, page_of
+from pipeline.gap.report.advice import advice_on, page_of
 from pipeline.gap.report.contributions import contributions
-from pipeline.gap.report.covariate_ranking import steady, where
+from pipeline.gap.report.covariate_ranking import inliers, rank_disagreements
+from pipeline.gap.report.datum_scale import estimate_scale
 from pipeline.gap.report.figures import gap_figure, maps_figure, matrix_figure, profiles_figure
-from pipeline.gap.report.in_words import (
+from pipeline.gap.report.wording import (
     answer,
-    decimal,
-    gap_in_words,
-    number,
+    covariate_with_unit,
+    describe_gap,
+    format_decimal,
+    format_number,
+    format_parameters,
+    format_value,
     outcome,
-    rounded,
-    sentence,
-    shown,
-    spread_outcome,
+    round_entry,
     title,
-    values,
-    with_unit,
+    variance_outcome,
+    verdict_in_words,
 )
-from pipeline.gap.report.scale import scale_of
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
+from pipeline.gap.thresholds import use_thresholds
 from pipeline.report.page import p_value_in_words, template
 from scene.geometry.mesh import FloatArray
 
 _MOST_TRIED = 25
+"""Most explanations that the report lists."""
 
 
 def to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
-    """gap.json, by the thresholds of the diagnosis."""
-    with deciding(found.decisions):
+    """Return the content of gap.json."""
+    with use_thresholds(found.thresholds):
         return _to_dict(found, measurement)
 
 
@@ -54,43 +55,43 @@ def _to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
         "schema": 1,
         "verdict": found.verdict,
         "effects": [effect.to_dict() for effect in found.effects],
-        "where": where(found),
+        "where": rank_disagreements(found),
         "scene_changes": [change.to_dict(measurement.frame) for change in found.changes],
         "sensor": measurement.sensor,
-        "registration": poses[0] | _scale(found),
+        "registration": poses[0] | _scale_entry(found),
         **({"further_registrations": poses[1:]} if len(poses) > 1 else {}),
         "identifiability": found.identifiability,
         "gap": found.gap.to_dict() if found.gap else None,
         "remaining": found.remaining,
-        "decisions": found.decisions.model_dump(),
+        "decisions": found.thresholds.model_dump(),
         "seconds": round(found.seconds, 2),
     }
 
 
-def _scale(found: GapDiagnosis) -> dict[str, Any]:
-    """Of a surface without cameras; null where its relief does not tell."""
+def _scale_entry(found: GapDiagnosis) -> dict[str, Any]:
+    """Entry of the scale, for a surface without cameras; null where its relief does not show it."""
     if not isinstance(found.residuals, SurfaceResiduals):
         return {}
-    scale = scale_of(found)
+    scale = estimate_scale(found)
     return {"scale_ppm": {"value": None, "std": None} if scale is None else scale.to_dict()}
 
 
 def _registration(pose: FloatArray, measurement: Measurement) -> dict[str, Any]:
-    """A set-up's pose (6,), wall frame, in the world frame."""
+    """The pose (6,) of a set-up, converted from the wall frame to the world frame."""
     axes = measurement.frame.rotation
     return {"translation_m": (axes.T @ pose[:3]).tolist(), "rotation_rad": (axes.T @ pose[3:]).tolist()}
 
 
-def write(out: Path, found: GapDiagnosis, measurement: Measurement) -> Path:
-    """Write all files of a diagnosis into `out`, once all pictures are drawn; returns report.html.
+def write_report(out: Path, found: GapDiagnosis, measurement: Measurement) -> Path:
+    """Write all files of a diagnosis into `out` and return the path of report.html. Nothing is written if a figure fails.
 
-    before.laz and after.laz hold `residual_m`, positive where the measured surface lies deeper than the predicted one; of
-    several effects before.laz holds what each takes away by itself, `effect_1_m` ..., in the order of gap.json.
+    before.laz and after.laz hold `residual_m`, positive where the measured surface lies deeper than the predicted one. With
+    several effects, before.laz also holds what each removes alone, `effect_1_m`, ..., in the order of gap.json.
     """
-    with deciding(found.decisions):
+    with use_thresholds(found.thresholds):
         parts = contributions(found, measurement) if len(found.effects) > 1 else np.empty((0, len(found.before)))
         pictures = _pictures(found)
-        page = _page(found, pictures)
+        page = _render_page(found, pictures)
     write_json(out / "gap.json", to_dict(found, measurement))
     write_text(out / "model_after.yaml", _yaml(found.model_after.model_dump(mode="json", exclude_defaults=False)))
     points = measurement.frame.to_world(measurement.cloud.points[found.residuals.index])
@@ -106,48 +107,49 @@ def write(out: Path, found: GapDiagnosis, measurement: Measurement) -> Path:
     return out / "report.html"
 
 
-def summary(found: GapDiagnosis) -> str:
-    """The verdict in some lines of text."""
-    with deciding(found.decisions):
+def summarise(found: GapDiagnosis) -> str:
+    """Return the verdict and the main numbers in a few lines of text."""
+    with use_thresholds(found.thresholds):
         return _summary(found)
 
 
 def _summary(found: GapDiagnosis) -> str:
-    lines, scale = [f"{found.verdict}: {sentence(found)}"], scale_of(found)
+    lines, scale = [f"{found.verdict}: {verdict_in_words(found)}"], estimate_scale(found)
     lines += [] if scale is None else [f"  {scale.words}"]
     if found.verdict == "insufficient_data":
-        lines += [f"  {found.remaining['note']}", f"  to measure: {_request(found)}"]
+        lines += [f"  {found.remaining['note']}", f"  to measure: {_describe_needed_data(found)}"]
     for effect in found.effects:
         alike = f"; cannot be told from {', '.join(effect.alike)}" if effect.alike else ""
-        lines.append(f"  {effect.name} ({values(effect)}){alike}")
+        lines.append(f"  {effect.name} ({format_parameters(effect)}){alike}")
     if found.changes:
         regions = "1 region" if len(found.changes) == 1 else f"{len(found.changes)} regions"
         lines.append(f"  set aside: {regions} where the scene itself moved")
     if found.gap is not None:
-        factor, unit = found.gap.shown
+        factor, unit = found.gap.display_unit
         scores = ", ".join(f"{factor * value:.3f} {unit} {name}" for name, value in found.gap.scores.items())
-        lines.append(f"  gap {scores}: {closing(found.gap, found.mended)}")
+        lines.append(f"  gap {scores}: {describe_closing(found.gap, found.model_changed)}")
     if found.verdict == "no_gap" and found.remaining.get("note"):
         lines.append(f"  note: {found.remaining['note']}")
     return "\n".join(lines)
 
 
-def _request(found: GapDiagnosis) -> str:
-    """What insufficient_data asks for."""
+def _describe_needed_data(found: GapDiagnosis) -> str:
+    """What to measure if the verdict is insufficient_data."""
     if found.evidence.much_moved:
         return (
             "stable_areas in measurement.yaml (boxes or polygons, wall frame, m) where nothing moved, or a reference of the same "
-            "time; what moved is measured as a difference of two epochs, not as an effect of the sensor."
+            "time. Movements of the rock are measured as a difference of two epochs, not as an effect of the sensor."
         )
     return (
-        f"at least {found.decisions.points.fewest} points on smooth rock of stable ground, spread over the wall: scan or match "
-        "more densely, take in more of the wall, or widen stable_areas (wall frame, m) where they leave out what did not move."
+        f"at least {found.thresholds.points.fewest} points on smooth rock of stable ground, spread over the wall: scan or match "
+        "more densely, include more of the wall, or enlarge stable_areas (wall frame, m) where they exclude stable rock."
     )
 
 
 def _pictures(found: GapDiagnosis) -> dict[str, bytes]:
+    """The figures by file name, as PNG."""
     pictures = {"maps.png": maps_figure(found)} if len(found.residuals) else {}
-    if steady(found).any():
+    if inliers(found).any():
         pictures["profiles.png"] = profiles_figure(found)
     if found.gap is not None:
         pictures["gap.png"] = gap_figure(found.gap)
@@ -158,8 +160,9 @@ def _pictures(found: GapDiagnosis) -> dict[str, bytes]:
     return pictures
 
 
-def _page(found: GapDiagnosis, pictures: dict[str, bytes]) -> str:
-    rows = where(found)
+def _render_page(found: GapDiagnosis, pictures: dict[str, bytes]) -> str:
+    """The page report.html."""
+    rows = rank_disagreements(found)
     tried = sorted(found.tried, key=lambda item: -item.score)
     best = tried[0].score if tried else 0.0
     after = found.model_after.model_dump(mode="json")
@@ -167,26 +170,26 @@ def _page(found: GapDiagnosis, pictures: dict[str, bytes]) -> str:
         found=found,
         title=title(found),
         answer=answer(found, rows),
-        scores=gap_in_words(found),
-        advice=advice,
+        scores=describe_gap(found),
+        advice=advice_on,
         page_of=page_of,
         pictures=pictures,
         where=rows,
         tried=[(item, best - item.score, outcome(found, tried, item)) for item in tried[:_MOST_TRIED]],
         more=max(len(tried) - _MOST_TRIED, 0),
-        spread_tried=[(item, spread_outcome(found, item)) for item in found.spread_tried],
-        added=_yaml({"effects": [rounded(effect.entry) for effect in found.effects]}),
+        variance_tried=[(item, variance_outcome(found, item)) for item in found.variance_tried],
+        added=_yaml({"effects": [round_entry(effect.entry) for effect in found.effects]}),
         model=_yaml(after),
-        number=number,
-        decimal=decimal,
-        shown=shown,
+        number=format_number,
+        decimal=format_decimal,
+        shown=format_value,
         p_value=p_value_in_words,
-        with_unit=with_unit,
-        request=_request(found),
+        with_unit=covariate_with_unit,
+        request=_describe_needed_data(found),
         total=sum(found.timings.values()) or 1.0,
     )
 
 
 def _yaml(content: dict[str, Any]) -> str:
-    """Lists of numbers stand in lines, not one number below another."""
+    """YAML in which lists of numbers stay on one line."""
     return yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110)

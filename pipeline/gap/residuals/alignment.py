@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement
-from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.residuals import BoolArray, Residuals, Rows
 from pipeline.gap.residuals.several_scans import residuals_of_scans
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, surface_residuals
 from pipeline.gap.residuals.tls_residuals import tls_residuals
+from pipeline.gap.thresholds import thresholds
 from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 
@@ -58,7 +58,7 @@ def fit_pose_robustly(residuals: Residuals) -> tuple[FloatArray, FloatArray, flo
         value = residuals.value - residuals.pose_jacobian @ pose
         z = np.abs(value / residuals.sigma)
         scale = max(1.0, nmad(z[residuals.usable], 0.0))
-        kept = residuals.usable & (z < decided().points.unregistered * scale)
+        kept = residuals.usable & (z < thresholds().points.registration_outlier_sigmas * scale)
         if kept.sum() < _FEWEST:
             kept = residuals.usable
         if np.array_equal(kept, before):  # converged

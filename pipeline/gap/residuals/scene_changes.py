@@ -33,10 +33,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.special import ndtri
 
 from pipeline.change.robust import nmad
-from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.sensor_view import NEIGHBOURS, SensorView
 from pipeline.gap.residuals.standardized import group_medians, nmad_along_covariates, standardize
+from pipeline.gap.thresholds import thresholds
 from scene.geometry.frame import WallFrame
 from scene.geometry.mesh import FloatArray
 
@@ -128,10 +128,10 @@ def find_scene_changes(residuals: Residuals, view: SensorView, eligible: BoolArr
         shared = np.sqrt(np.maximum(scatter**2 - _WHITE_MEDIAN_STD**2, 0.0))
         error = np.stack([np.abs(departure / np.where(z == 0, np.inf, z)), shared * residuals.sigma]) * residuals.unit_m
         faint = medians / np.maximum(scatter, _LEAST_MEDIAN_STD)
-        faint[np.abs(medians) * residuals.sigma * residuals.unit_m < decided().changes.smallest] = 0.0
+        faint[np.abs(medians) * residuals.sigma * residuals.unit_m < thresholds().changes.smallest_departure] = 0.0
         label, limit = _components(z, faint, view, eligible)
         members = np.flatnonzero(label >= 0)
-        beside = view.near(members, decided().changes.margin) if len(members) else np.zeros(len(residuals), dtype=bool)
+        beside = view.near(members, thresholds().changes.margin) if len(members) else np.zeros(len(residuals), dtype=bool)
         if not (beside & ~before).any():
             break
     limited = departure * np.minimum(1.0, limit / np.maximum(np.abs(z), 1e-12))
@@ -168,8 +168,8 @@ def moved_share(residuals: Residuals, view: SensorView, eligible: BoolArray) -> 
         return 0.0
     part = residuals.part(known)
     medians = view.part(known).neighbour_median(part.value / part.sigma)
-    far = np.abs(medians) * part.sigma * part.unit_m > decided().changes.smallest
-    return float(np.mean(far & (np.abs(medians) > decided().changes.moved_sigmas)))
+    far = np.abs(medians) * part.sigma * part.unit_m > thresholds().changes.smallest_departure
+    return float(np.mean(far & (np.abs(medians) > thresholds().changes.moved_sigmas)))
 
 
 def _components(z: FloatArray, faint: FloatArray, view: SensorView, eligible: BoolArray) -> tuple[NDArray[np.int64], FloatArray]:
@@ -177,12 +177,12 @@ def _components(z: FloatArray, faint: FloatArray, view: SensorView, eligible: Bo
 
     `z`: (n,) standardised residuals; `faint`: (n,) standardised medians of neighbours.
     """
-    exceeds = np.abs(faint) > decided().changes.faint
+    exceeds = np.abs(faint) > thresholds().changes.faint_sigmas
     side = np.where(exceeds, np.sign(faint), np.sign(z)) * (exceeds | (np.abs(z) > _LEVELS[0]))
     first, second = view.neighbour_pairs(np.flatnonzero(side))
     together = side[first] * side[second] > 0
     pairs, size = (first[together], second[together]), np.abs(z)
-    least = max(decided().changes.middle_sigmas, _correlated_sigmas(z, view, eligible))
+    least = max(thresholds().changes.median_sigmas, _correlated_sigmas(z, view, eligible))
     core = _faint_cores(faint, exceeds, pairs, eligible)
     for sign, level, ratio in product((1.0, -1.0), _LEVELS, _RATIOS):
         core |= _significant(sign * z, level, ratio, pairs, eligible, least)
@@ -201,7 +201,7 @@ def _faint_cores(faint: FloatArray, exceeds: BoolArray, pairs: Pairs, eligible: 
     inside = label >= 0
     highest = np.zeros(int(label.max(initial=-1)) + 1)
     np.maximum.at(highest, label[inside], np.where(eligible, np.abs(faint), 0.0)[inside])
-    return np.isin(label, np.flatnonzero(highest > -ndtri(decided().changes.by_chance / (2 * eligible.sum())))) & inside
+    return np.isin(label, np.flatnonzero(highest > -ndtri(thresholds().changes.false_changes / (2 * eligible.sum())))) & inside
 
 
 def _agreeing(pairs: Pairs, size: FloatArray, ratio: float) -> Pairs:
@@ -229,8 +229,8 @@ def _significant(z: FloatArray, level: float, ratio: float, pairs: Pairs, eligib
     for _ in range(len(count)):
         stray = np.sort(z[inside][~accepted[label[inside]]])
         by_chance = _log_expected(count, int(eligible.sum()), len(stray), _agreeing_share(stray, ratio))
-        rare = by_chance < np.log(decided().changes.by_chance / _SEARCHES)
-        again = (count >= decided().changes.fewest) & (middle > least) & rare
+        rare = by_chance < np.log(thresholds().changes.false_changes / _SEARCHES)
+        again = (count >= thresholds().changes.fewest) & (middle > least) & rare
         if np.array_equal(again, accepted):
             break
         accepted = again
@@ -270,7 +270,7 @@ def _correlated_sigmas(z: FloatArray, view: SensorView, eligible: BoolArray) -> 
     chosen = counts >= NEIGHBOURS // 2
     if not chosen.any():
         return 0.0
-    return nmad(total[chosen] / (counts[chosen] + 1)) * float(-ndtri(decided().changes.by_chance / (2 * len(known))))
+    return nmad(total[chosen] / (counts[chosen] + 1)) * float(-ndtri(thresholds().changes.false_changes / (2 * len(known))))
 
 
 def _extended(core: BoolArray, size: FloatArray, pairs: Pairs, eligible: BoolArray) -> BoolArray:
@@ -313,8 +313,8 @@ def _compact(label: NDArray[np.int64], view: SensorView, points: int) -> NDArray
     place = view.scaled_coordinates[order]
     length = (np.maximum.reduceat(place, starts) - np.minimum.reduceat(place, starts)).max(axis=1)
     size = np.diff(np.append(starts, len(order))) / len(np.unique(view.epoch))
-    stripe = (length >= decided().changes.stripe) & (size <= 0.1 * length**2)
-    compact = (size * len(np.unique(view.epoch)) < decided().changes.largest_share * points) & ~stripe
+    stripe = (length >= thresholds().changes.stripe_length) & (size <= 0.1 * length**2)
+    compact = (size * len(np.unique(view.epoch)) < thresholds().changes.largest_share * points) & ~stripe
     return np.where(np.isin(label, label[order][starts][compact]), label, -1)
 
 

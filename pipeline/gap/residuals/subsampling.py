@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement
-from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.tls_residuals import pulse_count, pulse_number, recorded_polar
+from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 
 
-def subsample(measurement: Measurement, random: KeyedRandom) -> tuple[Measurement, NDArray[np.int64]]:
+def subsample_measurement(measurement: Measurement, random: KeyedRandom) -> tuple[Measurement, NDArray[np.int64]]:
     """Draw at most about `points.most` points of a laser scan or a surface; keep all points of a stereo pair.
 
     Call it after `with_scan_order`, because scan lines and times cannot be recovered from a subsample.
@@ -29,7 +29,7 @@ def subsample(measurement: Measurement, random: KeyedRandom) -> tuple[Measuremen
     -------
     The subsampled measurement, with a note if points were left out, and the (m,) rows of its points in the full one.
     """
-    count, most = len(measurement.cloud.points), decided().points.most
+    count, most = len(measurement.cloud.points), thresholds().points.most
     if isinstance(measurement, StereoMeasurement) or count <= most:
         return measurement, np.arange(count)
     share, generator, pulses = most / count, random.generator(), None

@@ -20,9 +20,9 @@ from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 
 from pipeline.formats.measurements.measurement import SurfaceMeasurement
-from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.alignment import align, fit_pose_robustly
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, point_spacing_m
+from pipeline.gap.thresholds import thresholds
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 from sensors.models.sensor_model import StereoModel, StereoNoise
@@ -128,8 +128,8 @@ def _fit_noise(points: FloatArray, value: FloatArray) -> SurfaceNoise:
             best = step, found
     step, (values, square) = best if best is not None else (1.0, without_nodes)
     shared = 4 / 9 * values[1]
-    improves = without_nodes[1] - square > decided().nodes.least_gain
-    if not improves or shared < decided().spread.least_excess * values[0]:
+    improves = without_nodes[1] - square > thresholds().grid_noise.least_gain
+    if not improves or shared < thresholds().variance.least_excess * values[0]:
         return SurfaceNoise(float(np.sqrt(without_nodes[0][0])), 0.0, 0.1, spacing, 0.0)
     own = max(values[0], 1e-4 * shared)
     return SurfaceNoise(float(np.sqrt(own)), float(np.sqrt(values[1])), step * spacing, spacing, float(shared / (own + shared)))

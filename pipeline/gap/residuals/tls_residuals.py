@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from pipeline.formats.measurements.config import ScanPattern
 from pipeline.formats.measurements.measurement import TlsMeasurement
-from pipeline.gap.decisions import decided
 from pipeline.gap.residuals.ray_hits import RayGeometry, cast_rays, redirect_hits
 from pipeline.gap.residuals.residuals import BoolArray, ExpectedPulses, Residuals, range_derivative
 from pipeline.gap.residuals.scan_simulation import mean_beam_directions, predict_ranges
+from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Stage
@@ -134,7 +134,7 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
     hit = np.isfinite(predicted) & np.isfinite(distance)
     flat = (seen.curvature < np.maximum(_EDGE_SIGMAS * sigma, 0.01)) & (slope < _LARGEST_SLOPE)
     if seen.scatter is not None:
-        flat &= seen.scatter < decided().points.scattered
+        flat &= seen.scatter < thresholds().points.most_reference_scatter
     whole = TlsResiduals(
         value=measured - predicted,
         sigma=sigma,

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.gap.decisions import decided
-from pipeline.gap.other.spread import spread_candidates
+from pipeline.gap.noise_and_edges.variance_model import variance_candidates
 from pipeline.gap.survey.survey_design import DETECTION_SNR, view_signatures
 from pipeline.gap.survey.survey_views import Survey, SurveyView, TlsView
+from pipeline.gap.thresholds import thresholds
 from sensors.effects import catalogue
 from sensors.effects.base import Effect
 from sensors.effects.detection_limit import DetectionLimit
@@ -75,9 +75,9 @@ def _systematic_names(view: SurveyView) -> set[str]:
 def _variance_effects(view: SurveyView) -> list[NoiseOrLossEffect]:
     """Effects on the variance: sigma_i² = model + theta f_i has the information sum (f_i / sigma_i²)² / 2 on theta."""
     residuals = view.residuals
-    candidates = spread_candidates(residuals)
+    candidates = variance_candidates(residuals)
     found: dict[str, NoiseOrLossEffect] = {}
-    excess = decided().spread.least_excess
+    excess = thresholds().variance.least_excess
     for candidate in candidates:
         form = candidate.variance.sum(axis=1) / residuals.sigma**2
         information = 0.5 * float(np.sum(form**2)) * view.point_count / len(residuals)

@@ -1,0 +1,119 @@
+"""Draw public definitions, pages and messages for readers who have not seen the code, and write the page of their grades.
+
+    python benchmarks/readers/draw.py SEED OUT.json         60 definitions, 15 pages, 40 messages, each with a number
+    python benchmarks/readers/draw.py --page                docs/validation/readers.md from the grades that are kept
+
+A reader says of each item what it does, what its arguments are and why it exists, and a grade of how well that could be told:
+3 at once, 2 after a second reading, 1 in part, 0 not at all. Grades are kept in docs/validation/readers/.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import random
+import statistics
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+FOLDER, PAGE = ROOT / "docs" / "validation" / "readers", ROOT / "docs" / "validation" / "readers.md"
+PACKAGES = ("scene", "sensors", "pipeline")
+COUNTS = {"definition": 60, "page": 15, "message": 40}
+_HEAD = """# What readers understand
+
+This page shows how well readers who had not seen the code understood it. Each round drew 60 public definitions, 15 pages and 40
+messages at random. A reader saw a definition's signature and docstring alone, a page, or a message, said what it means, and
+gave a grade: 3 if it could be told at once, 2 after a second reading, 1 in part, 0 not at all. What got less than 2 was
+rewritten afterwards.
+
+"""
+
+
+def definitions() -> Iterator[dict[str, str]]:
+    """Public functions, classes and methods with their signatures and docstrings."""
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            for node in tree.body:
+                yield from _public(node, f"{path.relative_to(ROOT)}")
+
+
+def _public(node: ast.stmt, place: str) -> Iterator[dict[str, str]]:
+    if not isinstance(node, ast.FunctionDef | ast.ClassDef) or node.name.startswith("_"):
+        return
+    yield {"where": f"{place}: {node.name}", "text": f"{_signature(node)}\n{ast.get_docstring(node) or '(no docstring)'}"}
+    for inner in node.body if isinstance(node, ast.ClassDef) else ():
+        if isinstance(inner, ast.FunctionDef) and not inner.name.startswith("_") and ast.get_docstring(inner):
+            yield {"where": f"{place}: {node.name}.{inner.name}", "text": f"{_signature(inner)}\n{ast.get_docstring(inner)}"}
+
+
+def _signature(node: ast.FunctionDef | ast.ClassDef) -> str:
+    if isinstance(node, ast.FunctionDef):
+        returns = f" -> {ast.unparse(node.returns)}" if node.returns else ""
+        return f"def {node.name}({ast.unparse(node.args)}){returns}"
+    fields = [ast.unparse(each) for each in node.body if isinstance(each, ast.AnnAssign)]
+    return "\n    ".join([f"class {node.name}", *fields])
+
+
+def pages() -> Iterator[dict[str, str]]:
+    """Pages of the documentation that people read."""
+    for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
+        if "readers" not in path.parts:
+            yield {"where": str(path.relative_to(ROOT)), "text": "(read the file)"}
+
+
+def messages() -> Iterator[dict[str, str]]:
+    """Errors that users see, as they stand in the code."""
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "InputError" and node.args:
+                    parts = [ast.unparse(node.args[0]), *(f"{key.arg}: {ast.unparse(key.value)}" for key in node.keywords)]
+                    yield {"where": f"{path.relative_to(ROOT)}:{node.lineno}", "text": "; ".join(parts)}
+
+
+def drawn(seed: int) -> list[dict[str, Any]]:
+    """The items of one round."""
+    source = random.Random(seed)
+    items: list[dict[str, Any]] = []
+    for kind, every in (("definition", definitions()), ("page", pages()), ("message", messages())):
+        items += [{"kind": kind, **each} for each in source.sample(list(every), COUNTS[kind])]
+    return [{"number": number, **each} for number, each in enumerate(items, start=1)]
+
+
+def page() -> str:
+    """The page, from files of grades: a list of {number, kind, where, grade, understood}."""
+    lines = ["| round | kind | items | median grade | below 2 |", "|---|---|---|---|---|"]
+    failed = ["| round | item | grade | what was unclear |", "|---|---|---|---|"]
+    for number, path in enumerate(sorted(FOLDER.glob("*.json")), start=1):
+        graded = json.loads(path.read_text(encoding="utf-8"))
+        for kind in COUNTS:
+            grades = [each["grade"] for each in graded if each["kind"] == kind]
+            if grades:
+                below = sum(grade < 2 for grade in grades)
+                lines.append(f"| {number} | {kind}s | {len(grades)} | {statistics.median(grades):g} | {below} |")
+        failed += [
+            f"| {number} | `{each['where']}` | {each['grade']} | {each['understood'].replace('|', '/')} |"
+            for each in graded
+            if each["grade"] < 2
+        ]
+    end = (
+        "\nThe draws and grades are in `docs/validation/readers/`; `python benchmarks/readers/draw.py --page` writes this page.\n"
+    )
+    return _HEAD + "\n".join(lines) + "\n\n## What got less than 2\n\n" + "\n".join(failed) + "\n" + end
+
+
+def main() -> None:
+    if sys.argv[1:] == ["--page"]:
+        PAGE.write_text(page(), encoding="utf-8")
+        return
+    seed, out = sys.argv[1:]
+    Path(out).write_text(json.dumps(drawn(int(seed)), indent=1), encoding="utf-8")
+    print(f"{sum(COUNTS.values())} items: {out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,136 @@
+"""List the candidate explanations of the mean (families) that a measurement allows: the catalogue, non-parametric terms and
+nulls."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.formats.measurements.measurement import Measurement
+from pipeline.gap.mean.candidates import (
+    MOST_CYCLES,
+    MOST_CYCLES_OF_A_SENSOR,
+    Candidate,
+    SineGrid,
+    angle_error_terms,
+    half_pixel_sine,
+    line_pattern_terms,
+    nonparametric_terms,
+    polynomial_term,
+    robust_extent,
+    spatial_null_candidates,
+)
+from pipeline.gap.mean.signatures import systematic_families
+from pipeline.gap.residuals.disparity_raster import raster_spacing_px
+from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.thresholds import thresholds
+from scene.geometry.mesh import FloatArray
+from sensors.effects import EFFECTS, effect_of
+from sensors.effects.angle_empirical import AngleEmpirical
+
+PERIODIC = {effect.tag(): effect.searched.along for effect in EFFECTS if effect.searched and effect.searched.along != "line"}
+"""Sinusoidal effects and the covariate along which they repeat. A periodic error that is no sine belongs to none of them."""
+_IMAGE = ("image_x", "image_y")
+_NO_NONPARAMETRIC_TERM = ("edge_step", "line", "disparity_fraction")
+_MOST_POINTS = 5_000
+"""Number of points on which signatures are compared with the curves that the model already contains."""
+
+
+def model_has(measurement: Measurement, name: str) -> bool:
+    """Whether the model contains an effect already."""
+    return any(effect.name == name for effect in measurement.model.effects)
+
+
+def catalogue_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
+    """Return the effects of the catalogue that the recorded fields allow, with a Gaussian prior of their size."""
+    return [_with_prior(each) for each in systematic_families(part, measurement)]
+
+
+def candidate_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
+    """Return every explanation of the mean that the recorded fields allow: catalogue, non-parametric terms, spatial null
+    candidates."""
+    named = catalogue_families(measurement, part)
+    lowest = {PERIODIC[each.name]: each.frequencies[0] for each in named if isinstance(each, SineGrid) and each.name in PERIODIC}
+    free = [
+        form
+        for name, values in part.covariates.items()
+        if name not in _NO_NONPARAMETRIC_TERM and np.ptp(values) > 0
+        for form in nonparametric_terms(name, values, lowest.get(name, np.inf), _most_cycles(name, values))
+    ]
+    if isinstance(part, TlsResiduals):
+        angles = _angle_terms(part)
+        named, free = _without_described_by_curves(named, angles, measurement, part), [*free, *angles]
+    first, second = part.position_covariates
+    both = polynomial_term(first, second, part.covariates[first], part.covariates[second])
+    return [*named, *free, *_half_pixel_sines(part), both, *_repeating_terms(part), *spatial_null_candidates(part.wall_xy)]
+
+
+def _most_cycles(name: str, values: FloatArray) -> float:
+    """Highest number of cycles of a wave along a covariate; along an image's axes as many as the raster can show."""
+    if name not in _IMAGE:
+        return MOST_CYCLES
+    step = raster_spacing_px(values)
+    return MOST_CYCLES_OF_A_SENSOR if step is None else min(MOST_CYCLES_OF_A_SENSOR, robust_extent(values) / (2 * step))
+
+
+def _angle_terms(part: TlsResiduals) -> list[Candidate | SineGrid]:
+    """Non-parametric terms of errors of both angles. An error of an angle changes the range by the slope of the surface."""
+    angles = {"azimuth": part.geometry.azimuth, "zenith": part.geometry.zenith}
+    levers = {"azimuth": -part.geometry.by_azimuth, "zenith": -part.geometry.by_zenith}
+    along = [(angle, name, values) for angle in levers for name, values in angles.items() if np.ptp(values) > 0]
+    return [form for angle, name, values in along for form in angle_error_terms(angle, name, values, levers[angle])]
+
+
+def _without_described_by_curves(
+    named: list[Candidate | SineGrid], angles: list[Candidate | SineGrid], measurement: Measurement, part: TlsResiduals
+) -> list[Candidate | SineGrid]:
+    """Leave out effects that a curve of an angle's error, already in the model, describes too."""
+    curves = {(each.angle, each.covariate) for each in measurement.model.effects if isinstance(each, AngleEmpirical)}
+    held = [each.columns for each in angles if isinstance(each, Candidate) and (each.angle, each.name) in curves]
+    if not held:
+        return named
+    rows = slice(None, None, max(len(part) // _MOST_POINTS, 1))
+    basis = np.linalg.qr(np.concatenate([part.pose_jacobian[rows], *(columns[rows] for columns in held)], axis=1))[0]
+
+    def left(columns: FloatArray) -> float:
+        """Share of a signature's sum of squares that pose and curves leave."""
+        return float(np.sum((columns - basis @ (basis.T @ columns)) ** 2) / np.sum(columns**2))
+
+    least = thresholds().mean.absorbed_share
+    return [each for each in named if isinstance(each, SineGrid) or left(each.columns[rows]) > least]
+
+
+def _repeating_terms(part: Residuals) -> list[Candidate]:
+    """Terms that repeat after a few scan lines, or after a few columns or rows of a pixel raster."""
+    found = part.covariates
+    if "line" in found and np.ptp(found["line"]) > 0:
+        turn = float(np.polyfit(found["line"], found["azimuth"], 1)[0])
+        return line_pattern_terms("azimuth", found["line"], turn)
+    steps = {name: step for name in _IMAGE if name in found and (step := raster_spacing_px(found[name])) is not None}
+    return [
+        form for name, step in steps.items() for form in line_pattern_terms(name, (found[name] - found[name].min()) / step, step)
+    ]
+
+
+def _half_pixel_sines(part: Residuals) -> list[SineGrid]:
+    """Sines of twice the pixel frequency, if the disparities span enough pixels for locking."""
+    disparity = part.covariates.get("disparity")
+    if disparity is None or robust_extent(disparity) < thresholds().locking.fewest_cycles:
+        return []
+    return half_pixel_sine("disparity", disparity)
+
+
+def _with_prior(candidate: Candidate | SineGrid) -> Candidate | SineGrid:
+    """Add the prior of an effect's size, so that two effects that nearly cancel cannot both become arbitrarily large."""
+    if isinstance(candidate, SineGrid):
+        return candidate
+    typical = effect_of(candidate.name).typical_sizes()
+    units = np.eye(len(candidate.names))
+    first = next(iter(typical.values()))
+    sizes = [
+        typical.get(key, first) / max(abs(candidate.parameters(unit)[key]), 1e-300) if not key.startswith("phase") else first
+        for key, unit in zip(candidate.names, units, strict=True)
+    ]
+    return replace(candidate, prior_precision=1 / (thresholds().mean.prior_size * np.array(sizes)) ** 2)

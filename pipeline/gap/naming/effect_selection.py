@@ -1,0 +1,353 @@
+"""Select effects from the training points: rounding and locking first, then systematic effects and noise terms in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pipeline.change.robust import nmad
+from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement
+from pipeline.gap.mean.candidates import LINE_PATTERN, SPATIAL_NULL
+from pipeline.gap.mean.search import MeanSearch
+from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
+from pipeline.gap.naming.candidate_families import candidate_families, model_has
+from pipeline.gap.naming.named_effects import (
+    Estimate,
+    NamedEffect,
+    aligned_with,
+    effect_from_estimate,
+    effect_from_locking,
+    effect_from_range_step,
+    effect_from_variance,
+    merge_angle_curves,
+    within_bounds,
+)
+from pipeline.gap.naming.nonlinear_refit import (
+    SearchInput,
+    SearchOutcome,
+    absorbed_by_registration,
+    at_points_of,
+    out_of_bounds,
+    select_and_refit,
+    with_added_variance,
+    with_fitted_variance,
+)
+from pipeline.gap.noise_and_edges.grid_noise import find_grid_noise, separate_white_and_grid_noise
+from pipeline.gap.noise_and_edges.pixel_locking import NoiseBounds, find_locking
+from pipeline.gap.noise_and_edges.rounded_ranges import find_range_step
+from pipeline.gap.noise_and_edges.variance_model import NoiseRatio, VarianceScore, VarianceTerm, fit_variance_model
+from pipeline.gap.residuals.alignment import fit_pose_robustly
+from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.residuals.wall_blocks import WallCells
+from pipeline.gap.thresholds import thresholds
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from sensors.effects.angle_empirical import AngleEmpirical
+from sensors.effects.base import ShowsIn
+from sensors.effects.pixel_locking import PixelLocking
+from sensors.effects.range_quantization import RangeQuantization
+from sensors.effects.regularization_noise import RegularizationNoise
+
+_GRID_NOISE = RegularizationNoise.tag()
+NONPARAMETRIC_TERMS = ("", True)
+"""Stands for all families of non-parametric terms."""
+
+
+@dataclass(frozen=True)
+class SelectionResult:
+    """What a selection leaves beside the effects that it named.
+
+    Attributes
+    ----------
+    tried, variance_tried : systematic effects and noise terms that were tried.
+    systematic : names of the selected systematic effects, empirical ones included.
+    p_value : p-value of the misfit beside all of them, None where nothing was tried.
+    p_without_effects : p-value of the misfit without any of them, None where nothing was tried.
+    unexplained_noise : observed over predicted standard deviation within cells; 1 where a noise term explains it.
+    notes : notes for the report.
+    identifiability : cosines of the signatures, and the share of each that the pose fit leaves.
+    reference_sigma : standard deviation of the reference error, in the observable's unit.
+    noise_ratio : standard deviation of the residuals beside the systematic effects, over the predicted one.
+    """
+
+    tried: tuple[FamilyScore, ...]
+    variance_tried: tuple[VarianceScore, ...]
+    systematic: frozenset[str]
+    p_value: float | None
+    p_without_effects: float | None
+    unexplained_noise: NoiseRatio
+    notes: tuple[str, ...]
+    identifiability: dict[str, Any]
+    reference_sigma: float
+    noise_ratio: float
+
+    def p_beside(self, named: Sequence[NamedEffect]) -> float | None:
+        """Return the p-value of the misfit beside the systematic effects that were kept; None where it was not computed for this
+        set."""
+        kept = self.systematic & {item.name for item in named}
+        if kept == self.systematic:
+            return self.p_value
+        return None if kept else self.p_without_effects
+
+
+def select_effects(
+    measurement: Measurement,
+    part: Residuals,
+    noise_ratio: float,
+    random: KeyedRandom,
+    excluded: frozenset[tuple[str, bool]] = frozenset(),
+    grid_noise: VarianceTerm | None = None,
+) -> tuple[list[NamedEffect], SelectionResult]:
+    """Select the systematic effects and noise terms that explain the residuals.
+
+    The effects that the first search finds are put into the model, the residuals are computed again against it, and the search is
+    repeated beside them. Strong effects are refitted without linearising (`nonlinear_refit`). The noise terms are fitted to the
+    residuals of the search and weight the next one.
+
+    Parameters
+    ----------
+    measurement : measurement of the training points.
+    part : residuals of the training points.
+    noise_ratio : their standard deviation over the predicted one.
+    random : source of random numbers of the null distributions.
+    excluded : families (name, empirical) that are not tried, or `NONPARAMETRIC_TERMS`. A family whose best value is out of bounds
+        is added, and the selection is repeated.
+    grid_noise : grid-correlated noise that an earlier selection left. It imitates non-parametric terms and errors of the
+        reference, so the selection is repeated beside it.
+
+    Returns
+    -------
+    tuple : the named effects, and the rest of the result.
+    """
+    named: list[NamedEffect] = []
+    all_residuals, initial_noise_ratio, added = part, noise_ratio, 0.0
+    range_step = locking = None
+    if isinstance(part, TlsResiduals) and not model_has(measurement, RangeQuantization.tag()):
+        range_step = find_range_step(part.geometry.measured_m)
+    if isinstance(part, StereoResiduals) and not model_has(measurement, PixelLocking.tag()):
+        at = part.geometry
+        allowed = NoiseBounds(float(np.median(part.sigma)), nmad(fit_pose_robustly(part)[0]))
+        locking = find_locking(at.found, at.disparity, at.tangent, at.infinity, allowed)
+    if range_step is not None:
+        named.append(effect_from_range_step(range_step, part))
+        added, noise_ratio = range_step.step_m**2 / 12, 1.0
+    found_separately = set()
+    if locking is not None:
+        named.append(effect_from_locking(locking))
+        added = locking.amplitude_px**2 / 2
+        found_separately.add((PixelLocking.tag(), False))
+    part = with_added_variance(part, added)
+    out = excluded | found_separately
+    possible = (each for each in candidate_families(measurement, part) if (each.name, each.empirical) not in out)
+    families = [each for each in possible if not (each.empirical and NONPARAMETRIC_TERMS in out)]
+    noise_terms, variance_tried, note = _fit_variance(
+        measurement, part, WallCells.over(part.wall_xy), fit_pose_robustly(part)[0], random, excluded
+    )
+    if wrong := _implausible_variance(measurement, noise_terms):
+        return select_effects(measurement, all_residuals, initial_noise_ratio, random, excluded | wrong)
+    if not noise_terms and grid_noise is not None:
+        noise_terms = [grid_noise]
+
+    def variance_at(at: Residuals) -> list[VarianceTerm]:
+        fitted = _fit_variance(measurement, at, WallCells.over(at.wall_xy), fit_pose_robustly(at)[0], random, excluded)[0]
+        if fitted or grid_noise is None:
+            return fitted
+        return [replace(grid_noise, variance=grid_noise.variance[np.isin(part.index, at.index)])]
+
+    points = SearchInput(measurement, part, families, variance_at, added, random)
+    first = MeanSearch(with_fitted_variance(part, noise_terms, noise_ratio), families, random)
+    found = select_and_refit(points, first)
+    physical = any(not each.empirical for each in families)
+    names, cosines, survival = first.design.identifiability() if physical else ([], np.zeros((0, 0)), np.zeros(0))
+    wrong = out_of_bounds(measurement, found.estimates, found.residuals)
+    implausible = absorbed_by_registration(found.estimates, found.residuals, dict(zip(names, survival, strict=True)))
+    if implausible and not _explains_everything(found):
+        wrong |= implausible
+    design = found.search.design
+    left = design.residuals_after([each.candidate for each in found.beside])
+    if found.chosen and not wrong:
+        noise_terms, variance_tried, note = _fit_variance(measurement, found.residuals, design.cells, left, random, excluded)
+    if noise_terms in ([], [grid_noise]) and (_GRID_NOISE, False) not in excluded:
+        match measurement, part, found.residuals:
+            case StereoMeasurement(model=model), StereoResiduals(), StereoResiduals():
+                noise_left, shared = find_grid_noise(found.residuals, left, model, random)
+                described = any(each.candidate.empirical for each in found.estimates)
+                if noise_left is not None and grid_noise is None:
+                    noise_in_all = find_grid_noise(part, fit_pose_robustly(part)[0], model, random)[0] if described else None
+                    refound = noise_in_all or noise_left.with_constant_variance(len(part))
+                    return select_effects(measurement, all_residuals, initial_noise_ratio, random, excluded, refound)
+                kept = noise_left or (None if described else grid_noise)
+                noise_terms, note = ([], note or shared) if kept is None else ([kept], note)
+    if wrong := (wrong | _implausible_variance(measurement, noise_terms)) - excluded:
+        again, result = select_effects(measurement, all_residuals, initial_noise_ratio, random, excluded | wrong)
+        return keep_implausible_in_class(
+            again, found.chosen, frozenset(each.candidate.name for each in found.estimates), wrong
+        ), result
+    systematic = [effect_from_estimate(each, found.residuals) for each in found.estimates]
+    named += systematic
+    named += [effect_from_variance(each, part.sensor) for each in noise_terms]
+    unexplained_noise = NoiseRatio(1.0, False) if noise_terms else NoiseRatio.of(found.residuals, design.cells, left, random)
+    said = (*_note_repetition(found.estimates), *_note_oblique_waves(found), *_note_most_similar(found, part))
+    notes = (*part.notes, *_note_left_out(excluded), *filter(None, [note]), *said)
+    p_value = found.search.goodness_of_fit_p_value(found.tried)
+    alone = first.score_families(()) if systematic else ()
+    p_without_effects = first.goodness_of_fit_p_value(alone) if alone else p_value
+    systematic_names = frozenset(each.name for each in systematic)
+    table = {"names": [f"{part.sensor}.{name}" for name in names], "cosines": cosines.tolist(), "survival": survival.tolist()}
+    tried = found.chosen[0].family_scores if found.chosen else found.tried
+    without_nulls = tuple(item for item in tried if not item.name.startswith(SPATIAL_NULL))
+    sigma = design.reference_sigma([each.candidate for each in found.beside])
+    noise_ratio_left = nmad(left / found.residuals.sigma, 0.0)
+    result = SelectionResult(
+        without_nulls,
+        tuple(variance_tried),
+        systematic_names,
+        p_value,
+        p_without_effects,
+        unexplained_noise,
+        notes,
+        table,
+        sigma,
+        noise_ratio_left,
+    )
+    angles = [each for each in systematic if each.effect is AngleEmpirical]
+    if angles and not model_has(measurement, AngleEmpirical.tag()):
+        return _select_beside_angle_terms(measurement, all_residuals, angles, result, random, excluded)
+    return named, result
+
+
+def _explains_everything(found: SearchOutcome) -> bool:
+    """Whether only effects of the catalogue were found, and no misfit is left beside them."""
+    p_value = found.search.goodness_of_fit_p_value(found.tried)
+    physical = not any(each.candidate.empirical for each in found.estimates)
+    return physical and p_value is not None and p_value > thresholds().verdict.rejection_p
+
+
+def keep_implausible_in_class(
+    named: list[NamedEffect], chosen: list[SelectedEffect], before: frozenset[str], excluded: frozenset[tuple[str, bool]]
+) -> list[NamedEffect]:
+    """Add effects that were selected first, but are implausibly large, to the class of the effects named instead.
+
+    An effect belongs to the class if the linearised search says so, or if it was named only after the implausible one was
+    excluded.
+
+    Parameters
+    ----------
+    named : effects of the selection without the implausible ones.
+    chosen : explanations of the first selection.
+    before : names of the systematic effects of the first selection.
+    excluded : families that were excluded as implausible.
+    """
+    implausible = [each for each in chosen if (each.candidate.name, False) in excluded]
+    found = []
+    for item in named:
+        sensor, name = item.name.split(".", 1)
+        instead = item.kind == "physical" and item.effect.shows_in == ShowsIn.MEAN and name not in before
+        alike = {f"{sensor}.{each.candidate.name}" for each in implausible if instead or name in each.indistinguishable}
+        found.append(replace(item, alike=(*item.alike, *sorted(alike - {item.name, *item.alike}))))
+    return found
+
+
+def _select_beside_angle_terms(
+    measurement: Measurement,
+    all_residuals: Residuals,
+    angles: list[NamedEffect],
+    first: SelectionResult,
+    random: KeyedRandom,
+    excluded: frozenset[tuple[str, bool]],
+) -> tuple[list[NamedEffect], SelectionResult]:
+    """Repeat the selection with curves of an angle's error in the model: the linear model is wrong for a ray that turns far.
+
+    What the second selection finds of the same form is added to the curves of the first.
+    """
+    aligned, found, _ = aligned_with(measurement, angles, all_residuals.index)
+    at = at_points_of(found, all_residuals)
+    named, result = select_effects(aligned, at, fit_pose_robustly(at)[2], random.child("angles"), excluded)
+    joined, others = merge_angle_curves(angles, [item for item in named if item.effect is AngleEmpirical], all_residuals)
+    rest = [item for item in named if item.effect is not AngleEmpirical]
+    systematic = result.systematic | {item.name for item in angles}
+    again = replace(
+        result,
+        tried=first.tried,
+        systematic=systematic,
+        p_without_effects=first.p_without_effects,
+        identifiability=first.identifiability,
+    )
+    return [*joined, *others, *rest], again
+
+
+def _note_repetition(estimates: list[Estimate]) -> list[str]:
+    """Notes on terms that repeat after a few scan lines."""
+    lines = [each.candidate.fixed["lines"] for each in estimates if each.candidate.form.startswith(LINE_PATTERN)]
+    return [
+        f"the empirical term repeats after exactly {each} lines: think of the facets of a mirror, or of a read-out in blocks"
+        for each in lines
+    ]
+
+
+def _note_most_similar(found: SearchOutcome, part: Residuals) -> list[str]:
+    """Note on the best candidate where a misfit is left and nothing was accepted."""
+    p_value = found.search.goodness_of_fit_p_value(found.tried)
+    if found.estimates or p_value is None or p_value > thresholds().verdict.rejection_p:
+        return []
+    best = max((item for item in found.tried if not item.name.startswith(SPATIAL_NULL)), key=lambda item: item.score)
+    what = f"a change with {best.name} ({best.candidate.form})" if best.empirical else best.name
+    size = 1e3 * found.search.fitted_std(best) * float(np.median(part.unit_m))
+    return [
+        f"the remaining misfit is most similar to {what}, {size:.2g} mm (standard deviation). A reference that errs along whole "
+        "lines or columns, as in strips, looks the same; a scan from another station would separate the two"
+    ]
+
+
+def _note_oblique_waves(found: SearchOutcome) -> list[str]:
+    """Note on oblique waves on the wall that the error model of the reference does not explain."""
+    p_value = found.search.spatial_null_p_value(found.tried)
+    if p_value is None or p_value > thresholds().verdict.rejection_p:
+        return []
+    return [
+        f"the residuals contain waves at an oblique angle that the reference's error model does not explain (p = {p_value:.2g}). "
+        "No sensor effect is aligned like that; they are attributed to the reference"
+    ]
+
+
+def _fit_variance(
+    measurement: Measurement,
+    part: Residuals,
+    cells: WallCells,
+    value: FloatArray,
+    random: KeyedRandom,
+    excluded: frozenset[tuple[str, bool]],
+) -> tuple[list[VarianceTerm], list[VarianceScore], str]:
+    """Fit the variance model: noise terms, what was tried, and a note on variance that no term explains.
+
+    value: (n,) residuals after the systematic effects.
+    """
+    names = frozenset(name for name, empirical in excluded if not empirical)
+    found, tried, note = fit_variance_model(part, cells, value, random, names)
+    match measurement, part:
+        case StereoMeasurement(), StereoResiduals():
+            found = separate_white_and_grid_noise(found, part, value, measurement.model)
+    return [each for each in found if each.effect not in names], tried, note
+
+
+def _implausible_variance(measurement: Measurement, noise_terms: list[VarianceTerm]) -> frozenset[tuple[str, bool]]:
+    """Families of noise terms whose values are outside the bounds of their effect."""
+    entries = {each.effect: effect_from_variance(each, measurement.sensor).entry for each in noise_terms}
+    return frozenset((name, False) for name, entry in entries.items() if not within_bounds(measurement.model, entry))
+
+
+def _note_left_out(excluded: frozenset[tuple[str, bool]]) -> list[str]:
+    """Notes on families that were excluded."""
+    said = (
+        f"non-parametric terms of {name}" if empirical else name for name, empirical in sorted(excluded - {NONPARAMETRIC_TERMS})
+    )
+    why = (
+        "its best value is outside the bounds of the effect, or it is many typical sizes, the registration absorbs nearly all "
+        "of it, and a misfit is left"
+    )
+    return [f"{what} left out: {why}" for what in said]

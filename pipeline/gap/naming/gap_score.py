@@ -1,0 +1,273 @@
+"""Measure the gap before and after on validation blocks, by simulating again through the sensor's own code.
+
+Measure: the continuous ranked probability score (CRPS) of measured patches of the wall against an ensemble of simulated ones, in
+metres. The score is proper: neither a wrong mean nor an inflated noise can lower it (Gneiting & Raftery 2007, eq. 21, fair
+ensemble form). A patch is scored twice, by the mean and by the standard deviation of its residuals, because in single points the
+noise hides both. Measured and simulated residuals are clipped at the same values, so that a few points at depth steps do not
+dominate.
+
+Floor: the same score of draws of the model itself. It is limited to the score after, because one draw may fall below.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.change.robust import nmad
+from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
+from pipeline.gap.residuals.disparity_simulation import simulate_disparities
+from pipeline.gap.residuals.residuals import BoolArray, ExpectedPulses, Residuals
+from pipeline.gap.residuals.several_scans import simulate_range_errors
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, simulate_distances
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.residuals.wall_blocks import wall_blocks_by_points
+from pipeline.gap.thresholds import thresholds
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from sensors.models.sensor_model import StereoModel, TlsModel
+
+MEASURE = (
+    "mean continuous ranked probability score of patches (mean and standard deviation of their residuals) against simulations"
+)
+LOSS_MEASURE = "mean Brier score of pulses (lost or not) against their predicted probability of loss"
+_ENSEMBLE_SIZE = 8
+"""Simulations of an ensemble, most points that are simulated, points of a patch, and fewest points of a patch that is scored."""
+_MOST_POINTS = 30_000
+_POINTS_PER_PATCH = 30.0
+_FEWEST_POINTS = 8
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Scores on validation points, in `unit`.
+
+    Attributes
+    ----------
+    before, after, floor : mean score of the old model, of the new model, and of draws of the new model.
+    error : standard error of before - after.
+    floor_error : standard error of before - floor.
+    points : number of points that were scored.
+    measure : what the score is, in words.
+    unit : m, or 1 for the Brier score of missing returns.
+    """
+
+    before: float
+    after: float
+    floor: float
+    error: float
+    floor_error: float
+    points: int
+    measure: str = MEASURE
+    unit: str = "m"
+
+    @property
+    def scores(self) -> dict[str, float]:
+        """The three scores by name."""
+        return {"before": self.before, "after": self.after, "floor": self.floor}
+
+    @property
+    def display_unit(self) -> tuple[float, str]:
+        """The factor by which reports multiply a score, and the unit of the product."""
+        return (1e3, "mm") if self.unit == "m" else (1.0, "Brier")
+
+    @property
+    def closed(self) -> float | None:
+        """Share of the gap that the new model closes; None where the gap is within its own uncertainty."""
+        return None if self.uncertain else (self.before - self.after) / (self.before - self.floor)
+
+    @property
+    def above_floor(self) -> bool:
+        """Whether the score before exceeds the floor by more than its uncertainty."""
+        return self.before - self.floor > thresholds().verdict.floor_sigmas * self.floor_error
+
+    @property
+    def left_open(self) -> bool:
+        """Whether the score after exceeds the floor by more than its uncertainty."""
+        return self.after - self.floor > thresholds().verdict.floor_sigmas * self.floor_error
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether both before - floor and before - after are within their uncertainties."""
+        return not self.above_floor and self.before - self.after <= thresholds().verdict.gap_sigmas * self.error
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the gap as gap.json holds it."""
+        note = "before - floor is within its own uncertainty" if self.uncertain else ""
+        return {
+            "measure": self.measure,
+            "unit": self.unit,
+            "before": self.before,
+            "after": self.after,
+            "floor": self.floor,
+            "closed": self.closed,
+            "evaluated_on": "held-out blocks",
+            "points": self.points,
+            "standard_error": {"before_minus_after": self.error, "before_minus_floor": self.floor_error},
+            "note": note,
+        }
+
+
+@dataclass(frozen=True)
+class RegisteredModel:
+    """A model with the pose (6,) that registers it: shift (m) and rotation (rad) of the sensor against the survey."""
+
+    model: TlsModel | StereoModel
+    pose: FloatArray
+
+
+def simulate_errors(
+    measurement: Measurement, model: TlsModel | StereoModel, residuals: Residuals, randoms: Sequence[KeyedRandom]
+) -> FloatArray:
+    """Simulate the sensor's errors at the points of some residuals: simulated minus geometric observable.
+
+    Parameters
+    ----------
+    measurement : measurement with its sensor at the pose to simulate from; `residuals` may be those of another pose.
+    model : model to simulate.
+    residuals : residuals whose points are simulated.
+    randoms : one source of random numbers for each simulation.
+
+    Returns
+    -------
+    FloatArray : (d, n) errors in the observable's unit, NaN without a return.
+
+    Raises
+    ------
+    TypeError : measurement, model and residuals are of different sensors.
+    """
+    match measurement, model, residuals:
+        case TlsMeasurement(), TlsModel(), TlsResiduals():
+            return np.stack([simulate_range_errors(measurement, model, residuals, random) for random in randoms])
+        case StereoMeasurement(), StereoModel(), StereoResiduals():
+            return simulate_disparities(measurement, model, residuals, randoms)
+        case SurfaceMeasurement(), StereoModel(), SurfaceResiduals():
+            return np.stack([simulate_distances(model, residuals, random) for random in randoms])
+    raise TypeError("measurement, model and residuals are of different sensors")
+
+
+def measure_gap(
+    measurement: Measurement,
+    before: RegisteredModel,
+    after: RegisteredModel,
+    residuals: Residuals,
+    reference_sigma: float,
+    most_sigmas: float,
+    random: KeyedRandom,
+) -> Gap | None:
+    """Score two models on validation residuals, with common random numbers.
+
+    Parameters
+    ----------
+    measurement : aligned measurement.
+    before, after : the models to compare.
+    residuals : residuals of the validation points.
+    reference_sigma : standard deviation of the reference error, in the observable's unit; it is added to every draw.
+    most_sigmas : points farther than this many predicted standard deviations from both models are left out.
+    random : source of random numbers.
+
+    Returns
+    -------
+    Gap or None : the scores; None where too few points remain.
+    """
+    patch = wall_blocks_by_points(residuals.wall_xy, _POINTS_PER_PATCH)
+    versions = [_draw_ensemble(measurement, version, residuals, random.child("ensemble")) for version in (before, after)]
+    truth, measured = _draw_ensemble(measurement, after, residuals, random.child("floor")), residuals.total_departure
+    usable = np.isfinite(np.concatenate([*versions, truth])).all(axis=0)
+    medians, sigma = [np.median(draws, axis=0) for draws in versions], residuals.sigma
+    off = np.min([np.abs(measured - median) for median in medians], axis=0)
+    usable &= off < most_sigmas * sigma
+    if not usable.any():
+        return None
+    spread = max(most_sigmas, thresholds().points.outlier_sigmas * nmad((measured - medians[0])[usable] / sigma[usable], 0.0))
+    low, high = medians[0] - spread * sigma, medians[0] + spread * sigma
+    measured, truth, *versions = (np.clip(each, low, high) for each in (measured, truth, *versions))
+    usable &= np.isin(patch, np.flatnonzero(np.bincount(patch[usable], minlength=patch.max() + 1) >= _FEWEST_POINTS))
+    if not usable.any():
+        return None
+    _, number = np.unique(patch[usable], return_inverse=True)
+    unit = np.bincount(number, residuals.unit_m[usable]) / np.bincount(number)
+    errors = reference_sigma * random.child("reference").generator().standard_normal((3, _ENSEMBLE_SIZE, len(unit)))
+    value = _patch_statistics(measured[None, usable], number)[:, 0]
+    ensembles = [_patch_statistics(drawn[:, usable], number, errors[0]) for drawn in versions]
+    drawn = _patch_statistics(truth[:, usable], number, errors[1])
+    old, new = (np.sum([_crps(e, v) for e, v in zip(found, value, strict=True)], axis=0) * unit for found in ensembles)
+    floors = [
+        np.sum([_crps(e, d[row]) for e, d in zip(ensembles[1], drawn, strict=True)], axis=0) for row in range(_ENSEMBLE_SIZE)
+    ]
+    floor, count = np.mean(floors, axis=0) * unit, len(unit)
+    floor = floor + min(float(new.mean() - floor.mean()), 0.0)
+    return Gap(
+        before=float(old.mean()),
+        after=float(new.mean()),
+        floor=float(floor.mean()),
+        error=float((old - new).std() / np.sqrt(count)),
+        floor_error=float((old - floor).std() / np.sqrt(count)),
+        points=int(usable.sum()),
+    )
+
+
+def measure_losses(missing: ExpectedPulses, chance: FloatArray, held_out: BoolArray) -> Gap | None:
+    """Score the predicted probability (m,) of losing pulses on validation pulses; before, it is the share lost of all others.
+
+    The floor is the expected score if pulses are lost with exactly that probability. held_out: (m,) validation pulses. Returns
+    None for fewer than 100 of these.
+    """
+    if held_out.sum() < 100:
+        return None
+    lost, p = missing.lost[held_out].astype(np.float64), chance[held_out]
+    patch = wall_blocks_by_points(missing.wall_xy[held_out], _POINTS_PER_PATCH)
+    count = np.bincount(patch)
+    share = float(missing.lost[~held_out].mean())
+    old, new, floor = (np.bincount(patch, each) / count for each in ((lost - share) ** 2, (lost - p) ** 2, p * (1 - p)))
+    floor = floor + min(float(new.mean() - floor.mean()), 0.0)
+    errors = [float((old - each).std() / np.sqrt(len(count))) for each in (new, floor)]
+    return Gap(
+        before=float(old.mean()),
+        after=float(new.mean()),
+        floor=float(floor.mean()),
+        error=errors[0],
+        floor_error=errors[1],
+        points=len(lost),
+        measure=LOSS_MEASURE,
+        unit="1",
+    )
+
+
+def _draw_ensemble(measurement: Measurement, version: RegisteredModel, residuals: Residuals, random: KeyedRandom) -> FloatArray:
+    """(d, n) simulated errors of one model at its pose, including errors of the reference."""
+    registered = measurement.moved(version.pose)
+    draws = simulate_errors(registered, version.model, residuals, [random.child(number) for number in range(_ENSEMBLE_SIZE)])
+    if isinstance(residuals, TlsResiduals):
+        return draws - np.stack(
+            [residuals.draw_reference_error(random.child("vertices", number)) for number in range(_ENSEMBLE_SIZE)]
+        )
+    # a cloud without cameras cannot be simulated at another pose: its datum enters by the Jacobian
+    return draws + residuals.pose_jacobian @ version.pose if isinstance(residuals, SurfaceResiduals) else draws
+
+
+def _patch_statistics(draws: FloatArray, patch: NDArray[np.int64], error: FloatArray | None = None) -> FloatArray:
+    """(2, d, p) mean and standard deviation of each of p patches in draws (d, n). error: (d, p) error of the reference of each
+    patch."""
+    count = np.bincount(patch)
+    mean = np.stack([np.bincount(patch, row) for row in draws]) / count
+    square = np.stack([np.bincount(patch, (row - m[patch]) ** 2) for row, m in zip(draws, mean, strict=True)])
+    return np.stack([mean if error is None else mean + error, np.sqrt(square / np.maximum(count - 1, 1))])
+
+
+def _crps(draws: FloatArray, value: FloatArray) -> FloatArray:
+    """(n,) fair ensemble CRPS: mean |x - y| - mean |x - x'| / 2."""
+    ordered, count = np.sort(draws, axis=0), len(draws)
+    weight = (2 * np.arange(count) - count + 1)[:, None]
+    spread = 2 * np.sum(weight * ordered, axis=0) / (count * (count - 1))
+    return np.asarray(np.abs(draws - value).mean(axis=0) - spread / 2)
+
+
+def subsampling(count: int) -> slice:
+    """Return the slice that leaves at most about 30,000 of `count` validation points."""
+    return slice(None, None, max(count // _MOST_POINTS, 1))

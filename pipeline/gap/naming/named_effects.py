@@ -1,0 +1,375 @@
+"""Turn what was found into named effects: entries of a config and of gap.json, with standard deviations and equivalence class."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.formats.measurements.measurement import Measurement
+from pipeline.gap.mean.candidates import POLYNOMIAL, Candidate
+from pipeline.gap.mean.selection import SelectedEffect
+from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
+from pipeline.gap.noise_and_edges.missing_returns import LossExplanation
+from pipeline.gap.noise_and_edges.pixel_locking import Locking
+from pipeline.gap.noise_and_edges.rounded_ranges import RangeStep
+from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
+from pipeline.gap.residuals.alignment import AlignedMeasurement, align
+from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.thresholds import thresholds
+from scene.common.config import parse
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
+from sensors.effects import effect_of
+from sensors.effects.angle_empirical import AngleEmpirical
+from sensors.effects.base import Effect, ShowsIn
+from sensors.effects.detection_limit import DetectionLimit
+from sensors.effects.pixel_locking import PixelLocking
+from sensors.effects.range_quantization import RangeQuantization
+from sensors.models.sensor_model import StereoModel, TlsModel
+from sensors.numerics.curve import Axis, interpolate_on_host
+
+_CURVE_NODES, _SURFACE_NODES, _SUM_NODES, _MOST_POINTS = 65, 17, 257, 20_000
+"""Nodes of the curve of an empirical term, of each side of a surface, and of a sum of curves; most points that a surface is
+fitted to."""
+_STD_INFLATION = 1.1
+"""Factor on all standard deviations, because the covariance of the reference error is itself estimated. Without it, 52 of 61
+intervals of 90 % contained the true value on the development cases."""
+_WEAKEST_POWERS = 20
+"""Number of spacings between the weakest recorded powers that tell how close they come to a detection limit."""
+
+
+@dataclass(frozen=True)
+class NamedEffect:
+    """One effect of gap.json.
+
+    Attributes
+    ----------
+    name : name with the sensor's prefix, such as `tls.range_offset`.
+    kind : physical (of the catalogue) or empirical.
+    entry : entry of the model's `effects`: name and parameters.
+    std : standard deviations of the parameters, by key.
+    alike : names of the other effects of its equivalence class.
+    p_value : p-value from the simulated null distribution, None where none was simulated.
+    gain : log-likelihood ratio, on validation blocks once it was validated.
+    split_by : further measurement that would separate the class, "" for a class of one.
+    """
+
+    name: str
+    kind: str
+    entry: dict[str, Any]
+    std: dict[str, float]
+    alike: tuple[str, ...]
+    p_value: float | None
+    gain: float
+    split_by: str = ""
+
+    @property
+    def effect(self) -> type[Effect]:
+        """Class of the effect, which for an empirical term is the effect that carries it."""
+        return effect_of(self.name)
+
+    @property
+    def adds_variance(self) -> bool:
+        """Whether it is a noise term: it changes the standard deviation of the residuals and not their mean."""
+        return self.effect.shows_in == ShowsIn.SPREAD
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the effect as gap.json holds it."""
+        parameters = {key: {"value": value, "std": self.std.get(key)} for key, value in self.entry.items() if key != "name"}
+        return {
+            "name": self.name,
+            "cannot_be_told_from": list(self.alike),
+            "split_by": self.split_by,
+            "kind": self.kind,
+            "parameters": parameters,
+            "p_value": self.p_value,
+            "held_out_log_score_gain": self.gain,
+        }
+
+
+def with_effects(
+    model: TlsModel | StereoModel, entries: list[dict[str, Any]], noise: dict[str, float] | None = None
+) -> TlsModel | StereoModel:
+    """Return the model with further effects and other noise values, validated like a config.
+
+    Parameters
+    ----------
+    model : model to extend.
+    entries : entries of the effects to append.
+    noise : new values of the model's noise, by key.
+
+    Raises
+    ------
+    InputError : a value is outside its bounds.
+    """
+    values = model.model_dump(mode="json")
+    changed = {"effects": [*values["effects"], *entries], "noise": {**values["noise"], **(noise or {})}}
+    return parse(type(model), {**values, **changed}, "model_after.yaml")
+
+
+def aligned_with(
+    measurement: Measurement,
+    effects: Iterable[NamedEffect],
+    registration_rows: NDArray[np.int64] | None = None,
+    noise: dict[str, float] | None = None,
+) -> AlignedMeasurement:
+    """Put effects into the model of a measurement, compute its residuals and estimate the pose again.
+
+    Parameters
+    ----------
+    measurement : measurement to start from.
+    effects : effects to append to its model.
+    registration_rows : rows of the measurement's points from which the pose is estimated; all where None.
+    noise : new values of the model's noise, by key.
+
+    Returns
+    -------
+    Settled : the measurement at the estimated pose, its residuals and the pose.
+    """
+    model = with_effects(measurement.model, [item.entry for item in effects], noise)
+    return align(measurement.changed(model=model), registration_rows)
+
+
+def within_bounds(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
+    """Whether a config accepts the values of an entry."""
+    try:
+        with_effects(model, [entry])
+    except InputError:
+        return False
+    return True
+
+
+def only_within_bounds(model: TlsModel | StereoModel, named: list[NamedEffect]) -> tuple[list[NamedEffect], list[str]]:
+    """Return the effects whose values a config accepts, and a note for each of the others."""
+    kept = [item for item in named if within_bounds(model, item.entry)]
+    return kept, [
+        f"{item.name} left out: its best value is outside the bounds of the effect" for item in named if item not in kept
+    ]
+
+
+def is_plausible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
+    """Whether an entry's values are within the bounds of its effect and below the largest plausible size."""
+    if not within_bounds(model, entry):
+        return False
+    return relative_size(entry) <= thresholds().mean.largest_size
+
+
+def relative_size(entry: dict[str, Any]) -> float:
+    """Return the size of an effect in its typical sizes; 0 for an effect that is not in the catalogue."""
+    effect = effect_of(entry["name"])
+    sizes = effect.typical_sizes() if effect.catalogue else {}
+    return max((abs(entry.get(key, 0.0) / typical) for key, typical in sizes.items()), default=0.0)
+
+
+def effect_from_range_step(comb: RangeStep, part: Residuals) -> NamedEffect:
+    """Name the rounding of ranges. Its gain is at least one unit of log-likelihood for each range on a multiple of the step."""
+    entry = {"name": RangeQuantization.tag(), "step_m": comb.step_m}
+    name, gain = f"tls.{RangeQuantization.tag()}", float(len(part)) * comb.strength
+    return NamedEffect(name, "physical", entry, {"step_m": comb.std_m}, (), None, gain)
+
+
+def effect_from_locking(found: Locking) -> NamedEffect:
+    """Name the pixel locking that the measured disparities show."""
+    entry = {
+        "name": PixelLocking.tag(),
+        "amplitude_px": found.amplitude_px,
+        "period_px": found.period_px,
+        "phase_rad": found.phase_rad,
+        "tilt_rad": found.tilt_rad,
+    }
+    return NamedEffect(f"stereo.{PixelLocking.tag()}", "physical", entry, {"amplitude_px": found.std_px}, (), None, found.gain)
+
+
+def effect_from_variance(found: VarianceTerm, sensor: str) -> NamedEffect:
+    """Name a noise term of laser ranges or disparities."""
+    alike = tuple(f"{sensor}.{name}" for name in found.alike)
+    empirical = found.empirical or effect_of(found.effect).empirical
+    entry = {"name": found.effect, **found.parameters}
+    name, kind = f"{sensor}.{found.effect}", "empirical" if empirical else "physical"
+    return NamedEffect(name, kind, entry, found.std, () if empirical else alike, found.p_value, found.gain)
+
+
+def effect_from_edges(found: EdgeEffect) -> NamedEffect:
+    """Name an edge effect."""
+    entry = {"name": found.name, **found.effect.model_dump(mode="json", exclude_unset=True)}
+    return NamedEffect(f"{found.effect.sensor}.{found.name}", "physical", entry, found.std, (), None, found.gain)
+
+
+def effect_from_tails(part: Residuals, sigma: float, gain: float) -> NamedEffect:
+    """Name heavy tails as white noise marked empirical, because the catalogue has no effect for them.
+
+    sigma: standard deviation of that noise, in the observable's unit.
+    """
+    noise, key = part.white_noise
+    return NamedEffect(f"{part.sensor}.{noise.tag()}", "empirical", {"name": noise.tag(), key: sigma}, {}, (), None, gain)
+
+
+def effect_from_losses(found: LossExplanation, intensity: FloatArray | None) -> NamedEffect:
+    """Name an effect on the returns. Where powers were recorded, a detection limit is taken from the weakest ones."""
+    parameters, std = dict(found.parameters), dict(found.std)
+    kind = "empirical" if found.covariate else "physical"
+    if found.name == DetectionLimit.tag() and intensity is not None:
+        # the limit lies about as far below the weakest power as the weakest powers lie apart
+        low = np.sort(intensity)[: _WEAKEST_POWERS + 1]
+        gap = float(low[-1] - low[0]) / (len(low) - 1)
+        parameters["minimum_power"], std["minimum_power"] = float(low[0]) - gap, gap
+    return NamedEffect(f"tls.{found.name}", kind, {"name": found.name, **parameters}, std, (), None, found.gain)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A systematic effect with estimated coefficients.
+
+    chosen: the selected explanation; candidate: its columns; values: (k,) coefficients; covariance: (k, k) of the coefficients.
+    """
+
+    chosen: SelectedEffect
+    candidate: Candidate
+    values: FloatArray
+    covariance: FloatArray
+
+
+def effect_from_estimate(found: Estimate, part: Residuals) -> NamedEffect:
+    """Name a systematic effect. part: the residuals on whose rows its candidate is defined."""
+    if found.candidate.empirical:
+        return _empirical_effect(found.candidate, found.values, found.chosen, part)
+    return _physical_effect(found.candidate, found.values, found.covariance, found.chosen, part)
+
+
+def _physical_effect(
+    candidate: Candidate, values: FloatArray, covariance: FloatArray, item: SelectedEffect, part: Residuals
+) -> NamedEffect:
+    """Name an effect of the catalogue by its parameters."""
+    entry = {"name": candidate.name, **candidate.fixed, **candidate.parameters(values)}
+    std = _standard_deviations(candidate, values, covariance)
+    alike = tuple(f"{part.sensor}.{name}" for name in item.indistinguishable)
+    return NamedEffect(
+        f"{part.sensor}.{candidate.name}", "physical", _plain_numbers(entry), std, alike, item.p_value, item.log_likelihood_ratio
+    )
+
+
+def _standard_deviations(candidate: Candidate, values: FloatArray, covariance: FloatArray) -> dict[str, float]:
+    """Standard deviations of the parameters, propagated from the coefficients by finite differences."""
+    base = candidate.parameters(values)
+    steps = np.sqrt(np.maximum(np.diag(covariance), 1e-300)) * 1e-3
+    std = {}
+    for key in base:
+        slopes = [
+            (candidate.parameters(values + step * unit)[key] - base[key]) / step
+            for step, unit in zip(steps, np.eye(len(values)), strict=True)
+        ]
+        std[key] = _STD_INFLATION * float(np.sqrt(max(np.array(slopes) @ covariance @ np.array(slopes), 0.0)))
+    return std
+
+
+def _empirical_effect(candidate: Candidate, values: FloatArray, item: SelectedEffect, part: Residuals) -> NamedEffect:
+    """Describe a non-parametric term by its values at nodes: over one cycle if periodic, else over the range of its covariate."""
+    error = candidate.columns @ values[: candidate.columns.shape[1]]
+    if candidate.angle and isinstance(part, TlsResiduals):
+        return _angle_term(candidate, error, item, part)
+    term, key = part.empirical_term
+    found = _surface_nodes(candidate, error, part) if candidate.form == POLYNOMIAL else _curve_nodes(candidate, error, part)
+    rows = _rounded_rows(found.pop("values"))
+    entry = {"name": term.tag(), **found, key: rows}
+    return NamedEffect(f"{part.sensor}.{term.tag()}", "empirical", entry, {}, (), item.p_value, item.log_likelihood_ratio)
+
+
+def _angle_term(candidate: Candidate, error: FloatArray, item: SelectedEffect, part: TlsResiduals) -> NamedEffect:
+    """Describe an error of an angle by a curve, recovered from the ranges where the surface slants more than at half of the
+    points."""
+    levers = {"azimuth": part.geometry.by_azimuth, "zenith": part.geometry.by_zenith}
+    lever = -levers[candidate.angle]
+    steep = np.abs(lever) > np.median(np.abs(lever))
+    found = _curve_nodes(candidate, np.divide(error, lever, out=np.zeros_like(error), where=steep), part, steep)
+    rows = _rounded_rows(found.pop("values"))
+    entry = {"name": AngleEmpirical.tag(), "angle": candidate.angle, **found, "values_rad": rows}
+    return NamedEffect(
+        f"{part.sensor}.{AngleEmpirical.tag()}", "empirical", entry, {}, (), item.p_value, item.log_likelihood_ratio
+    )
+
+
+def merge_angle_curves(
+    angles: list[NamedEffect], later: list[NamedEffect], part: Residuals
+) -> tuple[list[NamedEffect], list[NamedEffect]]:
+    """Add curves of an angle's error that were found later along the same angle and covariate.
+
+    Parameters
+    ----------
+    angles : curves that were found first.
+    later : effects that were found with those curves in the model.
+    part : residuals, for the range of the covariates.
+
+    Returns
+    -------
+    tuple : the first curves with the later ones added, and the later effects that were not merged.
+    """
+    joined, others = [], list(later)
+    for term in angles:
+        alike = [item for item in others if all(item.entry[key] == term.entry[key] for key in ("angle", "covariate"))]
+        others = [item for item in others if item not in alike]
+        joined.append(_sum_of_curves(term, alike, part) if alike else term)
+    return joined, others
+
+
+def _sum_of_curves(term: NamedEffect, later: list[NamedEffect], part: Residuals) -> NamedEffect:
+    """Return the sum of some curves over the whole range of their covariate."""
+    x = part.covariates[term.entry["covariate"]]
+    low, high = float(x.min()), float(x.max())
+    nodes = np.linspace(low, high, _SUM_NODES)
+    curves = ((Axis(**item.entry["along"]), item.entry["values_rad"]) for item in (term, *later))
+    total = sum(interpolate_on_host(nodes, nodes, along, Axis(), values) for along, values in curves)
+    return replace(term, entry={**term.entry, "along": {"low": low, "high": high}, "values_rad": _rounded_rows([total])})
+
+
+def _rounded_rows(values: Any) -> list[list[float]]:
+    """Round values to six significant digits."""
+    return [[float(f"{value:.6g}") for value in row] for row in values]
+
+
+def _curve_nodes(candidate: Candidate, error: FloatArray, part: Residuals, rows: Any = slice(None)) -> dict[str, Any]:
+    """Describe a curve by its values at nodes. rows: rows whose error (n,) is known."""
+    x = part.covariates[candidate.name]
+    cycle = candidate.period * ((float(x.std()) or 1.0) if candidate.form == "wave" else 1.0)
+    x = x + _covariate_offset(candidate.name, part)  # the sensor's own value, before it is folded
+    low, high = (0.0, cycle) if cycle else (float(x.min()), float(x.max()))
+    turned, error = (np.mod(x, cycle) if cycle else x)[rows], error[rows]
+    order = np.argsort(turned)
+    curve = np.interp(np.linspace(low, high, _CURVE_NODES), turned[order], error[order], period=cycle or None)
+    return {"covariate": candidate.name, "along": {"low": low, "high": high, "period": cycle}, "values": [curve]}
+
+
+def _surface_nodes(candidate: Candidate, error: FloatArray, part: Residuals) -> dict[str, Any]:
+    """Fit the polynomial of two covariates to its values at the points and evaluate it on a grid of nodes."""
+    first, second = part.position_covariates
+    x, y = part.covariates[first], part.covariates[second]
+    axes = [np.linspace(values.min(), values.max(), _SURFACE_NODES) for values in (x, y)]
+    nodes = np.meshgrid(*axes)
+    thin = slice(None, None, max(len(x) // _MOST_POINTS, 1))
+    columns, there = (
+        np.stack(
+            [((s - x.mean()) / np.ptp(x)) ** a * ((t - y.mean()) / np.ptp(y)) ** b for a in range(5) for b in range(5 - a)],
+            axis=-1,
+        )
+        for s, t in ((x[thin], y[thin]), nodes)
+    )
+    values = there @ np.linalg.lstsq(columns, error[thin], rcond=None)[0]
+    along, across = ({"low": float(axis[0]), "high": float(axis[-1])} for axis in axes)
+    return {"covariate": first, "along": along, "second": second, "across": across, "values": values}
+
+
+def _covariate_offset(covariate: str, part: Residuals) -> float:
+    """Return an effect's covariate minus that of the residuals: not zero only for the power, which is relative in the
+    residuals."""
+    if covariate != "intensity" or not isinstance(part, TlsResiduals):
+        return 0.0
+    return float(np.median(np.log(np.maximum(part.geometry.power, 1e-12)) - part.covariates[covariate]))
+
+
+def _plain_numbers(entry: dict[str, Any]) -> dict[str, Any]:
+    """Convert NumPy numbers of an entry to Python floats."""
+    return {key: float(value) if isinstance(value, np.floating) else value for key, value in entry.items()}

@@ -1,0 +1,511 @@
+"""Refit strong systematic effects without linearising (Gauss-Newton), and repeat the selection beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.formats.measurements.measurement import Measurement
+from pipeline.gap.mean.candidates import (
+    HARMONIC_ORDERS,
+    HARMONICS,
+    Candidate,
+    ExplanationKey,
+    SineGrid,
+    harmonics,
+    prior_precision,
+)
+from pipeline.gap.mean.search import MeanSearch
+from pipeline.gap.mean.selection import FamilyScore, SelectedEffect, equivalence_margin
+from pipeline.gap.naming.candidate_families import PERIODIC, candidate_families, catalogue_families
+from pipeline.gap.naming.named_effects import Estimate, aligned_with, effect_from_estimate, is_plausible, relative_size
+from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
+from pipeline.gap.residuals.alignment import AlignedMeasurement, fit_pose_robustly
+from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from pipeline.gap.thresholds import thresholds
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from sensors.effects import effect_of
+from sensors.effects.matching_noise import MatchingNoise
+
+_MOST_CONVERGED, _MOST_ROUNDS, _CONVERGED_GAIN = 3, 8, 1.0
+"""Effects that are refitted to convergence, and most iterations of each."""
+_ABSORBED_SHARE = 0.5
+"""Share of an effect's gain that may be linearisation error of the others."""
+_MOST_FITS, _CONVERGED_DECREASE = 10, 0.005
+"""Most iterations of the joint fit of all effects."""
+
+
+@dataclass(frozen=True)
+class SearchInput:
+    """Input shared by the searches for systematic effects.
+
+    Attributes
+    ----------
+    measurement : measurement of the training points.
+    part : their residuals.
+    families : candidates to search.
+    variance_at : returns the noise terms of residuals against a model with some systematic effects.
+    added : variance to add to the predicted one, in squared units of the observable.
+    random : source of random numbers of the null distributions.
+    """
+
+    measurement: Measurement
+    part: Residuals
+    families: list[Candidate | SineGrid]
+    variance_at: Callable[[Residuals], list[VarianceTerm]]
+    added: float
+    random: KeyedRandom
+
+
+@dataclass(frozen=True)
+class SearchOutcome:
+    """Effects that a search selected, and the search repeated beside them without linearising.
+
+    Attributes
+    ----------
+    chosen : explanations of the first search.
+    estimates : effects of both searches with their coefficients.
+    search : the last search.
+    residuals : residuals of the last search.
+    beside : explanations of the last search alone.
+    tried : candidates that the last search tried.
+    """
+
+    chosen: list[SelectedEffect]
+    estimates: list[Estimate]
+    search: MeanSearch
+    residuals: Residuals
+    beside: list[SelectedEffect]
+    tried: tuple[FamilyScore, ...]
+
+    @property
+    def complexity(self) -> tuple[int, int]:
+        """Number of empirical terms, and number of all effects; smaller is simpler."""
+        return sum(each.candidate.empirical for each in self.estimates), len(self.estimates)
+
+
+@dataclass(frozen=True)
+class _SingleFit:
+    """One effect alone in the model, without linearising.
+
+    Attributes
+    ----------
+    estimate : the effect with its coefficients.
+    residuals : residuals against the model with it.
+    measurement : the measurement with it in its model, at the estimated pose.
+    log_likelihood : log-likelihood of all points.
+    """
+
+    estimate: Estimate
+    residuals: Residuals
+    measurement: Measurement
+    log_likelihood: float
+
+    @property
+    def name(self) -> str:
+        """Name of the effect."""
+        return self.estimate.candidate.name
+
+    @property
+    def score(self) -> float:
+        """Penalised log-likelihood."""
+        return self.log_likelihood - (self.estimate.chosen.log_likelihood_ratio - self.estimate.chosen.score)
+
+    @classmethod
+    def of(cls, given: SearchInput, first: MeanSearch, estimate: Estimate) -> _SingleFit | None:
+        """Put one effect into the model; None if it is out of bounds, or if too few rays meet the reference with it."""
+        if out_of_bounds(given.measurement, [estimate], given.part):
+            return None
+        measurement, found, _ = _aligned_with_estimates(given, [estimate])
+        found = found.part(np.isin(found.index, given.part.index))
+        registered_residuals, _, noise_ratio = fit_pose_robustly(found)
+        largest = thresholds().points.outlier_sigmas * noise_ratio * found.sigma
+        value, kept = np.zeros(len(given.part)), _still_present(found, given.part)
+        if kept.mean() < thresholds().points.least_share_on_reference:
+            return None
+        value[kept] = np.where(found.usable, np.clip(registered_residuals, -largest, largest), 0.0)
+        return cls(estimate, at_points_of(found, given.part), measurement, first.design.log_likelihood(value, estimate.candidate))
+
+    def improved(self, given: SearchInput, first: MeanSearch) -> _SingleFit | None:
+        """Return the fit after one Gauss-Newton step from the present values."""
+        candidate = _recomputed(self.estimate.candidate, candidate_families(self.measurement, self.residuals))
+        width = candidate.columns.shape[1]
+        step = _gauss_newton_step(self.residuals, candidate.columns, prior_precision(candidate, width), np.zeros(width))
+        return _SingleFit.of(given, first, replace(self.estimate, values=self.estimate.values + step))
+
+
+def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
+    """Select systematic effects and refit the strong ones without linearising.
+
+    The linearised model is inexact for a large effect, and forward selection then adds spurious effects that absorb the
+    linearisation error. The strongest effects are therefore refitted alone without linearising, and the selection is repeated
+    beside the best one. It is also repeated at the joint fit of all effects. The explanation with the fewest effects is kept.
+
+    Parameters
+    ----------
+    given : input of the searches.
+    first : the linearised search.
+
+    Returns
+    -------
+    SearchOutcome : the explanation with the fewest empirical terms, then the fewest effects.
+    """
+    together, tried = first.select()
+    linear = SearchOutcome(together, _estimates_of(first, together), first, given.part, together, tried)
+    alone = _strongest_single_fits(given, first, together) if together else []
+    if not alone:
+        return _search_beside(given, linear) or linear
+    beside_best = _search_beside_best(given, linear, alone)
+    if beside_best is not None and len(beside_best.estimates) > 1:
+        others = {each.candidate.name for each in beside_best.estimates if not each.candidate.empirical}
+        extended = _with_alternatives(given, first, alone, others)
+        if extended[0] is not alone[0]:
+            beside_best = _search_beside_best(given, linear, extended) or beside_best
+    if beside_best is not None and len(beside_best.estimates) == 1:
+        return beside_best
+    joint = search_at_joint_fit(given)
+    found = [_search_beside(given, linear) or linear]
+    if beside_best is not None:
+        found.insert(0, beside_best)
+    if joint is not None and joint.chosen:
+        found.append(_search_beside(given, joint) or joint)
+    possible = [each for each in found if not out_of_bounds(given.measurement, each.estimates, each.residuals)]
+    return min(possible, key=lambda each: each.complexity, default=linear)
+
+
+def search_at_joint_fit(given: SearchInput) -> SearchOutcome | None:
+    """Select effects with the model linearised at the joint fit of all effects of the catalogue.
+
+    There the rays are traced to where they really went, whichever effect turned them, so the Jacobian is right. The fitted part
+    of all effects is added back to the residuals before the selection. Returns None if an effect is out of bounds.
+    """
+    plain = [each for each in given.families if isinstance(each, Candidate) and not each.empirical]
+    fitted = fit_jointly(given, plain)
+    if fitted is None:
+        return None
+    measurement, at, explained = fitted
+    allowed = {(family.name, family.empirical) for family in given.families}
+    families = [each for each in candidate_families(measurement, at) if (each.name, each.empirical) in allowed]
+    left = replace(at, value=at.value + explained)
+    weighted = replace(_with_variance_refitted(given, at), value=left.value)
+    search = MeanSearch(weighted, families, given.random.child("best fit"))
+    together, tried = search.select()
+    return SearchOutcome(together, _estimates_of(search, together), search, left, together, tried)
+
+
+def fit_jointly(given: SearchInput, candidates: list[Candidate]) -> tuple[Measurement, Residuals, FloatArray] | None:
+    """Fit some effects together by Gauss-Newton.
+
+    Parameters
+    ----------
+    given : input of the searches.
+    candidates : effects to fit.
+
+    Returns
+    -------
+    tuple or None : the measurement with the effects in its model, the residuals against it, and the effects' linearised part (n,)
+        of the observations. None if an effect is out of bounds or too few points remain.
+    """
+    measurement, at, before = given.measurement, given.part, np.inf
+    widths = [each.columns.shape[1] for each in candidates]
+    values = np.zeros(sum(widths))
+    for _ in range(_MOST_FITS):
+        after = float(np.mean((at.value / at.sigma) ** 2))
+        if after > (1 - _CONVERGED_DECREASE) * before:
+            break
+        before = after
+        precision = np.concatenate([prior_precision(each, width) for each, width in zip(candidates, widths, strict=True)])
+        values = values + _gauss_newton_step(at, _all_columns(candidates), precision, values)
+        parts = np.split(values, np.cumsum(widths)[:-1])
+        estimates = [_estimate_of_size(each, part) for each, part in zip(candidates, parts, strict=True)]
+        if out_of_bounds(given.measurement, estimates, at):
+            return None
+        measurement, found, _ = _aligned_with_estimates(given, estimates)
+        at = with_added_variance(at_points_of(found, given.part), given.added)
+        if _too_few_left(given, at):
+            return None
+        renewed = catalogue_families(measurement, at)
+        candidates = [_recomputed(each, renewed) for each in candidates]
+    explained: FloatArray = _all_columns(candidates) @ values
+    return measurement, at, explained
+
+
+def _too_few_left(given: SearchInput, at: Residuals) -> bool:
+    """Whether too few of the points are left for a search."""
+    return len(at) < thresholds().points.least_share_on_reference * len(given.part)
+
+
+def _all_columns(candidates: list[Candidate]) -> FloatArray:
+    """Columns of all candidates side by side."""
+    columns: FloatArray = np.concatenate([each.columns for each in candidates], axis=1)
+    return columns
+
+
+def _estimate_of_size(candidate: Candidate, values: FloatArray) -> Estimate:
+    """An estimate with given coefficients and no evidence yet."""
+    nothing = SelectedEffect(candidate, (), 1.0, 0.0, 0.0, ())
+    return Estimate(nothing, candidate, values, np.zeros((len(values), len(values))))
+
+
+def _gauss_newton_step(at: Residuals, columns: FloatArray, precision: FloatArray, values: FloatArray) -> FloatArray:
+    """(k,) change of the coefficients: weighted least squares with the Jacobian (n, k), free pose and a Gaussian prior around
+    0."""
+    design = np.concatenate([at.pose_jacobian, columns], axis=1) / at.sigma[:, None]
+    known, pull = np.zeros(design.shape[1]), np.zeros(design.shape[1])
+    start = at.pose_jacobian.shape[1]
+    known[start:], pull[start:] = precision, precision * values
+    found = np.linalg.solve(design.T @ design + np.diag(known), design.T @ (at.value / at.sigma) - pull)
+    return np.asarray(found[start:])
+
+
+def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list[SelectedEffect]) -> list[_SingleFit]:
+    """The effects that alone explain most, refitted without linearising, best first.
+
+    Empty where the linearised model is good enough: its error is smaller than the gain of any selected effect.
+    """
+    found: list[_SingleFit] = []
+    tolerance = min([thresholds().mean.linearisation_error, *(_ABSORBED_SHARE * each.log_likelihood_ratio for each in together)])
+    for candidate in first.leading_effects():
+        alone = _single_fit(given, first, candidate)
+        if alone is None:
+            continue
+        linearised = first.design.log_likelihood(given.part.value, candidate)
+        if not found and abs(alone.log_likelihood - linearised) < tolerance:
+            return []
+        found.append(alone)
+    if not found:
+        return []
+    likeliest = _best_variants(given, first, found)
+    return _with_alternatives(given, first, likeliest, set(likeliest[0].estimate.chosen.indistinguishable))
+
+
+def _with_alternatives(given: SearchInput, first: MeanSearch, alone: list[_SingleFit], names: set[str]) -> list[_SingleFit]:
+    """Add single fits of further effects, and of those that the linearised search cannot tell from the best; best first.
+
+    Of each effect the variant with the parameters that the linearised search prefers is used, in every camera.
+    """
+    others = {item.name: item.candidate.names for item in first.score_families(()) if not item.empirical and item.name in names}
+    for each in alone:
+        others.pop(each.name, None)
+    plain = (each for each in first.design.families.plain if not each.empirical)
+    variants = [each for each in plain if each.names == others.get(each.name)]
+    more = [each for each in (_single_fit(given, first, variant) for variant in variants) if each is not None]
+    if not more:
+        return alone
+    ranked = sorted([*alone, *_best_variants(given, first, more)], key=lambda each: -each.score)
+    return _with_alternatives(given, first, ranked, set(ranked[0].estimate.chosen.indistinguishable))
+
+
+def _single_fit(given: SearchInput, first: MeanSearch, candidate: Candidate) -> _SingleFit | None:
+    """One effect in the model, at the coefficients of the linearised fit."""
+    (estimate,) = _estimates_of(first, [first.selected_alone(candidate)])
+    return _SingleFit.of(given, first, estimate)
+
+
+def _best_variants(given: SearchInput, first: MeanSearch, found: list[_SingleFit]) -> list[_SingleFit]:
+    """The best effects, refitted to convergence, best first.
+
+    Of the best effect further variants are refitted too, because which camera it belongs to may not show before.
+    """
+    ranked = sorted(found, key=lambda each: -each.log_likelihood)
+    variants = {each.name: each for each in reversed(ranked)}
+    likely = sorted(variants.values(), key=lambda each: -each.log_likelihood)[:_MOST_CONVERGED]
+    best, *rest = sorted((_converged(given, first, each) for each in likely), key=lambda each: -each.score)
+    others = [each for each in ranked if each.name == best.name and each is not variants[best.name]][: _MOST_CONVERGED - 1]
+    best = max([best, *(_converged(given, first, each) for each in others)], key=lambda each: each.score)
+    return [best, *rest]
+
+
+def _search_beside_best(given: SearchInput, plain: SearchOutcome, alone: list[_SingleFit]) -> SearchOutcome | None:
+    """Repeat the search beside the best of some single fits."""
+    estimate = _with_equivalence_class(alone).estimate
+    return _search_beside(given, replace(plain, chosen=[estimate.chosen], estimates=[estimate]))
+
+
+def _with_equivalence_class(converged: list[_SingleFit]) -> _SingleFit:
+    """The best single fit with its equivalence class; the linearised search decides for effects that were not refitted."""
+    best, *others = converged
+    chosen = best.estimate.chosen
+    least = best.score - equivalence_margin(chosen.log_likelihood_ratio)
+    near = {each.name for each in others if each.score > least}
+    linearised = set(chosen.indistinguishable) - {each.name for each in others}
+    return replace(
+        best, estimate=replace(best.estimate, chosen=replace(chosen, indistinguishable=tuple(sorted(near | linearised))))
+    )
+
+
+def _converged(given: SearchInput, first: MeanSearch, alone: _SingleFit) -> _SingleFit:
+    """Gauss-Newton steps until the log-likelihood rises by less than 1."""
+    for _ in range(_MOST_ROUNDS):
+        improved = alone.improved(given, first)
+        if improved is None or improved.log_likelihood < alone.log_likelihood + _CONVERGED_GAIN:
+            break
+        alone = improved
+    return alone
+
+
+def _search_beside(given: SearchInput, chosen: SearchOutcome) -> SearchOutcome | None:
+    """Repeat the search beside the selected effects; None where there are none, or where one is out of bounds."""
+    physical = [each for each in chosen.estimates if not each.candidate.empirical]
+    if not physical or out_of_bounds(given.measurement, chosen.estimates, chosen.residuals):
+        return None
+    again = _repeat_search(given, physical, chosen.search.single_effect_ratios)
+    if again is None:
+        return None
+    search, at, estimates, beside, tried = again
+    return replace(chosen, estimates=estimates, search=search, residuals=at, beside=beside, tried=tried)
+
+
+def out_of_bounds(measurement: Measurement, estimates: list[Estimate], part: Residuals) -> frozenset[tuple[str, bool]]:
+    """Return the families whose estimate is outside the bounds of the effect, or implausibly large."""
+    wrong = [each for each in estimates if not is_plausible(measurement.model, effect_from_estimate(each, part).entry)]
+    return frozenset((each.candidate.name, each.candidate.empirical) for each in wrong)
+
+
+def absorbed_by_registration(
+    estimates: list[Estimate], part: Residuals, survival: Mapping[str, float]
+) -> frozenset[tuple[str, bool]]:
+    """Return implausibly large effects of which the registration leaves next to nothing.
+
+    survival: share of each signature that the pose fit leaves, by name.
+    """
+    by = thresholds().mean
+    doubtful = [each for each in estimates if not each.candidate.empirical and survival[each.candidate.name] < by.absorbed_share]
+    large = [each for each in doubtful if relative_size(effect_from_estimate(each, part).entry) > by.absorbed_size]
+    return frozenset((each.candidate.name, False) for each in large)
+
+
+def with_added_variance(part: Residuals, variance: float) -> Residuals:
+    """Add a variance to the predicted one."""
+    return replace(part, sigma=np.sqrt(part.sigma**2 + variance)) if variance else part
+
+
+def with_fitted_variance(part: Residuals, noise_terms: list[VarianceTerm], noise_ratio: float) -> Residuals:
+    """Use the fitted noise in place of the predicted one, as it counts for means of neighbours.
+
+    noise_terms: fitted noise terms; where there are none, the predicted standard deviations are multiplied by `noise_ratio`.
+    """
+    part = part.with_sigma_of_means
+    if not noise_terms:
+        return replace(part, sigma=part.sigma * noise_ratio)
+    made = (effect_of(each.effect)(**each.parameters) for each in noise_terms if each.parameters)
+    shared = [effect for effect in made if isinstance(effect, MatchingNoise)]
+    sigma = np.sqrt(part.sigma**2 + sum(each.variance for each in noise_terms))
+    return replace(part, sigma=sigma, correlated_noise=part.correlated_noise.with_effects(shared))
+
+
+def _estimates_of(search: MeanSearch, chosen: list[SelectedEffect]) -> list[Estimate]:
+    """Refine the selected explanations jointly and return their coefficients with covariance."""
+    candidates, fit = search.design.fit_refined([item.candidate for item in chosen])
+    places = search.design.split_coefficients(np.arange(len(fit.coefficients)), candidates)
+    return [
+        Estimate(item, candidate, fit.coefficients[place], fit.covariance[np.ix_(place, place)])
+        for item, candidate, place in zip(chosen, candidates, places, strict=True)
+    ]
+
+
+def _repeat_search(
+    given: SearchInput, known_effects: list[Estimate], alone: Mapping[ExplanationKey, float]
+) -> tuple[MeanSearch, Residuals, list[Estimate], list[SelectedEffect], tuple[FamilyScore, ...]] | None:
+    """Repeat the search with some effects in the model, whose coefficients stay free like the pose.
+
+    Parameters
+    ----------
+    given : input of the searches.
+    known_effects : effects to put into the model.
+    alone : log-likelihood ratio of each explanation alone.
+
+    Returns
+    -------
+    tuple or None : the search, its residuals, the estimates of all effects, the new explanations, and what was tried last; None
+        if too few rays meet the reference with the effects.
+    """
+    part = given.part
+    measurement, found, _ = _aligned_with_estimates(given, known_effects)
+    at = with_added_variance(at_points_of(found, part), given.added)
+    if _too_few_left(given, at):
+        return None
+    renewed = candidate_families(measurement, at)
+    allowed = {(family.name, family.empirical) for family in given.families}
+    names = {each.candidate.name for each in known_effects}
+    others = [each for each in renewed if (each.name, each.empirical) in allowed and (each.empirical or each.name not in names)]
+    known = [replace(each, candidate=_recomputed(each.candidate, renewed)) for each in known_effects]
+    columns = [_free_columns(each) for each in known]
+    periodic = [(PERIODIC[name], each.candidate) for each in known if (name := each.candidate.name) in PERIODIC]
+    others += [harmonics(covariate, sine, last) for covariate, sine in periodic for last in HARMONIC_ORDERS]
+    weighted = _with_variance_refitted(given, at)
+    precision = [prior_precision(each.candidate, matrix.shape[1]) for each, matrix in zip(known, columns, strict=True)]
+    search = MeanSearch(
+        replace(weighted, pose_jacobian=np.concatenate([at.pose_jacobian, *columns], axis=1)),
+        others,
+        given.random.child("again"),
+        np.concatenate([np.zeros(at.pose_jacobian.shape[1]), *precision]),
+        alone,
+    )
+    chosen, tried = search.select()
+    fit = search.design.fit_refined([item.candidate for item in chosen])[1]
+    kept, start = [], at.pose_jacobian.shape[1]
+    for each, matrix in zip(known, columns, strict=True):
+        place = slice(start, start := start + matrix.shape[1])
+        kept.append(replace(each, values=each.values + fit.coefficients[place], covariance=fit.covariance[place, place]))
+    return search, at, _merge_sines_with_overtones([*kept, *_estimates_of(search, chosen)]), chosen, tried
+
+
+def _with_variance_refitted(given: SearchInput, at: Residuals) -> Residuals:
+    """Residuals with the noise fitted beside the effects in the model. Without these, their signatures would look like noise."""
+    return with_fitted_variance(at, given.variance_at(at), fit_pose_robustly(at)[2])
+
+
+def _aligned_with_estimates(given: SearchInput, effects: list[Estimate]) -> AlignedMeasurement:
+    """Put some effects into the model of the measurement and estimate the pose again."""
+    return aligned_with(given.measurement, [effect_from_estimate(each, given.part) for each in effects], given.part.index)
+
+
+def _merge_sines_with_overtones(estimates: list[Estimate]) -> list[Estimate]:
+    """Merge a named sine and its overtones into one empirical term."""
+    found = list(estimates)
+    for overtones in (each for each in estimates if each.candidate.form == HARMONICS):
+        sine = next(each for each in estimates if PERIODIC.get(each.candidate.name) == overtones.candidate.name)
+        both = np.concatenate([sine.candidate.columns, overtones.candidate.columns], axis=1)
+        width = sine.candidate.columns.shape[1]
+        values = np.concatenate([sine.values[:width], overtones.values])
+        found = [each for each in found if each is not sine and each is not overtones]
+        found.append(replace(overtones, candidate=replace(overtones.candidate, matrix=both), values=values))
+    return found
+
+
+def at_points_of(found: Residuals, part: Residuals) -> Residuals:
+    """Restrict residuals to the points of `part` that are smooth there too and no outliers."""
+    registered_residuals, _, noise_ratio = fit_pose_robustly(found)
+    good = found.usable & (np.abs(registered_residuals) < thresholds().points.outlier_sigmas * noise_ratio * found.sigma)
+    place = np.full(int(max(found.index.max(initial=-1), part.index.max())) + 1, -1)
+    place[found.index[good]] = np.flatnonzero(good)
+    rows = place[part.index]
+    return found.part(rows[rows >= 0])
+
+
+def _still_present(at: Residuals, part: Residuals) -> BoolArray:
+    """Which points of `part` are left."""
+    return np.isin(part.index, at.index)
+
+
+def _recomputed(candidate: Candidate, families: list[Candidate | SineGrid]) -> Candidate:
+    """The same candidate for other rays."""
+    key = "" if candidate.wave is None else candidate.wave.key
+    chosen = {name: value for name, value in candidate.fixed.items() if name != key}
+    for family in families:
+        if family.name == candidate.name and not family.empirical and dict(family.fixed) == chosen:
+            if isinstance(family, SineGrid):
+                return family.at_period(candidate.period)
+            if family.names == candidate.names:
+                return family
+    raise KeyError(candidate.name)
+
+
+def _free_columns(found: Estimate) -> FloatArray:
+    """(n, k) columns of an effect's coefficients; a sine also has that of its frequency."""
+    wave = found.candidate.wave
+    return found.candidate.columns if wave is None else wave.with_frequency_derivative(found.candidate.period, found.values[:2])

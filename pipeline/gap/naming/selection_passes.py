@@ -1,0 +1,310 @@
+"""Selection passes: the input of a pass after edge effects, the effects that it selects, and the choice between passes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, TlsMeasurement
+from pipeline.gap.naming.candidate_families import model_has
+from pipeline.gap.naming.effect_selection import SelectionResult, select_effects
+from pipeline.gap.naming.named_effects import NamedEffect, aligned_with, effect_from_edges, with_effects
+from pipeline.gap.noise_and_edges.beam_footprint import find_footprint
+from pipeline.gap.noise_and_edges.disparity_edges import find_disparity_edge_effects
+from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
+from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
+from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from pipeline.gap.residuals.scene_changes import SceneChange, drop_duplicates, find_scene_changes
+from pipeline.gap.residuals.sensor_view import SensorView
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.residuals.wall_blocks import WallCells
+from pipeline.gap.thresholds import thresholds
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from sensors.effects.beam_divergence import BeamDivergence
+from sensors.effects.smoothing import Smoothing
+
+_LEAST_COMPLEXITY = 0, 1
+"""Complexity (empirical terms, all effects) of a pass that selects one effect of the catalogue and nothing else."""
+_MOST_POINTS = 60_000
+"""Most points that a selection uses; more add little information to about 800 cells."""
+
+
+@dataclass(frozen=True)
+class PassInput:
+    """Input of one selection pass: the measurement and its residuals after edge effects have been applied.
+
+    Edge effects are edge fattening, smoothing, filled occlusions and the beam footprint.
+
+    Attributes
+    ----------
+    edge_effects : effects that were found at depth steps.
+    measurement : the measurement with these effects in its model.
+    residuals : residuals against that model.
+    touched : (n,) points that edge effects move, so that their residuals cannot be predicted to the noise.
+    changes : regions where the scene itself changed.
+    changed : (n,) points in these regions.
+    registered_residuals : (n,) residuals after a robust pose fit, in the observable's unit.
+    noise_ratio : their standard deviation over the predicted one.
+    cells : cells of the wall in which the mean model averages.
+    held_out : (n,) points kept for validation.
+    training_rows : (k,) rows of the residuals that the selection may use.
+    """
+
+    edge_effects: list[EdgeEffect]
+    measurement: Measurement
+    residuals: Residuals
+    touched: BoolArray
+    changes: list[SceneChange]
+    changed: BoolArray
+    registered_residuals: FloatArray
+    noise_ratio: float
+    cells: WallCells
+    held_out: BoolArray
+    training_rows: NDArray[np.int64]
+
+    @classmethod
+    def of(
+        cls,
+        aligned: Measurement,
+        plain: Residuals,
+        held_out_points: BoolArray,
+        edge_effects: list[EdgeEffect],
+        realigned: bool = True,
+    ) -> PassInput:
+        """Build the input of a pass from the aligned measurement and some edge effects.
+
+        Parameters
+        ----------
+        aligned : aligned measurement.
+        plain : its residuals, without edge effects.
+        held_out_points : (N,) points of the measurement that are kept for validation.
+        edge_effects : effects to put into the model; their `touched` refers to the points of the measurement.
+        realigned : whether the pose is estimated again with the edge effects in the model.
+        """
+        touched = np.any([np.zeros(len(plain), dtype=bool), *(each.touched[plain.index] for each in edge_effects)], axis=0)
+        registration_rows = plain.index[~(touched | held_out_points[plain.index])] if realigned else None
+        modelled, residuals = _with_edge_effects(aligned, plain, edge_effects, touched, registration_rows)
+        registered_residuals, _, noise_ratio = fit_pose_robustly(residuals)
+        sight = SensorView.of(aligned, residuals)
+        changes, changed = find_scene_changes(
+            replace(residuals, value=registered_residuals), sight, residuals.on_smooth_surface & ~touched
+        )
+        if isinstance(aligned, TlsMeasurement) and aligned.scans:
+            changes = drop_duplicates(changes)
+        registered_residuals, _, noise_ratio = fit_pose_robustly(replace(residuals, usable=residuals.usable & ~changed))
+        cells = WallCells.over(residuals.wall_xy)
+        held_out = held_out_points[residuals.index]
+        usable = (
+            residuals.usable
+            & ~changed
+            & (np.abs(registered_residuals) < thresholds().points.outlier_sigmas * noise_ratio * residuals.sigma)
+        )
+        training_rows = subsample_rows(np.flatnonzero(usable & ~held_out))
+        return cls(
+            edge_effects,
+            modelled,
+            residuals,
+            touched,
+            changes,
+            changed,
+            registered_residuals,
+            noise_ratio,
+            cells,
+            held_out,
+            training_rows,
+        )
+
+    @property
+    def stable(self) -> BoolArray:
+        """(n,) points on smooth surface that did not change."""
+        return np.asarray(self.residuals.usable & ~self.changed)
+
+    @property
+    def measurable(self) -> BoolArray:
+        """(n,) points on which the gap may be measured: on smooth surface, or moved by an edge effect, and unchanged."""
+        return np.asarray((self.residuals.usable | self.touched) & ~self.changed)
+
+    @property
+    def training_part(self) -> tuple[Measurement, Residuals]:
+        """The measurement and the residuals of the training rows alone.
+
+        What edge effects do at these points is kept fixed: it hardly changes while the cameras move by millimetres.
+        """
+        measurement, residuals = self.measurement, self.residuals
+        if isinstance(measurement, StereoMeasurement) and isinstance(residuals, StereoResiduals):
+            shaped = np.zeros(len(measurement.cloud.points))
+            shaped[residuals.index] = residuals.geometry.shaped
+            measurement = measurement.changed(shaped_px=shaped)
+        return subsample(measurement, residuals, self.training_rows)
+
+
+@dataclass(frozen=True)
+class SelectionPass:
+    """One selection pass: its input, the effects that it named, and the rest of its result."""
+
+    pass_input: PassInput
+    named: list[NamedEffect]
+    selection: SelectionResult
+
+    @classmethod
+    def of(cls, pass_input: PassInput, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]) -> SelectionPass:
+        """Select effects for this input. excluded: families that are not tried, as in `select_effects`."""
+        return cls(pass_input, *select_effects(*pass_input.training_part, pass_input.noise_ratio, random, excluded))
+
+    @property
+    def edge_effect_names(self) -> set[str]:
+        """Names of the edge effects of the input."""
+        return {each.name for each in self.pass_input.edge_effects}
+
+    @property
+    def complexity(self) -> tuple[int, int]:
+        """Number of empirical terms, and number of all effects and scene changes; smaller is simpler."""
+        given = self.pass_input
+        return sum(item.kind == "empirical" for item in self.named), len(self.named) + len(given.edge_effects) + len(
+            given.changes
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PassInputs:
+    """The inputs that a selection pass may have: with all edge effects, with some, or with none.
+
+    measurement: the aligned measurement; plain: its residuals; held_out_points: (N,) its points kept for validation.
+    """
+
+    measurement: Measurement
+    plain: Residuals
+    held_out_points: BoolArray
+
+    @cached_property
+    def _edge_effects(self) -> list[EdgeEffect]:
+        """The edge effects that show in the plain residuals."""
+        return _find_edge_effects(self.measurement, self.plain, self.held_out_points)
+
+    @cached_property
+    def with_edge_effects(self) -> PassInput:
+        """The input with the edge effects that show in the plain residuals, and the pose estimated again beside them."""
+        return self.with_these(self._edge_effects)
+
+    @cached_property
+    def at_initial_pose(self) -> PassInput:
+        """The same edge effects, with the pose that was estimated without them."""
+        return PassInput.of(self.measurement, self.plain, self.held_out_points, self._edge_effects, realigned=False)
+
+    @cached_property
+    def without_edge_effects(self) -> PassInput:
+        """The input without any edge effect."""
+        return self.with_these([])
+
+    def edge_effects_beside(self, named: list[NamedEffect]) -> list[EdgeEffect]:
+        """Return the edge effects that show once some named effects are in the model."""
+        seen = aligned_with(self.measurement, named, self.plain.index[~self.held_out_points[self.plain.index]])
+        return _find_edge_effects(seen.measurement, seen.residuals, self.held_out_points)
+
+    def with_these(self, edge_effects: list[EdgeEffect]) -> PassInput:
+        """Return the input with the given edge effects."""
+        return PassInput.of(self.measurement, self.plain, self.held_out_points, edge_effects)
+
+
+def best_pass(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]) -> SelectionPass:
+    """Run the selection with several inputs and return the simplest pass that explains the residuals.
+
+    An effect that moves all rays can hide or imitate an edge effect. Edge effects are therefore searched again beside what was
+    named, and, if some were found, also beside what is named without them. Smoothing can shift the estimated pose. If the first
+    pass needs an empirical term and no single effect explains everything, a pass at the initial pose is tried too.
+
+    Among the passes whose noise is close to the lowest, the one of least complexity wins. The noise is compared because enough
+    noise can take the place of any effect.
+
+    Parameters
+    ----------
+    inputs : inputs to choose from.
+    random : source of random numbers of the null distributions.
+    excluded : families that are not tried, as in `select_effects`.
+    """
+
+    def search_edges_again(found: SelectionPass) -> SelectionPass:
+        """Repeat the pass beside the edge effects that show once the named effects are in the model."""
+        if not found.named:
+            return found
+        # a small error of the rays' directions looks like smoothing
+        imitated = {Smoothing.tag()} - found.edge_effect_names
+        edge_effects = [each for each in inputs.edge_effects_beside(found.named) if each.name not in imitated]
+        if {each.name for each in edge_effects} == found.edge_effect_names:
+            return found
+        return SelectionPass.of(inputs.with_these(edge_effects), random, excluded)
+
+    first = SelectionPass.of(inputs.with_edge_effects, random, excluded)
+    found = [search_edges_again(first)]
+    if first.edge_effect_names and found[0].complexity > _LEAST_COMPLEXITY:
+        without = SelectionPass.of(inputs.without_edge_effects, random, excluded)
+        if without.named:
+            found.append(search_edges_again(without))
+    simple = found[-1].complexity <= _LEAST_COMPLEXITY and found[-1].selection.noise_ratio <= found[0].selection.noise_ratio
+    if Smoothing.tag() in first.edge_effect_names and found[0].complexity >= (1, 0) and not simple:
+        found.insert(1, search_edges_again(SelectionPass.of(inputs.at_initial_pose, random, excluded)))
+    most_noise = thresholds().edges.most_relative_noise * min(each.selection.noise_ratio for each in found)
+    return min((each for each in found if each.selection.noise_ratio <= most_noise), key=lambda each: each.complexity)
+
+
+def subsample_rows(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return at most about 60,000 of the rows, evenly spaced."""
+    return rows[:: max(len(rows) // _MOST_POINTS, 1)]
+
+
+def _find_edge_effects(measurement: Measurement, residuals: Residuals, held_out_points: BoolArray) -> list[EdgeEffect]:
+    """Find edge effects that the model lacks; their `touched` refers to the points of the measurement.
+
+    held_out_points: (N,) points of the measurement that must not be used.
+    """
+    registered_residuals, _, noise_ratio = fit_pose_robustly(residuals)
+    found: list[EdgeEffect] = []
+    held_out = held_out_points[residuals.index]
+    match measurement, residuals:
+        case StereoMeasurement(), StereoResiduals():
+            found = find_disparity_edge_effects(measurement, residuals, registered_residuals, held_out)
+        case TlsMeasurement(), TlsResiduals() if not model_has(measurement, BeamDivergence.tag()):
+            found = find_footprint(measurement, residuals, registered_residuals, noise_ratio, held_out)
+    touched = np.zeros((len(found), len(measurement.cloud.points)), dtype=bool)
+    for row, each in zip(touched, found, strict=True):
+        row[residuals.index] = each.touched
+    return [replace(each, touched=row) for each, row in zip(found, touched, strict=True)]
+
+
+def _with_edge_effects(
+    measurement: Measurement,
+    residuals: Residuals,
+    edge_effects: list[EdgeEffect],
+    touched: BoolArray,
+    registration_rows: NDArray[np.int64] | None,
+) -> tuple[Measurement, Residuals]:
+    """Put edge effects into the model and return the measurement with the residuals of the same points.
+
+    The pose is estimated again from `registration_rows`, rows of the measurement's points; None keeps it. touched: (n,) points
+    that the effects move, which then do not count as smooth.
+    """
+    if not edge_effects:
+        return measurement, residuals
+    entries = [effect_from_edges(shape).entry for shape in edge_effects]
+    modelled = measurement.changed(model=with_effects(measurement.model, entries))
+    if registration_rows is None:
+        found = compute_residuals(modelled)
+    else:
+        modelled, found, _ = align(modelled, registration_rows)
+    place = np.full(len(measurement.cloud.points), -1)
+    place[found.index] = np.arange(len(found))
+    rows = place[residuals.index]
+    known = rows >= 0
+    matched = residuals.with_rows_from(known, found.part(rows[known]))
+    return modelled, replace(matched, usable=residuals.usable & ~touched & known)
+
+
+def subsample(measurement: Measurement, residuals: Residuals, rows: NDArray[np.int64]) -> tuple[Measurement, Residuals]:
+    """Restrict a measurement and its residuals to some rows of the residuals."""
+    part = residuals.part(rows)
+    return measurement.part(part.index), replace(part, index=np.arange(len(rows)), expected_pulses=None)

@@ -1,0 +1,49 @@
+"""Find the further measurement that would separate the effects of an equivalence class, at this site and for this sensor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from pipeline.formats.measurements.measurement import Measurement
+from pipeline.gap.naming.named_effects import NamedEffect
+from pipeline.gap.survey.identifiability import SIMILAR_COSINE, Identifiability, identifiability
+from pipeline.gap.survey.survey_views import measured_survey
+from sensors.effects import effect_of
+
+_POINTS = 4000
+_IN_GENERAL = {
+    "tls": "a second station at another range and azimuth, or targets of known position",
+    "stereo": "a second distance, or check points of known position across the whole frame",
+}
+
+
+def with_separating_measurements(measurement: Measurement, named: list[NamedEffect]) -> list[NamedEffect]:
+    """Fill in `split_by` of effects whose class has more than one member.
+
+    The signatures of the survey are compared with those after one additional measurement.
+    """
+    if not any(item.alike for item in named):
+        return named
+    found = identifiability(measured_survey(measurement, _POINTS))
+    return [replace(item, split_by=_separating_measurement(found, item)) if item.alike else item for item in named]
+
+
+def measurement_separating_noises(item: NamedEffect, sensor: str) -> str:
+    """Return what would separate some noise terms, by what they depend on; white noise depends on nothing."""
+    told = (effect_of(name).told_by for name in (item.name, *item.alike))
+    return " or ".join(filter(None, told)) or _IN_GENERAL[sensor]
+
+
+def _separating_measurement(found: Identifiability, item: NamedEffect) -> str:
+    """Return the additional measurement after which the signatures of a class are no longer alike."""
+    if item.adds_variance:
+        return measurement_separating_noises(item, found.sensor)
+    known = [found.names.index(name) for name in item.alike if name in found.names]
+    if item.name not in found.names or len(known) < len(item.alike):
+        return _IN_GENERAL[found.sensor]  # effects on returns and edge effects have no signature in the mean
+    own = found.names.index(item.name)
+    cosine = {each.name: max(float(each.cosines[own, other]) for other in known) for each in found.extensions}
+    best = min(cosine, key=lambda name: cosine[name])
+    if cosine[best] < SIMILAR_COSINE:
+        return " or ".join(name for name in sorted(cosine, key=lambda name: cosine[name]) if cosine[name] < SIMILAR_COSINE)
+    return f"no single further measurement; the best is {best} (signatures still alike: cosine {cosine[best]:.2f})"

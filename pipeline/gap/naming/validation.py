@@ -1,0 +1,178 @@
+"""Last step of the diagnosis: measure the gap with the named effects, and drop effects that make the predictions worse."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.formats.measurements.measurement import Measurement
+from pipeline.gap.naming.gap_score import LOSS_MEASURE, Gap, RegisteredModel, measure_gap, measure_losses, subsampling
+from pipeline.gap.naming.named_effects import NamedEffect, aligned_with, with_effects
+from pipeline.gap.noise_and_edges.missing_returns import LossExplanation
+from pipeline.gap.residuals.alignment import fit_pose
+from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from pipeline.gap.thresholds import thresholds
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from sensors.effects.base import ShowsIn
+from sensors.models.sensor_model import StereoModel, TlsModel
+
+_FEWEST_POINTS = 100
+
+
+@dataclass(frozen=True)
+class ValidationResult:
+    """A model with some effects, and the gap that it leaves.
+
+    Attributes
+    ----------
+    named : effects in the model.
+    reduced_noise : lower noise values of the model, by key; empty where its noise was kept.
+    model : the model.
+    value : (n,) registered residuals against it.
+    pose : (6,) pose of that registration, shift (m) and rotation (rad).
+    gap : scores before and after, None where too few points can be scored.
+    """
+
+    named: list[NamedEffect]
+    reduced_noise: dict[str, float]
+    model: TlsModel | StereoModel
+    value: FloatArray
+    pose: FloatArray
+    gap: Gap | None
+
+    @property
+    def is_worse(self) -> bool:
+        """Whether the model predicts no better with the effects than without them.
+
+        Missing returns are not judged this way: a shrub before the validation blocks outweighs a few drops.
+        """
+        gap = self.gap
+        return gap is not None and gap.measure != LOSS_MEASURE and gap.after > gap.before
+
+    @property
+    def is_clearly_worse(self) -> bool:
+        """Whether it predicts worse by more than the uncertainty of the scores."""
+        return (
+            self.is_worse
+            and self.gap is not None
+            and self.gap.after - self.gap.before > thresholds().verdict.gap_sigmas * self.gap.error
+        )
+
+
+@dataclass(frozen=True)
+class Validation:
+    """What is needed to measure the gap for any set of effects.
+
+    Attributes
+    ----------
+    measurement : measurement at the estimated pose.
+    residuals : residuals against its model.
+    registration_rows : rows of the residuals from which the pose is estimated.
+    tested : (n,) validation points, which no step has used.
+    training : (n,) points that the selection may use.
+    losses : explanation of the missing returns and the pulses that it was not fitted to, or None.
+    reference_sigma : standard deviation of the reference error, in the observable's unit.
+    most_sigmas : points farther than this many predicted standard deviations from the models are not scored.
+    random : source of random numbers.
+    reduced_noise : lower noise values to propose because the model's noise is too large, by key.
+    """
+
+    measurement: Measurement
+    residuals: Residuals
+    registration_rows: NDArray[np.int64]
+    tested: BoolArray
+    training: BoolArray
+    losses: tuple[LossExplanation, BoolArray] | None
+    reference_sigma: float
+    most_sigmas: float
+    random: KeyedRandom
+    reduced_noise: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def pose(self) -> FloatArray:
+        """(6,) pose that registers the model without effects."""
+        return fit_pose(self.residuals, self.registration_rows)
+
+    def validate(self, named: list[NamedEffect]) -> tuple[ValidationResult, list[str]]:
+        """Measure the gap on validation points, and drop effects that make the predictions worse.
+
+        While the score is worse with the effects than without, the effect that does most harm on training points is dropped, if
+        that harm exceeds its uncertainty. If the validation score itself is worse by more than its uncertainty, any effect may be
+        dropped; otherwise descriptions of the mean are kept. A lower noise is proposed only if it predicts better.
+
+        Returns
+        -------
+        tuple : the result, and a note for each effect that was dropped.
+        """
+        result, words = self._result_of(named, self.tested), []
+        if self.reduced_noise and result.is_worse:
+            return replace(self, reduced_noise={}).validate(named)
+        while result.is_worse:
+            doubtful = [item for item in _without_losses(result.named) if result.is_clearly_worse or _may_be_dropped(item)]
+            harms = [self._harm(result, item) for item in doubtful]
+            if max(harms, default=0.0) <= 0:
+                break
+            out = doubtful[int(np.argmax(harms))]
+            words.append(f"{out.name} dropped: the model predicts worse with it")
+            result = self._result_of([item for item in result.named if item is not out], self.tested)
+        return result, words
+
+    def _harm(self, result: ValidationResult, item: NamedEffect) -> float:
+        """By how much more than its uncertainty an effect worsens the predictions of the same training points.
+
+        The same points are compared, because an effect that moves some points far may bring others near.
+        """
+        others = [each for each in result.named if each is not item]
+        without = RegisteredModel(self._model(_without_losses(others)), self._registered(others)[1])
+        gap = self._gap(
+            result.named, (without, RegisteredModel(self._model(_without_losses(result.named)), result.pose)), self.training
+        )
+        return 0.0 if gap is None else gap.after - gap.before - thresholds().verdict.gap_sigmas * gap.error
+
+    def _model(self, named: list[NamedEffect]) -> TlsModel | StereoModel:
+        """The model with the effects and the reduced noise."""
+        return with_effects(self.measurement.model, [item.entry for item in named], self.reduced_noise)
+
+    def _result_of(self, named: list[NamedEffect], rows: BoolArray) -> ValidationResult:
+        """Put the effects into the model and measure the gap on some points (n,)."""
+        value, pose = self._registered(named)
+        versions = RegisteredModel(self.measurement.model, self.pose), RegisteredModel(self._model(_without_losses(named)), pose)
+        return ValidationResult(named, self.reduced_noise, self._model(named), value, pose, self._gap(named, versions, rows))
+
+    def _registered(self, named: list[NamedEffect]) -> tuple[FloatArray, FloatArray]:
+        """(n,) registered residuals of the same points with some effects, NaN where their rays miss the reference, and the pose
+        (6,)."""
+        if not (named or self.reduced_noise):
+            return self.residuals.value - self.residuals.pose_jacobian @ self.pose, self.pose
+        registered_points = self.residuals.index[self.registration_rows]
+        _, found, pose = aligned_with(self.measurement, named, registered_points, self.reduced_noise)
+        rest = fit_pose(found, found.usable & np.isin(found.index, registered_points))
+        return found.values_at(found.value - found.pose_jacobian @ rest, self.residuals.index), pose + rest
+
+    def _gap(self, named: list[NamedEffect], versions: tuple[RegisteredModel, RegisteredModel], rows: BoolArray) -> Gap | None:
+        """Score two models on some points (n,), or on pulses if the first effect explains missing returns."""
+        missing = self.residuals.expected_pulses
+        if self.losses is not None and missing is not None and named and named[0].name == f"tls.{self.losses[0].name}":
+            found, held_out = self.losses
+            share = np.full(len(held_out), float(missing.lost.mean()))
+            return measure_losses(missing, share if found.covariate else found.probability, held_out)
+        places = np.flatnonzero(rows)
+        if len(places) < _FEWEST_POINTS:
+            return None
+        part = self.residuals.part(places[subsampling(len(places))])
+        random = self.random.child("verify")
+        return measure_gap(self.measurement, *versions, part, self.reference_sigma, self.most_sigmas, random)
+
+
+def _without_losses(named: list[NamedEffect]) -> list[NamedEffect]:
+    """The effects that change ranges on the wall; drops return early, which no range on the wall is like."""
+    return [item for item in named if item.effect.shows_in != ShowsIn.RETURNS]
+
+
+def _may_be_dropped(item: NamedEffect) -> bool:
+    """Whether an effect may be dropped for slight harm. An empirical term on the mean may not: it is inexact, but describes a
+    misfit."""
+    return item.adds_variance or (item.kind == "physical" and item.effect.shows_in != ShowsIn.VALUES)

@@ -1,0 +1,213 @@
+"""Validate each effect on wall blocks that no fit has used: the Gaussian log score with the effect minus the score without it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cholesky, solve_triangular
+from scipy.sparse import csr_array
+
+from pipeline.change.robust import nmad
+from pipeline.formats.measurements.measurement import Measurement
+from pipeline.gap.mean.within_cell_noise import inverse_from_cholesky
+from pipeline.gap.naming.named_effects import NamedEffect, aligned_with
+from pipeline.gap.residuals.alignment import fit_pose
+from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise
+from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from pipeline.gap.residuals.wall_blocks import wall_blocks_by_points
+from pipeline.gap.thresholds import thresholds
+from scene.geometry.mesh import FloatArray
+from sensors.effects.base import ShowsIn
+
+_POINTS_PER_PATCH = 30.0
+_LEAST_WHITE_SHARE = 0.02
+"""Least share of a point's variance that counts as white noise, where the model has correlated noise only."""
+
+
+@dataclass(frozen=True)
+class ValidatedEffects:
+    """Result of the validation.
+
+    named: effects with their validation gains; failed: effects that do not improve the validation blocks; weak: effects that
+    improve them beside others, but too little to be named.
+    """
+
+    named: list[NamedEffect]
+    failed: list[NamedEffect]
+    weak: list[NamedEffect]
+
+
+def validate_effects(
+    measurement: Measurement, residuals: Residuals, named: list[NamedEffect], training: BoolArray, reference_sigma: float
+) -> ValidatedEffects:
+    """Score each effect on the validation blocks with all other effects in the model.
+
+    Two systematic effects may only compensate each other, and then each seems to be needed. The gain of all of them together is
+    therefore tested first. If that fails, the least important one is removed, an empirical term before any other.
+
+    Parameters
+    ----------
+    measurement : aligned measurement.
+    residuals : its residuals.
+    named : effects to validate.
+    training : (n,) points from which the pose is estimated; the other points are scored.
+    reference_sigma : standard deviation of the reference error, in the observable's unit.
+
+    Returns
+    -------
+    ValidatedEffects : accepted, failed and weak effects.
+    """
+    scorable = [item for item in named if item.effect.scored()]
+    if not scorable or (~training).sum() < 100:
+        return ValidatedEffects(named, [], [])
+    with_all = _registered_residuals(measurement, named, residuals, training)
+    shared = float(np.mean(residuals.with_sigma_of_means.sigma**2 - residuals.sigma**2)) / _POINTS_PER_PATCH
+    patch_sigma = float(np.sqrt(reference_sigma**2 + shared))
+
+    def gains(out: list[NamedEffect]) -> tuple[float, float]:
+        """Validation gain of some effects, and the gain expected from the training points."""
+        without = _registered_residuals(measurement, [each for each in named if each not in out], residuals, training)
+        known = np.isfinite(with_all.value) & np.isfinite(without.value)
+        tested, learned = (
+            _log_score_gain(with_all, without, known & rows, residuals.wall_xy, patch_sigma) for rows in (~training, training)
+        )
+        return tested, learned * float(np.sum(known & ~training)) / max(float(np.sum(known & training)), 1.0)
+
+    found = {item.name: gains([item]) for item in scorable}
+    systematic = [item for item in scorable if not item.adds_variance]
+    if len(systematic) > 1:
+        tested, expected = gains(systematic)
+        if tested <= _gain_needed(expected):
+            out = min(systematic, key=lambda item: (item.kind != "empirical", found[item.name][0]))
+            left = validate_effects(
+                measurement, residuals, [each for each in named if each is not out], training, reference_sigma
+            )
+            return ValidatedEffects(left.named, [out, *left.failed], left.weak)
+    failed = [item for item in scorable if found[item.name][0] <= _gain_needed_by(item, found[item.name][1])]
+    measured = [replace(item, gain=found[item.name][0]) if item.name in found else item for item in named if item not in failed]
+    weak = [item for item in measured if _is_weak(item)] if len(measured) > 1 else []
+    return ValidatedEffects([item for item in measured if item not in weak], failed, weak)
+
+
+def _is_weak(item: NamedEffect) -> bool:
+    """Whether an effect beside others gains no more than its standard error, sqrt(2 g) for a gain g, or is consistent with
+    zero."""
+    by = thresholds().validation
+    return (
+        item.kind == "physical"
+        and item.effect.scored()
+        and (item.gain <= by.least_gain_beside_others or _is_consistent_with_zero(item))
+    )
+
+
+def describe_weakness(item: NamedEffect) -> str:
+    """Return in words why an effect is mentioned but not named."""
+    if _is_consistent_with_zero(item):
+        return "its value is within its uncertainty of zero"
+    return f"it gains only {item.gain:.1f} in log-likelihood on validation blocks"
+
+
+def _is_consistent_with_zero(item: NamedEffect) -> bool:
+    """Whether the only parameter of a systematic effect is within its uncertainty of zero."""
+    values = [(item.entry[key], std) for key, std in item.std.items() if std]
+    if item.effect.shows_in != ShowsIn.MEAN or len(values) != 1:
+        return False
+    ((value, std),) = values
+    return abs(value) < thresholds().validation.null_sigmas * std
+
+
+def _gain_needed_by(item: NamedEffect, expected: float) -> float:
+    """The gain at or below which an effect fails; some effects have a limit of their own."""
+    return item.effect.held_out_gain or _gain_needed(expected)
+
+
+@dataclass(frozen=True)
+class _RegisteredResiduals:
+    """Residuals (n,) against some model after the pose fit, their predicted standard deviations, and their correlated noise."""
+
+    value: FloatArray
+    sigma: FloatArray
+    shared: GridCorrelatedNoise
+
+    def log_score(self, rows: NDArray[np.int64], patch: NDArray[np.int64], reference_sigma: float) -> float:
+        """Return the Gaussian log score of some rows, without its constant.
+
+        Each patch of the wall shares one error of the reference, and neighbours share grid-correlated noise. The covariance is
+        inverted by Woodbury's identity and the determinant lemma, first for the errors of the patches and then for the grid.
+
+        Parameters
+        ----------
+        rows : (k,) rows to score.
+        patch : (k,) number of the patch in which each row lies.
+        reference_sigma : standard deviation of the reference error of a patch, in the observable's unit.
+        """
+        value, sigma = self.value[rows], self.sigma[rows]
+        field = self.shared.part(rows).node_field(len(rows))
+        nodes, own = field.weights, np.maximum(sigma**2 - field.variance, _LEAST_WHITE_SHARE * sigma**2)
+        total = np.bincount(patch, 1 / own)
+        mean = np.bincount(patch, value / own) / total
+        limit = thresholds().validation.clip_sigmas * sigma
+        left = np.clip(value - mean[patch], -limit, limit)
+        shrinkage = 1 / (1 / reference_sigma**2 + total) if reference_sigma else np.zeros(len(total))
+        gathered = csr_array((1 / own, (patch, np.arange(len(rows)))))
+        weighed = (left + mean[patch]) / own
+        sums, node_sums = total * mean, gathered @ nodes
+        square = np.sum((left + mean[patch]) * weighed) - np.sum(shrinkage * sums**2)
+        size = np.sum(np.log(own)) - np.sum(np.log1p(-shrinkage * total))
+        if nodes.shape[1]:
+            matrix = (nodes.T @ nodes.multiply(1 / own[:, None]) - node_sums.T @ node_sums.multiply(shrinkage[:, None])).toarray()
+            prior = cholesky(field.covariance, lower=True)
+            root = cholesky(matrix + inverse_from_cholesky(prior), lower=True)
+            right = nodes.T @ weighed - node_sums.T @ (shrinkage * sums)
+            square -= np.sum(solve_triangular(root, right, lower=True) ** 2)
+            size += 2 * np.sum(np.log(np.diag(root)) + np.log(np.diag(prior)))
+        return float(-0.5 * (square + size))
+
+
+def _log_score_gain(
+    with_all: _RegisteredResiduals, without: _RegisteredResiduals, rows: BoolArray, at: FloatArray, sigma: float
+) -> float:
+    """Return the log score with an effect minus that without, over some rows (n,). Outliers of both models are left out.
+
+    at: (n, 2) places on the wall, m; sigma: standard deviation of the reference error.
+    """
+    chosen = np.flatnonzero(rows & (_inliers(with_all) | _inliers(without)))
+    patch = wall_blocks_by_points(at[chosen], _POINTS_PER_PATCH)
+    return with_all.log_score(chosen, patch, sigma) - without.log_score(chosen, patch, sigma)
+
+
+def _inliers(found: _RegisteredResiduals) -> BoolArray:
+    """(n,) residuals that are no outliers. Debris or a fallen block would move the mean of a patch."""
+    z = found.value / found.sigma
+    return np.asarray(np.abs(z) < thresholds().points.outlier_sigmas * max(nmad(z), 1.0))
+
+
+def _gain_needed(expected: float) -> float:
+    """The gain at or below which an effect fails: zero, or less where little is expected, as chance may take that much.
+
+    The gain of a true effect, half a difference of two chi^2, has a variance of about twice its expectation.
+    """
+    likely = max(expected, 0.0)
+    return max(
+        min(0.0, likely - thresholds().validation.shortfall_sigmas * float(np.sqrt(2 * likely))),
+        -thresholds().validation.most_loss,
+    )
+
+
+def _registered_residuals(
+    measurement: Measurement, named: list[NamedEffect], residuals: Residuals, training: BoolArray
+) -> _RegisteredResiduals:
+    """Residuals of all points with some effects in the model, the pose estimated from the training points; NaN where not
+    smooth."""
+    found = aligned_with(measurement, named, residuals.index[training]).residuals
+    count = len(measurement.cloud.points)
+    place = np.full(count, -1)
+    place[found.index[found.usable]] = np.flatnonzero(found.usable)  # points at edges under this model are not used
+    rows = place[residuals.index]
+    known = rows >= 0
+    value, sigma = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
+    pose = fit_pose(found, rows[training & known])
+    value[known], sigma[known] = (found.value - found.pose_jacobian @ pose)[rows[known]], found.sigma[rows[known]]
+    return _RegisteredResiduals(value, sigma, found.correlated_noise.part(rows))

@@ -1,0 +1,112 @@
+"""Find the width of a beam from points at edges, whose ranges lie between near and far surface (mixed pixels)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache, cached_property, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.formats.measurements.measurement import TlsMeasurement
+from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect, WallBlocks, log_density, maximise_gain
+from pipeline.gap.residuals.residuals import BoolArray
+from pipeline.gap.residuals.scan_simulation import simulate_ranges, simulate_ranges_by_mode, systematic_part
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.thresholds import thresholds
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from sensors.effects.angle_noise import AngleNoise
+from sensors.effects.beam_divergence import BeamDivergence
+from sensors.models.sensor_model import TlsModel
+from sensors.signal_chain.beam import Mode
+
+_MODES: tuple[Mode, ...] = ("strongest", "mean", "first")
+_DIVERGENCES_RAD = [1e-4 * 2 ** (step / 2) for step in range(11)]
+"""Divergences that are tried first, rad."""
+_REFINEMENT_FACTORS = (1.12, 1.03)
+_MOST_POINTS = 30_000
+_PROFILE_UNCERTAINTY = 0.12
+"""Relative uncertainty of a divergence, because the beam's energy may be distributed differently from the model's."""
+
+_RANDOM = KeyedRandom(0, ("gap", "mean"))
+
+
+def find_footprint(
+    measurement: TlsMeasurement,
+    residuals: TlsResiduals,
+    registered_residuals: FloatArray,
+    noise_ratio: float,
+    held_out: BoolArray,
+) -> list[EdgeEffect]:
+    """Find the beam divergence that explains points at edges better than noise of the angles does.
+
+    Parameters
+    ----------
+    measurement : aligned scan.
+    residuals : its residuals.
+    registered_residuals : (n,) residuals after a robust pose fit, m.
+    noise_ratio : their standard deviation over the predicted one.
+    held_out : (n,) points that must not be used.
+
+    Returns
+    -------
+    list : one edge effect, or none.
+    """
+    sigma, footprint = noise_ratio * residuals.sigma, _FootprintSimulation(measurement, residuals)
+    every = slice(None, None, max(len(residuals) // _MOST_POINTS, 1))
+    rows = np.flatnonzero(~held_out)[every]
+    widest_shift = footprint.shift(rows, ("mean",), _DIVERGENCES_RAD[-1])["mean"]
+    rows = rows[np.abs(widest_shift) > sigma[rows]]
+    if len(rows) < thresholds().edges.footprint_fewest:
+        return []
+    blocks = WallBlocks(WallBlocks.over(residuals.wall_xy).number[rows])
+    jittered = footprint.shift(rows, ("mean",), _equivalent_divergence(measurement.model))["mean"]
+    without = [log_density(registered_residuals[rows], moved, sigma[rows]) for moved in (np.zeros_like(jittered), jittered)]
+    null = np.logaddexp(*without) - np.log(2)  # the first holds at a step, the second on a curved slope
+    shift_by = cache(partial(footprint.shift, rows, _MODES))
+
+    def gains(mode: Mode, divergence_rad: float) -> FloatArray:
+        moved = shift_by(divergence_rad)[mode]
+        return np.asarray(log_density(registered_residuals[rows], moved, sigma[rows]) - null)
+
+    best_divergence = {mode: maximise_gain(partial(gains, mode), _DIVERGENCES_RAD, ()) for mode in _MODES}
+    mode = max(best_divergence, key=lambda each: float(gains(each, best_divergence[each]).sum()))
+    gain = blocks.total_if_agreed(gains(mode, best_divergence[mode]), thresholds().edges.footprint_block_sigmas)
+    if gain is None:
+        return []
+    divergence = maximise_gain(partial(gains, mode), [best_divergence[mode]], _REFINEMENT_FACTORS)
+    std = {"divergence_rad": float(np.hypot(blocks.std(partial(gains, mode), divergence), _PROFILE_UNCERTAINTY * divergence))}
+    touched = np.abs(footprint.shift(np.arange(len(residuals)), (mode,), 1.5 * divergence)[mode]) > sigma
+    return [EdgeEffect(BeamDivergence(divergence_rad=divergence, mode=mode), std, gain, touched)]
+
+
+def _equivalent_divergence(model: TlsModel) -> float:
+    """Divergence (rad) of a beam whose energy spreads as the directions of a thin beam with the model's noise of the angles.
+
+    On average such a thin beam records what the wide one records as the mean of its returns. Energy that falls as exp(-8 r^2 /
+    D^2) has a standard deviation of D / 4 in each direction.
+    """
+    noises = [each for each in model.chain() if isinstance(each, AngleNoise)]
+    both = sum(each.azimuth_sigma_rad**2 + each.zenith_sigma_rad**2 for each in noises)
+    return 4 * float(np.sqrt(both / 2))
+
+
+@dataclass(frozen=True)
+class _FootprintSimulation:
+    """Simulates how a beam's divergence changes the ranges of a scan."""
+
+    measurement: TlsMeasurement
+    residuals: TlsResiduals
+
+    @cached_property
+    def _axis(self) -> FloatArray:
+        """(n,) ranges along the beams' axes, m."""
+        return simulate_ranges(self.measurement, systematic_part(self.measurement.model), self.residuals.geometry, _RANDOM)
+
+    def shift(self, rows: NDArray[np.int64], modes: tuple[Mode, ...], angle: float) -> dict[Mode, FloatArray]:
+        """(m,) range of a beam of divergence `angle` minus that of its axis, m, for each mode; 0 where either does not return."""
+        plain = systematic_part(self.measurement.model)
+        beam = plain.model_copy(update={"effects": (*plain.effects, BeamDivergence(divergence_rad=angle))})
+        whole = simulate_ranges_by_mode(self.measurement, beam, modes, self.residuals.geometry.part(rows), _RANDOM)
+        return {mode: np.asarray(np.nan_to_num(whole[mode] - self._axis[rows])) for mode in modes}

@@ -1,0 +1,271 @@
+"""Explain missing returns by a Bernoulli model of the pulses: losses that grow with range, or that fall on weak echoes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import expit, logit, ndtr
+
+from pipeline.gap.residuals.residuals import BoolArray, ExpectedPulses
+from pipeline.gap.residuals.wall_blocks import wall_blocks_by_points
+from pipeline.gap.thresholds import thresholds
+from scene.geometry.mesh import FloatArray
+from sensors.effects import catalogue
+from sensors.effects.base import ShowsIn
+from sensors.effects.detection_limit import DetectionLimit
+from sensors.effects.precipitation import Precipitation
+
+LOSS_EFFECTS = tuple(effect.tag() for effect in catalogue("tls") if effect.shows_in == ShowsIn.RETURNS)
+"""Names of the effects of the catalogue that make returns disappear."""
+_PULSES_PER_PATCH = 60.0
+_STRIPS = 8
+"""Strips across a sector whose losses must agree."""
+_DIRECTIONS = {"azimuth": "zenith", "zenith": "azimuth"}
+"""Angles on which losses may depend without an effect of the catalogue, and the angle across each. Range, incidence and power are
+explained by the catalogue."""
+_BINS = 16
+_MOST_PULSES = 20_000
+"""Pulses that decide where the search for the best values starts."""
+_LARGEST_LOG_POWER = 500.0
+"""Bound of a limit's log power: where losses depend on nothing, the search diverges."""
+
+
+@dataclass(frozen=True)
+class LossExplanation:
+    """An effect that explains missing returns.
+
+    Attributes
+    ----------
+    name : name of the effect; of a non-parametric explanation the nearest effect of the catalogue.
+    gain : log-likelihood ratio against a constant share of losses.
+    score : the same minus the number of parameters.
+    parameters, std : values of the effect and their standard deviations.
+    probability : (m,) probability of losing each pulse.
+    tried : names and scores of the explanations that were tried.
+    covariate : covariate of a non-parametric explanation, else "".
+    """
+
+    name: str
+    gain: float
+    score: float
+    parameters: dict[str, float]
+    std: dict[str, float]
+    probability: FloatArray
+    tried: tuple[tuple[str, float], ...] = ()
+    covariate: str = ""
+
+
+@dataclass(frozen=True)
+class LossData:
+    """Lost pulses.
+
+    lost: (m,) whether each pulse was lost; fit: (m,) pulses that may be used; log_likelihood: of these with one share of losses.
+    """
+
+    lost: BoolArray
+    fit: BoolArray
+    log_likelihood: float
+
+    @classmethod
+    def of(cls, lost: BoolArray, fit: BoolArray) -> LossData:
+        """Build it from pulses (m,)."""
+        share = np.full(int(fit.sum()), np.clip(lost[fit].mean(), 1e-9, 1 - 1e-9))
+        return cls(lost, fit, _log_likelihood(lost[fit], share))
+
+    def best(
+        self, probability: Callable[[FloatArray, FloatArray], FloatArray], x: FloatArray, starts: list[FloatArray]
+    ) -> _LossFit:
+        """Maximise the likelihood over the parameters of a probability of loss.
+
+        Parameters
+        ----------
+        probability : function of the parameters and of x that returns the probability of loss.
+        x : (m,) covariate of each pulse.
+        starts : parameters to start from; the best start is used.
+        """
+        seen, lost = x[self.fit], self.lost[self.fit]
+        every = slice(None, None, max(len(lost) // _MOST_PULSES, 1))
+        first = starts[int(np.argmax([_log_likelihood(lost[every], probability(start, seen[every])) for start in starts]))]
+
+        def cost(values: FloatArray) -> float:
+            return -_log_likelihood(lost, probability(values, seen))
+
+        found = minimize(cost, first, method="Nelder-Mead", options={"maxiter": 150, "xatol": 1e-3, "fatol": 0.05})
+        return _LossFit(found.x, -float(found.fun) - self.log_likelihood, probability(found.x, x), cost)
+
+
+@dataclass(frozen=True)
+class _LossFit:
+    """Result of a fit.
+
+    values: parameters at the maximum; gain: log-likelihood ratio; probability: (m,); cost: negative log-likelihood of parameters.
+    """
+
+    values: FloatArray
+    gain: float
+    probability: FloatArray
+    cost: Callable[[FloatArray], float]
+
+
+def explain_missing_returns(
+    missing: ExpectedPulses, fit: BoolArray, early: int, points: int, intensity: FloatArray | None
+) -> LossExplanation | None:
+    """Find the effect that explains the missing returns; None if none gains enough.
+
+    Losses come in clusters (shrubs, wet rock), so a likelihood of independent pulses is overconfident. Gains are therefore
+    divided by the overdispersion: how much more the losses of wall patches vary than independent ones under the best explanation.
+
+    Parameters
+    ----------
+    missing : lost pulses with their covariates.
+    fit : (m,) pulses that may be used.
+    early : number of returns far before the surface, as from drops.
+    points : number of points among which these were counted.
+    intensity : (n,) recorded powers, or None.
+    """
+    lost = missing.lost
+    losses = LossData.of(lost, fit)
+    limit = _fit_detection_limit(losses, missing.covariates["log_power"])
+    precipitation = _fit_precipitation(losses, missing.covariates["range"], early, points)
+    if intensity is not None and not _ends_abruptly(intensity):
+        limit = replace(limit, score=-np.inf)
+    best, second = (limit, precipitation) if limit.score >= precipitation.score else (precipitation, limit)
+    free = _fit_directional_losses(losses, missing.covariates)
+    by = thresholds().missing_returns
+    if free.score > by.nonparametric_ratio * max(best.score, 0.0) + by.nonparametric_margin and _strips_agree(
+        missing, best, free, fit
+    ):
+        best = free
+    confidence = 1 / _overdispersion(lost[fit], best.probability[fit], missing.wall_xy[fit])
+    best = replace(best, gain=best.gain * confidence, score=best.score * confidence)
+    if best.score < thresholds().missing_returns.least_gain:
+        return None
+    return replace(
+        best,
+        std={key: value / np.sqrt(confidence) for key, value in best.std.items()},
+        tried=((best.name, best.score), (second.name, second.score)),
+    )
+
+
+def count_isolated_returns(at: FloatArray, early: BoolArray) -> int:
+    """Return the number of early returns if they come from drops, which fall anywhere; 0 if they come from objects.
+
+    An object before the wall, or its edge, returns many pulses side by side.
+    """
+    patch, count = wall_blocks_by_points(at, _PULSES_PER_PATCH), int(early.sum())
+    number = int(patch.max()) + 1
+    anywhere = number * (1 - (1 - 1 / number) ** count)
+    return count if len(np.unique(patch[early])) >= thresholds().missing_returns.least_isolated_share * anywhere else 0
+
+
+def _overdispersion(lost: BoolArray, probability: FloatArray, at: FloatArray) -> float:
+    """Variance of the patches' losses over that of independent ones, at least 1."""
+    patch = wall_blocks_by_points(at, _PULSES_PER_PATCH)
+    left = np.bincount(patch, lost - probability)
+    expected = np.bincount(patch, probability * (1 - probability))
+    return float(max(np.sum(left**2) / np.sum(expected), 1.0))
+
+
+def _strips_agree(missing: ExpectedPulses, known: LossExplanation, free: LossExplanation, fit: BoolArray) -> bool:
+    """Whether losses by one angle occur in all strips of the other angle. Each strip is predicted from the losses of the others.
+
+    A shrub before the wall takes pulses in a few strips only, and so do lines that the scanner dropped.
+    """
+    lost, across = missing.lost[fit], missing.covariates[_DIRECTIONS[free.covariate]][fit]
+    strip, group = _quantile_group(across, _STRIPS), _quantile_group(missing.covariates[free.covariate], _BINS)[fit]
+    sent, gone = (np.bincount(strip * _BINS + group, each, _STRIPS * _BINS).reshape(_STRIPS, _BINS) for each in (None, lost))
+    others = (gone.sum(axis=0) - gone + 0.5) / (sent.sum(axis=0) - sent + 1.0)
+    p, q = np.clip(known.probability[fit], 1e-9, 1 - 1e-9), others[strip, group]
+    sums = np.bincount(strip, np.where(lost, np.log(q / p), np.log1p(-q) - np.log1p(-p)), _STRIPS)
+    return float(sums.sum()) > thresholds().missing_returns.strip_agreement * np.sqrt(_STRIPS) * float(np.linalg.norm(sums))
+
+
+def _quantile_group(values: FloatArray, count: int) -> NDArray[np.int64]:
+    """(m,) group of each value, of `count` groups of equal size."""
+    return np.asarray(np.searchsorted(np.quantile(values, np.linspace(0, 1, count + 1)[1:-1]), values))
+
+
+def _ends_abruptly(intensity: FloatArray) -> bool:
+    """Whether the recorded powers end abruptly, as at a detection limit, and do not thin out.
+
+    Below a limit the density drops to zero, so the lowest percent of the log powers covers twice the interval of the lowest half
+    percent (ratio 0.5). The tail of a normal distribution gives 0.8.
+    """
+    ordered = np.sort(np.log(np.maximum(intensity, 1e-12)))
+    low, middle, high = (float(ordered[int(share * (len(ordered) - 1))]) for share in (0.0005, 0.005, 0.01))
+    return (middle - low) < thresholds().missing_returns.cutoff_ratio * (high - low)
+
+
+def _fit_detection_limit(losses: LossData, log_power: FloatArray) -> LossExplanation:
+    """P = p0 + (1 - p0) Phi((ln P_min - ln rho - ln(cos i / R^2)) / s), for an unknown, log-normal albedo rho."""
+
+    def probability(values: FloatArray, x: FloatArray) -> FloatArray:
+        base = expit(values[2])
+        return np.asarray(base + (1 - base) * ndtr((values[0] - x) / np.exp(values[1])))
+
+    starts = [
+        np.array([level - spread, np.log(spread), logit(base)])
+        for spread in (0.05, 0.2, 0.5)
+        for level in np.quantile(log_power, [0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95])
+        for base in (0.003, 0.02, 0.08)
+    ]
+    found = losses.best(probability, log_power, starts)
+    value = float(np.exp(np.clip(found.values[0], -_LARGEST_LOG_POWER, _LARGEST_LOG_POWER)) * 0.5)
+    std = {"minimum_power": value * float(np.exp(found.values[1]))}
+    return LossExplanation(DetectionLimit.tag(), found.gain, found.gain - 3.0, {"minimum_power": value}, std, found.probability)
+
+
+def _fit_precipitation(losses: LossData, range_m: FloatArray, early: int, points: int) -> LossExplanation:
+    """P = 1 - (1 - p0) exp(-2 beta R). Early returns count as drops if there are more than a few."""
+
+    def probability(values: FloatArray, x: FloatArray) -> FloatArray:
+        return np.asarray(1 - (1 - expit(values[1])) * np.exp(-2 * np.exp(values[0]) * x))
+
+    starts = [np.array([np.log(rate), logit(base)]) for rate in np.geomspace(1e-6, 0.05, 20) for base in (0.003, 0.01, 0.03, 0.1)]
+    found = losses.best(probability, range_m, starts)
+    share = min(early / max(float(losses.lost.sum()) + early, 1.0), 1.0)
+    rate = max(float(np.exp(found.values[0])) / max(1 - share, 1e-3), 1e-6)
+    drops = 10.0 * early if early > max(5, 1e-4 * points) else 0.0
+    std = {
+        "rate_per_m": rate * _first_parameter_std(found.cost, found.values),
+        "early_share": float(np.sqrt(share / max(early, 1))),
+    }
+    gain, parameters = found.gain + drops, {"rate_per_m": rate, "early_share": share}
+    return LossExplanation(Precipitation.tag(), gain, gain - 2.0, parameters, std, found.probability)
+
+
+def _first_parameter_std(cost: Callable[[FloatArray], float], top: FloatArray) -> float:
+    """Standard deviation of the first of two parameters, from the curvature of the cost; 1 where that is not positive
+    definite."""
+    step = 0.05
+    moves = step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1]])
+    a, b, c, d, e, f = (cost(top + move) for move in moves)
+    middle = cost(top)
+    own, other = (a + b - 2 * middle) / step**2, (c + d - 2 * middle) / step**2
+    both = (e + f - a - b - c - d + 2 * middle) / (2 * step**2)
+    determinant = own * other - both**2
+    return float(np.sqrt(other / determinant)) if determinant > 0 < other else 1.0
+
+
+def _fit_directional_losses(losses: LossData, covariates: dict[str, FloatArray]) -> LossExplanation:
+    """Losses free in each bin of one angle (non-parametric); their mean is given as a rate of precipitation."""
+    found, lost, fit = [], losses.lost, losses.fit
+    rate = max(-float(np.log1p(-min(float(lost.mean()), 0.999))) / (2 * float(np.mean(covariates["range"]))), 1e-6)
+    for name in _DIRECTIONS:
+        group = _quantile_group(covariates[name], _BINS)
+        count = np.maximum(np.bincount(group[fit], minlength=_BINS), 1)
+        probability = (np.bincount(group[fit], lost[fit], _BINS) / count)[group]
+        gain = _log_likelihood(lost[fit], probability[fit]) - losses.log_likelihood
+        parameters = {"rate_per_m": rate, "early_share": 0.0}
+        found.append(LossExplanation(Precipitation.tag(), gain, gain - _BINS, parameters, {}, probability, (), name))
+    return max(found, key=lambda each: each.score)
+
+
+def _log_likelihood(lost: BoolArray, probability: FloatArray) -> float:
+    """Bernoulli log-likelihood of losses (m,) with probability (m,)."""
+    p = np.clip(probability, 1e-9, 1 - 1e-9)
+    return float(np.sum(np.log(np.where(lost, p, 1 - p))))

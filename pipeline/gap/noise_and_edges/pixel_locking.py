@@ -1,0 +1,240 @@
+"""Find pixel locking from the measured disparities alone: they crowd around the pixels of the matched image, whatever the noise.
+
+If d' = x + A sin(2 pi x / n + phase) and x is distributed over many pixels, the mean of exp(2 pi i d' / n) is -J1(2 pi A / n)
+exp(-i phase) (Jacobi-Anger). This also holds where noise in x would average the sine away in the residuals. The k-th multiple of
+the angle gives |Jk(2 pi k A / n)|. Noise of standard deviation s after the locking multiplies it by exp(-2 (pi k s / n)^2).
+
+The rectification in which the disparities were matched is not part of a measurement. Another rectification has another principal
+distance and may be rotated about the base by an angle w, so that d' = s d / (1 + y tan w). Here d is counted from the disparity
+of a point at infinity, and y is the tangent of a row's angle to the axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import j1, jv
+
+from pipeline.gap.thresholds import thresholds
+from scene.geometry.mesh import FloatArray
+
+_REDUCTIONS = (1.0, 2.0, 4.0, 8.0)
+"""Pixels of the matched image in pixels of the full one."""
+_SCALE_UNKNOWN, _TILT_UNKNOWN = 0.03, 0.1
+"""Relative uncertainty of the principal distance of the matcher's rectification, and uncertainty of its rotation about the base,
+rad."""
+_SHAPE_BAND = 0.18
+"""Relative half-width of the band around the pixel frequency in which crowding of the reference counts as the wall's shape."""
+_BINS_A_CYCLE, _STEPS_A_CYCLE = 8, 4
+"""Bins and trial frequencies for each cycle."""
+_MOST_BINS = 4096
+_LARGEST_AMPLITUDE = 0.6
+"""Largest amplitude that is tried, in matched pixels."""
+_PROFILE_HALF_WIDTH = 0.06
+"""Half-width in matched pixels of the profile likelihood from which the standard deviation is taken: twice the smallest amplitude
+that shows in the noise."""
+_NOISE_UNCERTAINTY, _LEAST_NOISE_SHARE = 0.1, 0.01
+"""Relative uncertainty of the noise; least share of the measured variance that is noise."""
+_MULTIPLES = np.arange(1, 5)
+_FOLDING, _LARGE_AMPLITUDE, _HARMONIC_MISFIT = 1 / (2 * np.pi), 0.3, 0.02
+"""Amplitude from which disparities fold over; amplitude that is large; chi^2 share by which a small amplitude may fit worse,
+because a matcher's error is not exactly a sine."""
+_MOST_POINTS = 60_000
+
+
+@dataclass(frozen=True)
+class Locking:
+    """Pixel locking that was found.
+
+    amplitude_px, std_px: amplitude and its standard deviation; period_px: size of a matched pixel n; phase_rad: phase of the
+    given disparities; tilt_rad: rotation of the matcher's rectification about the base; gain: log-likelihood ratio.
+    """
+
+    amplitude_px: float
+    std_px: float
+    period_px: float
+    phase_rad: float
+    tilt_rad: float
+    gain: float
+
+
+@dataclass(frozen=True)
+class NoiseBounds:
+    """What is known about the matching noise beside the locking, px.
+
+    predicted: standard deviation by the model; measured: standard deviation about the reference, noise and locking together. For
+    small amplitudes only the first multiple shows, and noise changes its size as the amplitude does; so the noise must be
+    bounded.
+    """
+
+    predicted: float
+    measured: float
+
+    def in_matched_pixels(self, frequency: float) -> NoiseBounds:
+        """Convert to matched pixels. frequency: matched pixels in one px."""
+        return NoiseBounds(self.predicted * frequency, self.measured * frequency)
+
+    def range_beside(self, amplitude: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the lowest and highest standard deviation of the noise beside each amplitude (k,), px."""
+        left = np.sqrt(np.maximum(self.measured**2 - amplitude**2 / 2, _LEAST_NOISE_SHARE * self.measured**2))
+        return (1 - _NOISE_UNCERTAINTY) * np.minimum(left, self.predicted), (1 + _NOISE_UNCERTAINTY) * np.maximum(
+            left, self.predicted
+        )
+
+
+def find_locking(
+    disparity: FloatArray,
+    reference: FloatArray,
+    tangent: FloatArray | float = 0.0,
+    infinity: FloatArray | float = 0.0,
+    noise: NoiseBounds | None = None,
+) -> Locking | None:
+    """Find the pixel locking that measured disparities show; None if chance would make as much crowding.
+
+    Without locking, n |R|^2 of the mean phasor R is exponentially distributed (Rayleigh test).
+
+    Parameters
+    ----------
+    disparity : (n,) measured disparities, px.
+    reference : (n,) disparities of the reference, px. What crowds there, beyond chance, is the wall's shape.
+    tangent : (n,) tangent of the angle between a point's rectified row and the axis.
+    infinity : disparity of a point at infinity, px.
+    noise : bounds of the matching noise; None if it may be anything.
+    """
+    every = slice(None, None, max(len(disparity) // _MOST_POINTS, 1))
+    far = np.broadcast_to(infinity, disparity.shape)[every]
+    disparities, known, rows = disparity[every] - far, reference[every] - far, np.broadcast_to(tangent, disparity.shape)[every]
+    count, reach = len(disparities), float(np.ptp(np.quantile(disparities, [0.02, 0.98])))
+    best: tuple[float, float, float, float] | None = None
+    for reduction in _REDUCTIONS:
+        if reach < thresholds().locking.fewest_cycles * reduction:
+            continue
+        whole = 1 / reduction
+        frequency, tilt, _, tries = _strongest_crowding(disparities, rows, whole, _SCALE_UNKNOWN)
+        _, _, strength_of_reference, tries_beside = _strongest_crowding(known, rows, whole, _SHAPE_BAND)
+        shape = np.sqrt(max(strength_of_reference**2 - np.log(tries_beside) / count, 0.0))
+        frequency, tilt = _refine_frequency(disparities, rows, frequency, tilt)
+        strength_found = _crowding(disparities, rows, frequency, tilt)
+        gain = count * max(strength_found - thresholds().locking.crowding_ratio * shape, 0.0) ** 2
+        if best is None or gain > best[0]:
+            best = gain, frequency, tilt, tries
+    if best is None:
+        return None
+    gain, frequency, tilt, tries = best
+    p_value = min(1.0, len(_REDUCTIONS) * tries * float(np.exp(-gain)))
+    if p_value > thresholds().locking.significance:
+        return None
+    pixels = frequency * (disparities / (1 + np.tan(tilt) * rows) + far)
+    strength = np.array([abs(np.exp(2j * np.pi * k * pixels).mean()) for k in _MULTIPLES])
+    share, error = _amplitude(strength, count, None if noise is None else noise.in_matched_pixels(frequency))
+    first = complex(np.exp(2j * np.pi * pixels).mean())
+    phase = float(np.angle(-np.conj(first) * np.sign(j1(2 * np.pi * share))))
+    return Locking(share / frequency, error / frequency, 1 / frequency, phase, tilt, float(gain))
+
+
+def _strongest_crowding(
+    disparity: FloatArray, tangent: FloatArray, whole: float, share: float
+) -> tuple[float, float, float, float]:
+    """Return the frequency (1/px) within a share of `whole`, and the tilt, at which disparities crowd most; how much; number of
+    trials.
+
+    The mean of exp(2 pi i f d (1 - w y)) for all f and w is a Fourier transform over d and d y of the phasors of whole pixels.
+    Its frequencies are low, so the phasors are gathered in bins of an eighth of their shortest cycle.
+    """
+    phasor = np.exp(2j * np.pi * whole * disparity)
+    axes = [disparity - disparity.mean(), disparity * tangent]
+    axes[1] = axes[1] - axes[1].mean()
+    highest = [share * whole, (1 + share) * _TILT_UNKNOWN * whole]
+    bins = [int(np.clip(np.ceil(np.ptp(x) * f * _BINS_A_CYCLE), 4, _MOST_BINS)) for x, f in zip(axes, highest, strict=True)]
+    edges = [np.linspace(x.min(), x.max() + 1e-9, n + 1) for x, n in zip(axes, bins, strict=True)]
+    real, imaginary = (np.histogram2d(axes[0], axes[1], bins=edges, weights=part)[0] for part in (phasor.real, phasor.imag))
+    middles, steps = [(edge[1:] + edge[:-1]) / 2 for edge in edges], []
+    found = real + 1j * imaginary
+    for axis in (1, 0):
+        reach = max(float(np.ptp(axes[axis])), 1e-9)
+        tried = np.arange(-highest[axis], highest[axis], 1 / (_STEPS_A_CYCLE * reach))
+        steps.append(tried)
+        turned = np.exp(2j * np.pi * tried[:, None] * middles[axis])
+        found = found @ turned.T if axis else turned @ found
+    strength = np.abs(found) / len(disparity)
+    row, column = np.unravel_index(int(np.argmax(strength)), strength.shape)
+    frequency = whole + float(steps[1][row])
+    return frequency, -float(steps[0][column]) / frequency, float(strength[row, column]), float(strength.size)
+
+
+def _crowding(disparity: FloatArray, tangent: FloatArray, frequency: float, tilt: float) -> float:
+    """Mean resultant length of the phases."""
+    return float(abs(np.exp(2j * np.pi * frequency * disparity / (1 + np.tan(tilt) * tangent)).mean()))
+
+
+def _refine_frequency(disparity: FloatArray, tangent: FloatArray, frequency: float, tilt: float) -> tuple[float, float]:
+    """Frequency and tilt at the maximum of the crowding."""
+    unit = 1 / float(np.ptp(disparity)), 1 / (frequency * max(float(np.ptp(disparity * tangent)), 1e-9))
+
+    def negative_strength(at: FloatArray) -> float:
+        if np.abs(at).max() > 1:
+            return 0.0
+        return -_crowding(disparity, tangent, frequency + at[0] * unit[0], tilt + at[1] * unit[1])
+
+    top = minimize(
+        negative_strength, np.zeros(2), method="Nelder-Mead", options={"initial_simplex": [[0, 0], [0.1, 0], [0, 0.1]]}
+    ).x
+    return frequency + top[0] * unit[0], tilt + top[1] * unit[1]
+
+
+def _amplitude(strength: FloatArray, count: int, noise: NoiseBounds | None) -> tuple[float, float]:
+    """Amplitude and its standard deviation, matched pixels: least squares over amplitude and noise from the mean of each
+    multiple.
+
+    noise: in matched pixels.
+    """
+
+    def chi2(share: FloatArray, blur: FloatArray) -> FloatArray:
+        harmonics = np.abs(jv(_MULTIPLES, 2 * np.pi * _MULTIPLES * share[:, None, None]))
+        predicted = harmonics * np.exp(-2 * (np.pi * _MULTIPLES * blur[None, :, None]) ** 2)
+        found = np.asarray(np.sum((predicted - strength) ** 2, axis=2) * 2 * count)
+        if noise is None:
+            return found
+        least, most = noise.range_beside(share)
+        beyond = np.maximum(least[:, None] - blur, 0) + np.maximum(blur - most[:, None], 0)
+        return np.asarray(found + (beyond / (_NOISE_UNCERTAINTY * noise.predicted)) ** 2)
+
+    largest = thresholds().locking.most_noise
+    shares, blurs = np.linspace(0.002, _LARGEST_AMPLITUDE, 400), np.linspace(0.0, largest, 60)
+    coarse = chi2(shares, blurs)
+    row = _plausible_minimum(shares, coarse.min(axis=1), float(np.sum(strength**2)) * 2 * count)
+    for width in (0.01, 0.002):
+        column = int(np.argmin(coarse[row]))
+        shares = shares[row] + np.linspace(-width, width, 81)
+        blurs = np.maximum(blurs[column] + np.linspace(-width, width, 41), 0.0)
+        coarse = chi2(shares, blurs)
+        row = int(np.argmin(coarse.min(axis=1)))
+    best = float(coarse.min())
+    # standard deviation of the amplitude, with the noise free within its bounds
+    around = np.maximum(shares[row] + np.linspace(-_PROFILE_HALF_WIDTH, _PROFILE_HALF_WIDTH, 201), 0.0)
+    profile = chi2(around, np.linspace(0.0, largest, 200)).min(axis=1)
+    weight = np.exp(-0.5 * (profile - profile.min()) / max(best, 1.0))
+    weight /= weight.sum()
+    mean = float(weight @ around)
+    return mean, float(np.sqrt(weight @ (around - mean) ** 2 + 1e-8))
+
+
+def _plausible_minimum(shares: FloatArray, chi2: FloatArray, whole: float) -> int:
+    """Choose among the minima of chi^2 the row of the plausible amplitude, because Bessel functions repeat their values.
+
+    Of amplitudes that fit equally well the smallest is taken. An amplitude that folds disparities over, from 1 / 2 pi on, must
+    fit well. A large one gives way to a small one that leaves as little as a matcher's deviation from a sine. whole: chi^2
+    without locking.
+    """
+    lowest = (chi2 <= np.append(chi2[1:], np.inf)) & (chi2 <= np.append(np.inf, chi2[:-1]))
+    rows = np.flatnonzero(lowest & (chi2 < chi2.min() + thresholds().locking.equal_fit))
+    unfolded = np.flatnonzero(lowest & (shares < _FOLDING))
+    if len(unfolded):
+        small = int(unfolded[np.argmin(chi2[unfolded])])
+        if chi2.min() > thresholds().locking.good_fit or (
+            shares[rows[0]] > _LARGE_AMPLITUDE and chi2[small] < _HARMONIC_MISFIT * whole
+        ):
+            return small
+    return int(rows[0])

@@ -1,0 +1,490 @@
+"""Fit the variance model: which noise terms explain the squared deviations within cells, by the Gaussian likelihood.
+
+sigma_i^2 = predicted variance + sum_k theta_k f_k(i), theta_k >= 0, for candidate terms f_k of the catalogue.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from pipeline.change.robust import nmad
+from pipeline.gap.residuals.residuals import BoolArray, Geometry, Residuals
+from pipeline.gap.residuals.wall_blocks import WallCells, wall_block_numbers
+from pipeline.gap.thresholds import thresholds
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from sensors.effects.base import Effect, ShowsIn
+
+DRAWS = 1999
+"""Number of sign flips of the null distribution."""
+_LEAST_REMAINING_VARIANCE = 0.3
+"""Least share of a point's variance that the plane of its cell must leave."""
+_LEAST_WHITE_SHARE, _EXPECTATION_DRAWS = 0.02, 10
+"""Least share of a point's variance that counts as white noise; number of simulations of correlated noise."""
+_BINS = 8
+_CLIP_SIGMAS = 12.0
+"""Standard deviations at which outliers are clipped."""
+_HIGHEST_QUANTILE = 0.999
+"""Quantile of a candidate's variance above which it is clipped."""
+_FISHER_ROUNDS = 25
+
+
+@dataclass(frozen=True)
+class VarianceCandidate:
+    """A candidate noise term.
+
+    Attributes
+    ----------
+    name : name of the effect.
+    variance : (n, k) variance at its typical sizes, to be scaled by theta (k,).
+    scale : typical sizes: a parameter is scale * sqrt(theta).
+    names : names of the parameters.
+    cost : number of free parameters.
+    fixed : values that tell variants of the effect apart.
+    """
+
+    name: str
+    variance: FloatArray
+    scale: tuple[float, ...]
+    names: tuple[str, ...]
+    cost: float = 1.0
+    fixed: Mapping[str, float] = field(default_factory=dict)
+
+    def parameters(self, theta: FloatArray) -> dict[str, float]:
+        """Return the effect's parameters for theta (k,)."""
+        return dict(zip(self.names, map(float, np.sqrt(theta) * np.array(self.scale)), strict=True)) | dict(self.fixed)
+
+    def standard_deviations(self, theta: FloatArray, error: FloatArray) -> dict[str, float]:
+        """Return standard deviations of the parameters from those of theta; for a parameter of 0 its possible size."""
+        root = np.sqrt(theta)
+        std = np.where(theta > error, error / np.maximum(2 * root, 1e-300), np.sqrt(error))
+        return dict(zip(self.names, map(float, std * np.array(self.scale)), strict=True))
+
+
+@dataclass(frozen=True)
+class VarianceTerm:
+    """A noise term that was found.
+
+    Attributes
+    ----------
+    name : name of the effect, or what an empirical term depends on.
+    effect : effect of the catalogue that is nearest, which also carries an empirical term.
+    alike : other effects of its equivalence class.
+    p_value : p-value from the null distribution.
+    gain : log-likelihood ratio.
+    parameters, std : values and their standard deviations, from the curvature of the likelihood.
+    empirical : whether no effect of the catalogue fits.
+    variance : (n,) variance that it adds.
+    """
+
+    name: str
+    effect: str
+    alike: tuple[str, ...]
+    p_value: float
+    gain: float
+    parameters: dict[str, float]
+    std: dict[str, float]
+    empirical: bool
+    variance: FloatArray
+
+    def with_constant_variance(self, count: int) -> VarianceTerm:
+        """Return the term for `count` points with its mean variance, for noise that does not depend on place."""
+        return replace(self, variance=np.full(count, float(self.variance.mean())))
+
+
+@dataclass(frozen=True)
+class VarianceScore:
+    """Result of one candidate: its log-likelihood ratio `gain`, and `score`, the same minus its number of parameters."""
+
+    name: str
+    gain: float
+    score: float
+    empirical: bool = False
+
+
+def standardised_deviations(residuals: Residuals, cells: WallCells, value: FloatArray) -> FloatArray:
+    """Return deviations from the cells' planes over the predicted standard deviation, (n,), NaN outside of cells.
+
+    They have unit variance if the model is right. The plane in each cell removes the reference error, which is correlated over
+    metres.
+
+    Parameters
+    ----------
+    residuals : residuals with their predicted standard deviations.
+    cells : cells of the wall.
+    value : (n,) residuals after the systematic effects.
+    """
+    inside = cells.cell >= 0
+    cell = cells.cell[inside]
+    offset = (residuals.wall_xy[inside] - cells.centre[cell]) / cells.side_m
+    weight = 1 / residuals.sigma[inside]
+    basis = np.stack([np.ones(len(cell)), offset[:, 0], offset[:, 1]], axis=1) * weight[:, None]
+    y = value[inside] * weight
+
+    def total(column: FloatArray) -> FloatArray:
+        return np.bincount(cell, column, len(cells)).astype(np.float64)
+
+    matrix = np.stack([np.stack([total(basis[:, i] * basis[:, j]) for j in range(3)], axis=-1) for i in range(3)], axis=-2)
+    right = np.stack([total(basis[:, i] * y) for i in range(3)], axis=-1)
+    inverse = np.linalg.pinv(matrix, rcond=1e-8, hermitian=True)
+    fitted = np.einsum("ni,nij,nj->n", basis, inverse[cell], right[cell])
+    left = 1 - np.einsum("ni,nij,nj->n", basis, inverse[cell], basis)
+    z = np.full(len(residuals), np.nan)
+    z[inside] = np.where(
+        left > _LEAST_REMAINING_VARIANCE, (y - fitted) / np.sqrt(np.maximum(left, _LEAST_REMAINING_VARIANCE)), np.nan
+    )
+    return z
+
+
+def variance_candidates(residuals: Residuals) -> list[VarianceCandidate]:
+    """Return the candidate noise terms that the recorded fields allow, without noise that neighbours share."""
+    found = []
+    for effect in residuals.candidates:
+        if effect.shows_in == ShowsIn.SPREAD and not effect.shared and effect.known(residuals.geometry):
+            key, tried = effect.trials or ("", ())
+            found += [_candidate(effect, residuals.geometry, {key: value}) for value in tried] or [
+                _candidate(effect, residuals.geometry, {})
+            ]
+    return found
+
+
+def _candidate(effect: type[Effect], geometry: Geometry, fixed: dict[str, float]) -> VarianceCandidate:
+    """The candidate of an effect, one column for each typical size. Extreme values are clipped, so that a few points cannot
+    decide."""
+    sizes = effect.typical_sizes()
+    columns = np.stack([effect(**fixed, **{key: size}).variance(geometry) for key, size in sizes.items()], axis=1)
+    columns = np.minimum(columns, np.quantile(columns, _HIGHEST_QUANTILE, axis=0))
+    cost = len(sizes) + thresholds().variance.trial_cost * len(fixed)
+    return VarianceCandidate(effect.tag(), columns, tuple(sizes.values()), tuple(sizes), cost, fixed)
+
+
+def fit_variance_model(
+    residuals: Residuals, cells: WallCells, value: FloatArray, random: KeyedRandom, excluded: frozenset[str] = frozenset()
+) -> tuple[list[VarianceTerm], list[VarianceScore], str]:
+    """Find the noise terms that explain the squared deviations, at most two.
+
+    Parameters
+    ----------
+    residuals : residuals with their predicted standard deviations.
+    cells : cells of the wall.
+    value : (n,) residuals after the systematic effects.
+    random : source of random numbers of the null distribution.
+    excluded : names of effects that are not tried.
+
+    Returns
+    -------
+    tuple : the noise terms, all candidates that were tried, best first, and a note on variance that no effect explains ("" if
+        none).
+    """
+    candidates = [each for each in variance_candidates(residuals) if each.name not in excluded]
+    if not candidates:
+        return [], [], ""
+    weighted, predicted = residuals, residuals.sigma**2 * _expected_mean_square(residuals, cells, random)
+    for first_round in (True, False):
+        # in the second round points have the weight of their fitted noise, as noisy points would shift the plane of their cell
+        z = standardised_deviations(weighted, cells, value)
+        used = np.isfinite(z) & (np.abs(z) < thresholds().variance.clip_sigmas * max(1.0, nmad(z, 0.0)))
+        squares = (z * weighted.sigma)[used] ** 2 / predicted[used]
+        shapes = [candidate.variance[used] / predicted[used, None] for candidate in candidates]
+        singles = [_JointFit.fitted(squares, shapes, [number], candidates) for number in range(len(shapes))]
+        best = max(singles, key=lambda fit: fit.score)
+        if first_round:
+            added = candidates[best.members[0]].variance @ best.theta[0]
+            weighted = replace(residuals, sigma=np.sqrt(residuals.sigma**2 + added))
+    excess = float(np.mean(best.added(shapes)))
+    block = wall_block_numbers(residuals.wall_xy[used], cells.side_m)
+    p_value = null_p_value(squares, [shape.sum(axis=1) for shape in shapes], block, random)
+    tried = [VarianceScore(c.name, fit.gain, fit.score) for c, fit in zip(candidates, singles, strict=True)]
+    tried = sorted(_best_variants(tried), key=lambda item: -item.score)
+    by = thresholds().variance
+    if best.gain < by.least_gain or p_value > by.significance or excess < by.least_excess:
+        return [], tried, ""
+    # for disparities `grid_noise` compares neighbours, because grid-correlated noise moves them alike too
+    unshared = _unshared_share(residuals, value, used, best.added(shapes)) if residuals.sensor == "tls" else 1.0
+    if unshared < by.least_unshared_share:
+        return [], tried, _describe_shared_variance(excess, unshared, residuals.sigma)
+    pairs = [
+        _JointFit.fitted(squares, shapes, [first, second], candidates)
+        for first, second in combinations(range(len(shapes)), 2)
+        if candidates[first].name != candidates[second].name
+    ]
+    pair = max(pairs, key=lambda fit: fit.score, default=best)
+    free_name, free_score, free = _best_binned_variance(squares, {name: v[used] for name, v in residuals.covariates.items()})
+    # where one effect leaves a misfit, a second one of the catalogue is preferred to a binned variance
+    ahead = max(by.nonparametric_margin, by.class_share * best.gain)
+    needed = by.second_gain if free_score > best.score + ahead else by.least_gain
+    agreed = pair.score > best.score + needed and _blocks_agree(squares, best.added(shapes), pair.added(shapes), block)
+    chosen = pair if agreed and all(float(theta.max()) > 0 for theta in pair.theta) else best
+    free_fits_better = free_score > chosen.score + ahead and _blocks_prefer_binned(squares, chosen.added(shapes), free, block)
+    empirical = free_fits_better and free_score > chosen.score + by.nonparametric_share * chosen.gain
+    note = f"the noise also varies with {free_name}, which no effect of the catalogue explains" if free_fits_better else ""
+    if empirical:
+        chosen, note = best, ""
+    tried = sorted([*tried, VarianceScore(free_name, free_score + _BINS, free_score, True)], key=lambda item: -item.score)
+    margin = max(by.class_margin, by.class_share * chosen.gain)
+    found = []
+    for place, number in enumerate(chosen.members):
+        candidate, theta = candidates[number], chosen.theta[place]
+        others = [fit for fit in (singles if len(chosen.members) == 1 else pairs) if _replaces_only(fit, chosen, number)]
+        near = {candidates[n].name for fit in others if fit.score > chosen.score - margin for n in fit.members}
+        alike = near - {candidates[each].name for each in chosen.members}
+        parameters = candidate.parameters(theta)
+        std = candidate.standard_deviations(theta, chosen.error[place])
+        gain = chosen.gain - max(
+            (fit.gain for fit in singles if fit.members != (number,) and fit.members[0] in chosen.members), default=0.0
+        )
+        name = f"variance by {free_name}" if empirical else candidate.name
+        found.append(
+            VarianceTerm(
+                name,
+                candidate.name,
+                tuple(sorted(alike)),
+                p_value,
+                gain,
+                parameters,
+                std,
+                empirical,
+                candidate.variance @ theta,
+            )
+        )
+    return found, tried, note
+
+
+def _describe_shared_variance(excess: float, unshared: float, sigma: FloatArray) -> str:
+    """Note on variance that neighbours share, which is no sensor noise. excess: added variance over the predicted one."""
+    ratio, excess_mm = float(np.sqrt(1 + excess)), 1e3 * float(np.median(sigma)) * float(np.sqrt(excess))
+    shared_percent = 100 * min(max(1 - unshared, 0.0), 1.0)
+    return (
+        f"the residuals have {ratio:.2g} times the predicted standard deviation ({excess_mm:.2g} mm more), and neighbours share "
+        f"{shared_percent:.0f} % of the excess: an error of the reference, a change of the scene or wrong coordinates, not noise "
+        "of the sensor"
+    )
+
+
+def _unshared_share(residuals: Residuals, value: FloatArray, used: BoolArray, added: FloatArray) -> float:
+    """Share of an added variance that shows in the differences of neighbours, from the points `used`. added: over the predicted
+    variance."""
+    part = residuals.part(used)
+    value, predicted = value[used], part.sigma**2
+    other = cKDTree(part.wall_xy).query(part.wall_xy, k=2)[1][:, 1]
+    variance = predicted + predicted[other] - 2 * part.reference_covariance_with(other)
+    total = (added * predicted + (added * predicted)[other]) / variance
+    weight = total / (1 + total) ** 2
+    return float(np.sum(weight * ((value - value[other]) ** 2 / variance - 1)) / np.sum(weight * total))
+
+
+@dataclass(frozen=True)
+class NoiseRatio:
+    """Observed over predicted standard deviation of the residuals within cells.
+
+    value: the ratio; clearly_below: whether wall blocks agree that it is below 1.
+    """
+
+    value: float
+    clearly_below: bool
+
+    @classmethod
+    def of(cls, residuals: Residuals, cells: WallCells, value: FloatArray, random: KeyedRandom) -> NoiseRatio:
+        """Compute it from residuals (n,) after the systematic effects; outliers are clipped."""
+        z = standardised_deviations(residuals, cells, value)
+        used = np.isfinite(z)
+        squares = np.minimum(z[used] ** 2, _CLIP_SIGMAS**2) / _expected_mean_square(residuals, cells, random)
+        means = np.bincount(
+            np.unique(wall_block_numbers(residuals.wall_xy[used], cells.side_m), return_inverse=True)[1], squares - 1
+        )
+        below = float(means.sum()) < -thresholds().variance.block_sigmas * float(np.linalg.norm(means))
+        return cls(float(np.sqrt(squares.mean())), below)
+
+    @property
+    def at_most_one(self) -> float:
+        """The ratio where it is clearly below 1, else 1. No effect removes noise, so the model's own noise is too large there."""
+        return self.value if self.clearly_below and self.value < thresholds().variance.excess_noise_ratio else 1.0
+
+
+def _expected_mean_square(residuals: Residuals, cells: WallCells, random: KeyedRandom) -> float:
+    """Mean square of standardised deviations if the model is right, by simulation: planes absorb more correlated than white
+    noise."""
+    field = residuals.correlated_noise.node_field(len(residuals))
+    if not field.weights.shape[1]:
+        return 1.0
+    own = np.sqrt(np.maximum(residuals.sigma**2 - field.variance, _LEAST_WHITE_SHARE * residuals.sigma**2))
+    root, draws = np.linalg.cholesky(field.covariance), random.child("share").generator()
+    squares = []
+    for _ in range(_EXPECTATION_DRAWS):
+        shared = field.weights @ (root @ draws.standard_normal(len(root)))
+        squares.append(np.nanmean(standardised_deviations(residuals, cells, shared + own * draws.standard_normal(len(own))) ** 2))
+    return float(np.mean(squares))
+
+
+def _best_variants(tried: list[VarianceScore]) -> list[VarianceScore]:
+    """The best variant of each effect."""
+    best: dict[str, VarianceScore] = {}
+    for item in tried:
+        if item.name not in best or item.score > best[item.name].score:
+            best[item.name] = item
+    return list(best.values())
+
+
+@dataclass(frozen=True)
+class _JointFit:
+    """Some candidates fitted together.
+
+    members: numbers of the candidates; theta, error: coefficients of each and their standard deviations; gain: log-likelihood
+    ratio; score: gain minus the number of parameters.
+    """
+
+    members: tuple[int, ...]
+    theta: tuple[FloatArray, ...]
+    error: tuple[FloatArray, ...]
+    gain: float
+    score: float
+
+    @classmethod
+    def fitted(
+        cls, squares: FloatArray, shapes: list[FloatArray], members: list[int], candidates: list[VarianceCandidate]
+    ) -> _JointFit:
+        """Fit 1 + sum theta f to the squared deviations by Fisher scoring, theta >= 0."""
+        columns = np.concatenate([shapes[number] for number in members], axis=1)
+        scale = 1 / np.maximum(columns.mean(axis=0), 1e-300)
+        columns = columns * scale
+        theta = np.full(len(scale), max(float(np.mean(squares)) - 1, 1e-3) / len(scale))
+        information = np.eye(len(scale))
+        for _ in range(_FISHER_ROUNDS):
+            total = 1 + columns @ theta
+            slope = 0.5 * columns.T @ ((squares - total) / total**2)
+            information = 0.5 * (columns / total[:, None] ** 2).T @ columns
+            free = (theta > 0) | (slope > 0)
+            step = np.zeros(len(theta))
+            step[free] = np.linalg.lstsq(information[np.ix_(free, free)], slope[free], rcond=1e-10)[0]
+            theta = np.maximum(theta + step, 0.0)
+        gain = _log_likelihood_gain(squares, columns @ theta)
+        error = np.sqrt(np.maximum(np.diag(np.linalg.pinv(information, hermitian=True)), 0.0))
+        ends = np.cumsum([shapes[number].shape[1] for number in members])[:-1]
+        score = gain - sum(candidates[number].cost for number in members)
+        return cls(tuple(members), tuple(np.split(theta * scale, ends)), tuple(np.split(error * scale, ends)), gain, score)
+
+    def added(self, shapes: list[FloatArray]) -> FloatArray:
+        """(n,) added variance over the predicted one."""
+        return np.asarray(sum(shapes[number] @ theta for theta, number in zip(self.theta, self.members, strict=True)))
+
+
+def _replaces_only(fit: _JointFit, chosen: _JointFit, number: int) -> bool:
+    """Whether a fit differs from the chosen one in one candidate only."""
+    return number not in fit.members and set(chosen.members) - {number} <= set(fit.members)
+
+
+def _blocks_agree(squares: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> bool:
+    """Whether wall blocks agree that one variance fits better than another, so that the gain is not due to a few blocks."""
+    gain, sigmas = _gain_over(squares, first, second, block)
+    return gain > 0 and sigmas > thresholds().variance.block_sigmas
+
+
+def _blocks_prefer_binned(squares: FloatArray, first: FloatArray, free: FloatArray, block: NDArray[np.int64]) -> bool:
+    """Whether wall blocks agree that a binned variance fits better, which only has to show that the named one does not fit."""
+    gain, sigmas = _gain_over(squares, first, free, block)
+    return gain > thresholds().variance.nonparametric_gain and sigmas > thresholds().variance.nonparametric_block_sigmas
+
+
+def _gain_over(squares: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> tuple[float, float]:
+    """Log-likelihood ratio of one variance over another, and the same over the root sum of squares of the blocks'
+    contributions."""
+    terms = 0.5 * (squares * (second - first) / ((1 + first) * (1 + second)) + np.log1p(first) - np.log1p(second))
+    sums = np.bincount(np.unique(block, return_inverse=True)[1], terms)
+    return float(sums.sum()), float(sums.sum() / max(float(np.linalg.norm(sums)), 1e-300))
+
+
+def _log_likelihood_gain(squares: FloatArray, added: FloatArray) -> float:
+    """Log-likelihood ratio of an added variance (n,)."""
+    return float(0.5 * np.sum(squares * added / (1 + added) - np.log1p(added)))
+
+
+def null_p_value(squares: FloatArray, shapes: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
+    """Return the p-value (1 + b) / (1 + N) of the largest standardised score over the candidates, with signs flipped by wall
+    block.
+
+    Parameters
+    ----------
+    squares : (n,) squared deviations over the predicted variance.
+    shapes : (n,) candidate variances over the predicted one.
+    block : (n,) wall block of each point.
+    random : source of random numbers.
+    """
+    _, number = np.unique(block, return_inverse=True)
+    scores = np.stack([np.bincount(number, (squares - 1) * shape) for shape in shapes])
+    size = np.sqrt(np.sum(scores**2, axis=1))
+    signs = random.child("spread").generator().choice([-1.0, 1.0], size=(scores.shape[1], DRAWS))
+    largest = np.max(scores @ signs / size[:, None], axis=0)
+    return float((1 + np.sum(largest >= np.max(scores.sum(axis=1) / size))) / (1 + DRAWS))
+
+
+@dataclass(frozen=True)
+class HeavyTails:
+    """Outliers beyond those of normal noise.
+
+    Attributes
+    ----------
+    share : share of all residuals beyond `limit_sigmas` predicted standard deviations.
+    sigma : standard deviation that they add, over the predicted one.
+    gain : log-likelihood ratio of a mixture with this share of wider noise.
+    uniform : whether they lie all over the wall, as the instrument's own do. Edges, plants and moved rock leave them in parts of
+        it.
+    """
+
+    share: float
+    limit_sigmas: float
+    sigma: float
+    gain: float
+    uniform: bool
+
+    @property
+    def note(self) -> str:
+        """The note of the report."""
+        where = "all over the wall" if self.uniform else "in parts of the wall, as at edges, plants or moved rock"
+        return f"{100 * self.share:.2g} % of the points lie beyond {self.limit_sigmas:g} predicted standard deviations, {where}"
+
+
+def find_heavy_tails(z: FloatArray, block: NDArray[np.int64]) -> HeavyTails | None:
+    """Find heavy tails; None where there are no more outliers than normal noise and small faults of a reference leave.
+
+    z: (n,) residuals over the standard deviation that all effects together predict. Of normal noise, 6e-5 lie beyond 4.
+    """
+    by = thresholds().variance
+    outlying = np.abs(z) > by.tail_sigmas
+    share = float(outlying.mean())
+    if share < by.most_tail_share:
+        return None
+    square = np.minimum(z**2, _CLIP_SIGMAS**2)
+    tail_variance = max(float(square[outlying].mean()), 1.0)
+    mixed = np.log(1 - share + share / np.sqrt(tail_variance) * np.exp(0.5 * square * (1 - 1 / tail_variance)))
+    sigma = float(np.sqrt(max(float(square.mean()) - 1, 0.0)))
+    return HeavyTails(share, by.tail_sigmas, sigma, float(mixed.sum()), _unevenness(outlying, block) < by.most_tail_unevenness)
+
+
+def _unevenness(outlying: BoolArray, block: NDArray[np.int64]) -> float:
+    """Standard deviation over mean of the blocks' shares of outliers, beyond chance."""
+    _, number = np.unique(block, return_inverse=True)
+    expected = np.bincount(number) * outlying.mean()
+    beyond_chance = np.sum((np.bincount(number, outlying) - expected) ** 2 - expected * (1 - outlying.mean()))
+    return float(np.sqrt(max(float(beyond_chance), 0.0) / np.sum(expected**2)))
+
+
+def _best_binned_variance(squares: FloatArray, covariates: Mapping[str, FloatArray]) -> tuple[str, float, FloatArray]:
+    """The covariate along which a variance free in each bin explains most, its score, and the variance that it adds (n,)."""
+    best: tuple[str, float, FloatArray] = ("", -np.inf, np.zeros(len(squares)))
+    for name, values in covariates.items():
+        if name in ("edge_step", "line"):
+            continue
+        edges = np.quantile(values, np.linspace(0, 1, _BINS + 1)[1:-1])
+        group = np.searchsorted(edges, values)
+        count = np.maximum(np.bincount(group, minlength=_BINS), 1)
+        variance = np.maximum(np.bincount(group, squares, _BINS) / count, 1e-9)
+        score = float(0.5 * np.sum(count * (variance - 1 - np.log(variance)))) - _BINS
+        if score > best[1]:
+            best = name, score, (variance - 1)[group]
+    return best

@@ -1,0 +1,318 @@
+"""Thresholds of what is no systematic effect: variance model, grid noise, pixel locking, rounding, edges, missing returns."""
+
+from __future__ import annotations
+
+from pydantic import PositiveFloat, PositiveInt
+
+from pipeline.gap.threshold_field import DEVELOPMENT, JUDGEMENT, ThresholdGroup, threshold_field
+
+
+class VarianceThresholds(ThresholdGroup):
+    """Thresholds of the variance model (heteroscedastic noise terms)."""
+
+    significance: PositiveFloat = threshold_field(
+        0.004,
+        "probability",
+        "Significance level of noise terms. The variance differs from the predicted one if the p-value of the largest "
+        "standardised score, with signs flipped by wall block, is at most this.",
+        "target of 1 % false alarms over all steps",
+        lt=1,
+    )
+    least_gain: PositiveFloat = threshold_field(
+        6.0, "log-likelihood", "The best noise term needs at least this log-likelihood ratio.", JUDGEMENT
+    )
+    least_excess: PositiveFloat = threshold_field(
+        0.04,
+        "share of the predicted variance",
+        "Less additional variance than this is attributed to small errors of the reference.",
+        DEVELOPMENT,
+    )
+    least_unshared_share: PositiveFloat = threshold_field(
+        0.75,
+        "share of the added variance",
+        "At least this share must differ between neighbouring points. An error of the reference, correlated over metres, moves "
+        "both alike.",
+        DEVELOPMENT,
+        le=1,
+    )
+    excess_noise_ratio: PositiveFloat = threshold_field(
+        0.9,
+        "ratio of observed to predicted standard deviation",
+        "Below this ratio the model's noise is reported as too large, and a lower one is proposed.",
+        JUDGEMENT,
+    )
+    clip_sigmas: PositiveFloat = threshold_field(
+        4.5, "standard deviations", "A deviation beyond this is not used to fit the variance model.", JUDGEMENT
+    )
+    class_margin: PositiveFloat = threshold_field(
+        5.0,
+        "log-likelihood",
+        "Noise terms whose score is within this of the best one belong to its equivalence class. It is larger than for "
+        "systematic effects, because a few steep wall blocks decide.",
+        "in three development scans the true term scored 9 to 15 more than the next",
+    )
+    class_share: PositiveFloat = threshold_field(
+        0.01,
+        "share of the log-likelihood ratio",
+        "Noise terms within this share of the best one's ratio belong to its class too, as no form of a variance is exact.",
+        JUDGEMENT,
+        lt=1,
+    )
+    nonparametric_margin: PositiveFloat = threshold_field(
+        6.0,
+        "log-likelihood",
+        "A variance free in bins of a covariate must score this much more than the catalogue's best noise term.",
+        DEVELOPMENT,
+    )
+    nonparametric_gain: PositiveFloat = threshold_field(
+        15.0,
+        "log-likelihood",
+        "A variance free in bins must gain at least this over the named noise term to be reported.",
+        DEVELOPMENT,
+    )
+    nonparametric_share: PositiveFloat = threshold_field(
+        0.1,
+        "share of the named term's log-likelihood ratio",
+        "A variance free in bins that gains no more than this over the named term is only a note; beyond, the term is marked "
+        "empirical. Known noise put into real scans came to 0.05 and 0.09, and noise outside the catalogue to 0.15.",
+        DEVELOPMENT,
+    )
+    nonparametric_block_sigmas: PositiveFloat = threshold_field(
+        2.0,
+        "root sums of squares of the wall blocks' gains",
+        "The wall blocks must prefer a variance free in bins by this much.",
+        DEVELOPMENT,
+    )
+    second_gain: PositiveFloat = threshold_field(
+        3.0,
+        "log-likelihood",
+        "A second noise term must score this much more where the first alone leaves a misfit.",
+        JUDGEMENT,
+    )
+    block_sigmas: PositiveFloat = threshold_field(
+        3.0,
+        "root sums of squares of the wall blocks' gains",
+        "The wall blocks must agree by this much on a second noise term, or on noise that is lower than predicted.",
+        JUDGEMENT,
+    )
+    trial_cost: PositiveFloat = threshold_field(
+        0.5, "log-likelihood", "Penalty of a parameter for which only a few values are tried.", JUDGEMENT
+    )
+    tail_sigmas: PositiveFloat = threshold_field(
+        4.0, "standard deviations", "A residual beyond this counts as an outlier of the tails.", JUDGEMENT
+    )
+    most_tail_share: PositiveFloat = threshold_field(
+        0.004,
+        "share of the residuals",
+        "More outliers than this are reported as heavy tails. Shares up to 0.0016 are normal.",
+        DEVELOPMENT,
+        le=1,
+    )
+    most_tail_unevenness: PositiveFloat = threshold_field(
+        0.5,
+        "standard deviation over mean of the wall blocks' shares of outliers, beyond chance",
+        "If the share of outliers differs more than this between blocks, parts of the wall are the cause, not the instrument.",
+        JUDGEMENT,
+    )
+    core_excess: PositiveFloat = threshold_field(
+        0.15,
+        "share of the predicted variance",
+        "Beside heavy tails a noise term is kept only if the core of the residuals has this much more variance than predicted.",
+        JUDGEMENT,
+    )
+
+
+class GridNoiseThresholds(ThresholdGroup):
+    """Thresholds that separate white from grid-correlated noise of disparities, and noise from errors of the reference."""
+
+    margin: PositiveFloat = threshold_field(
+        6.0, "chi^2", "White or grid-correlated noise is named alone if its semivariogram fits better by this.", JUDGEMENT
+    )
+    least_gain: PositiveFloat = threshold_field(
+        12.0,
+        "chi^2",
+        "Grid-correlated noise must improve the fit of the semivariogram by this where single points show no added variance.",
+        DEVELOPMENT,
+    )
+    least_sigmas: PositiveFloat = threshold_field(
+        4.0,
+        "standard deviations of its variance",
+        "Grid-correlated noise must be this significant where single points show no added variance.",
+        DEVELOPMENT,
+    )
+    finest_grid: PositiveFloat = threshold_field(
+        2.0,
+        "cells of the disparity raster",
+        "A grid with narrower nodes than this cannot be told from white noise and is not tried.",
+        JUDGEMENT,
+    )
+    reference_error: PositiveFloat = threshold_field(
+        0.02,
+        "m",
+        "Largest standard deviation that is attributed to an error of the reference correlated over metres.",
+        JUDGEMENT,
+    )
+    reference_length: PositiveFloat = threshold_field(
+        0.45,
+        "m, standard deviation of a Gaussian correlation",
+        "From this correlation length on the error of the reference may be as large as `reference_error`. Errors in waves of "
+        "1.5 m have this length (0.3 of a wave).",
+        JUDGEMENT,
+    )
+    short_reference_error: PositiveFloat = threshold_field(
+        0.005,
+        "m",
+        "Largest standard deviation that is attributed to an error of the reference of a shorter correlation length.",
+        JUDGEMENT,
+    )
+
+
+class LockingThresholds(ThresholdGroup):
+    """Thresholds of pixel locking: measured disparities that crowd around whole pixels."""
+
+    fewest_cycles: PositiveFloat = threshold_field(
+        6.0, "pixels of disparity", "The disparities must span at least this for pixel locking to be tested.", JUDGEMENT
+    )
+    crowding_ratio: PositiveFloat = threshold_field(
+        1.5,
+        "ratio of resultant lengths",
+        "Measured disparities must crowd this many times as strongly as those of the reference, whose shape may crowd too.",
+        DEVELOPMENT,
+    )
+    most_noise: PositiveFloat = threshold_field(
+        0.35, "px", "Largest standard deviation of matching noise that is fitted; more noise hides any crowding.", JUDGEMENT
+    )
+    significance: PositiveFloat = threshold_field(
+        1e-4, "probability", "Significance level: crowding that chance makes more often is not reported.", JUDGEMENT, lt=1
+    )
+    equal_fit: PositiveFloat = threshold_field(
+        6.0,
+        "chi^2 of four values",
+        "Amplitudes whose fits differ by less than this count as equally good, and the smallest is taken.",
+        JUDGEMENT,
+    )
+    good_fit: PositiveFloat = threshold_field(
+        20.0,
+        "chi^2 of four values",
+        "If no amplitude fits better than this, the best small amplitude is taken, below the one that folds disparities over.",
+        DEVELOPMENT,
+    )
+
+
+class QuantizationThresholds(ThresholdGroup):
+    """Threshold of rounded ranges."""
+
+    least_resultant: PositiveFloat = threshold_field(
+        0.2,
+        "mean resultant length of the ranges' phases",
+        "Ranges count as rounded if their phases modulo the step have at least this; noise never reaches it.",
+        DEVELOPMENT,
+    )
+
+
+class EdgeThresholds(ThresholdGroup):
+    """Thresholds of edge effects: edge fattening, smoothing, filled occlusions and the beam footprint."""
+
+    least_gain: PositiveFloat = threshold_field(
+        30.0, "log-likelihood", "An edge effect needs at least this log-likelihood ratio.", DEVELOPMENT
+    )
+    block_sigmas: PositiveFloat = threshold_field(
+        3.0,
+        "root sums of squares of the wall blocks' gains",
+        "The wall blocks must agree by this much on an edge effect.",
+        JUDGEMENT,
+    )
+    most_gain_of_a_point: PositiveFloat = threshold_field(
+        3.0, "log-likelihood", "The gain of one point is clipped at this before the wall blocks are compared.", JUDGEMENT
+    )
+    footprint_block_sigmas: PositiveFloat = threshold_field(
+        2.0,
+        "root sums of squares of the wall blocks' gains",
+        "The wall blocks must agree by this much on a beam divergence: for example four blocks of four. None of 60 development "
+        "cases without a footprint came to 1.9.",
+        DEVELOPMENT,
+    )
+    footprint_fewest: PositiveInt = threshold_field(
+        20, "points", "At least this many points must lie at edges that a wide beam would move clearly.", JUDGEMENT
+    )
+    clear_sigmas: PositiveFloat = threshold_field(
+        3.0,
+        "standard deviations",
+        "A point at a depth step is used to test edge fattening if the effect moves it by more than this.",
+        JUDGEMENT,
+    )
+    most_relative_noise: PositiveFloat = threshold_field(
+        1.5,
+        "ratio of standard deviations",
+        "A selection pass is rejected if its residuals have more than this times the noise of the best pass.",
+        JUDGEMENT,
+    )
+    overdispersion: PositiveFloat = threshold_field(
+        2.0,
+        "ratio of standard deviations",
+        "If the residuals have more than this times the predicted noise, each trial of edge fattening gets its own registration "
+        "and noise. It must then lower the noise by this factor.",
+        JUDGEMENT,
+    )
+    clear_step: PositiveFloat = threshold_field(
+        1.3,
+        "ratio of depth steps",
+        "A point is used to test edge fattening if the step is this many times the smallest one; matchers disagree on smaller "
+        "ones.",
+        JUDGEMENT,
+    )
+    fewest_filled: PositiveInt = threshold_field(8, "cells", "Filled occlusions need at least this many filled cells.", JUDGEMENT)
+    least_filled_gain: PositiveFloat = threshold_field(
+        10.0, "log-likelihood", "Filled occlusions need at least this log-likelihood ratio.", JUDGEMENT
+    )
+    least_filled_share: PositiveFloat = threshold_field(
+        0.6,
+        "share of the half-occluded cells",
+        "At least this share of the cells in strips up to the estimated width must hold a point.",
+        JUDGEMENT,
+        le=1,
+    )
+
+
+class MissingReturnsThresholds(ThresholdGroup):
+    """Thresholds of the effects that explain missing returns."""
+
+    least_gain: PositiveFloat = threshold_field(
+        9.0, "log-likelihood", "An effect on the returns needs at least this penalised log-likelihood ratio.", JUDGEMENT
+    )
+    cutoff_ratio: PositiveFloat = threshold_field(
+        0.7,
+        "ratio of log-power intervals: lowest 0.5 % over lowest 1 %",
+        "The recorded powers end abruptly, as at a detection limit, if the ratio is below this; a normal tail gives 0.8.",
+        DEVELOPMENT,
+        le=1,
+    )
+    least_isolated_share: PositiveFloat = threshold_field(
+        0.8,
+        "share of the wall blocks that scattered returns would reach",
+        "Early returns count as drops if they lie in at least this share of those blocks; objects return many side by side.",
+        DEVELOPMENT,
+        le=1,
+    )
+    nonparametric_margin: PositiveFloat = threshold_field(
+        6.0, "log-likelihood", "Losses free by direction must score this much more than the catalogue's best effect.", JUDGEMENT
+    )
+    nonparametric_ratio: PositiveFloat = threshold_field(
+        1.5, "ratio of scores", "Losses free by direction must score this many times as much as the best effect.", JUDGEMENT
+    )
+    strip_agreement: PositiveFloat = threshold_field(
+        0.85,
+        "ratio; 1: every strip gains equally",
+        "Strips across a sector must agree this well on its losses. The highest of 35 cases without losses by direction is 0.73, "
+        "the lowest of 3 sectors 0.96.",
+        DEVELOPMENT,
+    )
+    early_sigmas: PositiveFloat = threshold_field(
+        8.0,
+        "standard deviations",
+        "A return counts as early, possibly from a drop, if it lies this far before the surface.",
+        JUDGEMENT,
+    )
+    early_m: PositiveFloat = threshold_field(
+        0.5, "m", "A return counts as early if it also lies this far before the surface.", JUDGEMENT
+    )

@@ -1,0 +1,261 @@
+"""Put a diagnosis into words: title, first paragraph of the report, and the outcome of each explanation that was tried."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from pipeline.gap.mean.selection import FamilyScore
+from pipeline.gap.naming.named_effects import NamedEffect
+from pipeline.gap.naming.verdict import VERDICTS, describe_closing, describe_misfit, verdict_sentence
+from pipeline.gap.naming.workflow import GapDiagnosis
+from pipeline.gap.noise_and_edges.variance_model import VarianceScore
+from pipeline.gap.report.datum_scale import estimate_scale
+from pipeline.gap.report.quantities import format_with_std
+from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
+from pipeline.report.page import with_minus_sign
+from sensors.effects.base import ShowsIn
+from sensors.effects.surface_empirical import SurfaceEmpirical
+
+_STATISTICS = {"mean": "mean", "spread": "standard deviation", "shape": "outliers", "missing": "lost returns"}
+_SURFACE_SENTENCES = {
+    VERDICTS["no_gap"]: "The cloud agrees with the reference: the residuals are no larger than its noise.",
+    VERDICTS["unknown"]: "The cloud differs from the reference by more than its noise; an empirical term describes how.",
+}
+"""Sentences of verdicts where no effect of the catalogue can be tried, because there are no cameras."""
+_CLEAR_P_VALUE = 0.01
+"""p-value up to which a covariate is mentioned."""
+_COVARIATES = {
+    "range": ("range", "m"), "depth": ("depth", "m"), "azimuth": ("azimuth", "rad"), "zenith": ("zenith", "rad"),
+    "incidence": ("incidence", "rad"), "image_x": ("image x", "px"), "image_y": ("image y", "px"),
+    "radius": ("distance from the image's middle", "px"), "disparity": ("disparity", "px"),
+    "disparity_fraction": ("fraction of the disparity", "px"), "intensity": ("intensity", "ln of power over its median"),
+    "line": ("scan line", "number"), "time": ("time", "share of the scan"),
+    "along": ("place along the wall", "m"), "up": ("place up the wall", "m"), "out": ("place out of the wall's plane", "m"),
+    "slope": ("slope against the wall's plane", "rad"), "roughness": ("roughness", "m"), "convexity": ("convexity", "m"),
+    "edge_distance": ("distance to the nearest edge", "m"),
+    "log_power": ("expected power", "ln of power over that at 100 m"), "edge_step": ("step beside the point", ""),
+}  # fmt: skip
+"""Each covariate in words, and the unit of its values; "" for the unit of the observable."""
+
+
+def title(found: GapDiagnosis) -> str:
+    """Return the outcome as a headline."""
+    names = [" or ".join([effect.name, *effect.alike]) for effect in found.effects if effect.kind == "physical"]
+    match found.verdict:
+        case "no_gap" | "unknown" if found.evidence.only_too_noisy(found.effects):
+            return "No missing effect was found, but the model is too noisy"
+        case "no_gap":
+            return "No effect is missing"
+        case "insufficient_data" if found.evidence.much_moved:
+            return "Much of the wall moved: nothing can be said about the sensor"
+        case "insufficient_data":
+            return "Too few data for a diagnosis"
+        case "unknown" if not found.effects:
+            return "Measurement and model disagree, and nothing that was tried explains it"
+        case "unknown" if not any(effect.kind == "empirical" for effect in found.effects):
+            if found.evidence.stays_open:
+                return f"{join_words(names)} closes little of the gap: something else is missing"
+            if found.evidence.supports_nothing:
+                return f"{join_words(names)} does not make the gap smaller: something else may be missing"
+            if found.evidence.stays_rejected:
+                return f"{join_words(names)} leaves a misfit larger than chance would: something else is missing"
+            return f"{join_words(names)}, and something that adds noise to the residuals"
+        case "unknown" if isinstance(found.residuals, SurfaceResiduals):
+            return "The cloud differs from the reference by more than its noise"
+        case "unknown":
+            return "Missing: something that is not in the catalogue" + (f", and {join_words(names)}" if names else "")
+        case _:
+            return f"Missing: {join_words(names)}"
+
+
+def paragraph(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
+    """Return a paragraph: what was compared, what was found, and how far the gap closes. rows: result of `rank_disagreements`."""
+    return " ".join(each for each in (*_findings(found, rows), describe_gap(found), *_side_notes(found)) if each)
+
+
+def answer(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
+    """Return the same without scores, for the top of the report."""
+    return " ".join(each for each in (*_findings(found, rows), _describe_closed_gap(found), *_side_notes(found)) if each)
+
+
+def verdict_in_words(found: GapDiagnosis) -> str:
+    """Return the verdict as a sentence. A surface without cameras has sentences of its own."""
+    said = verdict_sentence(found.verdict, found.effects, found.evidence)
+    return _SURFACE_SENTENCES.get(said, said) if isinstance(found.residuals, SurfaceResiduals) else said
+
+
+def _findings(found: GapDiagnosis, rows: list[dict[str, Any]]) -> list[str]:
+    """Sentences on what was compared and what was found."""
+    parts = [f"{len(found.residuals):,} {found.residuals.label} were compared with what the model predicts."]
+    parts.append(verdict_in_words(found))
+    scale = estimate_scale(found)
+    parts += [] if scale is None else [scale.words]
+    parts += [_describe_effect(effect) for effect in found.effects]
+    return [*parts, describe_misfit(found.effects, found.evidence), _largest_disagreement(found, rows)]
+
+
+def _describe_closed_gap(found: GapDiagnosis) -> str:
+    """How much of the gap closes, if something was named."""
+    if found.gap is None or found.gap.closed is None or not found.model_changed:
+        return ""
+    return (
+        f"With it in the model, {describe_closing(found.gap, found.model_changed)} on validation blocks, which no fit had used."
+    )
+
+
+def _side_notes(found: GapDiagnosis) -> list[str]:
+    """Sentences on scene changes, and the notes."""
+    parts = []
+    if found.changes:
+        volume = sum(abs(change.volume_m3) for change in found.changes)
+        regions, were = ("1 region", "was") if len(found.changes) == 1 else (f"{len(found.changes)} regions", "were")
+        std = sum(change.volume_std_m3**2 for change in found.changes) ** 0.5
+        moved = f"{volume:.2g} \N{PLUS-MINUS SIGN} {std:.1g} m\N{SUPERSCRIPT THREE} in all"
+        parts.append(f"{regions} where the rock itself moved ({moved}) {were} set aside.")
+    if found.remaining.get("note"):
+        parts.append(f"Note: {found.remaining['note']}.")
+    return parts
+
+
+def _largest_disagreement(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
+    """Where the disagreement is largest, and how large it is there if nothing describes it."""
+    if found.verdict in ("no_gap", "insufficient_data") or not rows:
+        return ""
+    clear = [row for row in rows if row["p_value"] <= _CLEAR_P_VALUE]
+    first = (clear or rows)[0]
+    statistic = _STATISTICS[first["statistic"]]
+    if not found.effects:
+        what = covariate_name(first["covariate"])
+        region = " to ".join(format_number(first["region"][key]) for key in ("from", "to"))
+        size = f"{format_number(1e3 * abs(first['size_m']), 2)} mm"
+        size = f"{100 * first['share_lost']:.0f} % lost" if first["statistic"] == "missing" else size
+        return f"The disagreement is largest in the {statistic} against {what}, from {region}: {size} there."
+    if not clear:
+        return ""
+    seen = [covariate_name(row["covariate"]) for row in clear[:3] if row["statistic"] == first["statistic"]]
+    return f"Before any effect was named, the disagreement was largest in the {statistic} against {join_words(seen)}."
+
+
+def outcome(found: GapDiagnosis, tried: Sequence[FamilyScore], item: FamilyScore) -> str:
+    """Return what became of an explanation of the mean: named, of the class of a named one, added as empirical, or rejected.
+
+    tried: all explanations, best first; item: one of these.
+    """
+    if item.empirical:
+        added = {effect.entry.get("covariate") for effect in found.effects if effect.kind == "empirical"}
+        best = next(each for each in tried if each.empirical and each.name == item.name)
+        return "added as empirical" if item is best and item.name in added else "rejected"
+    return _outcome_of_effect(found, item.name)
+
+
+def variance_outcome(found: GapDiagnosis, item: VarianceScore) -> str:
+    """Return what became of an explanation of the variance."""
+    if item.empirical:
+        added = any(effect.kind == "empirical" and effect.adds_variance for effect in found.effects)
+        return "added as empirical" if added else "rejected"
+    return _outcome_of_effect(found, item.name)
+
+
+def _outcome_of_effect(found: GapDiagnosis, effect: str) -> str:
+    """What became of an effect of the catalogue."""
+    name = f"{found.residuals.sensor}.{effect}"
+    physical = [each for each in found.effects if each.kind == "physical"]
+    if any(each.name == name for each in physical):
+        return "named"
+    alike = {other for each in physical for other in each.alike}
+    return "cannot be told from the named one" if name in alike else "rejected"
+
+
+def join_words(words: Sequence[str]) -> str:
+    """Join words as in "a, b and c"."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def covariate_with_unit(covariate: str, sensor: str) -> str:
+    """Return a covariate in words, with the unit of its values."""
+    _, unit = _COVARIATES.get(covariate, ("", ""))
+    return f"{covariate_name(covariate)}, {unit or ('m' if sensor == 'tls' else 'px')}"
+
+
+def covariate_name(covariate: str) -> str:
+    """Return a covariate in words."""
+    return _COVARIATES[covariate][0] if covariate in _COVARIATES else covariate.replace("_", " ")
+
+
+def format_number(value: float, digits: int = 4) -> str:
+    """Format a number with at most `digits` significant digits, without exponent from 0.0001 to a million."""
+    return f"{float(f'{value:.{digits}g}'):g}"
+
+
+def format_decimal(value: float) -> str:
+    """Format a number with one decimal, or without decimals from ten thousand on."""
+    return with_minus_sign(value, 1) if abs(value) < 9999.95 else format_number(value, 5)
+
+
+def round_entry(value: Any) -> Any:
+    """Round all numbers of an effect's entry to five significant digits."""
+    if isinstance(value, dict):
+        return {key: round_entry(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [round_entry(each) for each in value]
+    return float(f"{value:.5g}") if isinstance(value, float) else value
+
+
+def format_parameters(effect: NamedEffect) -> str:
+    """Format the parameters of an effect with their standard deviations."""
+    return ", ".join(
+        f"{key} {format_value(key, value, effect.std.get(key))}" for key, value in effect.entry.items() if key != "name"
+    )
+
+
+def format_value(key: str, value: Any, std: float | None) -> str:
+    """Format one value of an effect's entry: a number with its standard deviation, an axis or a table by its range."""
+    if isinstance(value, dict):
+        cycle = f", repeated every {format_number(value['period'])}" if value.get("period") else ""
+        return f"{format_number(value['low'])} to {format_number(value['high'])}{cycle}"
+    if isinstance(value, list):
+        flat = [each for row in value for each in row]
+        return f"{len(value)} x {len(value[0])} from {format_number(min(flat), 3)} to {format_number(max(flat), 3)}"
+    if not isinstance(value, float):
+        return str(value)
+    return format_with_std(key, value, std)
+
+
+def _describe_effect(effect: NamedEffect) -> str:
+    """Sentence on one named effect."""
+    if effect.kind == "empirical":
+        return f"The disagreement {_describe_empirical(effect)}; {effect.name} describes it but does not explain it."
+    said = f"It is {effect.name} ({format_parameters(effect)})."
+    return (
+        f"{said} It cannot be told from {', '.join(effect.alike)}; to separate them: {effect.split_by}." if effect.alike else said
+    )
+
+
+def _describe_empirical(effect: NamedEffect) -> str:
+    """What an empirical term depends on."""
+    covariates = [covariate_name(effect.entry[key]) for key in ("covariate", "second") if effect.entry.get(key)]
+    if covariates:
+        return f"depends on {join_words(covariates)}{_describe_range(effect)}"
+    lost = effect.effect.shows_in == ShowsIn.RETURNS
+    return "is in the directions from which nothing returns" if lost else "is larger than the model predicts"
+
+
+def _describe_range(effect: NamedEffect) -> str:
+    """Range of the values of an empirical term of a surface."""
+    if effect.effect is not SurfaceEmpirical:
+        return ""
+    values = [each for row in effect.entry["values_m"] for each in row]
+    return f" (by {format_number(1e3 * (max(values) - min(values)), 3)} mm from its lowest to its highest value)"
+
+
+def describe_gap(found: GapDiagnosis) -> str:
+    """Return a sentence with the scores before and after and the floor; "" where they were not measured."""
+    if found.gap is None:
+        return ""
+    gap, model_changed = found.gap, found.model_changed
+    factor, unit = gap.display_unit
+    before, after, floor = (f"{factor * value:.3f} {unit}" for value in (gap.before, gap.after, gap.floor))
+    scores = f"{before} before, {after} after" if model_changed else f"{before} before"
+    text = f"On validation blocks, which no fit has used, the gap is {scores}; the model's own noise leaves {floor}"
+    return f"{text}{', so ' if gap.closed is None else ': '}{describe_closing(gap, model_changed)}."

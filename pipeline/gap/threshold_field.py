@@ -1,0 +1,30 @@
+"""The form in which `thresholds.py` and `noise_thresholds.py` declare a threshold: value, unit, what it decides, source."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+DEVELOPMENT, JUDGEMENT = "development cases", "judgement"
+"""Sources of values: tuned on the development cases of the closed-form generator, or chosen by the authors."""
+
+
+class ThresholdGroup(BaseModel):
+    """A group of thresholds: frozen, without unknown keys, infinities or NaN."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+def threshold_field(default: float, unit: str, decides: str, source: str, **bounds: Any) -> Any:
+    """Return the pydantic field of one threshold.
+
+    Parameters
+    ----------
+    default : value.
+    unit : unit of the value, in words.
+    decides : what the threshold decides, as whole sentences.
+    source : where the value comes from.
+    bounds : limits on the value, as `pydantic.Field` takes them.
+    """
+    return Field(default, description=decides, json_schema_extra={"unit": unit, "source": source}, **bounds)

@@ -1,0 +1,370 @@
+"""Every threshold of the diagnosis (`scarpsim gap`), with its unit, what it decides and where the value comes from.
+
+`scarpsim gap --set mean.class_margin=4` changes one threshold for one diagnosis; gap.json records all values under `decisions`.
+The groups of noise, edges and missing returns are in `noise_thresholds.py`. Purely numerical limits (iterations, simulations,
+grids, smallest divisors) are constants in the modules that use them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+from pydantic import PositiveFloat, PositiveInt
+
+from pipeline.config.overrides import apply_overrides
+from pipeline.gap.noise_thresholds import (
+    EdgeThresholds,
+    GridNoiseThresholds,
+    LockingThresholds,
+    MissingReturnsThresholds,
+    QuantizationThresholds,
+    VarianceThresholds,
+)
+from pipeline.gap.threshold_field import DEVELOPMENT, JUDGEMENT, ThresholdGroup, threshold_field
+from scene.common.config import parse
+
+
+class PointThresholds(ThresholdGroup):
+    """Thresholds on the number of points, and on which points are used."""
+
+    fewest: PositiveInt = threshold_field(
+        800, "points", "With fewer points on smooth, stable rock the verdict is insufficient_data.", JUDGEMENT
+    )
+    most: PositiveInt = threshold_field(
+        2_000_000,
+        "points of a laser scan",
+        "A scan with more points is subsampled at random to this number.",
+        "memory: 1.5 kB a point; the selection uses 60,000 of them in any case",
+    )
+    fewest_epochs: PositiveInt = threshold_field(
+        3, "epochs", "From this number of epochs on, the whole last epoch is kept for validation.", JUDGEMENT
+    )
+    outlier_sigmas: PositiveFloat = threshold_field(
+        5.0,
+        "predicted standard deviations, times the ratio of observed to predicted noise",
+        "A residual beyond this is an outlier and is not used for fitting.",
+        JUDGEMENT,
+    )
+    most_reference_scatter: PositiveFloat = threshold_field(
+        2.0,
+        "times the typical scatter about planes through 24 points, along the ray",
+        "Points where a reference made of points scatters more than this are not used: edges and thin objects lie there.",
+        "a tenth of the points of a workshop lie beyond it, and a twelfth of a forest's ground, with most of the outliers",
+    )
+    registration_outlier_sigmas: PositiveFloat = threshold_field(
+        3.5, "standard deviations", "A residual beyond this is an outlier in the robust pose estimate.", JUDGEMENT
+    )
+    least_share_on_reference: PositiveFloat = threshold_field(
+        0.9,
+        "share of the points",
+        "An effect is rejected if, with it in the model, fewer rays than this still meet the reference.",
+        JUDGEMENT,
+        le=1,
+    )
+
+
+class MeanThresholds(ThresholdGroup):
+    """Thresholds of the systematic effects (mean model)."""
+
+    significance: PositiveFloat = threshold_field(
+        0.004,
+        "probability",
+        "Significance level of systematic effects. An effect is accepted if the p-value of the best candidate, under a null "
+        "distribution simulated without effects and maximised over all candidates, is at most this.",
+        "target of 1 % false alarms over all steps",
+        lt=1,
+    )
+    least_score: PositiveFloat = threshold_field(
+        4.0, "log-likelihood", "An effect needs at least this penalised log-likelihood ratio to be accepted.", JUDGEMENT
+    )
+    class_margin: PositiveFloat = threshold_field(
+        3.0,
+        "log-likelihood",
+        "Effects whose score is within this of the best one belong to its equivalence class. The likelihood factor exp(-3) "
+        "bounds by 5 % how often the true effect is left out.",
+        "target of 93 to 97 % of classes that contain the true effect",
+    )
+    class_share: PositiveFloat = threshold_field(
+        0.01,
+        "share of the log-likelihood ratio",
+        "Effects whose score is within this share of the best one's log-likelihood ratio belong to its class too. No signature "
+        "is exact, and the error grows with the ratio: 6 degrees between two signatures leave this share.",
+        "geometry of small angles",
+        lt=1,
+    )
+    nonparametric_margin: PositiveFloat = threshold_field(
+        5.0,
+        "log-likelihood",
+        "A non-parametric term must score this much more than the best effect of the catalogue to be chosen instead.",
+        DEVELOPMENT,
+    )
+    least_nonparametric_score: PositiveFloat = threshold_field(
+        12.0,
+        "log-likelihood",
+        "A non-parametric term needs at least this score. The reference error departs a little from its model, and a flexible "
+        "term absorbs that first.",
+        DEVELOPMENT,
+    )
+    least_surface_score: PositiveFloat = threshold_field(
+        15.0, "log-likelihood", "A non-parametric term of two covariates needs at least this score.", DEVELOPMENT
+    )
+    surface_ratio: PositiveFloat = threshold_field(
+        1.15,
+        "ratio of scores",
+        "A non-parametric term of two covariates must score this many times as much as the best term of one covariate.",
+        DEVELOPMENT,
+    )
+    null_wave_ratio: PositiveFloat = threshold_field(
+        2.0,
+        "ratio of scores",
+        "A wave along a covariate must score this many times as much as the best oblique wave on the wall (spatial null "
+        "candidate).",
+        DEVELOPMENT,
+    )
+    most_effects: PositiveInt = threshold_field(3, "effects", "At most this many systematic effects are selected.", JUDGEMENT)
+    absorbed_size: PositiveFloat = threshold_field(
+        10.0,
+        "typical sizes of the effect",
+        "An effect that the registration absorbs nearly, and that is larger than this, is accepted only if no misfit is left.",
+        JUDGEMENT,
+    )
+    absorbed_share: PositiveFloat = threshold_field(
+        0.1,
+        "share of the signature's sum of squares",
+        "An effect counts as nearly absorbed if the registration, or a curve of an angle's error, leaves less than this of its "
+        "signature.",
+        JUDGEMENT,
+        lt=1,
+    )
+    least_relative_gain: PositiveFloat = threshold_field(
+        0.02,
+        "share of the log-likelihood ratio",
+        "Beside other effects a candidate must gain at least this share of what it gains alone. Less may be the inexactness of "
+        "the others: 8 degrees between two signatures leave this share.",
+        "geometry of small angles",
+        le=1,
+    )
+    least_wave_sigmas: PositiveFloat = threshold_field(
+        1.0,
+        "standard deviations of the reference error",
+        "A wave that is no effect of the catalogue must be at least this large, or it is attributed to the reference.",
+        JUDGEMENT,
+    )
+    same_covariate: PositiveFloat = threshold_field(
+        0.95,
+        "absolute correlation",
+        "Covariates with a higher correlation count as one covariate for non-parametric terms.",
+        JUDGEMENT,
+        lt=1,
+    )
+    refit_share: PositiveFloat = threshold_field(
+        0.5,
+        "share of the largest log-likelihood ratio",
+        "An effect that alone gains at least this share of the largest ratio is refitted without linearising.",
+        JUDGEMENT,
+        le=1,
+    )
+    refit_gain: PositiveFloat = threshold_field(
+        50.0,
+        "log-likelihood",
+        "Below this log-likelihood ratio the linearised model is used, and no effect is refitted without linearising.",
+        DEVELOPMENT,
+    )
+    linearisation_error: PositiveFloat = threshold_field(
+        10.0,
+        "log-likelihood",
+        "The linearised model is used if it misjudges the log-likelihood of the strongest effect by less than this.",
+        JUDGEMENT,
+    )
+    prior_size: PositiveFloat = threshold_field(
+        20.0, "typical sizes of the effect", "Standard deviation of the Gaussian prior of an effect's size.", JUDGEMENT
+    )
+    largest_size: PositiveFloat = threshold_field(
+        100.0,
+        "typical sizes of the effect",
+        "An effect that would have to be larger than this is rejected, as no instrument is that far off.",
+        JUDGEMENT,
+    )
+
+
+class ChangesThresholds(ThresholdGroup):
+    """Thresholds of scene changes: regions where the rock itself moved."""
+
+    false_changes: PositiveFloat = threshold_field(
+        0.01,
+        "expected number in one measurement",
+        "A region is a change if noise would produce fewer than this in the whole measurement.",
+        "target of 1 % false alarms",
+    )
+    fewest: PositiveInt = threshold_field(
+        5, "points", "A change needs at least this many points.", "reported rockfalls that were missed: five points of 5 sigma"
+    )
+    median_sigmas: PositiveFloat = threshold_field(
+        3.5, "standard deviations", "The median residual of a change must exceed this.", JUDGEMENT
+    )
+    faint_sigmas: PositiveFloat = threshold_field(
+        3.0,
+        "standard deviations of medians of nine points",
+        "Neighbouring medians beyond this are joined to one region, which finds faint but wide changes.",
+        JUDGEMENT,
+    )
+    smallest_departure: PositiveFloat = threshold_field(
+        0.02,
+        "m",
+        "A median of neighbours that departs by less than this is no change: errors of the reference and of rays are as large.",
+        DEVELOPMENT,
+    )
+    margin: PositiveFloat = threshold_field(
+        3.0, "point spacings", "Points within this distance of a change are set aside with it.", JUDGEMENT
+    )
+    largest_share: PositiveFloat = threshold_field(
+        0.25, "share of the wall", "A region that is larger than this is not taken for a compact change.", JUDGEMENT
+    )
+    moved_sigmas: PositiveFloat = threshold_field(
+        3.0,
+        "predicted standard deviations",
+        "A point counts as moved if the median of it and its neighbours lies this far off the reference.",
+        "development cases: 41 to 88 % of walls on which 40 % of the rock moved, at most 18 % beside any effect",
+    )
+    moved_share: PositiveFloat = threshold_field(
+        0.3,
+        "share of the wall",
+        "If at least this share moved, the verdict is insufficient_data and no effect is named.",
+        DEVELOPMENT,
+        le=1,
+    )
+    moved_share_beside_noise: PositiveFloat = threshold_field(
+        0.1,
+        "share of the wall",
+        "If a noise term was named, at least this share must have moved beside that noise too. Noise closes part of any gap, but "
+        "does not move neighbours together.",
+        "six walls of which a third moved: 0.22 to 0.31; next to nothing beside a true noise",
+        le=1,
+    )
+    stripe_length: PositiveFloat = threshold_field(
+        30.0,
+        "point spacings",
+        "A region at least this long, and less than a tenth as wide, is a stripe and not a compact change.",
+        JUDGEMENT,
+    )
+
+
+class ValidationThresholds(ThresholdGroup):
+    """Thresholds of validation: what an effect must gain on wall blocks that no fit used."""
+
+    clip_sigmas: PositiveFloat = threshold_field(
+        5.0, "standard deviations", "Deviations in validation blocks are clipped at this, which limits outliers.", JUDGEMENT
+    )
+    shortfall_sigmas: PositiveFloat = threshold_field(
+        2.5,
+        "standard deviations of the gain",
+        "An effect that lowers the log score of the validation blocks still passes if that is within this of the gain that the "
+        "training blocks predict.",
+        JUDGEMENT,
+    )
+    most_loss: PositiveFloat = threshold_field(
+        1.5,
+        "log-likelihood",
+        "An effect that lowers the log score of the validation blocks by this or more always fails.",
+        DEVELOPMENT,
+    )
+    least_gain_beside_others: PositiveFloat = threshold_field(
+        2.0,
+        "log-likelihood",
+        "Beside other effects an effect must gain more than this on validation blocks to be named, not only mentioned. At this "
+        "value a gain equals its standard error.",
+        "the gain of a true effect, half a difference of two chi^2, has twice its expectation as variance",
+    )
+    null_sigmas: PositiveFloat = threshold_field(
+        2.0,
+        "standard deviations of the parameter",
+        "Beside other effects, an effect whose only parameter is within this of zero is only mentioned.",
+        JUDGEMENT,
+    )
+    leftover_share: PositiveFloat = threshold_field(
+        0.02,
+        "share of the gain of the empirical term",
+        "A noise term that gains less than this beside an empirical term is dropped: it is the misfit of that term.",
+        DEVELOPMENT,
+        le=1,
+    )
+
+
+class VerdictThresholds(ThresholdGroup):
+    """Thresholds of the verdict: when the model is rejected, and how much named effects must explain."""
+
+    rejection_p: PositiveFloat = threshold_field(
+        0.01,
+        "probability",
+        "Significance level of the goodness of fit. The model is rejected if the p-value of the residual misfit is at most this.",
+        "definition of the verdict no_gap",
+        lt=1,
+    )
+    least_closed: PositiveFloat = threshold_field(
+        0.5,
+        "share of the gap",
+        "Named effects that close clearly less than this of a significant gap are not the answer; the verdict is unknown.",
+        JUDGEMENT,
+        lt=1,
+    )
+    overdispersion: PositiveFloat = threshold_field(
+        1.5,
+        "ratio of observed to predicted standard deviation",
+        "The model is rejected if the residuals have at least this ratio and no noise term explains it.",
+        JUDGEMENT,
+        gt=1,
+    )
+    gap_sigmas: PositiveFloat = threshold_field(
+        2.0, "standard errors", "The gap before and after differ if their difference exceeds this.", JUDGEMENT
+    )
+    floor_sigmas: PositiveFloat = threshold_field(
+        2.6,
+        "standard errors",
+        "A score lies above the floor if the difference exceeds this: 0.5 % exceed it by chance.",
+        JUDGEMENT,
+    )
+
+
+class Thresholds(ThresholdGroup):
+    """All thresholds of a diagnosis, in groups."""
+
+    points: PointThresholds = PointThresholds()
+    mean: MeanThresholds = MeanThresholds()
+    variance: VarianceThresholds = VarianceThresholds()
+    grid_noise: GridNoiseThresholds = GridNoiseThresholds()
+    locking: LockingThresholds = LockingThresholds()
+    edges: EdgeThresholds = EdgeThresholds()
+    missing_returns: MissingReturnsThresholds = MissingReturnsThresholds()
+    quantization: QuantizationThresholds = QuantizationThresholds()
+    changes: ChangesThresholds = ChangesThresholds()
+    validation: ValidationThresholds = ValidationThresholds()
+    verdict: VerdictThresholds = VerdictThresholds()
+
+
+_DEFAULTS = Thresholds()
+_IN_USE: ContextVar[Thresholds] = ContextVar("thresholds", default=_DEFAULTS)
+
+
+def read_thresholds(overrides: Sequence[str]) -> Thresholds:
+    """Return the thresholds with the values that the user gave on the command line.
+
+    overrides: `group.key=value` each. Raises InputError for an unknown key or a value outside its bounds.
+    """
+    return parse(Thresholds, apply_overrides({}, overrides), "--set")
+
+
+def thresholds() -> Thresholds:
+    """Return the thresholds of the current diagnosis, the defaults outside of one."""
+    return _IN_USE.get()
+
+
+@contextmanager
+def use_thresholds(chosen: Thresholds) -> Iterator[None]:
+    """Make `thresholds()` return the chosen thresholds inside the `with` block."""
+    token = _IN_USE.set(chosen)
+    try:
+        yield
+    finally:
+        _IN_USE.reset(token)

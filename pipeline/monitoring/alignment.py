@@ -1,0 +1,283 @@
+"""Register an epoch on the reference by what did not move, and say how uncertain that is.
+
+ICP brings the points near the reference. A robust least-squares fit of the two rasters then removes what is left: a small shift t
+and rotation w of the epoch change its height at a place (x, y), to first order, by
+
+    dz = tz + wx y - wy x - a (tx + wy z - wz y) - b (ty + wz x - wx z),
+
+a and b the slopes of the surface. Tukey's weights leave out what moved. The covariance of the six parameters comes from leaving
+out one block of the wall at a time (delete-a-group jackknife), since neighbouring pixels share their errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.change.areas import Area, in_areas
+from pipeline.monitoring.gridding import HeightRaster
+from pipeline.registration.closest_points import ReferenceSurface
+from pipeline.registration.register import IcpConfig, register_to
+from pipeline.registration.rigid import RigidTransform
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray
+
+_MOST_REFERENCE, _MOST_MOVING = 400_000, 200_000
+"""Points that ICP works with."""
+_TUKEY = 4.685
+"""Tuning constant of Tukey's biweight, in standard deviations: 95 % efficient for normal errors (Huber 1981)."""
+_ROUNDS, _SETTLED_M = 30, 1e-6
+"""Most rounds of the robust fit, and change of a height below which it has converged, m."""
+_LOWERED, _MORE_THAN_EXPECTED, _ENOUGH_AGREE = 0.7, 1.5, 0.15
+"""Factor by which the scale of the robust fit is lowered at a time; it stops at so many times the expected one, and where a
+smaller share of the pixels would agree."""
+_MOST_FITTED = 150_000
+"""Pixels that the fit takes."""
+_BLOCKS = 6
+"""Blocks along the longer side of the wall, of which one at a time is left out."""
+_LEAST_PIXELS = 300
+"""Stable pixels without which no fit is made."""
+_FEWEST_BLOCKS = 5
+_FEW_STABLE = 0.25
+"""Share of the compared pixels below which the user is told that little of the wall is stable."""
+_FARTHEST_NOISE = 3.0
+"""Times the limit of the robust fit (14 standard deviations) beyond which a difference is no noise, however long its tails."""
+_UNDETERMINED = 1e-7
+"""Motions whose effect on the heights, relative to the largest, is smaller than this are left as they are."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How an epoch was brought to the reference.
+
+    Attributes
+    ----------
+    transform : RigidTransform
+        From the epoch's points to the reference, wall frame.
+    covariance : (6, 6) array
+        Of shift (m) and rotation (rad) about `centre`, wall frame.
+    centre : (3,) array
+        Centre of the rotation, wall frame, m.
+    stable : (h, w) bool array
+        Pixels on which the registration rests.
+    quiet : (h, w) bool array
+        Those and pixels as far off as the long tails of noise reach.
+    rms_m : float
+        Root mean square of the differences on these pixels.
+    notes : tuple of str
+        What the user should know.
+    """
+
+    transform: RigidTransform
+    covariance: FloatArray
+    centre: FloatArray
+    stable: NDArray[np.bool_]
+    quiet: NDArray[np.bool_]
+    rms_m: float
+    notes: tuple[str, ...] = ()
+
+    def sigma(self, raster: HeightRaster) -> NDArray[np.float32]:
+        """Standard deviation of the registration's effect on each pixel's height, (h, w), m; NaN without data."""
+        design = _design(raster, self.centre)
+        variance = np.einsum("khw,kl,lhw->hw", design, self.covariance, design)
+        return np.sqrt(np.maximum(variance, 0.0)).astype(np.float32)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As monitor.json holds it."""
+        sigma = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        return {
+            **self.transform.to_dict(),
+            "stable_pixels": int(self.stable.sum()),
+            "rms_m": self.rms_m,
+            "sigma_translation_m": sigma[:3].tolist(),
+            "sigma_rotation_rad": sigma[3:].tolist(),
+            "notes": list(self.notes),
+        }
+
+
+def reference_surface(raster: HeightRaster) -> ReferenceSurface:
+    """Index the pixels of the reference with their normals for ICP."""
+    rows, columns = np.nonzero(raster.known)
+    few = slice(None, None, max(len(rows) // _MOST_REFERENCE, 1))
+    rows, columns = rows[few], columns[few]
+    x, y = _places(raster.grid)
+    points = np.stack([x[rows, columns], y[rows, columns], raster.height[rows, columns]], axis=1).astype(np.float64)
+    slopes = raster.slope_x[rows, columns], raster.slope_y[rows, columns]
+    normals = np.stack([-slopes[0], -slopes[1], np.ones(len(rows))], axis=1)
+    return ReferenceSurface.build(points, normals)
+
+
+def coarse(surface: ReferenceSurface, points: FloatArray, gsd_m: float, seed: int) -> RigidTransform:
+    """Bring points (n, 3), wall frame, m, near the reference by ICP. Raises InputError where they do not meet."""
+    config = IcpConfig(outlier_distance_threshold=max(0.1, 3 * gsd_m))
+    moving = points[:: max(len(points) // _MOST_MOVING, 1)]
+    return register_to(surface, moving, config, KeyedRandom(seed)).transform
+
+
+def refine(reference: HeightRaster, epoch: HeightRaster, areas: Sequence[Area]) -> Alignment:
+    """Fit what ICP left, by the pixels that are stable; `transform` is from the gridded points to the reference.
+
+    Parameters
+    ----------
+    reference, epoch : HeightRaster
+        On one grid.
+    areas : sequence of Area
+        Where the wall is stable, as the user says, wall frame; empty: found here.
+
+    Raises
+    ------
+    InputError
+        Where too few pixels are stable.
+    """
+    difference = reference.height - epoch.height
+    compared = np.isfinite(difference)
+    if areas:
+        compared &= in_areas(areas, *_places(reference.grid))
+    if int(compared.sum()) < _LEAST_PIXELS:
+        place = "in the stable areas" if areas else "of the epoch on the reference"
+        problem = f"only {int(compared.sum()):,} pixels {place} have data in both epochs"
+        remedy = "give larger stable areas" if areas else "check that both epochs show the same wall, or give a larger --gsd"
+        raise InputError(problem, where="registration", allowed=f"at least {_LEAST_PIXELS}", remedy=remedy)
+    x, y = _places(reference.grid)
+    centre = np.array([x[compared].mean(), y[compared].mean(), float(epoch.height[compared].mean())])
+    fitted = _thinned(compared)
+    design = _design(epoch, centre)[:, fitted]
+    target, weight = difference[fitted].astype(np.float64), _weights_by_sigma(reference, epoch, fitted)
+    expected = float(np.median(np.sqrt(weight) * np.hypot(reference.sigma[fitted], epoch.sigma[fitted])))
+    parameters, robust, limit = _robust_fit(design, target, weight, expected)
+    covariance, groups = _jackknife(design, target, weight * robust, _block_numbers(fitted))
+    rest = np.where(compared, difference - np.einsum("k,khw->hw", parameters, _design(epoch, centre)), np.nan)
+    stable = compared.copy()
+    apart = np.abs(rest[compared]) * np.sqrt(_weights_by_sigma(reference, epoch, compared))
+    stable[compared] = apart < limit
+    quiet = compared.copy()
+    quiet[compared] = apart < _FARTHEST_NOISE * limit
+    notes = _notes(float(stable.sum() / compared.sum()), groups, bool(areas))
+    transform = RigidTransform.about(centre, parameters[3:], parameters[:3])
+    return Alignment(transform, covariance, centre, stable, quiet, float(np.sqrt(np.mean(rest[stable] ** 2))), notes)
+
+
+def applied(alignment: Alignment, epoch: HeightRaster) -> NDArray[np.float32]:
+    """Return the epoch's heights, (h, w), m, once the fit of `refine` is applied, to first order in its small motion."""
+    shift = alignment.transform.apply(alignment.centre) - alignment.centre
+    parameters = np.concatenate([shift, alignment.transform.rotation_vector])
+    change = np.einsum("k,khw->hw", parameters, _design(epoch, alignment.centre))
+    return np.asarray(epoch.height + change.astype(np.float32))
+
+
+def _places(grid: Grid) -> tuple[FloatArray, FloatArray]:
+    """x and y of the pixels' centres, (h, w), wall frame, m."""
+    x = grid.x_min + (np.arange(grid.width) + 0.5) * grid.gsd
+    y = grid.y_max - (np.arange(grid.height) + 0.5) * grid.gsd
+    return np.broadcast_to(x, grid.shape), np.broadcast_to(y[:, None], grid.shape)
+
+
+def _design(raster: HeightRaster, centre: FloatArray) -> FloatArray:
+    """(6, h, w) change of height with shift and rotation about `centre`; NaN without data."""
+    x, y = _places(raster.grid)
+    x, y, z = x - centre[0], y - centre[1], raster.height.astype(np.float64) - centre[2]
+    a, b = raster.slope_x.astype(np.float64), raster.slope_y.astype(np.float64)
+    return np.stack([-a, -b, np.ones_like(z) + 0 * z, y + b * z, -x - a * z, a * y - b * x])
+
+
+def _weights_by_sigma(reference: HeightRaster, epoch: HeightRaster, where: NDArray[np.bool_]) -> FloatArray:
+    """Weights of pixels by the variance of their difference, at most those of the best tenth: no pixel rules alone."""
+    variance = reference.sigma[where].astype(np.float64) ** 2 + epoch.sigma[where].astype(np.float64) ** 2
+    floor = max(float(np.quantile(variance, 0.1)), 1e-12)
+    return np.asarray(floor / np.maximum(variance, floor))
+
+
+def _thinned(compared: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return every so many pixels of those that are compared: heights of 3 x 3 pixels share their points anyway."""
+    step = int(np.ceil(np.sqrt(compared.sum() / _MOST_FITTED)))
+    if step <= 1:
+        return compared
+    few = np.zeros_like(compared)
+    few[::step, ::step] = compared[::step, ::step]
+    return few
+
+
+def _robust_fit(
+    design: FloatArray, target: FloatArray, weight: FloatArray, expected: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Iteratively reweighted least squares with Tukey's weights, from the median on.
+
+    The scale begins at the spread of the residuals. Where much of the wall moved, that is far more than noise: it is lowered step
+    by step towards what noise explains, as long as enough pixels agree, so that the fit settles on what did not move.
+
+    Parameters
+    ----------
+    design, target, weight : (6, n), (n,), (n,) arrays
+    expected : float
+        Standard deviation of a weighted residual by the heights' own errors, m.
+
+    Returns
+    -------
+    parameters (6,), Tukey's weights (n,), and the weighted residual beyond which a weight is zero, m
+    """
+    parameters = np.zeros(6)
+    parameters[2] = np.median(target)
+    standard = np.sqrt(weight) * (target - parameters @ design)
+    scale, robust = max(1.4826 * float(np.median(np.abs(standard))), 1e-9), np.ones(len(target))
+    for _ in range(_ROUNDS):
+        standard = np.sqrt(weight) * (target - parameters @ design)
+        own = max(1.4826 * float(np.median(np.abs(standard))), 1e-9)
+        smaller = max(_LOWERED * scale, _MORE_THAN_EXPECTED * expected)
+        agree = float((np.abs(standard) < _TUKEY * smaller).mean())
+        scale = min(own, smaller if agree >= _ENOUGH_AGREE else scale)
+        robust = np.maximum(1 - (standard / (_TUKEY * scale)) ** 2, 0.0) ** 2
+        before, parameters = parameters, _solved(*_normal_equations(design, target, weight * robust))
+        settled = scale in (own, _MORE_THAN_EXPECTED * expected) or agree < _ENOUGH_AGREE
+        if settled and np.abs((parameters - before) @ design).max() < _SETTLED_M:
+            break
+    return parameters, robust, _TUKEY * scale
+
+
+def _normal_equations(design: FloatArray, target: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(6, 6) and (6,) of weighted least squares."""
+    return (design * weight) @ design.T, design @ (weight * target)
+
+
+def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve normal equations; motions that the heights do not determine are left at zero."""
+    scale = np.sqrt(np.where(np.diag(normal) > 0, np.diag(normal), 1.0))
+    values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
+    kept = values > _UNDETERMINED * values[-1]
+    return np.asarray(vectors[:, kept] @ ((vectors[:, kept].T @ (right / scale)) / values[kept]) / scale)
+
+
+def _block_numbers(where: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Number of the block of the wall of each pixel in `where`."""
+    side = max(max(where.shape) // _BLOCKS, 1)
+    row, column = np.nonzero(where)
+    return np.asarray((row // side) * (where.shape[1] // side + 1) + column // side)
+
+
+def _jackknife(design: FloatArray, target: FloatArray, weight: FloatArray, block: NDArray[np.int64]) -> tuple[FloatArray, int]:
+    """Covariance (6, 6) of the parameters by leaving out one block at a time, and the number of blocks."""
+    numbers = [number for number in np.unique(block) if weight[block == number].any()]
+    if len(numbers) < 2:
+        return np.diag(np.full(6, np.inf)), len(numbers)
+    parts = [_normal_equations(design[:, block == n], target[block == n], weight[block == n]) for n in numbers]
+    normal, right = (sum(each) for each in zip(*parts, strict=True))
+    whole = _solved(normal, right)
+    apart = np.array([_solved(normal - part[0], right - part[1]) - whole for part in parts])
+    return (len(numbers) - 1) / len(numbers) * np.einsum("gk,gl->kl", apart, apart), len(numbers)
+
+
+def _notes(share: float, blocks: int, given: bool) -> tuple[str, ...]:
+    notes = []
+    if share < _FEW_STABLE and not given:
+        notes.append(f"only {100 * share:.0f} % of the compared pixels are stable: name stable areas with --stable")
+    if blocks < _FEWEST_BLOCKS:
+        notes.append(
+            f"the stable rock lies in {blocks} blocks of the wall: the registration's uncertainty is known poorly, "
+            "and events far from it should be checked"
+        )
+    return tuple(notes)

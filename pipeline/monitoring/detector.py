@@ -1,0 +1,45 @@
+"""Events of a detector in place of regions beyond the level of detection."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from pycocotools import mask as coco_mask
+
+from pipeline.monitoring.events import Change, ChangedRegion, region_of_mask
+from scene.common.errors import InputError, OutsideError
+
+CONFIDENCE = 0.9
+"""Lowest score that counts."""
+_COMMAND = "import sys; from pipeline.cli.main import main; sys.exit(main(sys.argv[1:]))"
+_WRONG_INPUT = 2
+
+
+def regions_of_detector(detector: str, difference: Path, change: Change) -> list[ChangedRegion]:
+    """Search a difference map with a detector and measure what it finds, the largest volume first.
+
+    The detector works in a process of its own, as TensorFlow and the ray tracer's compiler do not belong into one. Raises
+    InputError for a detector that cannot be used.
+    """
+    with tempfile.TemporaryDirectory(prefix="scarpsim_detect_") as folder:
+        words = [detector, str(difference), "--out", str(Path(folder) / "found"), f"--confidence={CONFIDENCE:g}", "--quiet"]
+        command = [sys.executable, "-c", _COMMAND, "detect", *words, "--no-pictures"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            lines = done.stderr.strip().splitlines()
+            message = lines[-1].removeprefix("error: ") if lines else "the detector ended without a word"
+            raise InputError(message) if done.returncode == _WRONG_INPUT else OutsideError(message)
+        found = json.loads((Path(folder) / "found" / f"detections_{CONFIDENCE:g}.json").read_text(encoding="utf-8"))
+    regions = []
+    for each in found["annotations"]:
+        column, row, width, height = (int(value) for value in each["bbox"])
+        whole = coco_mask.decode(each["segmentation"]) > 0
+        mask = np.ascontiguousarray(whole[row : row + height, column : column + width])
+        region = region_of_mask(mask, row, column, float(each["score"]), change)
+        regions += [] if region is None else [region]
+    return sorted(regions, key=lambda region: -region.volume_m3)

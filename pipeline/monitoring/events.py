@@ -1,0 +1,304 @@
+"""Find regions that changed, and follow them from epoch to epoch.
+
+A region begins where the mean difference over a small square is far beyond its error, and grows over neighbouring pixels of the
+same sign that exceed half their level of detection. Its volume is the sum of the differences, its standard deviation that of the
+mean over so many pixels, with the registration's, times the area.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from pipeline.monitoring.gridding import HeightRaster
+from pipeline.monitoring.significance import Significance
+from scene.geometry.grid import Grid
+
+Kind = Literal["missing", "added"]
+_SQUARES_PX = (3, 5, 9)
+_BEGINS = 7.0
+"""Standard deviations by which the mean over a square must differ from zero for a region to begin."""
+_GROWS = 0.5
+"""Share of the level of detection that pixels at a region's rim exceed."""
+_LEAST_PIXELS = 16
+_SIGNIFICANT = 7.0
+"""Standard deviations by which the mean over a whole region must differ from zero."""
+_STEEP = 4.0
+"""Tangent of the angle to the wall's plane beyond which heights are those of an edge (76 degrees)."""
+_SCATTERED = 3.0
+"""Times the wall's usual scatter of points about the surface from which a region is rough: vegetation or an edge."""
+_OTHER_SIGN = 0.2
+_THIN_PX = 1.2
+"""Area over length of the outline, pixels, below which a region is a thin line."""
+_MARGIN_PX = 2
+"""Pixels without data in bays of a region that are at most twice as wide are counted to it."""
+_ISLAND = 0.3
+"""Share of the largest part of a mask below which another part is no part of the outline."""
+_EDGE_PX = 5
+"""Side of the square about a pixel in which an edge of the rock would be spread."""
+_GAP_SHARE, _RIM_SHARE = 1.0, 1.3
+"""Shares of the volume in pixels without data, and in the pixels along the outline, that are taken as one standard deviation of
+it. They are set so that the intervals of simulated rockfalls hold the truth as often as they say (docs/validation/monitor.md)."""
+_SAME_PLACE = 0.3
+"""Share of the smaller of two regions that lies in the other if both are one event."""
+
+
+@dataclass(frozen=True)
+class ChangedRegion:
+    """A connected part of the wall that changed.
+
+    Attributes
+    ----------
+    kind : "missing" or "added"
+    row, column : int
+        Top-left pixel of the mask in the map.
+    mask : (m, n) bool array
+    x_m, y_m, z_m : float
+        Centre of the mask and the reference's height there, wall frame.
+    width_m, height_m, area_m2 : float
+        Size of the mask, in the plane of the wall.
+    depth_median_m, depth_largest_m : float
+        Of the change along the wall's normal, positive whatever the kind.
+    volume_m3, volume_std_m3 : float
+        Positive whatever the kind, and its standard deviation.
+    significance : float
+        Mean change over its standard deviation.
+    score : float
+        A detector's, NaN without one.
+    marks : tuple of str
+        "edge", "vegetation", "thin": what may have feigned the change; "insignificant": a detector's that noise may explain.
+    identity : int
+        Number of the event; 0 as yet unknown.
+    """
+
+    kind: Kind
+    row: int
+    column: int
+    mask: NDArray[np.bool_] = field(repr=False)
+    x_m: float
+    y_m: float
+    z_m: float
+    width_m: float
+    height_m: float
+    area_m2: float
+    depth_median_m: float
+    depth_largest_m: float
+    volume_m3: float
+    volume_std_m3: float
+    significance: float
+    score: float = float("nan")
+    marks: tuple[str, ...] = ()
+    identity: int = 0
+
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns of the mask in the map."""
+        height, width = self.mask.shape
+        return slice(self.row, self.row + height), slice(self.column, self.column + width)
+
+    def numbers(self) -> dict[str, Any]:
+        """All but the mask, as JSON and tables hold it."""
+        names = (
+            "kind", "row", "column", "x_m", "y_m", "z_m", "width_m", "height_m", "area_m2", "depth_median_m", "depth_largest_m",
+            "volume_m3", "volume_std_m3", "significance", "score",
+        )  # fmt: skip
+        return {name: getattr(self, name) for name in names} | {"marks": list(self.marks), "id": self.identity}
+
+
+@dataclass(frozen=True)
+class Change:
+    """All that is known of the change between the reference and one epoch, on one grid.
+
+    difference: (h, w) float32, reference minus epoch, m; registration: (h, w) standard deviation of the registration's effect, m.
+    """
+
+    difference: NDArray[np.float32]
+    significance: Significance
+    registration: NDArray[np.float32]
+    reference: HeightRaster
+    epoch: HeightRaster
+
+    @property
+    def grid(self) -> Grid:
+        """Where the pixels lie."""
+        return self.reference.grid
+
+
+def find_regions(change: Change) -> list[ChangedRegion]:
+    """Find the regions that changed, the largest volume first."""
+    standard = change.difference / change.significance.one_sigma
+    beyond = np.abs(change.difference) > _GROWS * change.significance.level
+    regions: list[ChangedRegion] = []
+    for sign, kind in ((1.0, "missing"), (-1.0, "added")):
+        labels, count = ndimage.label(beyond & (sign * standard > 0))
+        begun = _begins(sign * standard, change.significance)
+        wanted = set(np.unique(labels[begun & (labels > 0)]).tolist())
+        for number, box in enumerate(ndimage.find_objects(labels, count), start=1):
+            if box is not None and number in wanted:
+                regions += _kept(labels[box] == number, box[0].start, box[1].start, kind, change)
+    return sorted(regions, key=lambda region: -region.volume_m3)
+
+
+def region_of_mask(mask: NDArray[np.bool_], row: int, column: int, score: float, change: Change) -> ChangedRegion | None:
+    """Measure a detector's mask; None where the map has no data in it."""
+    window = change.difference[row : row + mask.shape[0], column : column + mask.shape[1]]
+    known = mask & np.isfinite(window)
+    if not known.any():
+        return None
+    kind: Kind = "missing" if window[known].mean() >= 0 else "added"
+    region = replace(_measured(known, row, column, kind, change), score=score)
+    return region if region.significance >= _SIGNIFICANT else replace(region, marks=(*region.marks, "insignificant"))
+
+
+def _begins(standard: NDArray[np.floating], significance: Significance) -> NDArray[np.bool_]:
+    """(h, w) where the mean over a square about the pixel is far beyond its error, with the sign that is looked for."""
+    known = np.isfinite(standard)
+    filled = np.where(known, standard, 0.0)
+    found = np.zeros(standard.shape, dtype=bool)
+    for side in _SQUARES_PX:
+        share = ndimage.uniform_filter(known.astype(np.float32), side)
+        mean = ndimage.uniform_filter(filled.astype(np.float32), side) / np.maximum(share, 1e-6)
+        found |= (mean > _BEGINS * significance.sigma_of_mean(side**2)) & (share > 0.5)
+    return found
+
+
+def _kept(mask: NDArray[np.bool_], row: int, column: int, kind: str, change: Change) -> Iterator[ChangedRegion]:
+    """The region of a mask, where it is large and significant enough."""
+    if int(mask.sum()) < _LEAST_PIXELS:
+        return
+    region = _measured(mask, row, column, "missing" if kind == "missing" else "added", change)
+    if region.significance >= _SIGNIFICANT:
+        yield region
+
+
+def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change: Change) -> ChangedRegion:
+    """Measure the region of a mask whose pixels all have data.
+
+    Volume and significance are those of the whole mask. Heights come from 3 x 3 pixels, so that a sharp edge is spread over
+    neighbouring ones: outline, area and depth are those of the pixels with at least half the depth of what lies around.
+    """
+    row, column, mask = _padded(mask, row, column, change.difference.shape)
+    window = (slice(row, row + mask.shape[0]), slice(column, column + mask.shape[1]))
+    grid, gsd, sign = change.grid, change.grid.gsd, 1.0 if kind == "missing" else -1.0
+    whole, depth = _with_gaps_filled(mask, sign * change.difference[window].astype(np.float64))
+    pixels = int(whole.sum())
+    one_sigma = float(np.mean(change.significance.one_sigma[window][mask]))
+    registration = float(np.sqrt(np.mean(change.registration[window][mask].astype(np.float64) ** 2)))
+    noise = float(np.hypot(one_sigma * change.significance.sigma_of_mean(int(mask.sum())), registration))
+    rim = whole & ~ndimage.binary_erosion(whole)
+    rough = _GAP_SHARE * depth[whole & ~mask].sum(), _RIM_SHARE * np.abs(depth[rim]).sum()
+    deepest = ndimage.grey_dilation(np.where(whole, depth, 0.0), size=(_EDGE_PX, _EDGE_PX))
+    inner = _without_islands(whole & (depth >= deepest / 2))
+    rows, columns = np.nonzero(inner)
+    return ChangedRegion(
+        kind=kind,
+        row=row,
+        column=column,
+        mask=inner,
+        x_m=grid.x_min + (column + float(columns.mean()) + 0.5) * gsd,
+        y_m=grid.y_max - (row + float(rows.mean()) + 0.5) * gsd,
+        z_m=float(np.median(change.reference.height[window][mask])),
+        width_m=(int(columns.max()) - int(columns.min()) + 1) * gsd,
+        height_m=(int(rows.max()) - int(rows.min()) + 1) * gsd,
+        area_m2=int(inner.sum()) * gsd**2,
+        depth_median_m=float(np.median(depth[inner])),
+        depth_largest_m=float(depth[inner].max()),
+        volume_m3=float(depth[whole].sum()) * gsd**2,
+        volume_std_m3=float(np.sqrt((noise * pixels) ** 2 + rough[0] ** 2 + rough[1] ** 2)) * gsd**2,
+        significance=float(depth[mask].mean()) / max(noise, 1e-9),
+        marks=_marks(mask, window, sign, change),
+    )
+
+
+def _without_islands(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Drop parts of a mask that are much smaller than its largest one."""
+    labels, count = ndimage.label(mask, np.ones((3, 3)))
+    if count < 2:
+        return mask
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    return np.asarray((sizes >= _ISLAND * sizes.max())[labels] & mask)
+
+
+def _padded(mask: NDArray[np.bool_], row: int, column: int, shape: tuple[int, ...]) -> tuple[int, int, NDArray[np.bool_]]:
+    """Return the mask with a margin inside the map, and its top-left pixel."""
+    top, left = min(_MARGIN_PX, row), min(_MARGIN_PX, column)
+    bottom = min(_MARGIN_PX, shape[0] - row - mask.shape[0])
+    right = min(_MARGIN_PX, shape[1] - column - mask.shape[1])
+    return row - top, column - left, np.pad(mask, ((top, bottom), (left, right)))
+
+
+def _with_gaps_filled(mask: NDArray[np.bool_], depth: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Add pixels without data inside a region or in its small bays, with the depth of the nearest pixel of the region."""
+    closed = ndimage.binary_closing(np.pad(mask, _MARGIN_PX), np.ones((3, 3)), iterations=_MARGIN_PX)
+    closed = ndimage.binary_fill_holes(closed)[_MARGIN_PX:-_MARGIN_PX, _MARGIN_PX:-_MARGIN_PX]
+    whole = mask | (closed & ~np.isfinite(depth))
+    nearest = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
+    return whole, np.where(mask, depth, depth[tuple(nearest)])
+
+
+def _marks(mask: NDArray[np.bool_], window: tuple[slice, slice], sign: float, change: Change) -> tuple[str, ...]:
+    """What may have feigned the change."""
+    marks = []
+    edge = np.zeros(mask.shape, dtype=bool)
+    rough = []
+    for raster in (change.reference, change.epoch):
+        edge |= raster.steepness[window] > _STEEP
+        usual = float(np.nanmedian(raster.scatter))
+        rough.append(float(np.nanmedian(raster.scatter[window][mask])) > _SCATTERED * usual)
+    if float(edge[mask].mean()) > 0.5:
+        marks.append("edge")
+    around = np.isfinite(change.difference[window]) & ~mask
+    strong = np.abs(change.difference[window]) > change.significance.level[window]
+    other = around & strong & (sign * change.difference[window] < 0)
+    if all(rough) or (any(rough) and other.sum() > _OTHER_SIGN * mask.sum()):
+        marks.append("vegetation")
+    if _is_thin(mask):
+        marks.append("thin")
+    return tuple(marks)
+
+
+def _is_thin(mask: NDArray[np.bool_]) -> bool:
+    outline = mask & ~ndimage.binary_erosion(np.pad(mask, 1))[1:-1, 1:-1]
+    return float(mask.sum()) / max(int(outline.sum()), 1) < _THIN_PX
+
+
+class Catalogue:
+    """Events over all epochs: a region where an event was before is the same event."""
+
+    def __init__(self) -> None:
+        self._last: dict[int, ChangedRegion] = {}
+
+    def identified(self, regions: Sequence[ChangedRegion]) -> list[ChangedRegion]:
+        """Give the regions of the next epoch their events' numbers, the largest first; new events count on."""
+        named, taken = [], set()
+        for region in sorted(regions, key=lambda each: -each.volume_m3):
+            shared = {
+                number: _shared_share(region, other)
+                for number, other in self._last.items()
+                if number not in taken and other.kind == region.kind
+            }
+            number = max(shared, key=lambda each: shared[each], default=0)
+            if not number or shared[number] < _SAME_PLACE:
+                number = max(self._last, default=0) + 1
+            region = replace(region, identity=number)
+            taken.add(number)
+            self._last[number] = region
+            named.append(region)
+        return sorted(named, key=lambda each: -each.volume_m3)
+
+
+def _shared_share(one: ChangedRegion, other: ChangedRegion) -> float:
+    """Pixels that two regions share, over those of the smaller one."""
+    top, left = max(one.row, other.row), max(one.column, other.column)
+    bottom = min(one.row + one.mask.shape[0], other.row + other.mask.shape[0])
+    right = min(one.column + one.mask.shape[1], other.column + other.mask.shape[1])
+    if bottom <= top or right <= left:
+        return 0.0
+    parts = [each.mask[top - each.row : bottom - each.row, left - each.column : right - each.column] for each in (one, other)]
+    return float((parts[0] & parts[1]).sum()) / min(int(one.mask.sum()), int(other.mask.sum()))

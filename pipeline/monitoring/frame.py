@@ -1,0 +1,88 @@
+"""Choose the wall frame and the raster on which epochs are compared."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.measurement.scans import RawScan
+from pipeline.measurement.station import find_station
+from pipeline.monitoring.options import MonitorOptions
+from pipeline.monitoring.reading import EpochData
+from scene.common.errors import InputError
+from scene.geometry.frame import WallFrame
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray
+
+_SAMPLE = 200_000
+"""Points that the mean plane is fitted to."""
+_CELL_M, _POINTS_A_CELL, _ROUNDS = 0.5, 3.0, 3
+"""Side of the cells by which the area that has points is counted: at first, m, then in distances of the points; and how often."""
+_POINTS_APART = 1.5
+"""Pixel side over the mean distance of neighbouring points: 3 x 3 pixels then hold some twenty points."""
+_MOST_COUNTED = 300_000
+_ROUND = np.array([1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
+_MOST_PIXELS = 60_000_000
+_FINEST_M = 0.002
+
+
+def towards_sensor(data: EpochData, options: MonitorOptions, name: str) -> tuple[FloatArray, str]:
+    """Return a place before the wall, survey coordinates, m, and how it is known.
+
+    Raises InputError where nothing tells from which side the wall was measured.
+    """
+    if options.position is not None:
+        return options.position, "as given by --position"
+    if data.position is not None:
+        return data.position, "from the file"
+    if options.direction is not None:
+        return data.points.mean(axis=0) + options.direction, "by --direction"
+    try:
+        station = find_station(RawScan(name, PointCloud(data.points)))
+    except InputError:
+        raise InputError(
+            "does not say from which side the wall was measured",
+            where=name,
+            remedy="give --position X,Y,Z: where the scanner stood, or any place before the wall, in the file's coordinates",
+        ) from None
+    return station.position, "where the scan lines meet"
+
+
+def wall_frame(points: FloatArray, towards: FloatArray, direction: FloatArray | None) -> WallFrame:
+    """Fit the wall frame to points (n, 3), survey coordinates, m: z along `direction`, else along the mean plane's normal."""
+    few = points[:: max(len(points) // _SAMPLE, 1)]
+    if direction is None:
+        return WallFrame.fit(few, towards)
+    return WallFrame.along(direction / np.linalg.norm(direction), few)
+
+
+def raster_of(points: FloatArray, gsd_m: float | None) -> Grid:
+    """Return the raster over points (n, 3), wall frame, m; the pixel is chosen by their density where `gsd_m` is None.
+
+    Raises InputError for a pixel that gives no raster, or too large a one.
+    """
+    bounds = np.array([points.min(axis=0), points.max(axis=0)])
+    gsd = gsd_m if gsd_m is not None else _usual_gsd(points)
+    width, height = (bounds[1] - bounds[0])[:2]
+    coarsest, finest = min(width, height) / 10, float(np.sqrt(width * height / _MOST_PIXELS))
+    if not finest <= gsd <= coarsest:
+        raise InputError(
+            f"a pixel of {gsd:g} m is too {'large' if gsd > coarsest else 'small'} for a wall of {width:.1f} x {height:.1f} m",
+            where="--gsd",
+            allowed=f"{finest:.2g} to {coarsest:.3g} m",
+            remedy="" if gsd > coarsest else "choose a larger pixel, or cut the epochs to the wall",
+        )
+    return Grid.over(bounds, gsd)
+
+
+def _usual_gsd(points: FloatArray) -> float:
+    """A round number of metres somewhat above the mean distance of neighbouring points."""
+    few = points[:: len(points) // _MOST_COUNTED + 1, :2]
+    apart, cell = _CELL_M, _CELL_M
+    for _ in range(_ROUNDS):
+        cells = len(np.unique(np.floor(few / cell).astype(np.int64), axis=0))
+        apart = float(np.sqrt(cells * cell**2 / len(points)))
+        cell = _POINTS_A_CELL * apart * float(np.sqrt(len(points) / len(few)))
+    spacing = _POINTS_APART * apart
+    power = 10.0 ** np.floor(np.log10(max(spacing, _FINEST_M)))
+    return float(power * _ROUND[np.searchsorted(_ROUND, max(spacing, _FINEST_M) / power - 1e-9)])

@@ -1,0 +1,62 @@
+"""What a laser scanner's model predicts for the level of detection, to be set beside the measured one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.config.presets import read_preset
+from pipeline.formats.measurements.measurement import read_model
+from pipeline.monitoring.gridding import HeightRaster
+from pipeline.monitoring.options import MonitorOptions
+from pipeline.monitoring.significance import NORMAL_95
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
+from sensors.models.sensor_model import TlsModel
+
+DISAGREES = 1 / 3
+"""Share by which the measured level may differ from the predicted one before it is worth a diagnosis."""
+
+
+def scanner_model(options: MonitorOptions) -> TlsModel | None:
+    """The model that the options name, None where they name none. Raises InputError for one of a stereo pair."""
+    if options.model is not None:
+        model = read_model(options.model)
+        if not isinstance(model, TlsModel):
+            raise InputError("is the model of a stereo pair", where=str(options.model), allowed="sensor: tls")
+        return model
+    return None if options.scanner is None else read_preset(options.scanner).model()
+
+
+def predicted_level(model: TlsModel, reference: HeightRaster, epoch: HeightRaster, station: FloatArray) -> float:
+    """Median level of detection at 95 %, m, that white noise of range and angles gives.
+
+    Parameters
+    ----------
+    model : TlsModel
+    reference, epoch : HeightRaster
+        Their planes say how many points share in each pixel.
+    station : (3,) array
+        The scanner's place, wall frame, m.
+    """
+    grid = reference.grid
+    x = grid.x_min + (np.arange(grid.width) + 0.5) * grid.gsd - station[0]
+    y = grid.y_max - (np.arange(grid.height) + 0.5) * grid.gsd - station[1]
+    z = reference.height.astype(np.float64) - station[2]
+    distance = np.sqrt(x[None, :] ** 2 + y[:, None] ** 2 + z**2)
+    cosine = np.abs(z) / distance
+    along = np.hypot(model.noise.range_sigma_m, 1e-6 * model.noise.range_ppm * distance)
+    across = model.noise.angle_sigma_rad * distance
+    point = np.sqrt((along * cosine) ** 2 + across**2 * (1 - cosine**2))
+    share = (reference.sigma / reference.scatter) ** 2 + (epoch.sigma / epoch.scatter) ** 2
+    return float(NORMAL_95 * np.nanmedian(point * np.sqrt(share)))
+
+
+def compared_in_words(measured_m: float, predicted_m: float) -> str:
+    """Say how the measured level of detection compares with the predicted one, and what to do where they disagree."""
+    told = f"Level of detection: measured {1e3 * measured_m:.1f} mm, predicted by the model {1e3 * predicted_m:.1f} mm"
+    if abs(measured_m / predicted_m - 1) <= DISAGREES:
+        return f"{told}. They agree within a third."
+    return (
+        f"{told}. They disagree by more than a third: relief between the points, or an effect that the model lacks. "
+        "Find out with scarpsim gap on the scan and the reference, and fit the noise with scarpsim calibrate."
+    )

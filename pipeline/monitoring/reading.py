@@ -1,0 +1,226 @@
+"""Read epochs: scans, clouds, meshes and elevation models, folders of scans, and runs of `simulate`."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.formats.files.checksum import sha256
+from pipeline.formats.points.points import SUFFIXES
+from pipeline.formats.records.result_records import RUN_FILE, read_run
+from pipeline.measurement.reference import DEMS, is_cloud, reference_from_dem
+from pipeline.measurement.scans import read_scans
+from pipeline.monitoring.options import MonitorOptions
+from pipeline.monitoring.times import EpochTime, check_order, time_of
+from scene.common.errors import InputError
+from scene.geometry.frame import WallFrame
+from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray, TriangleMesh
+from scene.walls.imported import read_mesh
+
+_BEFORE_M = 100.0
+"""How far before the wall of a run the sensor is taken to stand: only the side counts."""
+_ANY = (*SUFFIXES, *DEMS, ".obj", ".stl", ".glb", ".off")
+
+
+@dataclass(frozen=True)
+class EpochSource:
+    """Where an epoch is read from.
+
+    Attributes
+    ----------
+    path : Path
+        What the user named.
+    files : tuple of Path
+        One file, or the scans of one epoch.
+    time : EpochTime
+    run : dict or None
+        run.json of the run of `simulate` that the epoch belongs to.
+    """
+
+    path: Path
+    files: tuple[Path, ...]
+    time: EpochTime
+    run: dict[str, Any] | None = field(default=None, repr=False)
+
+    @property
+    def name(self) -> str:
+        """As people call it."""
+        return self.path.name if self.run is None else f"{self.path.parent.name}/{self.path.name}"
+
+    def checksums(self) -> dict[str, str]:
+        """SHA-256 of each file, by its path."""
+        return {str(file): sha256(file) for file in self.files}
+
+
+@dataclass(frozen=True)
+class EpochData:
+    """What an epoch's files hold.
+
+    Attributes
+    ----------
+    points : (n, 3) array
+        Survey coordinates, m; the vertices of a mesh.
+    mesh : TriangleMesh or None
+        The surface, where the files hold one.
+    position : (3,) array or None
+        Where the sensor stood, survey coordinates, m, where the files say so.
+    crs : str
+        WKT of the coordinate system, empty where it is not stated.
+    notes : tuple of str
+    """
+
+    points: FloatArray
+    mesh: TriangleMesh | None = None
+    position: FloatArray | None = None
+    crs: str = ""
+    notes: tuple[str, ...] = ()
+
+    def wall_points(self, frame: WallFrame, gsd_m: float) -> FloatArray:
+        """(m, 3) points in the wall frame, m; those of a mesh lie on it, four to a pixel."""
+        if self.mesh is None:
+            return frame.to_wall(self.points)
+        from pipeline.change.difference import surface_raster
+
+        mesh = self.mesh.with_vertices(frame.to_wall(self.mesh.vertices))
+        grid = Grid.over(mesh.bounds, gsd_m / 2)
+        heights = surface_raster(mesh, grid).heights
+        row, column = np.nonzero(np.isfinite(heights))
+        x, y = grid.x_min + (column + 0.5) * grid.gsd, grid.y_max - (row + 0.5) * grid.gsd
+        return np.stack([x, y, heights[row, column]], axis=1).astype(np.float64)
+
+
+def find_epochs(paths: Sequence[Path], times: Sequence[str] = ()) -> list[EpochSource]:
+    """Find the epochs that some paths name, in order.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        A file is an epoch, a folder of scans is one, and a run of `simulate` is all of its epochs.
+    times : sequence of str
+        One for each epoch, ISO 8601; none: as files say.
+
+    Raises
+    ------
+    InputError
+        For paths that hold no epoch, the same file twice, fewer than two epochs, and times that run backwards.
+    """
+    found = [source for path in paths for source in _sources(path)]
+    if len(found) < 2:
+        raise InputError(
+            f"{len(found)} epoch is given",
+            where="EPOCH",
+            allowed="two and more",
+            remedy="name one before and one after",
+        )
+    if times and len(times) != len(found):
+        raise InputError(f"holds {len(times)} times for {len(found)} epochs", where="--times", remedy="give one for each epoch")
+    seen: dict[Path, str] = {}
+    for source in found:
+        for file in source.files:
+            if (real := file.resolve()) in seen:
+                raise InputError("is given twice", where=str(file), remedy="name each epoch once")
+            seen[real] = source.name
+    timed = [
+        EpochSource(source.path, source.files, time_of(source.path, given), source.run)
+        for source, given in zip(found, times or itertools.repeat(None, len(found)), strict=True)
+    ]
+    check_order([source.time for source in timed], [source.name for source in timed])
+    return timed
+
+
+def read_epoch(source: EpochSource, options: MonitorOptions) -> EpochData:
+    """Read an epoch. Raises InputError for whatever is wrong in its files."""
+    if source.run is not None:
+        return _of_run(source, source.run)
+    parts = [_read_file(file, options) for file in source.files]
+    if len(parts) == 1:
+        return parts[0]
+    if any(part.mesh is not None for part in parts):
+        raise InputError("holds meshes or elevation models among scans", where=str(source.path), allowed="scans alone")
+    notes = tuple(dict.fromkeys(note for part in parts for note in part.notes))
+    positions = [part.position for part in parts if part.position is not None]
+    position = np.mean(positions, axis=0) if positions else None
+    return EpochData(np.concatenate([part.points for part in parts]), None, position, parts[0].crs, notes)
+
+
+def epoch_files(folder: Path) -> list[Path]:
+    """Files of a folder that hold scans, clouds, meshes or elevation models, by name."""
+    return sorted(each for each in folder.iterdir() if each.suffix.lower() in _ANY and each.is_file())
+
+
+def _sources(path: Path) -> list[EpochSource]:
+    unknown = EpochTime(None, "")
+    if not path.exists():
+        raise InputError("there is no such file or folder", where=str(path), remedy="check the path")
+    if path.is_file():
+        return [EpochSource(path, (path,), unknown)]
+    if (path / RUN_FILE).is_file():
+        return _epochs_of_run(path)
+    files = tuple(epoch_files(path))
+    if not files:
+        allowed = f"files of scans ({', '.join(_ANY)}), or a run of simulate"
+        raise InputError("holds no scan", where=str(path), allowed=allowed)
+    return [EpochSource(path, files, unknown)]
+
+
+def _epochs_of_run(folder: Path) -> list[EpochSource]:
+    record = read_run(folder / RUN_FILE, "make the run again")
+    if not record.get("wall_frame"):
+        raise InputError("names no wall frame", where=str(folder / RUN_FILE), remedy="make the run again")
+    epochs = sorted(each for each in folder.glob("epoch_*") if (each / "points.laz").is_file())
+    if not epochs:
+        raise InputError("holds no epoch with points", where=str(folder), remedy="make the run again")
+    return [EpochSource(each, (each / "points.laz",), EpochTime(None, ""), record) for each in epochs]
+
+
+def _of_run(source: EpochSource, run: dict[str, Any]) -> EpochData:
+    """An epoch of a run, whose points are in the wall frame of its config."""
+    stated = run["wall_frame"]
+    frame = WallFrame(np.array(stated["rotation"]), np.array(stated["origin_m"]))
+    (scan,) = read_scans(source.files[0])
+    middle = scan.cloud.points.mean(axis=0) + np.array([0.0, 0.0, _BEFORE_M])
+    notes = ("an epoch of a run of simulate: its points were put into survey coordinates",)
+    return EpochData(frame.to_world(scan.cloud.points), None, frame.to_world(middle), "", notes)
+
+
+def _read_file(path: Path, options: MonitorOptions) -> EpochData:
+    suffix = path.suffix.lower()
+    if suffix in DEMS:
+        found = reference_from_dem(path, options.unit)
+        above = found.mesh.vertices.mean(axis=0) + np.array([0.0, 0.0, _BEFORE_M])
+        return EpochData(found.mesh.vertices, found.mesh, above, "", found.words)
+    if not is_cloud(path):
+        mesh, notes = read_mesh(path, options.unit or "m")
+        return EpochData(mesh.vertices, mesh, _before(mesh), "", notes)
+    scans = read_scans(path, options.unit, options.columns)
+    positions = [scan.position for scan in scans if scan.position is not None]
+    notes = tuple(dict.fromkeys(note for scan in scans for note in scan.cloud.notes))
+    position = np.mean(positions, axis=0) if positions else None
+    return EpochData(np.concatenate([scan.cloud.points for scan in scans]), None, position, _crs_of(path), notes)
+
+
+def _before(mesh: TriangleMesh) -> FloatArray:
+    """A place before a mesh, on the side to which its triangles face."""
+    corners = mesh.vertices[mesh.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
+    return np.asarray(mesh.vertices.mean(axis=0) + _BEFORE_M * normal / max(float(np.linalg.norm(normal)), 1e-12))
+
+
+def _crs_of(path: Path) -> str:
+    """WKT of the coordinate system of a LAS file, empty where it states none that is understood."""
+    if path.suffix.lower() not in (".las", ".laz"):
+        return ""
+    import laspy
+
+    try:
+        with laspy.open(path) as reader:
+            crs = reader.header.parse_crs()
+    except Exception:  # an unreadable record of the coordinate system is none
+        return ""
+    return "" if crs is None else str(crs.to_wkt())

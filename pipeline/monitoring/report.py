@@ -1,0 +1,154 @@
+"""The page that a person reads after `scarpsim monitor`: maps, events, volumes over time, what was registered on what."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from pipeline.formats.files.atomic import write_bytes, write_text
+from pipeline.formats.rasters.geotiff import read_geotiff
+from pipeline.monitoring.magnitude import PowerLaw, fit_power_law
+from pipeline.monitoring.model import compared_in_words
+from pipeline.monitoring.products import Followed, Result, event_raster
+from pipeline.monitoring.significance import NORMAL_95
+from pipeline.report.figures import blocks_figure, difference_figure, hillshade_figure, label_axes, png_bytes
+from pipeline.report.map_styles import difference_style, quantity_style
+from pipeline.report.page import template
+
+_SIGMAS_SHOWN = 6.0
+_LARGEST_SHOWN = 24
+_ROWS_SHOWN = 500
+_EPOCHS_FOR_LAW = 3
+"""Epochs, the reference among them, from which on a magnitude-frequency law is drawn."""
+
+
+def write_report(result: Result) -> None:
+    """Write report.html, its pictures as files of their own, and styles of the maps for GIS programs."""
+    pictures = {"reference.png": hillshade_figure(result.site.reference.raster.height, result.site.grid)}
+    for epoch in result.epochs:
+        pictures |= _pictures_of(epoch, result)
+    law = None
+    if len(result.sources) >= _EPOCHS_FOR_LAW:
+        pictures["volumes.png"] = _volumes_figure(result)
+        volumes = list(_missing_volumes(result).values())
+        law = fit_power_law(volumes)
+        if law is not None:
+            pictures["magnitude_frequency.png"] = _law_figure(volumes, law)
+    for name, png in pictures.items():
+        write_bytes(result.folder / name, png)
+    rows = result.rows()
+    text = template("monitoring/report.html.jinja").render(
+        result=result,
+        epochs=[_about(epoch, result) for epoch in result.epochs],
+        headline=headline(result),
+        pictures=pictures,
+        rows=rows[:_ROWS_SHOWN],
+        more=max(len(rows) - _ROWS_SHOWN, 0),
+        law=None if law is None else law_in_words(law),
+    )
+    write_text(result.folder / "report.html", text)
+
+
+def headline(result: Result) -> list[str]:
+    """One sentence an epoch: what fell, what was added, how small a change would show."""
+    told = []
+    for epoch in result.epochs:
+        when = f" ({epoch.source.time.text})" if epoch.source.time.when else ""
+        parts = [_kind_in_words(epoch, kind) for kind in ("missing", "added")]
+        found = "; ".join(part for part in parts if part) or "no change beyond the level of detection"
+        marked = sum(bool(region.marks) for region in epoch.regions)
+        doubtful = f" {marked} of them have a mark: something else may have feigned the change." if marked else ""
+        told.append(
+            f"Epoch {epoch.number}, {epoch.source.name}{when}: {found}. A pixel shows changes from "
+            f"{1e3 * epoch.record.level_m:.1f} mm on (95 %).{doubtful}"
+        )
+    return told
+
+
+def law_in_words(law: PowerLaw) -> str:
+    """The exponent with its interval."""
+    return (
+        f"{law.count} rockfalls of {law.smallest_m3:.3g} m³ and more follow N(> V) ~ V^-{law.exponent:.2f} "
+        f"(95 % interval {law.low:.2f} to {law.high:.2f})."
+    )
+
+
+def _kind_in_words(epoch: Followed, kind: str) -> str:
+    regions = [region for region in epoch.regions if region.kind == kind]
+    if not regions:
+        return ""
+    volume = sum(region.volume_m3 for region in regions)
+    sigma = float(np.sqrt(sum(region.volume_std_m3**2 for region in regions)))
+    what = "of missing rock" if kind == "missing" else "of added material"
+    places = "1 place" if len(regions) == 1 else f"{len(regions)} places"
+    return f"{volume:.3g} ± {NORMAL_95 * sigma:.2g} m³ {what} in {places}"
+
+
+def _about(epoch: Followed, result: Result) -> dict[str, Any]:
+    record = epoch.record
+    registration = record.registration
+    shift = 1e3 * float(np.linalg.norm(registration["sigma_translation_m"]))
+    registered = (
+        f"{epoch.source.name} was registered on {result.site.source.name} by {registration['stable_pixels']:,} stable pixels. "
+        f"Their differences have an RMS of {1e3 * registration['rms_m']:.1f} mm. "
+        f"The standard deviation of the shift is {shift:.2g} mm."
+    )
+    predicted = None if np.isnan(record.predicted_level_m) else compared_in_words(record.level_m, record.predicted_level_m)
+    return {"number": epoch.number, "registered": registered, "predicted": predicted, "notes": record.notes}
+
+
+def _pictures_of(epoch: Followed, result: Result) -> dict[str, bytes]:
+    grid, number = result.site.grid, epoch.number
+    difference, _ = read_geotiff(result.folder / f"difference_{number:03d}.tif")
+    level, _ = read_geotiff(result.folder / f"lod_{number:03d}.tif")
+    sigma = max(epoch.record.level_m / NORMAL_95, 1e-6)
+    difference_style(result.folder / f"difference_{number:03d}.tif", _SIGMAS_SHOWN * sigma)
+    quantity_style(result.folder / f"lod_{number:03d}.tif", level, "mm", 1e3)
+    labels = event_raster(epoch.regions, grid.shape)
+    captions = {
+        region.identity: f"{region.volume_m3:.3g} m³" if region.volume_m3 >= 0.1 else f"{1e3 * region.volume_m3:.3g} l"
+        for region in epoch.regions[:_LARGEST_SHOWN]
+    }
+    found = {f"map_{number:03d}.png": difference_figure(difference, grid, labels, sigma)}
+    gallery = blocks_figure(difference, grid, labels, sigma, captions)
+    return found if gallery is None else found | {f"events_{number:03d}.png": gallery}
+
+
+def _missing_volumes(result: Result) -> dict[int, float]:
+    """Volume of each rockfall, m3, when it was first seen, by its event's number."""
+    found: dict[int, float] = {}
+    for epoch in result.epochs:
+        for region in epoch.regions:
+            if region.kind == "missing" and not region.marks:
+                found.setdefault(region.identity, region.volume_m3)
+    return found
+
+
+def _volumes_figure(result: Result) -> bytes:
+    figure = Figure(figsize=(8.0, 3.4), dpi=120, layout="constrained")
+    axes = figure.subplots()
+    timed = all(epoch.source.time.when for epoch in result.epochs)
+    places: list[Any] = [epoch.source.time.when if timed else epoch.number for epoch in result.epochs]
+    for kind, colour in (("missing", "#b2182b"), ("added", "#2166ac")):
+        volumes = [sum(region.volume_m3 for region in epoch.regions if region.kind == kind) for epoch in result.epochs]
+        variances = [sum(region.volume_std_m3**2 for region in epoch.regions if region.kind == kind) for epoch in result.epochs]
+        axes.errorbar(
+            places, volumes, NORMAL_95 * np.sqrt(variances), color=colour, marker="o", markersize=3, capsize=2, label=kind
+        )
+    label_axes(axes, "time (UTC)" if timed else "epoch", "volume against the reference [m³]")
+    axes.legend(fontsize=8, frameon=False)
+    return png_bytes(figure)
+
+
+def _law_figure(volumes: list[float], law: PowerLaw) -> bytes:
+    ordered = np.sort(volumes)
+    figure = Figure(figsize=(5.0, 3.6), dpi=120, layout="constrained")
+    axes = figure.subplots()
+    axes.loglog(ordered, np.arange(len(ordered), 0, -1), "o", markersize=3, color="0.3", label="rockfalls")
+    line = np.geomspace(law.smallest_m3, ordered[-1], 50)
+    axes.loglog(line, law.count * (line / law.smallest_m3) ** -law.exponent, color="#b2182b", label=f"V^-{law.exponent:.2f}")
+    label_axes(axes, "volume V [m³]", "rockfalls larger than V")
+    axes.legend(fontsize=8, frameon=False)
+    return png_bytes(figure)

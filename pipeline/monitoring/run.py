@@ -1,0 +1,229 @@
+"""`monitor` from files to events: read, register, difference, level of detection, events, products.
+
+The reference is read once. Each further epoch is compared with it by itself, in this process or in several, and its record is
+kept, so that an interrupted monitoring goes on. Events get their numbers at the end, in the order of the epochs.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.formats.files.atomic import empty_folder
+from pipeline.formats.rasters.geotiff import write_geotiff
+from pipeline.monitoring.comparison import EpochChange, compare_epoch
+from pipeline.monitoring.detector import regions_of_detector
+from pipeline.monitoring.events import Catalogue
+from pipeline.monitoring.model import predicted_level, scanner_model
+from pipeline.monitoring.options import NO_DETECTOR, MonitorOptions
+from pipeline.monitoring.products import Followed, Result, write_points, write_results
+from pipeline.monitoring.reading import EpochData, EpochSource, find_epochs, read_epoch
+from pipeline.monitoring.records import EpochRecord, kept
+from pipeline.monitoring.site import ReferenceSite, prepared
+from pipeline.report.progress import Progress
+from scene.common.errors import InputError
+
+_TENTH = 0.1
+_UNLIKE_UNITS = 3.0
+"""Ratio of the extents of two epochs from which their units are taken to differ."""
+
+
+def monitor_paths(
+    paths: Sequence[Path],
+    out: Path,
+    options: MonitorOptions,
+    *,
+    times: Sequence[str] = (),
+    workers: int = 1,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> Result:
+    """Find the epochs that paths name, the reference first, and compare them as `monitor` does."""
+    return monitor(find_epochs(paths, times), out, options, workers=workers, resume=resume, progress=progress)
+
+
+def monitor(
+    sources: Sequence[EpochSource],
+    out: Path,
+    options: MonitorOptions,
+    *,
+    workers: int = 1,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> Result:
+    """Compare epochs with the first one, and write the folder of results.
+
+    Parameters
+    ----------
+    sources : sequence of EpochSource
+        The reference first.
+    out : Path
+        New or empty folder, or with `resume` that of an interrupted monitoring.
+    options : MonitorOptions
+    workers : int
+        Processes; the results do not depend on it.
+    resume : bool
+        Take over the epochs that are finished in `out`.
+    progress : Progress, optional
+
+    Raises
+    ------
+    InputError
+        For whatever is wrong in the files, and for epochs that do not meet.
+    """
+    progress = progress or Progress()
+    if not resume:
+        empty_folder(out)
+    with progress.stage(f"reference {sources[0].name}"):
+        site = prepared(sources[0], options)
+    fingerprint = _fingerprint(site, options)
+    further = list(enumerate(sources[1:], start=1))
+    progress.plan({f"epoch {number}": 1.0 for number, _ in further} | {"report": 0.3})
+    records = {number: kept(out, number, source.checksums(), fingerprint) for number, source in further} if resume else {}
+    if workers > 1:
+        left = [(number, source) for number, source in further if records.get(number) is None]
+        records |= _compared_in_processes(left, site, out, options, fingerprint, workers, progress)
+    followed = []
+    catalogue = Catalogue()
+    for number, source in further:
+        with progress.stage(f"epoch {number}"):
+            record, data = records.get(number), None
+            if record is None:
+                record, data = processed(number, source, site, out, options, fingerprint)
+            epoch = Followed(source, record, catalogue.identified(record.regions))
+            write_points(epoch, data or read_epoch(source, options), site, out)
+            followed.append(epoch)
+    with progress.stage("report"):
+        result = Result(out, tuple(sources), site, tuple(followed), options)
+        write_results(result)
+    return result
+
+
+def _fingerprint(site: ReferenceSite, options: MonitorOptions) -> str:
+    """Of all that a record depends on beside its epoch."""
+    told = {"reference": site.source.checksums(), "options": options.to_dict(), "grid": site.grid.__dict__}
+    return hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _compared_in_processes(
+    left: Sequence[tuple[int, EpochSource]],
+    site: ReferenceSite,
+    out: Path,
+    options: MonitorOptions,
+    fingerprint: str,
+    workers: int,
+    progress: Progress,
+) -> dict[int, EpochRecord | None]:
+    """The records of epochs, compared in processes of their own, by number."""
+    context = multiprocessing.get_context("spawn")
+    found: dict[int, EpochRecord | None] = {}
+    with progress.stage("comparisons"), ProcessPoolExecutor(min(workers, len(left) or 1), mp_context=context) as pool:
+        waiting = [pool.submit(_in_worker, number, source, site.source, out, options, fingerprint) for number, source in left]
+        for done in as_completed(waiting):
+            record = done.result()
+            found[record.number] = record
+            progress.advance(len(found) / len(left))
+    return found
+
+
+def _in_worker(
+    number: int, source: EpochSource, reference: EpochSource, out: Path, options: MonitorOptions, fingerprint: str
+) -> EpochRecord:
+    return processed(number, source, _site_of_worker(reference, _Frozen(options)), out, options, fingerprint)[0]
+
+
+class _Frozen:
+    """Options as a key of a cache."""
+
+    def __init__(self, options: MonitorOptions) -> None:
+        self.options = options
+        self._key = json.dumps(options.to_dict(), sort_keys=True, default=str)
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Frozen) and self._key == other._key
+
+
+@lru_cache(1)
+def _site_of_worker(reference: EpochSource, frozen: _Frozen) -> ReferenceSite:
+    """The reference, prepared once in each process."""
+    return prepared(reference, frozen.options)
+
+
+def processed(
+    number: int, source: EpochSource, site: ReferenceSite, out: Path, options: MonitorOptions, fingerprint: str
+) -> tuple[EpochRecord, EpochData]:
+    """Compare one epoch, write its maps and its record; returns the record and what was read."""
+    data = read_epoch(source, options)
+    notes = [*data.notes, *_check_same_site(data, site, source)]
+    points = data.wall_points(site.frame, site.grid.gsd)
+    found = compare_epoch(site.reference, points, options.stable, options.seed)
+    write_geotiff(out / f"difference_{number:03d}.tif", found.change.difference, site.grid)
+    write_geotiff(out / f"lod_{number:03d}.tif", found.change.significance.level, site.grid)
+    regions = found.regions
+    if options.detector != NO_DETECTOR:
+        regions = regions_of_detector(options.detector, out / f"difference_{number:03d}.tif", found.change)
+    compared = np.isfinite(found.change.difference)
+    record = EpochRecord(
+        number=number,
+        inputs=source.checksums(),
+        points=len(data.points),
+        notes=(*notes, *found.alignment.notes),
+        transform=found.transform,
+        registration={**found.alignment.to_dict(), **found.transform.to_dict()},
+        level_m=float(np.nanmedian(found.change.significance.level)),
+        predicted_level_m=_predicted(options, site, found),
+        area_m2=float(compared.sum()) * site.grid.gsd**2,
+        regions=tuple(regions),
+    )
+    record.write(out, fingerprint, site.grid.shape)
+    return record, data
+
+
+def _predicted(options: MonitorOptions, site: ReferenceSite, found: EpochChange) -> float:
+    model = None if options.photographs else scanner_model(options)
+    if model is None:
+        return float("nan")
+    return predicted_level(model, site.reference.raster, found.change.epoch, site.station)
+
+
+def _check_same_site(data: EpochData, site: ReferenceSite, source: EpochSource) -> list[str]:
+    """Notes on an epoch's coordinates and density. Raises InputError where it lies elsewhere, or is in another unit."""
+    wall = site.frame.to_wall(data.points[:: max(len(data.points) // 100_000, 1)])
+    grid = site.grid
+    extent = np.ptp(np.quantile(wall[:, :2], [0.02, 0.98], axis=0), axis=0)
+    ratio = float(np.min(extent / np.array([grid.width * grid.gsd, grid.height * grid.gsd])))
+    inside = (np.abs(wall[:, 0] - grid.x_min - grid.width * grid.gsd / 2) < grid.width * grid.gsd) & (
+        np.abs(wall[:, 1] - grid.y_max + grid.height * grid.gsd / 2) < grid.height * grid.gsd
+    )
+    if not inside.mean() > _TENTH:
+        unit = " or their units differ" if ratio > _UNLIKE_UNITS or ratio < 1 / _UNLIKE_UNITS else ""
+        raise InputError(
+            f"lies elsewhere than the reference {site.source.name}: its middle is "
+            f"{np.linalg.norm(np.median(wall, axis=0)):,.0f} m from the wall's corner; the coordinates differ{unit}",
+            where=source.name,
+            allowed="epochs of one coordinate system",
+            remedy="put them into one system, or give --unit",
+        )
+    if data.crs and site.crs and data.crs != site.crs and not _same_system(data.crs, site.crs):
+        raise InputError(
+            "is in another coordinate system than the reference", where=source.name, remedy="transform one of the two"
+        )
+    if len(data.points) < _TENTH * site.points:
+        return [f"has {len(data.points):,} points where the reference has {site.points:,}: small changes do not show"]
+    return []
+
+
+def _same_system(one: str, other: str) -> bool:
+    from pyproj import CRS
+
+    return bool(CRS.from_wkt(one).equals(CRS.from_wkt(other), ignore_axis_order=True))

@@ -1,0 +1,64 @@
+"""Prepare the first epoch: how it is observed, and to what later epochs are registered (its surface, or the true wall)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from pipeline.config.simulation import SimulationConfig
+from pipeline.registration.closest_points import ReferenceSurface
+from pipeline.registration.register import register_to
+from pipeline.run.site import SensorSite
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import TriangleMesh
+from sensors.laser.tls import LaserScanner
+from sensors.stereo.exchanged import StereoSensor
+from sensors.stereo.stereo_matched import MatchedStereoPair
+from sensors.stereo.stereo_pair import StereoPair
+
+
+def reference_sensor(config: SimulationConfig, site: SensorSite) -> SensorSite:
+    """Return the site as the reference epoch is observed: without the sensor's noise if the config says so."""
+    if config.noisy_reference:
+        return site
+    sensor = site.sensor
+    if isinstance(sensor, MatchedStereoPair):
+        quiet: LaserScanner | StereoSensor = replace(sensor, pair=_quiet(sensor.pair))
+    elif isinstance(sensor, StereoPair):
+        quiet = _quiet(sensor)
+    else:
+        quiet = replace(sensor, model=sensor.model.without_noise())
+    further = tuple(replace(each, model=each.model.without_noise()) for each in site.further_stations)
+    return replace(site, sensor=quiet, further_stations=further)
+
+
+def _quiet(pair: StereoPair) -> StereoPair:
+    """Return the pair without noise."""
+    return replace(pair, model=pair.model.without_noise())
+
+
+def reference_and_target(
+    config: SimulationConfig, surface: TriangleMesh, wall: TriangleMesh, random: KeyedRandom
+) -> tuple[TriangleMesh, ReferenceSurface | None]:
+    """Return the reference surface, wall frame, and the target of the later epochs' ICP (None without ICP).
+
+    With `icp_target: true_wall` (thesis 3.6) the reference itself is also registered to the wall; otherwise its own
+    misorientation would appear in every difference map.
+
+    Parameters
+    ----------
+    config : SimulationConfig
+        Config of the run.
+    surface : TriangleMesh
+        The reconstructed reference surface.
+    wall : TriangleMesh
+        The true wall.
+    random : KeyedRandom
+        Source of the registration's subsamples.
+    """
+    if config.icp is None:
+        return surface, None
+    if config.icp_target == "reference":
+        return surface, ReferenceSurface.build(surface.vertices, surface.vertex_normals())
+    target = ReferenceSurface.build(wall.vertices, wall.vertex_normals())
+    found = register_to(target, surface.vertices, config.icp, random)
+    return surface.with_vertices(found.apply(surface.vertices)), target

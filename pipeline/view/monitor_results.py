@@ -1,0 +1,120 @@
+"""The folder of `scarpsim monitor` as something to look at: the wall at each epoch, what changed, and the events."""
+
+from __future__ import annotations
+
+import json
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pycocotools import mask as coco_mask
+
+from pipeline.formats.points.laz import read_laz
+from pipeline.formats.rasters.geotiff import read_geotiff
+from pipeline.report.figures import SCALE_SIGMAS, mean_pooled
+from pipeline.view.results import Item, Layer, Patch, PointLayer, ViewWindow, centres, cut, inside
+from scene.common.errors import InputError
+from scene.common.regular_file import read_json
+from scene.geometry.frame import WallFrame
+
+MONITOR_FILE, REFERENCE_FILE = "monitor.json", "reference.tif"
+_MM, _NORMAL_95 = 1e3, 1.96
+_REMEDY = "run scarpsim monitor again"
+
+
+class MonitorResults:
+    """Epochs against the reference. Steps are the epochs, items the events."""
+
+    step_name = "epoch"
+    surfaces = {"epoch": "as measured", "reference": "reference"}  # noqa: RUF012
+
+    def __init__(self, folder: Path) -> None:
+        """Raises InputError where monitor.json is damaged or a map is absent."""
+        self.folder = folder
+        self._record = read_json(folder / MONITOR_FILE, remedy=_REMEDY)
+        try:
+            epochs = self._record["epochs"]
+            names = {str(each["epoch"]): each["time"] or Path(each["path"]).name for each in self._record["inputs"]}
+            frame = self._record["wall_frame"]
+            self._frame = WallFrame(np.array(frame["rotation"], dtype=float), np.array(frame["origin_m"], dtype=float))
+            self._levels = {str(each["epoch"]): float(each["level_of_detection_median_m"]) for each in epochs}
+            self._events = [dict(each) for each in self._record["events"]]
+        except (KeyError, TypeError, ValueError):
+            raise InputError("is no record of scarpsim monitor", where=str(folder / MONITOR_FILE), remedy=_REMEDY) from None
+        self.title = f"{folder.name}: {len(epochs)} epochs against {names.get('0', 'the reference')}"
+        self.steps = {key: f"epoch {key}, {names.get(key, '')}" for key in self._levels}
+        if not self.steps:
+            raise InputError("holds no epoch", where=str(folder), remedy=_REMEDY)
+        self._map = lru_cache(6)(read_geotiff)
+        self._cloud = lru_cache(1)(read_laz)
+        self._numbers = lru_cache(2)(self._event_raster)
+
+    def layers(self, step: str) -> list[Layer]:
+        """Change, level of detection, shaded rock and relief."""
+        limit = SCALE_SIGMAS * self._levels[step] / _NORMAL_95 * _MM
+        return [
+            Layer("difference", "reference minus epoch (missing rock positive)", "mm", _MM, diverging=True, limit=limit),
+            Layer("lod", "level of detection, 95 %", "mm", _MM),
+            Layer("rock", "rock (shaded)", ""),
+            Layer("height", "relief", "m"),
+        ]
+
+    def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
+        """The reference, or it minus the change, coloured by the layer."""
+        reference, grid = self._map(self.folder / REFERENCE_FILE)
+        rows, columns, factor = cut(grid, window, budget)
+        part = reference[rows, columns]
+        if surface == "epoch":
+            change = self._map(self._path("difference", step))[0][rows, columns]
+            part = part - np.where(np.isfinite(change), change, 0.0)
+        height = mean_pooled(part, factor)
+        value = height
+        if layer.key in ("difference", "lod"):
+            value = mean_pooled(self._map(self._path(layer.key, step))[0][rows, columns], factor) * layer.factor
+        label = self._numbers(step)[rows, columns]
+        middle = label[factor // 2 :: factor, factor // 2 :: factor][: height.shape[0], : height.shape[1]]
+        return Patch(*centres(grid, rows, columns, factor), height, value, middle, factor)
+
+    def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
+        """The registered points with their change and level of detection."""
+        path = self.folder / f"epoch_{int(step):03d}.laz"
+        if not path.is_file():
+            return None
+        cloud = self._cloud(path)
+        local = self._frame.to_wall(cloud.points)
+        shown = np.flatnonzero(inside(local, window))
+        shown = shown[:: max(1, int(np.ceil(len(shown) / budget)))]
+        facts = {name: channel[shown] for name, channel in cloud.extra.items()}
+        return PointLayer(local[shown], None, facts, len(shown) / max(len(local), 1))
+
+    def items(self, step: str) -> list[Item]:
+        """The events of the epoch."""
+        return [_item(each) for each in self._events if str(each["epoch"]) == step]
+
+    def _path(self, name: str, step: str) -> Path:
+        return self.folder / f"{name}_{int(step):03d}.tif"
+
+    def _event_raster(self, step: str) -> NDArray[np.int32]:
+        """(h, w) the number of the event at each pixel, 0 where there is none."""
+        shape = self._map(self.folder / REFERENCE_FILE)[0].shape
+        raster = np.zeros(shape, dtype=np.int32)
+        content = json.loads((self.folder / "annotations.json").read_text(encoding="utf-8"))
+        for each in sorted(content["annotations"], key=lambda annotation: -annotation["area"]):
+            if str(each["image_id"]) == step:
+                raster[coco_mask.decode(each["segmentation"]) > 0] = each["event"]
+        return raster
+
+
+def _item(event: dict[str, Any]) -> Item:
+    x, y, half_x, half_y = (event["x_m"], event["y_m"], event["width_m"] / 2, event["height_m"] / 2)
+    facts = {
+        "kind": "missing rock" if event["kind"] == "missing" else "added material",
+        "volume": f"{event['volume_m3']:.3g} ± {_NORMAL_95 * event['volume_std_m3']:.2g} m³",
+        "depth": f"{event['depth_median_m'] * _MM:.0f} mm, at most {event['depth_largest_m'] * _MM:.0f} mm",
+        "area": f"{event['area_m2']:.3g} m²",
+        "first seen": f"between {event['first_seen_after']} and {event['first_seen_by']}",
+        "marks": event["marks"] or "none",
+    }
+    return Item("event", f"event {event['id']}", (x - half_x, x + half_x, y - half_y, y + half_y, np.nan, np.nan), facts)

@@ -1,0 +1,101 @@
+"""Combine two pictures of the same wall with a movable border between them: before and after, two epochs, two sensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.view.results import Layer, Patch, Results, ViewWindow
+from scene.common.errors import InputError
+from scene.geometry.mesh import FloatArray
+
+OWN, OTHER = "own ", "other "
+"""Prefixes of a choice: a step of the same folder, or of the other one."""
+_APART_M = 0.02
+"""Largest difference of the frames of two runs, anywhere on the wall, m."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """What can be shown beside the present picture. results: of the same folder; other: of a second run of the same wall, or
+    None.
+    """
+
+    results: Results
+    other: Results | None = None
+
+    @property
+    def choices(self) -> dict[str, str]:
+        """The choices by key, with their labels."""
+        own = {f"{OWN}{key}": label for key, label in self.results.steps.items()}
+        if self.other is None:
+            return own
+        return own | {f"{OTHER}{key}": f"{self.other.title}, {label}" for key, label in self.other.steps.items()}
+
+    def patch(self, choice: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
+        """Return the picture of a choice, coloured by the same layer or, if it has none with that key, by its first one.
+
+        Parameters
+        ----------
+        choice : str
+            A key of `choices`.
+        surface : str
+            The surface that is shown; the first one if the other folder lacks it.
+        layer : Layer
+            The layer of the present picture.
+        window : ViewWindow, optional
+            Part of the wall.
+        budget : int
+            Approximate limit on the number of cells.
+        """
+        results = self.other if choice.startswith(OTHER) and self.other is not None else self.results
+        step = choice.removeprefix(OTHER).removeprefix(OWN)
+        layers = {each.key: each for each in results.layers(step)}
+        chosen = layers.get(layer.key) or next(iter(layers.values()))
+        return results.patch(
+            step, surface if surface in results.surfaces else next(iter(results.surfaces)), chosen, window, budget
+        )
+
+
+def border(patch: Patch, share: float) -> float:
+    """Return x of the border, m, at a share 0 to 1 of the picture's width."""
+    return float(patch.x[0] + share * (patch.x[-1] - patch.x[0]))
+
+
+def split_patch(left: Patch, right: Patch, share: float) -> Patch:
+    """Return `left` up to the border, and beyond it `right` at the same cells (nearest neighbour, no data where it has none)."""
+    beyond = left.x > border(left, share)
+    columns, outside_x = _nearest(left.x, right.x)
+    rows, outside_y = _nearest(left.y, right.y)
+    outside = outside_y[:, None] | outside_x[None]
+    place = np.ix_(rows, columns)
+
+    def joined(own: NDArray[Any], other: NDArray[Any], nothing: float) -> NDArray[Any]:
+        return np.where(beyond[None], np.where(outside, nothing, other[place]), own)
+
+    return replace(
+        left,
+        height=joined(left.height, right.height, np.nan),
+        value=joined(left.value, right.value, np.nan),
+        label=joined(left.label, right.label, 0).astype(left.label.dtype),
+    )
+
+
+def _nearest(wanted: FloatArray, there: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Return the nearest of evenly spaced positions for each wanted one, (n,), and which wanted ones lie beyond their cells."""
+    if len(there) < 2:
+        return np.zeros(len(wanted), dtype=np.intp), np.abs(wanted - there[0]) > _APART_M
+    step = (there[-1] - there[0]) / (len(there) - 1)
+    place = np.round((wanted - there[0]) / step)
+    return np.clip(place, 0, len(there) - 1).astype(np.intp), (place < 0) | (place > len(there) - 1)
+
+
+def check_same_wall(first: FloatArray, second: FloatArray, extent_m: float, where: str) -> None:
+    """Raise InputError if the matrices (4, 4), world to wall frame, of two runs differ on a wall of size `extent_m`."""
+    difference = np.abs(first - second)
+    if float(difference[:3, :3].max()) * extent_m > _APART_M or float(difference[:3, 3].max()) > _APART_M:
+        remedy = "compare runs of one wall, as `scarpsim compare` makes them"
+        raise InputError("is of another wall, or in another frame", where=where, remedy=remedy)

@@ -1,0 +1,31 @@
+"""Pages that are made from other files, and the draw of items for readers."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from benchmarks.readers.draw import COUNTS, PAGE, definitions, drawn, page
+
+
+def test_a_draw_has_its_numbers_and_can_be_repeated() -> None:
+    items = drawn(3)
+    assert Counter(item["kind"] for item in items) == COUNTS
+    assert items == drawn(3)
+    assert items != drawn(4)
+    assert len({item["where"] for item in items}) == len(items)
+
+
+def test_every_public_definition_has_a_docstring() -> None:
+    without = [each["where"] for each in definitions() if "(no docstring)" in each["text"]]
+    assert len(without) < 50, without
+
+
+def test_the_page_is_that_of_the_grades() -> None:
+    assert not PAGE.is_file() or PAGE.read_text(encoding="utf-8") == page()
+
+
+def test_the_page_of_long_tests_is_that_of_their_list() -> None:
+    from make_tests_page import PAGE as OF_TESTS
+    from make_tests_page import page as page_of_tests
+
+    assert OF_TESTS.read_text(encoding="utf-8") == page_of_tests()
