@@ -26,7 +26,7 @@ from manifold3d import Manifold, Mesh64
 from scene.blocks.block import Blocks, RockfallConfig, place_blocks
 from scene.blocks.carve import carve
 from scene.blocks.distributions import Gaussian
-from scene.blocks.solid import close
+from scene.blocks.solid import close_patch
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import TriangleMesh
 
@@ -61,7 +61,7 @@ def time_ours(wall: TriangleMesh, blocks: Blocks) -> dict[str, float]:
 
 
 def time_bare(wall: TriangleMesh, blocks: Blocks) -> dict[str, float]:
-    whole, _ = close(wall, np.arange(len(wall.faces), dtype=np.int32), float(blocks.bbox[:, 0, 2].min()))
+    whole, _ = close_patch(wall, np.arange(len(wall.faces), dtype=np.int32), float(blocks.bbox[:, 0, 2].min()))
     closed = whole.manifold.to_mesh64()
     arrays = [(np.array(closed.vert_properties), np.array(closed.tri_verts)), (blocks.vertices, blocks.faces.astype(np.uint64))]
     del whole, closed

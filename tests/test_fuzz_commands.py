@@ -25,7 +25,7 @@ from pipeline.cli.main import COMMANDS
 from scene.common.errors import InputError
 
 DOORS = (
-    "pipeline.run.simulation:_observe",
+    "pipeline.run.simulation:_make_epochs",
     "pipeline.planning.inspect:inspect",
     "pipeline.comparison.comparison:compare",
     "pipeline.icp_study.study:study",
