@@ -17,7 +17,7 @@ from surfaces import sphere
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.formats.measurements.measurement import Measurement, read_measurement
 from pipeline.formats.meshes.ply import read_ply, write_ply
-from pipeline.gap.residuals.registration import residuals_of
+from pipeline.gap.residuals.alignment import compute_residuals
 from pipeline.run.site import prepare_site
 from scene.common.config import parse
 from scene.common.errors import InputError
@@ -119,9 +119,9 @@ def test_a_reference_wound_the_wrong_way_gives_the_same_residuals_and_gap(tmp_pa
     other = turned_reference(tmp_path, which)
     assert right.notes == ()
     assert "triangles" in other.notes[0]
-    assert other.notes[0] in residuals_of(other).notes
+    assert other.notes[0] in compute_residuals(other).notes
     np.testing.assert_array_equal(other.reference.faces, right.reference.faces)
-    np.testing.assert_array_equal(residuals_of(other).value, residuals_of(right).value)
+    np.testing.assert_array_equal(compute_residuals(other).value, compute_residuals(right).value)
 
 
 def moebius() -> TriangleMesh:
