@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from test_fuzz import QUICK
 
 from benchmarks.bad_inputs.case import tried
-from benchmarks.bad_inputs.drawn_cases import SET_UPS, drawn
 from benchmarks.bad_inputs.materials import make_small
+from benchmarks.bad_inputs.random_cases import SET_UPS, drawn
 from benchmarks.bad_inputs.run import said
 from pipeline.cli.main import COMMANDS
 from scene.common.errors import InputError

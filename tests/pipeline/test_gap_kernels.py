@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from kernels import kernels
 
-from benchmarks.gap_challenge.cases import Case, make
+from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import diagnose
 

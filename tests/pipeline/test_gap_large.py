@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from gap_cases import write_scan
 
-from benchmarks.gap_challenge import stereo_cases
-from benchmarks.gap_challenge.cases import Case, make
-from benchmarks.gap_challenge.strength import Target
+from benchmarks.gap_closed_form import stereo_cases
+from benchmarks.gap_closed_form.cases import Case, make
+from benchmarks.gap_closed_form.strength import Target
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.mean.candidates import Candidate, SineGrid

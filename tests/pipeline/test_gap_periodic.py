@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from gap_cases import write_scan
 
-from benchmarks.gap_challenge.cases import Case, make
+from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.mean.candidates import FOLDED, REPEATED, Candidate, SineGrid, free_forms, repeated, twice_a_pixel
 from pipeline.gap.mean.search import MeanSearch

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from gap_cases import write_scan
 
-from benchmarks.gap_challenge.cases import Case, make
+from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.formats.measurements.measurement import StereoMeasurement, read_measurement
 from pipeline.gap.mean.candidates import PLACE
 from pipeline.gap.naming import workflow

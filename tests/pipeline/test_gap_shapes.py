@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy.interpolate import RectBivariateSpline
 
-from benchmarks.gap_challenge import stereo_effects
-from benchmarks.gap_challenge.cases import Case, make
-from benchmarks.gap_judge.cases import build, schedule
+from benchmarks.gap_closed_form import stereo_effects
+from benchmarks.gap_closed_form.cases import Case, make
+from benchmarks.gap_second_generator.cases import build, schedule
 from pipeline.formats.measurements.measurement import Measurement, TlsMeasurement, read_measurement
 from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.naming import effect_selection as steps

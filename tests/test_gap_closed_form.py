@@ -1,4 +1,4 @@
-"""The challenge of GAP.md: generator against closed forms, scorer against answers that are known, a small challenge."""
+"""The closed-form generator of measurements for `gap` (docs/validation/gap_closed_form.md), its scores, and a small run of it."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ import pytest
 import yaml
 from scipy.optimize import least_squares
 
-from benchmarks.gap_challenge import cases, stereo_cases, tls_effects
-from benchmarks.gap_challenge.casting import Surface
-from benchmarks.gap_challenge.run import run
-from benchmarks.gap_challenge.score import score
-from benchmarks.gap_challenge.stereo_cameras import INTERIOR, Frame, Pair, Rectified, looking_at
-from benchmarks.gap_challenge.stereo_effects import real_pair
-from benchmarks.gap_challenge.strength import Whitener, loss_distance, mean_strength, spread_distance
-from benchmarks.gap_challenge.table import markdown
-from benchmarks.gap_challenge.tls_effects import MEAN, SECOND, Rays
-from benchmarks.gap_challenge.walls import small_turn
+from benchmarks.gap_closed_form import cases, stereo_cases, tls_effects
+from benchmarks.gap_closed_form.casting import Surface
+from benchmarks.gap_closed_form.run import run
+from benchmarks.gap_closed_form.score import score
+from benchmarks.gap_closed_form.stereo_cameras import INTERIOR, Frame, Pair, Rectified, looking_at
+from benchmarks.gap_closed_form.stereo_effects import real_pair
+from benchmarks.gap_closed_form.strength import Whitener, loss_distance, mean_strength, spread_distance
+from benchmarks.gap_closed_form.table import markdown
+from benchmarks.gap_closed_form.tls_effects import MEAN, SECOND, Rays
+from benchmarks.gap_closed_form.walls import small_turn
 
-FOLDER = Path(__file__).parents[1] / "benchmarks/gap_challenge"
+FOLDER = Path(__file__).parents[1] / "benchmarks/gap_closed_form"
 SQUARE = Surface(np.array([[-50.0, 0, -50], [50, 0, -50], [50, 0, 50], [-50, 0, 50]]), np.array([[0, 1, 2], [0, 2, 3]]))
 
 
@@ -224,7 +224,7 @@ def test_a_process_that_diagnoses_cannot_read_the_truth(tmp_path: Path) -> None:
     (tmp_path / "truth").mkdir()
     (tmp_path / "truth/0001.json").write_text("{}")
     program = (
-        "import sys; from pathlib import Path; from benchmarks.gap_challenge.run import _guard\n"
+        "import sys; from pathlib import Path; from benchmarks.gap_closed_form.run import _guard\n"
         "hidden = Path(sys.argv[1]).resolve(); sys.addaudithook(_guard(hidden))\n"
         "open(sys.argv[2]).read()\nopen(hidden / '../truth/0001.json')"
     )
@@ -310,7 +310,7 @@ def test_powers_and_slopes_are_part_of_a_ray() -> None:
 
 
 @pytest.mark.slow
-def test_a_small_challenge_over_all_strata_and_both_sensors(tmp_path: Path) -> None:
+def test_a_small_run_over_all_strata_and_both_sensors(tmp_path: Path) -> None:
     """8 cases of some thousand points. The limits leave room for chance: with GAP.md's rates (1 % false alarms, 2 % wrong names)
     each fails in less than 4 % of draws; the seed is fixed."""
     found = run(8, 20, 1, tmp_path, small=True)
