@@ -123,7 +123,7 @@ def test_noise_beside_effects_is_asked_for_with_these_in_the_model(
     residuals spread as predicted: an NMAD of 3,000 values errs by 2 %, and the effects' values by their own errors."""
     points, _ = turned_and_zoomed
     asked: list[Residuals] = []
-    search_at_joint_fit(replace(points, spread_at=lambda at: asked.append(at) or []))  # type: ignore[func-returns-value]
+    search_at_joint_fit(replace(points, variance_at=lambda at: asked.append(at) or []))  # type: ignore[func-returns-value]
     (at,) = asked
 
     def noise_in(part: Residuals) -> list[VarianceTerm]:
@@ -164,7 +164,7 @@ def test_slopes_do_not_serve_where_what_they_miss_is_as_much_as_something_gains(
     monkeypatch.setattr(nonlinear_refit, "_single_fit", lambda *_: leading)
     monkeypatch.setattr(nonlinear_refit, "_best_variants", lambda *_: [leading])
     monkeypatch.setattr(nonlinear_refit, "_with_alternatives", lambda _points, _first, alone, _names: alone)
-    by = Thresholds().model_copy(update={"mean": Thresholds().mean.model_copy(update={"slopes_serve": 2 * wrong_by})})
+    by = Thresholds().model_copy(update={"mean": Thresholds().mean.model_copy(update={"linearisation_error": 2 * wrong_by})})
     with use_thresholds(by):
         assert _strongest_single_fits(points, first, [replace(chosen[0], gain=3 * wrong_by)]) == []
         assert _strongest_single_fits(

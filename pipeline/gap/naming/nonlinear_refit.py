@@ -83,12 +83,7 @@ class SearchOutcome:
 class _SingleFit:
     """One effect alone in the model, without linearising.
 
-    Attributes
-    ----------
-    estimate : the effect with its coefficients.
-    residuals : residuals against the model with it.
-    measurement : the measurement with it in its model, at the estimated pose.
-    log_likelihood : log-likelihood of all points.
+    estimate: the effect; residuals, measurement: with it in the model, at the estimated pose; log_likelihood: of all points.
     """
 
     estimate: Estimate
@@ -191,15 +186,8 @@ def search_at_joint_fit(given: SearchInput) -> SearchOutcome | None:
 def fit_jointly(given: SearchInput, candidates: list[Candidate]) -> tuple[Measurement, Residuals, FloatArray] | None:
     """Fit some effects together by Gauss-Newton.
 
-    Parameters
-    ----------
-    given : input of the searches.
-    candidates : effects to fit.
-
-    Returns
-    -------
-    tuple or None : the measurement with the effects in its model, the residuals against it, and the effects' linearised part (n,)
-        of the observations. None if an effect is out of bounds or too few points remain.
+    Returns the measurement with them in its model, the residuals against it, and the effects' linearised part (n,) of the
+    observations; None if an effect is out of bounds or too few points remain.
     """
     measurement, at, before = given.measurement, given.part, np.inf
     widths = [each.columns.shape[1] for each in candidates]
