@@ -27,7 +27,7 @@ def test_the_formulas_share_no_code_with_the_project() -> None:
 
 @pytest.fixture
 def scan() -> Scan:
-    """Of a horizontal plane 1.5 m below the scanner, on which 1 / cos i = R / 1.5."""
+    """A scan of a horizontal plane 1.5 m below the scanner, on which 1 / cos i = R / 1.5."""
     x, y = (each.ravel() for each in np.meshgrid(np.linspace(1, 4, 30), np.linspace(-1, 1, 30)))
     points = np.stack([x, y, np.full(x.shape, -1.5)], axis=1)
     return Scan.of(points, points, np.arange(len(x)) // 30, 2.0 + x)
@@ -125,7 +125,7 @@ def test_what_is_in_no_catalogue_is_right_where_nothing_is_blamed() -> None:
 @REAL
 @pytest.mark.slow
 def test_a_wobble_put_into_a_real_scan_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """20 degrees of the forest's ground; 0.4 mrad over 6.5 lines."""
+    """The scan is 20 degrees of forest ground; the wobble has 0.4 mrad over 6.5 lines."""
     small = bases.Base("small", "", bases.forest((-170, -150), (108, 131)), bases.put_scanned)
     monkeypatch.setitem(bases.BASES, "small", small)
     values = {"amplitude_rad": 4e-4, "lines_per_cycle": 6.5, "phase_rad": 0.5}

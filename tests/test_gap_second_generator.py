@@ -18,7 +18,7 @@ QUIET = {"share": 0.0, "bushes": 0, "gaps": 0, "double_removed": False}
 
 
 def imports(file):
-    """Top-level names of the packages that a file imports."""
+    """Return the top-level names of the packages that a file imports."""
     for node in ast.walk(ast.parse(file.read_text())):
         if isinstance(node, ast.Import):
             yield from (each.name.partition(".")[0] for each in node.names)
@@ -27,7 +27,7 @@ def imports(file):
 
 
 def farthest(surface, points):
-    """Largest distance of points (n, 3), the wall's frame, from the surface, m."""
+    """Return the largest distance of points (n, 3), wall frame, from the surface, m."""
     i = np.clip(np.searchsorted(surface.x, points[:, 0], side="right") - 1, 0, len(surface.x) - 2)
     j = np.clip(np.searchsorted(surface.z, points[:, 2], side="right") - 1, 0, len(surface.z) - 2)
     above = surface.at(i, j, points[:, 0], points[:, 2]) - points[:, 1]
