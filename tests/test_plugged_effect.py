@@ -1,4 +1,4 @@
-"""An effect of another package: one class and one entry point, and every command knows it without another line."""
+"""An effect from another package: one class and one entry point make it available in every command."""
 
 from __future__ import annotations
 

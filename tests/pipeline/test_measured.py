@@ -1,4 +1,4 @@
-"""Measured epochs as difference maps: planes with known offsets, areas with known shapes."""
+"""Measured epochs converted to difference maps: planes with known offsets, areas with known shapes."""
 
 from __future__ import annotations
 

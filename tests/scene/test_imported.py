@@ -1,4 +1,4 @@
-"""Imported walls: coordinates kept, each defect mended and named, each wrong input answered."""
+"""Imported walls: coordinates are kept, each defect is repaired and named, each wrong input has its message."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ def load(path, **keys):
 
 
 def edge_uses(faces):
-    """How often each undirected edge is used, the slow and obvious way."""
+    """Return how often each undirected edge is used, by a slow and simple loop."""
     uses = {}
     for a, b, c in faces.tolist():
         for edge in ((a, b), (b, c), (c, a)):
@@ -321,7 +321,7 @@ def test_a_one_sided_surface_is_refused():
 
 @pytest.mark.parametrize("more", ["", "colours", "signed colours", "quads", "ascii"])
 def test_a_ply_file_gives_the_same_wall_as_trimesh_reads(tmp_path, more):
-    """Files that hold triangles alone are read without trimesh, the others by it."""
+    """Files with triangles only are read without trimesh, the others by it."""
     sheet_mesh = sheet()
     if more == "quads":
         path = tmp_path / "wall.ply"

@@ -75,10 +75,10 @@ def _tilted(p: Parameters, shot: Shot) -> Array:
 
 CATALOGUE: dict[str, Effect] = {
     "range_offset": Effect(
-        "range", lambda p, s: np.full(len(s.line), p["offset_m"]), {"offset_m": 2e-3}, most=8.0, judged=("offset_m",)
+        "range", lambda p, s: np.full(len(s.line), p["offset_m"]), {"offset_m": 2e-3}, most=8.0, scored=("offset_m",)
     ),
     "range_scale": Effect(
-        "range", lambda p, s: p["scale_ppm"] * 1e-6 * s.range_m, {"scale_ppm": 50.0}, most=3.0, judged=("scale_ppm",)
+        "range", lambda p, s: p["scale_ppm"] * 1e-6 * s.range_m, {"scale_ppm": 50.0}, most=3.0, scored=("scale_ppm",)
     ),
     "range_cyclic": Effect(
         "range",
@@ -86,51 +86,51 @@ CATALOGUE: dict[str, Effect] = {
         {"amplitude_m": 1e-3},
         _cyclic,
         most=6.0,
-        judged=("amplitude_m", "period_m"),
+        scored=("amplitude_m", "period_m"),
     ),
     "range_intensity_bias": Effect(
         "range",
         lambda p, s: p["coefficient_m"] * np.log(s.relative_power),
         {"coefficient_m": 2e-3},
         most=10.0,
-        judged=("coefficient_m",),
+        scored=("coefficient_m",),
     ),
     "range_incidence_bias": Effect(
-        "range", lambda p, s: p["coefficient_m"] * s.obliquity, {"coefficient_m": 2e-3}, most=5.0, judged=("coefficient_m",)
+        "range", lambda p, s: p["coefficient_m"] * s.obliquity, {"coefficient_m": 2e-3}, most=5.0, scored=("coefficient_m",)
     ),
-    "range_quantization": Effect("step", lambda p, s: p["step_m"], {"step_m": 5e-3}, most=2.0, judged=("step_m",)),
-    "range_noise": Effect("spread", lambda p, s: np.full(len(s.line), p["sigma_m"]), {"sigma_m": 2e-3}, judged=("sigma_m",)),
-    "range_noise_proportional": Effect("spread", lambda p, s: p["ppm"] * 1e-6 * s.range_m, {"ppm": 50.0}, judged=("ppm",)),
-    "range_noise_incidence": Effect("spread", lambda p, s: p["sigma_m"] * s.obliquity, {"sigma_m": 2e-3}, judged=("sigma_m",)),
+    "range_quantization": Effect("step", lambda p, s: p["step_m"], {"step_m": 5e-3}, most=2.0, scored=("step_m",)),
+    "range_noise": Effect("spread", lambda p, s: np.full(len(s.line), p["sigma_m"]), {"sigma_m": 2e-3}, scored=("sigma_m",)),
+    "range_noise_proportional": Effect("spread", lambda p, s: p["ppm"] * 1e-6 * s.range_m, {"ppm": 50.0}, scored=("ppm",)),
+    "range_noise_incidence": Effect("spread", lambda p, s: p["sigma_m"] * s.obliquity, {"sigma_m": 2e-3}, scored=("sigma_m",)),
     "range_noise_intensity": Effect(
         "spread",
         lambda p, s: p["a_m"] * s.power ** p["exponent"],
         {"a_m": 2e-3},
         lambda rng, s: {"exponent": -float(rng.uniform(0.5, 1.0))},
-        judged=("a_m", "exponent"),
+        scored=("a_m", "exponent"),
     ),
     "angle_noise": Effect(
         "ray_spread",
         lambda p, s: _aim(s, p["azimuth_sigma_rad"], p["zenith_sigma_rad"]),
         {"azimuth_sigma_rad": 6e-5, "zenith_sigma_rad": 6e-5},
-        judged=("azimuth_sigma_rad", "zenith_sigma_rad"),
+        scored=("azimuth_sigma_rad", "zenith_sigma_rad"),
     ),
     "vertical_index": Effect(
-        "aim", lambda p, s: _aim(s, zenith=p["offset_rad"]), {"offset_rad": 1e-4}, most=10.0, judged=("offset_rad",)
+        "aim", lambda p, s: _aim(s, zenith=p["offset_rad"]), {"offset_rad": 1e-4}, most=10.0, scored=("offset_rad",)
     ),
     "collimation": Effect(
         "aim",
         lambda p, s: _aim(s, azimuth=p["angle_rad"] / np.sin(s.zenith)),
         {"angle_rad": 1e-4},
         most=10.0,
-        judged=("angle_rad",),
+        scored=("angle_rad",),
     ),
     "trunnion_tilt": Effect(
         "aim",
         lambda p, s: _aim(s, azimuth=p["angle_rad"] / np.tan(s.zenith)),
         {"angle_rad": 1e-4},
         most=10.0,
-        judged=("angle_rad",),
+        scored=("angle_rad",),
     ),
     "horizontal_eccentricity": Effect(
         "aim",
@@ -138,7 +138,7 @@ CATALOGUE: dict[str, Effect] = {
         {"amplitude_rad": 1e-4},
         _phase,
         most=10.0,
-        judged=("amplitude_rad",),
+        scored=("amplitude_rad",),
     ),
     "vertical_eccentricity": Effect(
         "aim",
@@ -146,7 +146,7 @@ CATALOGUE: dict[str, Effect] = {
         {"amplitude_rad": 1e-4},
         _phase,
         most=10.0,
-        judged=("amplitude_rad",),
+        scored=("amplitude_rad",),
     ),
     "wobble": Effect(
         "aim",
@@ -154,19 +154,19 @@ CATALOGUE: dict[str, Effect] = {
         {"amplitude_rad": 5e-5},
         _wobble,
         most=6.0,
-        judged=("amplitude_rad", "lines_per_cycle"),
+        scored=("amplitude_rad", "lines_per_cycle"),
     ),
-    "tilt_drift": Effect("aim", _tilted, {"rate_x_rad": 1e-4, "rate_y_rad": 1e-4}, most=8.0, judged=("rate_x_rad", "rate_y_rad")),
-    "beam_divergence": Effect("footprint", lambda p, s: p["divergence_rad"], {}, _beam, judged=("divergence_rad",)),
+    "tilt_drift": Effect("aim", _tilted, {"rate_x_rad": 1e-4, "rate_y_rad": 1e-4}, most=8.0, scored=("rate_x_rad", "rate_y_rad")),
+    "beam_divergence": Effect("footprint", lambda p, s: p["divergence_rad"], {}, _beam, scored=("divergence_rad",)),
     "detection_limit": Effect(
         "loss",
         lambda p, s: (s.power < p["minimum_power"]) * 1.0,
         {},
         lambda rng, s: {"minimum_power": float(np.quantile(s.power[s.seen > 0], rng.uniform(0.03, 0.2)))},
-        judged=("minimum_power",),
+        scored=("minimum_power",),
     ),
     "precipitation": Effect(
-        "loss", lambda p, s: 1 - np.exp(-2 * p["rate_per_m"] * s.range_m), {"rate_per_m": 1e-3}, most=4.0, judged=("rate_per_m",)
+        "loss", lambda p, s: 1 - np.exp(-2 * p["rate_per_m"] * s.range_m), {"rate_per_m": 1e-3}, most=4.0, scored=("rate_per_m",)
     ),
 }
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.gap_challenge.casting import Array, Surface
+from benchmarks.gap_closed_form.casting import Array, Surface
 
 Random = np.random.Generator
 _WAVES = 40

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.gap_challenge import stereo_effects as effects
-from benchmarks.gap_challenge.baselines import Data, rivals
-from benchmarks.gap_challenge.casting import Array, Surface
-from benchmarks.gap_challenge.files import write_mesh, write_points, write_yaml
-from benchmarks.gap_challenge.stereo_cameras import INTERIOR, Frame, Pair, Rectified, looking_at
-from benchmarks.gap_challenge.stereo_effects import Image, Parameters
-from benchmarks.gap_challenge.strength import (
+from benchmarks.gap_closed_form import stereo_effects as effects
+from benchmarks.gap_closed_form.baselines import Data, rivals
+from benchmarks.gap_closed_form.casting import Array, Surface
+from benchmarks.gap_closed_form.files import write_mesh, write_points, write_yaml
+from benchmarks.gap_closed_form.stereo_cameras import INTERIOR, Frame, Pair, Rectified, looking_at
+from benchmarks.gap_closed_form.stereo_effects import Image, Parameters
+from benchmarks.gap_closed_form.strength import (
     Strength,
     Target,
     Whitener,
@@ -25,7 +25,7 @@ from benchmarks.gap_challenge.strength import (
     spread_distance,
     spread_strength,
 )
-from benchmarks.gap_challenge.walls import (
+from benchmarks.gap_closed_form.walls import (
     Fall,
     Place,
     Random,

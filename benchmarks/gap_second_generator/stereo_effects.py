@@ -128,41 +128,41 @@ def _strides(name: str, low: float, high: float) -> Any:
 
 
 CATALOGUE: dict[str, Effect] = {
-    "focal_length": Effect("camera", _lens(f_px="delta_px"), {"delta_px": 1.0}, _any_side, most=12.0, judged=("delta_px",)),
-    "principal_point_x": Effect("camera", _lens(cx_px="delta_px"), {"delta_px": 1.0}, _one_side, most=12.0, judged=("delta_px",)),
-    "principal_point_y": Effect("camera", _lens(cy_px="delta_px"), {"delta_px": 1.0}, _one_side, most=12.0, judged=("delta_px",)),
+    "focal_length": Effect("camera", _lens(f_px="delta_px"), {"delta_px": 1.0}, _any_side, most=12.0, scored=("delta_px",)),
+    "principal_point_x": Effect("camera", _lens(cx_px="delta_px"), {"delta_px": 1.0}, _one_side, most=12.0, scored=("delta_px",)),
+    "principal_point_y": Effect("camera", _lens(cy_px="delta_px"), {"delta_px": 1.0}, _one_side, most=12.0, scored=("delta_px",)),
     "radial_distortion": Effect(
-        "camera", _lens(k1="k1", k2="k2", k3="k3", k4="k4"), {"k1": 5e-4}, _first_order, most=12.0, judged=("k1",)
+        "camera", _lens(k1="k1", k2="k2", k3="k3", k4="k4"), {"k1": 5e-4}, _first_order, most=12.0, scored=("k1",)
     ),
     "tangential_distortion": Effect(
-        "camera", _lens(p1="p1", p2="p2"), {"p1": 1e-4, "p2": 1e-4}, _any_side, most=12.0, judged=("p1", "p2")
+        "camera", _lens(p1="p1", p2="p2"), {"p1": 1e-4, "p2": 1e-4}, _any_side, most=12.0, scored=("p1", "p2")
     ),
     "affinity_skew": Effect(
-        "camera", _lens(b1="b1_px", b2="b2_px"), {"b1_px": 0.5, "b2_px": 0.5}, _one_side, most=12.0, judged=("b1_px", "b2_px")
+        "camera", _lens(b1="b1_px", b2="b2_px"), {"b1_px": 0.5, "b2_px": 0.5}, _one_side, most=12.0, scored=("b1_px", "b2_px")
     ),
-    "camera_omega": Effect("camera", _turned(0), {"angle_rad": 2e-4}, _one_side, most=12.0, judged=("angle_rad",)),
-    "camera_phi": Effect("camera", _turned(1), {"angle_rad": 2e-4}, _one_side, most=12.0, judged=("angle_rad",)),
-    "camera_kappa": Effect("camera", _turned(2), {"angle_rad": 2e-4}, _one_side, most=12.0, judged=("angle_rad",)),
+    "camera_omega": Effect("camera", _turned(0), {"angle_rad": 2e-4}, _one_side, most=12.0, scored=("angle_rad",)),
+    "camera_phi": Effect("camera", _turned(1), {"angle_rad": 2e-4}, _one_side, most=12.0, scored=("angle_rad",)),
+    "camera_kappa": Effect("camera", _turned(2), {"angle_rad": 2e-4}, _one_side, most=12.0, scored=("angle_rad",)),
     "camera_shift": Effect("camera", _shifted, {"x_m": 0.01, "y_m": 0.01, "z_m": 0.01}, _one_side, most=12.0),
-    "parallax_noise": Effect("spread", lambda p, m: np.full(len(m.u), p["sigma_px"]), {"sigma_px": 0.3}, judged=("sigma_px",)),
+    "parallax_noise": Effect("spread", lambda p, m: np.full(len(m.u), p["sigma_px"]), {"sigma_px": 0.3}, scored=("sigma_px",)),
     "regularization_noise": Effect(
-        "field", lambda p, m: p["sigma_px"], {"sigma_px": 0.3}, _strides("step_px", 4, 14), judged=("sigma_px", "step_px")
+        "field", lambda p, m: p["sigma_px"], {"sigma_px": 0.3}, _strides("step_px", 4, 14), scored=("sigma_px", "step_px")
     ),
     "pixel_locking": Effect(
         "disparity",
         lambda p, m: p["amplitude_px"] * np.sin(2 * np.pi * np.mod(m.disparity, 1.0)),
         {"amplitude_px": 0.15},
-        judged=("amplitude_px",),
+        scored=("amplitude_px",),
     ),
-    "edge_fattening": Effect("map", fattened, {}, _strides("radius_px", 1.5, 4.5), judged=("radius_px",)),
-    "smoothing": Effect("map", smoothed, {}, _strides("sigma_px", 1.0, 3.5), judged=("sigma_px",)),
+    "edge_fattening": Effect("map", fattened, {}, _strides("radius_px", 1.5, 4.5), scored=("radius_px",)),
+    "smoothing": Effect("map", smoothed, {}, _strides("sigma_px", 1.0, 3.5), scored=("sigma_px",)),
     "occlusion_fill": Effect("fill", lambda p, m: p["reach_px"], {}, _strides("reach_px", 2.0, 8.0)),
     "row_jitter": Effect(
         "disparity",
         lambda p, m: p["amplitude_px"] * np.sin(2 * np.pi * m.v / p["rows_per_cycle"] + p["phase_rad"]),
         {"amplitude_px": 0.15},
         _jitter,
-        judged=("amplitude_px", "rows_per_cycle"),
+        scored=("amplitude_px", "rows_per_cycle"),
     ),
 }
 

@@ -1,4 +1,4 @@
-"""The challenge of GAP.md: generator against closed forms, scorer against answers that are known, a small challenge."""
+"""The closed-form generator of measurements for `gap` (docs/validation/gap_closed_form.md), its scores, and a small run of it."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ import pytest
 import yaml
 from scipy.optimize import least_squares
 
-from benchmarks.gap_challenge import cases, stereo_cases, tls_effects
-from benchmarks.gap_challenge.casting import Surface
-from benchmarks.gap_challenge.run import run
-from benchmarks.gap_challenge.score import score
-from benchmarks.gap_challenge.stereo_cameras import INTERIOR, Frame, Pair, Rectified, looking_at
-from benchmarks.gap_challenge.stereo_effects import real_pair
-from benchmarks.gap_challenge.strength import Whitener, loss_distance, mean_strength, spread_distance
-from benchmarks.gap_challenge.table import markdown
-from benchmarks.gap_challenge.tls_effects import MEAN, SECOND, Rays
-from benchmarks.gap_challenge.walls import small_turn
+from benchmarks.gap_closed_form import cases, stereo_cases, tls_effects
+from benchmarks.gap_closed_form.casting import Surface
+from benchmarks.gap_closed_form.run import run
+from benchmarks.gap_closed_form.score import score
+from benchmarks.gap_closed_form.stereo_cameras import INTERIOR, Frame, Pair, Rectified, looking_at
+from benchmarks.gap_closed_form.stereo_effects import real_pair
+from benchmarks.gap_closed_form.strength import Whitener, loss_distance, mean_strength, spread_distance
+from benchmarks.gap_closed_form.table import markdown
+from benchmarks.gap_closed_form.tls_effects import MEAN, SECOND, Rays
+from benchmarks.gap_closed_form.walls import small_turn
 
-FOLDER = Path(__file__).parents[1] / "benchmarks/gap_challenge"
+FOLDER = Path(__file__).parents[1] / "benchmarks/gap_closed_form"
 SQUARE = Surface(np.array([[-50.0, 0, -50], [50, 0, -50], [50, 0, 50], [-50, 0, 50]]), np.array([[0, 1, 2], [0, 2, 3]]))
 
 
@@ -47,7 +47,7 @@ def test_it_shares_no_code_with_the_sensors_or_the_diagnosis(file: Path) -> None
 
 
 def rays_on_the_square(n: int = 400) -> tuple[Rays, Any]:
-    """Rays from (3, -40, 2) on the plane y = 0, whose range is 40 / (sin z sin az); and that range as a function."""
+    """Return rays from (3, -40, 2) to the plane y = 0, whose range is 40 / (sin z sin az), and that range as a function."""
     random = np.random.default_rng(1)
     az, ze = np.pi / 2 + random.uniform(-0.6, 0.6, n), np.pi / 2 + random.uniform(-0.5, 0.5, n)
 
@@ -69,7 +69,7 @@ def test_rays_meet_the_plane_where_they_should() -> None:
 
 @pytest.mark.parametrize("name", MEAN)
 def test_a_signature_is_the_change_of_the_recorded_range(name: str) -> None:
-    """Angles: the beam leaves in the recorded direction less the error. First order: 1 arcsec leaves less than 1e-8 m."""
+    """The beam leaves in the recorded direction minus the error; to first order, 1 arcsec leaves less than 1e-8 m."""
     rays, range_at = rays_on_the_square()
     p = tls_effects.shape(name, rays, np.random.default_rng(2))
     p = tls_effects.times(p, SECOND / (10 * SECOND))
@@ -81,7 +81,7 @@ def test_a_signature_is_the_change_of_the_recorded_range(name: str) -> None:
 
 @pytest.mark.parametrize("name", MEAN)
 def test_each_effect_lies_in_its_own_family(name: str) -> None:
-    """With its period at one of the grid's, an effect is a combination of the columns it is tried by."""
+    """If its period is one of the grid's, an effect is a linear combination of its candidate's columns."""
     rays, _ = rays_on_the_square()
     families = tls_effects.families(rays, {"intensity", "pattern", "gps_time"})
     p = tls_effects.shape(name, rays, np.random.default_rng(3))
@@ -122,7 +122,7 @@ def test_pixels_and_rays_are_inverse_and_nominal_cameras_give_the_surface_back()
 
 
 def test_a_longer_principal_distance_brings_the_surface_nearer_by_its_share() -> None:
-    """Both cameras' f off by df on a normal pair: Z_found = Z f / (f + df)."""
+    """Both cameras of a normal pair have f wrong by df: Z_found = Z f / (f + df)."""
     interior = dict.fromkeys(INTERIOR, 0.0) | {"f_px": 2500.0}
     forward = looking_at(np.array([0.0, -60, 0]), np.zeros(3), 0.0)
     pair = Pair(*(Frame(1840, 1228, interior, np.array([x, -60.0, 0.0]), forward) for x in (-5.0, 5.0)))
@@ -134,7 +134,7 @@ def test_a_longer_principal_distance_brings_the_surface_nearer_by_its_share() ->
 
 
 def test_strength_of_an_offset_is_that_of_a_mean() -> None:
-    """Signal-to-noise of a constant a under white noise s: a sqrt(n) / s; what is the same is of its class."""
+    """The signal-to-noise ratio of a constant a under white noise s is a sqrt(n) / s; identical effects are in one class."""
     random = np.random.default_rng(5)
     at, one = random.uniform(0, 30, (4000, 2)), np.ones((4000, 1))
     whiten = Whitener(np.full(4000, 0.003), at, np.zeros((4000, 1)))
@@ -145,7 +145,7 @@ def test_strength_of_an_offset_is_that_of_a_mean() -> None:
 
 
 def test_distances_of_small_effects_are_those_of_their_likelihoods() -> None:
-    """Spread: d^2 = n (excess)^2 / 2; losses: n (dp)^2 / (p (1 - p))."""
+    """For a larger spread d^2 = n (excess)^2 / 2; for losses n (dp)^2 / (p (1 - p))."""
     one = np.ones(10_000)
     assert spread_distance(1.02 * one, one) == pytest.approx(np.sqrt(10_000 * 0.02**2 / 2), rel=0.02)
     assert loss_distance(0.103 * one, 0.1 * one) == pytest.approx(np.sqrt(10_000 * 0.003**2 / 0.09), rel=0.02)
@@ -170,9 +170,10 @@ def made(folder: Path, seed: int, stratum: str, sensor: str, kinds: tuple[str, .
 
 
 def test_what_a_pose_leaves_of_an_effect_is_what_the_best_pose_leaves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A principal point 10 px off: scipy's trust region over the six parameters, from the middle, leaves within a tenth as much.
+    """A principal point is wrong by 10 px. What remains must be within a tenth of what scipy's trust region over the six pose
+    parameters leaves.
 
-    By slopes at the calibrated pose more than three times that stays, beside ledges.
+    Linearised at the calibrated pose, more than three times that remains beside ledges.
     """
     asked: dict[str, Any] = {}
 
@@ -201,7 +202,7 @@ def test_what_a_pose_leaves_of_an_effect_is_what_the_best_pose_leaves(tmp_path: 
 
 @pytest.mark.parametrize(("sensor", "kind"), [("tls", "range_incidence_bias"), ("stereo", "focal_length")])
 def test_a_folder_does_not_tell_what_is_in_it(tmp_path: Path, sensor: str, kind: str) -> None:
-    """With an effect and without, the same files with the same keys; the same seed gives the same bytes."""
+    """With and without an effect there are the same files with the same keys; the same seed gives the same bytes."""
     folders = [tmp_path / name for name in ("with", "without", "again")]
     for folder, kinds in zip(folders, ((kind,), (), (kind,)), strict=True):
         folder.mkdir()
@@ -224,7 +225,7 @@ def test_a_process_that_diagnoses_cannot_read_the_truth(tmp_path: Path) -> None:
     (tmp_path / "truth").mkdir()
     (tmp_path / "truth/0001.json").write_text("{}")
     program = (
-        "import sys; from pathlib import Path; from benchmarks.gap_challenge.run import _guard\n"
+        "import sys; from pathlib import Path; from benchmarks.gap_closed_form.run import _guard\n"
         "hidden = Path(sys.argv[1]).resolve(); sys.addaudithook(_guard(hidden))\n"
         "open(sys.argv[2]).read()\nopen(hidden / '../truth/0001.json')"
     )
@@ -264,7 +265,9 @@ def test_right_answers_score_well() -> None:
 
 
 def test_the_control_is_shown_beside_what_the_angle_lets_a_wrong_effect_close() -> None:
-    """S/N 30 and 20 of it unlike the nearest other: 1 - (20 / 30)^2 of the square can be taken over."""
+    """With S/N 30, of which 20 differ from the nearest other effect, that effect can explain 1 - (20 / 30)^2 of the sum of
+    squares.
+    """
     near, far = pair("one", "a", "a", ("c",)), pair("one", "a", "a", ("c",))
     far[0]["effects"][0]["snr_sin_angle"] = 29.8
     far[0]["closed_by"]["b"] = {"fitted": 0.01, "held_out": 0.01}
@@ -280,7 +283,7 @@ def test_the_control_is_shown_beside_what_the_angle_lets_a_wrong_effect_close() 
     ("alarms", "cases", "reached"), [(0, 64, "undecided"), (0, 400, "yes"), (20, 64, "no"), (1, 64, "undecided")]
 )
 def test_what_an_interval_does_not_settle_is_undecided(alarms: int, cases: int, reached: str) -> None:
-    """0 of 64 is 0 to 5.7 % (Wilson), 0 of 400 to 0.95 %."""
+    """0 of 64 has the Wilson interval 0 to 5.7 %, 0 of 400 has 0 to 0.95 %."""
     found = figures_of(*([pair("none", said="a")] * alarms + [pair("none")] * (cases - alarms)))
     assert found["false alarms on no-effect cases"]["reached"] == reached
 
@@ -310,9 +313,10 @@ def test_powers_and_slopes_are_part_of_a_ray() -> None:
 
 
 @pytest.mark.slow
-def test_a_small_challenge_over_all_strata_and_both_sensors(tmp_path: Path) -> None:
-    """8 cases of some thousand points. The limits leave room for chance: with GAP.md's rates (1 % false alarms, 2 % wrong names)
-    each fails in less than 4 % of draws; the seed is fixed."""
+def test_a_small_run_over_all_strata_and_both_sensors(tmp_path: Path) -> None:
+    """8 cases of a few thousand points. The limits leave room for chance: at the target rates (1 % false alarms, 2 % wrong names)
+    each limit fails in less than 4 % of draws; the seed is fixed.
+    """
     found = run(8, 20, 1, tmp_path, small=True)
     rows = found["rows"]
     assert {row["stratum"] for row in rows} == set(cases.STRATA)

@@ -1,4 +1,4 @@
-"""Effects of both sensors in this generator: how they act, how their size is set, and which of their parameters are judged."""
+"""Effects of both sensors in this generator: how they act, how their size is set, and which parameters are scored."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Effect:
         times the
         typical value (a few times the largest size of EFFECTS.md, beyond which no instrument would leave the factory).
     others : Draws the remaining parameters.
-    judged : Parameters whose interval is judged.
+    scored : Parameters whose interval is compared with the truth.
     """
 
     stage: str
@@ -38,7 +38,7 @@ class Effect:
     others: Callable[[np.random.Generator, Any], Parameters] = nothing_else
     most: float = 60.0
     least: float = 1e-3
-    judged: tuple[str, ...] = field(default=())
+    scored: tuple[str, ...] = field(default=())
 
     def draw(self, rng: np.random.Generator, shot: Any) -> Parameters:
         """Draw parameters at the typical size, with random signs for sizes that may have either."""

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.gap_challenge.casting import Array
+from benchmarks.gap_closed_form.casting import Array
 
 Families = Mapping[str, Sequence[Array]]
 """Candidate effects by name; each variant is a design (n, k)."""

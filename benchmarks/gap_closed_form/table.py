@@ -44,7 +44,7 @@ takes 1 - sin^2 a of its square, whatever the method."""
 
 
 def markdown(found: Json) -> str:
-    """docs/validation/gap_challenge.md, or that of one sensor, from results.json."""
+    """docs/validation/gap_closed_form.md, or that of one sensor, from results.json."""
     sensor = _SENSORS.get(found["settings"].get("sensor", ""), "both sensors")
     parts = [
         f"# Measurements simulated in closed form: {sensor}",
@@ -74,7 +74,7 @@ def _introduction(found: Json) -> str:
         return f"{figures[what]['successes']} of {figures[what]['count']}"
 
     return f"""This page shows how often `scarpsim gap` names the right effect in {_cases(found)} simulated measurements whose
-truth it cannot see. It is for users who want to know how far to trust an answer. The generator (`benchmarks/gap_challenge`)
+truth it cannot see. It is for users who want to know how far to trust an answer. The generator (`benchmarks/gap_closed_form`)
 works in closed form and shares no code with the sensors or the diagnosis.
 
 - {counted("right class")} clear effects are in the right class.
@@ -94,8 +94,8 @@ def _cases(found: Json) -> int:
 def _made_by(found: Json) -> str:
     settings, seconds = found["settings"], found["seconds"]
     sensor = settings.get("sensor")
-    page = f"docs/validation/gap_challenge{f'_{sensor}' if sensor else ''}.md"
-    words = f"python benchmarks/gap_challenge/run.py --cases {settings['cases']} --seed {settings['seed']}"
+    page = f"docs/validation/gap_closed_form{f'_{sensor}' if sensor else ''}.md"
+    words = f"python benchmarks/gap_closed_form/run.py --cases {settings['cases']} --seed {settings['seed']}"
     chosen = "".join(f" --{key} {settings[key]}" for key in ("stratum", "sensor") if key in settings)
     command = f"`{words}{chosen}{' --small' if settings['small'] else ''} --jobs 2 --out DIR --table {page}`"
     took = f"{seconds.get('median', 0):.0f} s (median), {seconds.get('longest', 0):.0f} s at most"

@@ -18,7 +18,7 @@ from .surface import Array, Mask, Surface
 
 Rng = np.random.Generator
 HIDDEN_M = 0.02  # the right camera sees something so much nearer: hidden, and no rounding
-OUTLIER_Z2 = 9.0  # no pixel counts for more, as no robust judge lets it
+OUTLIER_Z2 = 9.0  # no pixel counts for more, as a robust evaluation would limit it too
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The second judge of `gap`: its caster, what it makes without effects and noise, that it repeats itself, how it judges."""
+"""The second generator of measurements for `gap`: casting of rays, no error without effects, reproducibility, scoring."""
 
 import ast
 import json
@@ -11,14 +11,14 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
-from gap_judge import cases, judge, laser, laser_effects, stereo, stereo_effects
-from gap_judge.surface import Surface
+from gap_second_generator import cases, laser, laser_effects, score, stereo, stereo_effects
+from gap_second_generator.surface import Surface
 
 QUIET = {"share": 0.0, "bushes": 0, "gaps": 0, "double_removed": False}
 
 
 def imports(file):
-    """Top-level names of the packages that a file imports."""
+    """Return the top-level names of the packages that a file imports."""
     for node in ast.walk(ast.parse(file.read_text())):
         if isinstance(node, ast.Import):
             yield from (each.name.partition(".")[0] for each in node.names)
@@ -27,7 +27,7 @@ def imports(file):
 
 
 def farthest(surface, points):
-    """Largest distance of points (n, 3), the wall's frame, from the surface, m."""
+    """Return the largest distance of points (n, 3), wall frame, from the surface, m."""
     i = np.clip(np.searchsorted(surface.x, points[:, 0], side="right") - 1, 0, len(surface.x) - 2)
     j = np.clip(np.searchsorted(surface.z, points[:, 2], side="right") - 1, 0, len(surface.z) - 2)
     above = surface.at(i, j, points[:, 0], points[:, 2]) - points[:, 1]
@@ -91,17 +91,17 @@ def test_every_effect_of_a_catalogue_comes_up_once_in_a_round():
         assert max(counts) - min(counts) <= 1
 
 
-def test_it_shares_no_code_with_what_it_judges():
-    folder = Path(__file__).resolve().parents[1] / "benchmarks/gap_judge"
+def test_it_shares_no_code_with_the_program():
+    folder = Path(__file__).resolve().parents[1] / "benchmarks/gap_second_generator"
     imported = {name for file in folder.glob("*.py") for name in imports(file)}
-    assert imported <= {*sys.stdlib_module_names, "__future__", "gap_judge", "numpy", "scipy", "yaml"}
+    assert imported <= {*sys.stdlib_module_names, "__future__", "gap_second_generator", "numpy", "scipy", "yaml"}
 
 
 def test_answers_are_told_apart():
     truth = {"kind": "one", "effects": {"range_offset": {"offset_m": 1.0}}}
 
     def said(*classes):
-        return judge.outcome(
+        return score.outcome(
             truth, {"verdict": "named", "effects": [{"name": f"tls.{a[0]}", "cannot_be_told_from": list(a[1:])} for a in classes]}
         )
 
@@ -109,4 +109,4 @@ def test_answers_are_told_apart():
     assert said(["range_scale", "tls.range_offset"]) == "class"
     assert said(["range_offset"], ["wobble"]) == "more"
     assert said(["wobble"]) == "wrong name"
-    assert judge.outcome(truth, {"verdict": "no_gap", "effects": []}) == "no_gap"
+    assert score.outcome(truth, {"verdict": "no_gap", "effects": []}) == "no_gap"

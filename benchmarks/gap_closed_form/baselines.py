@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.gap_challenge.casting import Array
-from benchmarks.gap_challenge.strength import Families, basis
+from benchmarks.gap_closed_form.casting import Array
+from benchmarks.gap_closed_form.strength import Families, basis
 
 Z_LIMIT, BIC_LIMIT = 3.0, 10.0
 _CLIP, _ROUNDS, _MOST_POINTS, _BLOCKS = 5.0, 2, 20_000, 12
@@ -34,7 +34,7 @@ def rivals(data: Data, families: Families, forms: Mapping[str, Sequence[Array]],
     """Return the baselines' answers, and the control of each effect on the mean.
 
     The control is the share of the gap that an effect closes, where `truth` closes all: on the blocks of its fit, by which the
-    best effect is chosen, and on validation blocks, by which it is judged.
+    best effect is chosen, and on validation blocks, by which it is scored.
     """
     sound = _sound(data)
     rows = sound[:: max(len(sound) // _MOST_POINTS, 1)]

@@ -1,6 +1,6 @@
-"""Evaluate `scarpsim gap` on measurements of the second generator: make cases, run the command on each, judge the answers.
+"""Evaluate `scarpsim gap` on measurements of the second generator: make cases, run the command on each, score the answers.
 
-    python benchmarks/gap_judge/run.py --cases 40 --seed 77 --out /tmp/judge [--sensor tls|stereo]
+    python benchmarks/gap_second_generator/run.py --cases 40 --seed 77 --out /tmp/second [--sensor tls|stereo]
         [--table docs/validation/gap_second_generator.md]
 
 In --out, `cases/0007` is the measurement folder, `truth/0007.json` its truth, `answers/0007` what the command wrote. Cases that
@@ -19,7 +19,7 @@ from pathlib import Path
 if __package__ in (None, ""):
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from gap_judge import cases, judge
+from gap_second_generator import cases, score
 
 LONGEST_S = 900
 
@@ -48,7 +48,7 @@ def ask(folder: Path, answer: Path) -> None:
 
 
 def main() -> None:
-    """Make, ask and judge all cases."""
+    """Make all cases, diagnose each and score the answers."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=40, help="how many")
     parser.add_argument("--seed", type=int, default=77)
@@ -61,12 +61,14 @@ def main() -> None:
     for folder in folders:
         ask(folder, given.out / "answers" / folder.name)
         print(folder.name, flush=True)
-    results = [judge.judged(given.out, folder.name) for folder in folders]
+    results = [score.scored(given.out, folder.name) for folder in folders]
     sensor = f" --sensor {given.sensor}" if given.sensor else ""
-    command = f"python benchmarks/gap_judge/run.py --cases {given.cases} --seed {given.seed}{sensor} --out DIR --table FILE"
+    command = (
+        f"python benchmarks/gap_second_generator/run.py --cases {given.cases} --seed {given.seed}{sensor} --out DIR --table FILE"
+    )
     revision = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
     commit = subprocess.run(revision, capture_output=True, text=True, check=False).stdout.strip()
-    (given.table or given.out / "table.md").write_text(judge.table(results, command, commit))
+    (given.table or given.out / "table.md").write_text(score.table(results, command, commit))
 
 
 if __name__ == "__main__":

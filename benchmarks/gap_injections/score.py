@@ -1,4 +1,4 @@
-"""Judge an answer: which names, sizes and rejections are right."""
+"""Score an answer: which names, sizes and rejections are right."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SIZES = {
 _SIGMAS, _SHARE = 3.0, 0.15
 
 
-def judged(answer: Json, before: frozenset[str] = frozenset()) -> Json:
+def scored(answer: Json, before: frozenset[str] = frozenset()) -> Json:
     """Return a row of the table with the judgement of an answer.
 
     The judgement is one of: right (named, with the injected size, and nothing else blamed); class (among effects that cannot be

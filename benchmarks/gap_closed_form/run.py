@@ -1,7 +1,7 @@
 """Evaluate `scarpsim gap` on closed-form measurements with hidden truth, as GAP.md specifies: make, diagnose by the command, and
 score.
 
-    python benchmarks/gap_challenge/run.py --cases 60 --seed 1 --jobs 1 --out /tmp/challenge
+    python benchmarks/gap_closed_form/run.py --cases 60 --seed 1 --jobs 1 --out /tmp/closed_form
 
 An interrupted run continues. Under --out are cases/ (what the diagnosis gets), truth/ (which a diagnosing process must not open),
 answers/ (gap.json of each), results.json and table.md.
@@ -29,9 +29,9 @@ from typing import Any
 
 import psutil
 
-from benchmarks.gap_challenge.cases import SENSORS, STRATA, Case, make, plan
-from benchmarks.gap_challenge.score import score
-from benchmarks.gap_challenge.table import markdown
+from benchmarks.gap_closed_form.cases import SENSORS, STRATA, Case, make, plan
+from benchmarks.gap_closed_form.score import score
+from benchmarks.gap_closed_form.table import markdown
 
 TIME_LIMIT_S = 480.0  # of processor time, so that other work on the machine makes no difference
 _CONTEXT = multiprocessing.get_context("spawn")
@@ -57,7 +57,7 @@ def run(
     every = plan(count, seed, small)
     cases = [case for case in every if case.stratum == (stratum or case.stratum) and case.sensor == (sensor or case.sensor)]
     chosen = {key: value for key, value in {"stratum": stratum, "sensor": sensor}.items() if value}
-    _check_same(out / "challenge.json", {"cases": count, "seed": seed, "small": small, **chosen})
+    _check_same(out / "settings.json", {"cases": count, "seed": seed, "small": small, **chosen})
     open_cases = [case for case in cases if not _answer(out, case).exists()]
     missing = [
         case for case in open_cases if not _truth(out, case).exists() or not (_folder(out, case) / "measurement.yaml").exists()
@@ -98,7 +98,7 @@ def _pair(out: Path, case: Case) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def _check_same(path: Path, settings: dict[str, Any]) -> None:
     if path.exists() and json.loads(path.read_text()) != settings:
-        sys.exit(f"error: {path} is of another challenge: {path.read_text()}; choose another --out")
+        sys.exit(f"error: {path} belongs to a run with other settings: {path.read_text()}; choose another --out")
     path.write_text(json.dumps(settings))
 
 
@@ -231,7 +231,7 @@ def main() -> None:
     parser.add_argument("--stratum", choices=STRATA, help="cases of this kind alone, such as none: without any effect")
     parser.add_argument("--sensor", choices=SENSORS, help="cases of this sensor alone")
     parser.add_argument(
-        "--table", type=Path, help="write the table there too (docs/validation/gap_challenge.md), and its figures beside it"
+        "--table", type=Path, help="write the table there too (docs/validation/gap_closed_form.md), and its figures beside it"
     )
     arguments = parser.parse_args()
     found = run(

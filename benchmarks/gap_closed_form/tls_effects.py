@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.gap_challenge.casting import Array
-from benchmarks.gap_challenge.walls import Random
+from benchmarks.gap_closed_form.casting import Array
+from benchmarks.gap_closed_form.walls import Random
 
 Parameters = dict[str, Any]
 SECOND = np.pi / 180 / 3600

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.gap_challenge import stereo_cases, tls_cases
-from benchmarks.gap_challenge.files import plain
+from benchmarks.gap_closed_form import stereo_cases, tls_cases
+from benchmarks.gap_closed_form.files import plain
 
 STRATA = ("none", "one", "two", "off", "change")
 _CYCLE = (

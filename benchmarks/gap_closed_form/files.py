@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from benchmarks.gap_challenge.casting import Array
+from benchmarks.gap_closed_form.casting import Array
 
 
 def write_mesh(path: Path, vertices: Array, faces: Any) -> None:

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from benchmarks.gap_challenge.casting import Array
-from benchmarks.gap_challenge.stereo_cameras import Jitter, Pair
-from benchmarks.gap_challenge.walls import Random, turn
+from benchmarks.gap_closed_form.casting import Array
+from benchmarks.gap_closed_form.stereo_cameras import Jitter, Pair
+from benchmarks.gap_closed_form.walls import Random, turn
 
 Parameters = dict[str, Any]
 

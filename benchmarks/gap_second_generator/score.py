@@ -1,4 +1,4 @@
-"""Judge answers against truths and write the table: for each sensor, with binomial 95 % intervals, and every case that is not
+"""Score answers against truths and write the table: for each sensor, with binomial 95 % intervals, and every case that is not
 right.
 """
 
@@ -20,8 +20,9 @@ RIGHT = {"none": ("no_gap",), "change": ("no_gap",), "off": ("unknown",), "one":
 CLEAR = 12.0
 _NAMING, _BLAMING = ("alone", "class", "more", "part", "wrong name"), ("wrong name", "more")
 _TITLES = {"tls": "Laser scans", "stereo": "Stereo pairs"}
-_ABOUT = """The generator (`benchmarks/gap_judge`) was written from the descriptions of effects, measurement folders and answers
-alone, without knowledge of the program. So it makes other assumptions than the [first generator](gap_challenge.md):
+_ABOUT = """The generator (`benchmarks/gap_second_generator`) was written only from the descriptions of effects, measurement
+folders and answers, without knowledge of the program. So it makes other assumptions than the
+[first generator](gap_closed_form.md):
 
 | part | what it makes |
 |---|---|
@@ -42,7 +43,10 @@ EITHER_SIGN = {"tilt_drift"}  # EFFECTS.md does not say which way the tilt turns
 
 @dataclass(frozen=True)
 class Result:
-    """One case: its truth, its answer and the judgement; (inside, all) of the 90 % intervals that can be judged."""
+    """One case: its truth, its answer, its outcome, and how many of the 90 % intervals contain the truth.
+
+    inside, intervals: number of intervals that contain it, and of all that can be checked; outside: the other intervals, as text.
+    """
 
     truth: dict[str, Any]
     answer: dict[str, Any]
@@ -63,8 +67,8 @@ class Result:
         return min(ratios, default=np.inf)
 
 
-def judged(out: Path, name: str) -> Result:
-    """The case `name` of the folder `out`."""
+def scored(out: Path, name: str) -> Result:
+    """Read the case `name` of the folder `out`, with its answer, and score it."""
     truth = json.loads((out / "truth" / f"{name}.json").read_text())
     said = json.loads((out / "answers" / name / "said.json").read_text())
     written = out / "answers" / name / "gap.json"
@@ -102,7 +106,7 @@ def _short(name: str) -> str:
 
 
 def intervals(truth: dict[str, Any], effect: dict[str, Any]) -> list[tuple[str, bool]]:
-    """Return, for each parameter of a named effect that may be judged, the statement and whether the 90 % interval contains the
+    """Return, for each parameter of a named effect that may be checked, the statement and whether the 90 % interval contains the
     truth.
     """
     name = _short(effect["name"])
@@ -110,7 +114,7 @@ def intervals(truth: dict[str, Any], effect: dict[str, Any]) -> list[tuple[str, 
     true, said = truth["effects"].get(name), effect["parameters"]
     if known is None or true is None or said.get("camera", {}).get("value") != true.get("camera"):
         return []
-    return [_interval(name, key, true, said[key]) for key in known.judged if key in said and said[key].get("std")]
+    return [_interval(name, key, true, said[key]) for key in known.scored if key in said and said[key].get("std")]
 
 
 def _interval(name: str, key: str, true: dict[str, Any], said: dict[str, float]) -> tuple[str, bool]:
@@ -184,7 +188,7 @@ def _rates(results: list[Result]) -> str:
     moved = [each for each in results if each.truth["kind"] == "change"]
     spoke = [each for each in results if each.outcome in _NAMING]
     p = [each.answer["remaining"]["p_value"] for each in quiet if each.answer.get("remaining", {}).get("p_value") is not None]
-    inside, judgeable = sum(each.inside for each in results), sum(each.intervals for each in results)
+    inside, checked = sum(each.inside for each in results), sum(each.intervals for each in results)
     jumping, even = ([each for each in quiet if (each.truth["error"]["kind"] in EDGED) is edged] for edged in (True, False))
     rows = {
         f"right, of effects of a ratio of {CLEAR:.0f} or more, the nearest other apart": _count(clear, lambda each: each.right),
@@ -193,7 +197,7 @@ def _rates(results: list[Result]) -> str:
         "the reference wrong by a bend or a fractal": _count(even, _alarmed),
         "false alarms, change only": _count(moved, _alarmed),
         "wrong names among answers that name": _count(spoke, lambda each: each.outcome in _BLAMING),
-        "90 % intervals that hold the truth": share(inside, judgeable),
+        "90 % intervals that hold the truth": share(inside, checked),
         "p-value of what remains below 0.01, no effect": share(sum(each < 0.01 for each in p), len(p)),
         "median seconds": f"{np.median([each.answer['said']['seconds'] for each in results]):.0f}",
     }
@@ -209,7 +213,7 @@ def _count(results: list[Result], wanted: Callable[[Result], bool]) -> str:
 
 
 def _not_right(results: list[Result]) -> str:
-    rows = ["| case | truth | ratio (apart from) | judged | answer | p of what remains |", "|---|---|---|---|---|---|"]
+    rows = ["| case | truth | ratio (apart from) | outcome | answer | p of what remains |", "|---|---|---|---|---|---|"]
     for each in results:
         if not each.right or each.outside:
             named = "; ".join(_said(effect) for effect in each.answer["effects"]) or each.answer["verdict"]

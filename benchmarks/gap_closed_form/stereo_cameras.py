@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.gap_challenge.casting import Array, Surface
-from benchmarks.gap_challenge.walls import turn
+from benchmarks.gap_closed_form.casting import Array, Surface
+from benchmarks.gap_closed_form.walls import turn
 
 INTERIOR = ("f_px", "cx_px", "cy_px", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
 _UNDISTORTIONS = 25

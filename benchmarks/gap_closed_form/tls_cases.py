@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr
 
-from benchmarks.gap_challenge import tls_effects as effects
-from benchmarks.gap_challenge.baselines import Data, rivals
-from benchmarks.gap_challenge.casting import AT_ONCE, Array, Surface
-from benchmarks.gap_challenge.files import write_mesh, write_points, write_yaml
-from benchmarks.gap_challenge.strength import (
+from benchmarks.gap_closed_form import tls_effects as effects
+from benchmarks.gap_closed_form.baselines import Data, rivals
+from benchmarks.gap_closed_form.casting import AT_ONCE, Array, Surface
+from benchmarks.gap_closed_form.files import write_mesh, write_points, write_yaml
+from benchmarks.gap_closed_form.strength import (
     Strength,
     Target,
     Whitener,
@@ -23,8 +23,8 @@ from benchmarks.gap_challenge.strength import (
     spread_distance,
     spread_strength,
 )
-from benchmarks.gap_challenge.tls_effects import Parameters, Rays
-from benchmarks.gap_challenge.walls import (
+from benchmarks.gap_closed_form.tls_effects import Parameters, Rays
+from benchmarks.gap_closed_form.walls import (
     Fall,
     Place,
     Random,
