@@ -67,7 +67,7 @@ def bare(measurement: Measurement) -> Callable[[], None]:
 def made(sensor: str, points: int, folder: Path) -> Path:
     """Make a measurement in a folder, in a process of its own, so that its memory does not count."""
     kind, seed = CASES[sensor]
-    code = "import sys; from pathlib import Path; from benchmarks.gap_challenge.cases import Case, make; " + (
+    code = "import sys; from pathlib import Path; from benchmarks.gap_closed_form.cases import Case, make; " + (
         f"make(Case(0, {seed}, 'one', {sensor!r}, ({kind!r},), {points}, 200_000), Path(sys.argv[1]), Path(sys.argv[2]))"
     )
     case = folder / "case"

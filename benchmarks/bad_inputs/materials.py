@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from benchmarks.gap_challenge.cases import Case, make
+from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.change.annotate import run_length_encoding
 from pipeline.cli.main import main
 from pipeline.config.bundled import configs_folder

@@ -1,4 +1,4 @@
-"""Inject known effects into real measurements, diagnose each like `scarpsim gap`, and judge the answers.
+"""Inject known effects into real measurements, diagnose each like `scarpsim gap`, and score the answers.
 
     OMP_NUM_THREADS=1 python benchmarks/gap_injections/run.py --out /tmp/injections [--page docs/validation/gap_injections.md]
 
@@ -26,12 +26,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from benchmarks.gap_injections.bases import BASES
 from benchmarks.gap_injections.cases import CASES, Case
-from benchmarks.gap_injections.judge import Json, judged
 from benchmarks.gap_injections.page import page
+from benchmarks.gap_injections.score import Json, scored
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
-from pipeline.gap.residuals.registration import registered, residuals_of
+from pipeline.gap.residuals.alignment import compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.residuals import Residuals
 from scene.common.errors import InputError
 
@@ -116,22 +116,22 @@ def strength(effect: str, base: Path, folder: Path) -> float | None:
         before, after = registered_residuals(base), registered_residuals(folder)
     except InputError:
         return None
-    there, spread = after.of_points(after.value, before.index), nmad(before.value[before.smooth] / before.sigma[before.smooth])
-    used = before.smooth & np.isfinite(there) & (np.abs(before.value) < 4 * spread * before.sigma)
+    there, spread = after.values_at(after.value, before.index), nmad(before.value[before.usable] / before.sigma[before.usable])
+    used = before.usable & np.isfinite(there) & (np.abs(before.value) < 4 * spread * before.sigma)
     if not used.any():
         return None
     sigma = spread * before.sigma[used]
     if "noise" in effect:
         return float(abs(nmad(there[used] / sigma) ** 2 - nmad(before.value[used] / sigma) ** 2) * np.sqrt(used.sum() / 2))
-    columns, change = before.pose[used] / sigma[:, None], (there - before.value)[used] / sigma
+    columns, change = before.pose_jacobian[used] / sigma[:, None], (there - before.value)[used] / sigma
     return float(np.linalg.norm(change - columns @ np.linalg.lstsq(columns, change, rcond=None)[0]))
 
 
 @cache
 def registered_residuals(folder: Path) -> Residuals:
     """Return the residuals of a measurement's folder after registration."""
-    found = residuals_of(read_measurement(folder))
-    return replace(found, value=registered(found)[0])
+    found = compute_residuals(read_measurement(folder))
+    return replace(found, value=fit_pose_robustly(found)[0])
 
 
 def answered(case: Case, out: Path) -> Json:
@@ -159,10 +159,10 @@ def _write(path: Path, values: Any) -> None:
 
 
 def run(out: Path, cases: tuple[Case, ...] = CASES) -> list[Json]:
-    """Return the judged answers to all cases."""
+    """Return the scored answers to all cases."""
     found = []
     for case in cases:
-        row = judged(answered(case, out), named_before(case.base, out))
+        row = scored(answered(case, out), named_before(case.base, out))
         print(f"{case.name} {case.base} {case.effect} {row['judgement']}: {row['verdict']} {row['named']}", flush=True)
         found.append(row)
     return found
@@ -173,7 +173,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--only", nargs="*", default=[], metavar="BASE", help="measurements to use (default: all)")
     parser.add_argument("--page", type=Path, help="write the table there")
-    parser.add_argument("--answered", action="store_true", help="make no further answers, judge those that are there")
+    parser.add_argument("--answered", action="store_true", help="make no further answers, score those that are there")
     arguments = parser.parse_args()
     wanted = [case for case in CASES if not arguments.only or case.base in arguments.only]
     if arguments.answered:

@@ -1,4 +1,4 @@
-"""Calibration on references made of points: their error is not the instrument's."""
+"""Calibration on references made of points: the reference's error must not be attributed to the instrument."""
 
 from __future__ import annotations
 
@@ -51,10 +51,8 @@ def wall(rng: np.random.Generator, count: int = 40) -> TriangleMesh:
 
 @pytest.mark.parametrize("shared", [True, False])
 def test_points_lie_as_far_from_the_wall_as_from_one_whose_vertices_are_wrong(shared: bool) -> None:
-    """The reference's error moves points as if its vertices were displaced along the rays.
-
-    Errors that neighbours share agree to 1 % of the noise with casting on the displaced wall. Independent errors have the
-    variance of a weighted mean of three vertices, to 3 standard errors.
+    """For noise, distances are compared with ray casting on that wall, to 1 % of the noise. For relief, which neighbours do not
+    share, the variance is the sum of the squared weights, within 3 standard errors.
     """
     mesh, rng = wall(np.random.default_rng(1)), np.random.default_rng(2)
     caster, sigma = RayCaster(mesh), 1e-3
@@ -86,7 +84,7 @@ def test_points_that_are_missing_or_miss_the_wall_stay() -> None:
 
 @pytest.fixture(scope="module")
 def half(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One half of a scan of a wall against the other, with noise of 3 mm where the model believes in 1 mm."""
+    """One half of a scan of a wall against the other, with 3 mm of noise where the model claims 1 mm."""
     folder, rng = tmp_path_factory.mktemp("half"), np.random.default_rng(4)
     line, pulse = (each.ravel() for each in np.indices((360, 360)))
     ray = rays(np.pi / 2 - 0.12 + line * 6.6e-4, np.pi / 2 - 0.12 + pulse * 6.6e-4)
@@ -107,10 +105,10 @@ def inputs(half: Path) -> tuple[SimulationConfig, CalibrationInputs]:
 
 
 def test_maps_of_a_half_are_as_noisy_as_measured_only_with_the_reference_error(half: Path) -> None:
-    """Simulated maps of half a scan have the measured standard deviation, to 8 %, only with the reference's error.
+    """Without it the simulated maps have less than 0.85 of the measured deviation; with it they agree to 8 %.
 
-    Without it they have less than 0.85 of it. The two differ a little, because the half's points lie on a chessboard, simulated
-    ones on squares, and a pixel holds about three.
+    The remainder comes from the points' layout: those of a half lie like one colour of a chessboard, simulated ones on squares,
+    with about three per pixel.
     """
     config, found = inputs(half)
     assert found.reference_error is not None
@@ -139,7 +137,7 @@ def test_points_that_lie_in_one_direction_are_an_input_error(half: Path) -> None
 
 @pytest.mark.slow
 def test_the_noise_of_the_instrument_comes_back_from_a_half(half: Path) -> None:
-    """Within twice the interval of 95 %, and 8 % at most; without the reference's error it is a quarter more."""
+    """Within twice the 95 % interval, at most 8 %; without the reference's error it would be a quarter larger."""
     config, _ = inputs(half)
     result = calibrate(config, "tls", [half], Progress(), with_greedy=False)
     (value,), (low,), (high,) = (np.exp(each) for each in (result.found.x, result.found.low, result.found.high))

@@ -1,4 +1,4 @@
-"""Lost returns: chances drawn in closed form, and what must not be taken for an effect."""
+"""Lost returns: loss probabilities drawn in closed form, and losses that are no effect."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from scipy.stats import norm
 from pipeline.formats.measurements.measurement import TlsMeasurement, read_measurement
 from pipeline.gap.naming.gap_score import measure_losses
 from pipeline.gap.noise_and_edges.missing_returns import LossExplanation, count_isolated_returns, explain_missing_returns
-from pipeline.gap.residuals.residuals import Missing
-from pipeline.gap.residuals.tls_residuals import missing_returns, tls_residuals
+from pipeline.gap.residuals.residuals import ExpectedPulses
+from pipeline.gap.residuals.tls_residuals import find_expected_pulses, tls_residuals
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 COUNT = 30_000
 
 
 def pulses() -> tuple[Array, Array, dict[str, Array]]:
-    """A wall 40 m wide and 30 m high, seen from 50 m: places x and y, and the covariates of pulses to them."""
+    """Places x and y on a wall 40 m wide and 30 m high, seen from 50 m, and the covariates of pulses to them."""
     rng = np.random.default_rng(5)
     x, y = rng.uniform(-20, 20, COUNT), rng.uniform(0, 30, COUNT)
     distance = np.sqrt(x**2 + y**2 + 50**2)
@@ -38,11 +38,11 @@ def pulses() -> tuple[Array, Array, dict[str, Array]]:
 
 
 def found(chance: Array, early: int = 0, seed: int = 6) -> LossExplanation | None:
-    """What is found where pulses are lost with a chance (n,)."""
+    """Return the effects that are found where pulses are lost with probabilities (n,)."""
     x, y, covariates = pulses()
     lost = np.random.default_rng(seed).uniform(size=COUNT) < chance
     every = np.arange(COUNT) % 5 != 0
-    return explain_missing_returns(Missing(lost, covariates, np.stack([x, y], axis=1)), every, early, COUNT, None)
+    return explain_missing_returns(ExpectedPulses(lost, covariates, np.stack([x, y], axis=1)), every, early, COUNT, None)
 
 
 def test_a_limit_is_found_with_its_spread_of_albedo() -> None:
@@ -72,7 +72,7 @@ def test_losses_in_a_sector_are_no_effect_of_the_catalogue() -> None:
 
 
 def test_losses_alike_everywhere_are_none() -> None:
-    """20 draws, none with the seed of the places; a score of 9 has a chance of some 1e-4 in each."""
+    """20 draws; by chance a score of 9 occurs in about 1e-4 of them."""
     assert all(found(np.full(COUNT, 0.03), seed=seed) is None for seed in range(100, 120))
 
 
@@ -82,10 +82,8 @@ def test_a_shrub_before_the_wall_is_none() -> None:
 
 
 def test_lines_that_the_scanner_dropped_are_none() -> None:
-    """Gaps of some scan lines are not taken for the losses of a sector.
-
-    A scan has nine gaps, each over a fifth of the lines' height; by chance several may be in one sector. One of 20 draws may be
-    taken for a sector's losses. Two have a chance of 2 % if each has one of 1 %.
+    """There are nine gaps of a few lines and a fifth of their height. One of 20 draws may be taken for a sector's losses; two
+    would have a chance of 2 % if each has 1 %.
     """
     _, _, covariates = pulses()
     azimuth, zenith = covariates["azimuth"], covariates["zenith"]
@@ -108,12 +106,14 @@ def test_drops_scatter_and_what_stands_before_the_wall_does_not() -> None:
 
 
 def test_the_score_of_losses_closes_the_gap_of_the_true_chance() -> None:
-    """The Brier score of a chance p is p (1 - p) on average: what is left is nothing, within 3.3 standard errors."""
+    """The Brier score of a probability p is p (1 - p) on average, so with the true probability the gap is zero within 3.3
+    standard errors.
+    """
     x, y, covariates = pulses()
     chance = np.where(covariates["zenith"] < 1.2, 0.62, 0.02)
     lost = np.random.default_rng(8).uniform(size=COUNT) < chance
     held_out = np.arange(COUNT) % 5 == 0
-    gap = measure_losses(Missing(lost, covariates, np.stack([x, y], axis=1)), chance, held_out)
+    gap = measure_losses(ExpectedPulses(lost, covariates, np.stack([x, y], axis=1)), chance, held_out)
     assert gap is not None
     assert gap.unit == "1"
     floor = chance[held_out] * (1 - chance[held_out])
@@ -125,7 +125,7 @@ def test_the_score_of_losses_closes_the_gap_of_the_true_chance() -> None:
 
 
 def test_a_wall_on_both_sides_of_the_azimuth_pi_is_one_wall(tmp_path: Path) -> None:
-    """The scanner's frame turned, so that half of the same points have azimuths below pi and half above minus pi."""
+    """The scanner's frame is turned so that half of the same points have azimuths just below pi and half just above -pi."""
     write_scan(tmp_path, 1)
     plain = read_measurement(tmp_path)
     assert isinstance(plain, TlsMeasurement)
@@ -143,7 +143,7 @@ def test_a_wall_on_both_sides_of_the_azimuth_pi_is_one_wall(tmp_path: Path) -> N
     assert_allclose(after.value, before.value, atol=1e-9)
     turns = after.geometry.azimuth - before.geometry.azimuth - angle
     assert_allclose(turns, 2 * np.pi * np.rint(turns[0] / (2 * np.pi)), atol=1e-9)
-    counted = [missing_returns(each, residuals) for each, residuals in ((plain, before), (turned, after))]
+    counted = [find_expected_pulses(each, residuals) for each, residuals in ((plain, before), (turned, after))]
     assert counted[0] is not None
     assert counted[1] is not None
     assert_array_equal(counted[0].lost, counted[1].lost)

@@ -1,7 +1,7 @@
-"""The p-value of each statistic that the diagnosis tests, where the model is right: even between 0 and 1, or nearly.
+"""The p-values of all statistics that the diagnosis tests are (nearly) uniform where the model is right.
 
-Each by Kolmogorov and Smirnov at 0.1 %, which the right distribution fails once in a thousand seeds; for each something that is
-there as well, which it has to find.
+Each is tested by Kolmogorov-Smirnov at 0.1 %, which the right distribution fails for one seed in a thousand. Each statistic must
+also reject an error that is present.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ from scipy.spatial.distance import cdist
 from scipy.stats import kstest
 from threadpoolctl import threadpool_limits
 
-from pipeline.gap.mean.candidates import free_forms
+from pipeline.gap.mean.candidates import nonparametric_terms
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.noise_and_edges.grid_noise import _variogram
 from pipeline.gap.noise_and_edges.variance_model import null_p_value
-from pipeline.gap.residuals import cells
-from pipeline.gap.residuals.cells import block_numbers
+from pipeline.gap.residuals import wall_blocks
+from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise
 from pipeline.gap.residuals.nominal_pair import PixelGeometry
-from pipeline.gap.residuals.rays import RayGeometry
-from pipeline.gap.residuals.shared_noise import SharedNoise
+from pipeline.gap.residuals.ray_hits import RayGeometry
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.residuals.wall_blocks import wall_block_numbers
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.regularization_noise import RegularizationNoise
@@ -33,13 +33,13 @@ SIGMA = 0.003
 
 
 def over_the_wall(side: int = SIDE, step: float = 0.1) -> FloatArray:
-    """(n, 2), m, a little irregular."""
+    """Return slightly irregular places (n, 2) on the wall, m."""
     at = step * np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
     return np.asarray(at + np.random.default_rng(1).uniform(-0.4 * step, 0.4 * step, at.shape))
 
 
 def ranges(value: FloatArray, at: FloatArray) -> TlsResiduals:
-    """Residuals of a scan; the pose is a plane over the wall."""
+    """Return residuals of a scan; the pose is a plane over the wall."""
     nothing, every = np.zeros(len(at)), np.ones(len(at), dtype=bool)
     pose = np.stack([np.ones(len(at)), at[:, 0], at[:, 1]], axis=1)
     covariates = {"azimuth": 0.02 * at[:, 0], "zenith": 0.02 * at[:, 1]}
@@ -49,7 +49,7 @@ def ranges(value: FloatArray, at: FloatArray) -> TlsResiduals:
 
 
 def of_the_mean(count: int, reference: float, length_m: float, added: float = 0.0) -> list[float]:
-    """p-values of what remains in measurements of white noise beside an error of the reference; added: a curve of the azimuth."""
+    """Return p-values of the remainder, for white noise beside an error of the reference; added: a curve of the azimuth."""
     at = over_the_wall()
     root = np.linalg.cholesky(np.exp(-0.5 * (cdist(at, at) / length_m) ** 2) + 1e-8 * np.eye(len(at)))
     found = []
@@ -57,34 +57,31 @@ def of_the_mean(count: int, reference: float, length_m: float, added: float = 0.
         random = np.random.default_rng(seed)
         value = SIGMA * random.standard_normal(len(at)) + reference * root @ random.standard_normal(len(at))
         residuals = ranges(value + added * np.sin(2 * np.pi * at[:, 0] / 1.7), at)
-        families = [form for name, values in residuals.covariates.items() for form in free_forms(name, values)]
+        families = [form for name, values in residuals.covariates.items() for form in nonparametric_terms(name, values)]
         with threadpool_limits(1, "blas"):  # as `diagnose` has it
             search = MeanSearch(residuals, families, KeyedRandom(seed))
-            found.append(search.p_value(search.tried(())[0].score))
+            found.append(search.p_value(search.score_families(())[0].score))
     return found
 
 
 @pytest.mark.parametrize(("reference", "length_m"), [(0.0, 1.0), (0.002, 1.0)])
 def test_of_a_mean_of_ranges(monkeypatch: pytest.MonkeyPatch, reference: float, length_m: float) -> None:
-    """The p-values of the largest score are uniform under the null, with and without an error of the reference.
-
-    Cells have 0.5 m and ranges a noise of 3 mm. The reference's error, m, is correlated over two cells. With it the test passes
-    only just: 11 of 40 p-values lie below 0.05.
-    """
-    monkeypatch.setattr(cells, "_MOST_CELLS", 100)
+    """Cells of 0.5 m, ranges of 3 mm; the reference's error (m) is correlated over two cells. The second is what is reached: it
+    passes, but 11 of its 40 lie below 0.05."""
+    monkeypatch.setattr(wall_blocks, "_MOST_CELLS", 100)
     found = of_the_mean(40, reference, length_m)
     assert kstest(found, "uniform").pvalue > 0.001, sorted(found)
 
 
 def test_of_a_mean_that_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cells, "_MOST_CELLS", 100)
+    monkeypatch.setattr(wall_blocks, "_MOST_CELLS", 100)
     assert max(of_the_mean(4, 0.002, 1.0, added=0.002)) < 0.01
 
 
 def of_the_spread(count: int, excess: float) -> list[float]:
-    """p-values of one form that grows over the wall, one that is even and one of a few points."""
+    """Return p-values of a variance that grows over the wall, of one that is constant and of one of few points."""
     at = over_the_wall()
-    block = block_numbers(at, 0.15)
+    block = wall_block_numbers(at, 0.15)
     forms = [np.ones(len(at)), at[:, 0], np.exp(-at[:, 1])]
     found = []
     for seed in range(count):
@@ -103,13 +100,13 @@ def test_of_a_spread_that_is_there() -> None:
 
 
 def of_nodes(count: int, sigma_px: float) -> list[float]:
-    """p-values of noise on nodes in disparities of the model's own white noise."""
+    """Return p-values of grid noise in disparities that have only the model's white noise."""
     pixels = 4.0 * np.stack(np.meshgrid(np.arange(120.0), np.arange(120.0)), axis=-1).reshape(-1, 2)
     number, every = np.arange(len(pixels)), np.ones(len(pixels), dtype=bool)
     zero = np.zeros(len(pixels))
     geometry = PixelGeometry(pixels[:, 0], pixels[:, 1], *[zero] * 10)
     model = StereoModel(noise=StereoNoise(parallax_sigma_px=0.3, regularization_sigma_px=0.0))
-    field = SharedNoise((RegularizationNoise(sigma_px=1.0, step_px=32.0),), pixels).field(len(pixels))
+    field = GridCorrelatedNoise((RegularizationNoise(sigma_px=1.0, step_px=32.0),), pixels).node_field(len(pixels))
     nodes = sigma_px * np.linalg.cholesky(field.covariance)
     found = []
     for seed in range(count):

@@ -1,4 +1,6 @@
-"""What a diagnosis does where its first answer does not hold: rays that are turned off the wall, free forms that fail."""
+"""Where a first answer does not hold: effects that turn rays off the wall, free forms that fail validation, edge effects that are
+reconsidered.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,9 @@ import numpy as np
 import pytest
 from gap_cases import write_scan
 
-from benchmarks.gap_challenge.cases import Case, make
+from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.formats.measurements.measurement import StereoMeasurement, read_measurement
-from pipeline.gap.mean.candidates import PLACE
+from pipeline.gap.mean.candidates import SPATIAL_NULL
 from pipeline.gap.naming import workflow
 from pipeline.gap.naming.effect_selection import NONPARAMETRIC_TERMS, _note_most_similar
 from pipeline.gap.naming.gap_score import simulate_errors
@@ -23,9 +25,9 @@ from pipeline.gap.naming.selection_passes import PassInput, PassInputs, Selectio
 from pipeline.gap.naming.validation_scores import ValidatedEffects
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
+from pipeline.gap.residuals.alignment import align, compute_residuals
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.nominal_pair import NominalPair
-from pipeline.gap.residuals.registration import residuals_of, settled
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
 from scene.common.keyed_random import KeyedRandom
 from sensors.effects.edge_fattening import EdgeFattening
@@ -35,15 +37,15 @@ from sensors.stereo.stereo_pair import REDUCTION
 
 
 def test_an_effect_that_turns_all_rays_off_the_wall_leaves_no_residuals(tmp_path: Path) -> None:
-    """A principal point 10,000 px off, with an effect that looks at the raster of what is seen."""
+    """The principal point is wrong by 10,000 px, beside an effect that uses the raster of what is seen."""
     make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     measurement = read_measurement(tmp_path / "case")
     assert isinstance(measurement, StereoMeasurement)
     away = [{"name": "principal_point_x", "camera": "left", "delta_px": 1e4}, {"name": "smoothing", "sigma_px": 2.0}]
-    found = settled(measurement.changed(model=with_effects(measurement.model, away)))
+    found = align(measurement.changed(model=with_effects(measurement.model, away)))
     assert len(found.residuals) == 0
     assert not found.pose.any()
-    assert len(at_points_of(found.residuals, residuals_of(measurement))) == 0
+    assert len(at_points_of(found.residuals, compute_residuals(measurement))) == 0
 
 
 def test_noise_found_on_some_points_adds_alike_to_all() -> None:
@@ -66,7 +68,7 @@ def test_where_a_free_form_fails_all_is_named_again_without_any(
     without: list[NamedEffect], kept: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_scan(tmp_path, 10, step_rad=0.007)
-    there, plain, _ = settled(read_measurement(tmp_path))
+    there, plain, _ = align(read_measurement(tmp_path))
     nowhere = np.zeros(len(there.cloud.points), dtype=bool)
     pass_input = PassInput.of(there, plain, nowhere, [])
     seen: list[bool] = []
@@ -94,29 +96,27 @@ def test_where_a_free_form_fails_all_is_named_again_without_any(
 
 
 def test_a_simulation_without_noise_departs_nowhere_from_the_surface(tmp_path: Path) -> None:
-    """A simulation without noise agrees with the surface at the measurement's own pixels.
-
-    Depth maps have cells of two pixels or more, and the measurement's pixels are half a pixel off their centres. How the surface
-    varies between them must not count as an error of the sensor.
+    """Depth maps have cells of two pixels or more, whose centres differ by half a pixel from the measurement's pixels. What the
+    surface does between them must not count as an error of the sensor.
     """
     make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
-    there, residuals, _ = settled(read_measurement(tmp_path / "case"))
+    there, residuals, _ = align(read_measurement(tmp_path / "case"))
     assert isinstance(there, StereoMeasurement)
     noise = StereoNoise(parallax_sigma_px=1e-6, regularization_sigma_px=0.0)
     (seen,) = simulate_errors(there, there.model.model_copy(update={"noise": noise}), residuals, [KeyedRandom(1)])
     nominal, u, v = NominalPair.of(there), there.cloud.extra["pixel_x"], there.cloud.extra["pixel_y"]
-    between = nominal.of_surface(there.scene, u + 0.5, v + 0.5) - nominal.of_surface(there.scene, u, v)
-    assert np.nanstd(between[residuals.index[residuals.smooth]]) > 0.01, "px of disparity on smooth surface"
-    known = residuals.smooth & np.isfinite(seen)
+    between = nominal.surface_disparity(there.scene, u + 0.5, v + 0.5) - nominal.surface_disparity(there.scene, u, v)
+    assert np.nanstd(between[residuals.index[residuals.usable]]) > 0.01, "px of disparity on smooth surface"
+    known = residuals.usable & np.isfinite(seen)
     assert known.sum() > 5000
     np.testing.assert_allclose(seen[known], 0, atol=2e-4)
 
 
 def test_outlines_grow_among_the_measurement_s_own_pixels_when_it_is_simulated(tmp_path: Path) -> None:
-    """On a depth map of finer cells the same radius reaches another width, from other steps."""
+    """On a depth map with finer cells the same radius would have another reach and start at other steps."""
     make(Case(0, (4, 1), "one", "stereo", ("edge_fattening",), 6_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     read = read_measurement(tmp_path / "case")
-    plain = residuals_of(read)
+    plain = compute_residuals(read)
     raster = DisparityRaster.of(read, plain.geometry)
     assert raster is not None
     assert raster.step not in REDUCTION.values()
@@ -124,14 +124,16 @@ def test_outlines_grow_among_the_measurement_s_own_pixels_when_it_is_simulated(t
     model = with_effects(read.model, [grown])
     quiet = StereoNoise(parallax_sigma_px=1e-6, regularization_sigma_px=0.0)
     (seen,) = simulate_errors(read, model.model_copy(update={"noise": quiet}), plain, [KeyedRandom(1)])
-    expected = raster.moved([EdgeFattening(radius_px=2.5 * raster.step)], plain.geometry.disparity)
+    expected = raster.added_by([EdgeFattening(radius_px=2.5 * raster.step)], plain.geometry.disparity)
     known = np.isfinite(seen)
     assert np.count_nonzero(expected[known]) > 50
     assert np.mean(np.abs(seen - expected)[known] < 1e-3) > 0.99
 
 
 def test_outlines_grow_where_a_turned_camera_sees_them_when_they_are_simulated(tmp_path: Path) -> None:
-    """Where they grow the simulation is to half a pixel what the residuals take off; on the nominal camera's view 18 % were."""
+    """Where outlines grow, the simulation agrees to half a pixel with what the residuals subtract; seen by the nominal camera
+    only 18 % did.
+    """
     make(
         Case(0, (6, 1), "two", "stereo", ("edge_fattening", "camera_omega"), 5000, 5000),
         tmp_path / "case",
@@ -153,7 +155,7 @@ def test_outlines_grow_where_a_turned_camera_sees_them_when_they_are_simulated(t
 
 
 def test_a_low_pass_that_others_feign_takes_no_outlines_along(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Seen only beside what was named, it does not count; what was seen with it does."""
+    """A smoothing that is seen only beside the named effects does not count, but grown outlines that were seen with it do."""
     nowhere = np.zeros(1, dtype=bool)
     seen = [EdgeEffect(effect, {}, 50.0, nowhere) for effect in (EdgeFattening(radius_px=3.0), Smoothing(sigma_px=2.0))]
 
@@ -179,7 +181,9 @@ def test_a_low_pass_that_others_feign_takes_no_outlines_along(monkeypatch: pytes
 def test_a_low_pass_is_tried_where_the_sensor_stays_unless_one_effect_explains_all(
     monkeypatch: pytest.MonkeyPatch, smooth: tuple[int, int], spreads: float, expected: set[str]
 ) -> None:
-    """One effect by itself that leaves no more spread; the answer is the least complex of what was tried."""
+    """The search at the initial pose is skipped if a single effect explains the residuals without more spread; the simplest
+    result wins.
+    """
     asked: dict[str, tuple[tuple[int, int], float]] = {
         "with_edge_effects": ((1, 3), 1.0),
         "without_edge_effects": (smooth, spreads),
@@ -208,34 +212,40 @@ def test_a_low_pass_is_tried_where_the_sensor_stays_unless_one_effect_explains_a
 
 
 def test_an_unknown_without_a_name_says_what_remains_is_most_like() -> None:
-    """The largest of what was tried, but mere places, with its size; nothing where chance leaves as much, or one was found."""
+    """The note names the largest form that was tried, except steps at a place, with its size. There is no note if chance explains
+    as much or if an effect was found.
+    """
 
     def item(name: str, score: float, form: str) -> Any:
         return SimpleNamespace(name=name, score=score, empirical=bool(form), candidate=SimpleNamespace(form=form))
 
-    tried = (item(f"{PLACE} 30", 9.0, "step"), item("azimuth", 8.0, "smooth"), item("row_jitter", 3.0, ""))
+    tried = (item(f"{SPATIAL_NULL} 30", 9.0, "step"), item("azimuth", 8.0, "spline"), item("row_jitter", 3.0, ""))
     part: Any = SimpleNamespace(unit_m=np.full(3, 0.1))
     for p_value, estimates, expected in ((0.004, [], 1), (0.02, [], 0), (None, [], 0), (0.004, ["effect"], 0)):
-        search = SimpleNamespace(p_of_rest=lambda _, p_value=p_value: p_value, size=lambda each: 0.01 * each.score)
+        search = SimpleNamespace(
+            goodness_of_fit_p_value=lambda _, p_value=p_value: p_value, fitted_std=lambda each: 0.01 * each.score
+        )
         found: Any = SimpleNamespace(search=search, tried=tried, estimates=estimates)
         said = _note_most_similar(found, part)
         assert len(said) == expected
-        assert all("a change with azimuth (smooth), 8 mm" in words for words in said)
+        assert all("a change with azimuth (spline), 8 mm" in words for words in said)
 
 
 def test_what_shapes_do_is_found_once_for_a_search(tmp_path: Path) -> None:
-    """A search has it of the whole raster, points that miss the reference included, and a trial in it takes that over."""
+    """The search takes the edge effects' change from the whole raster, including points that miss the reference, and passes it on
+    to its trials.
+    """
     make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     read = read_measurement(tmp_path / "case")
     there = read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 40.0}]))
-    plain, nowhere = residuals_of(there), np.zeros(len(there.cloud.points), dtype=bool)
+    plain, nowhere = compute_residuals(there), np.zeros(len(there.cloud.points), dtype=bool)
     pass_input = PassInput.of(there, plain, nowhere, [])
     part, residuals = pass_input.training_part
-    found = residuals_of(part).value
+    found = compute_residuals(part).value
     assert len(found) > 1000
     np.testing.assert_allclose(found, residuals.value, atol=1e-6)
     assert isinstance(part, StereoMeasurement)
     assert part.shaped_px is not None
     assert np.std(part.shaped_px) > 0.01, "px that the low-pass does"
-    moved = residuals_of(part.changed(shaped_px=part.shaped_px + 1))
+    moved = compute_residuals(part.changed(shaped_px=part.shaped_px + 1))
     np.testing.assert_allclose(moved.value, found - 1)

@@ -1,4 +1,6 @@
-"""Effects where the surface is not smooth, and noise on a grid: measurements of the challenge's own generator."""
+"""Edge effects (smoothing, grown outlines, filled strips, beam footprints) and grid noise, on the closed-form
+generator's cases.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,9 @@ import numpy as np
 import pytest
 from scipy.interpolate import RectBivariateSpline
 
-from benchmarks.gap_challenge import stereo_effects
-from benchmarks.gap_challenge.cases import Case, make
-from benchmarks.gap_judge.cases import build, schedule
+from benchmarks.gap_closed_form import stereo_effects
+from benchmarks.gap_closed_form.cases import Case, make
+from benchmarks.gap_second_generator.cases import build, schedule
 from pipeline.formats.measurements.measurement import Measurement, TlsMeasurement, read_measurement
 from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.naming import effect_selection as steps
@@ -25,12 +27,12 @@ from pipeline.gap.noise_and_edges.edge_effects import WallBlocks
 from pipeline.gap.noise_and_edges.grid_noise import find_grid_noise, separate_white_and_grid_noise
 from pipeline.gap.noise_and_edges.variance_model import fit_variance_model
 from pipeline.gap.residuals import disparity_raster, stereo_residuals
-from pipeline.gap.residuals.cells import Cells
-from pipeline.gap.residuals.disparity_raster import DisparityRaster, spacing
+from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
+from pipeline.gap.residuals.disparity_raster import DisparityRaster, raster_spacing_px
 from pipeline.gap.residuals.nominal_pair import NominalPair, project
-from pipeline.gap.residuals.registration import registered, residuals_of, settled
 from pipeline.gap.residuals.residuals import Residuals
-from pipeline.gap.residuals.scan_simulation import mean_model, simulate_modes, simulate_ranges
+from pipeline.gap.residuals.scan_simulation import simulate_ranges, simulate_ranges_by_mode, systematic_part
+from pipeline.gap.residuals.wall_blocks import WallCells
 from scene.common.keyed_random import KeyedRandom
 from sensors.effects.beam_divergence import BeamDivergence
 from sensors.effects.edge_fattening import EdgeFattening
@@ -42,20 +44,22 @@ Made = tuple[Measurement, Residuals, dict[str, Any]]
 
 
 def made(tmp_path: Path, sensor: str, kinds: tuple[str, ...], seed: int) -> Made:
-    """A measurement with the effects `kinds`, its residuals, and the true parameters of the first of them."""
+    """Return a measurement with the effects `kinds`, its residuals, and the true parameters of the first effect."""
     stratum = "one" if kinds else "none"
     make(Case(0, (seed, 1), stratum, sensor, kinds, 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     effects = json.loads((tmp_path / "truth.json").read_text())["effects"]
-    there, residuals, _ = settled(read_measurement(tmp_path / "case"))
+    there, residuals, _ = align(read_measurement(tmp_path / "case"))
     return there, residuals, effects[0]["parameters"] if effects else {}
 
 
 def shapes_of(case: Made) -> dict[str, Any]:
-    """The effects on the shape of disparities, by name."""
+    """Return the edge effects that are found in disparities, by name."""
     there, residuals, _ = case
     return {
         each.name: each
-        for each in find_disparity_edge_effects(there, residuals, registered(residuals)[0], np.zeros(len(residuals), dtype=bool))
+        for each in find_disparity_edge_effects(
+            there, residuals, fit_pose_robustly(residuals)[0], np.zeros(len(residuals), dtype=bool)
+        )
     }
 
 
@@ -75,12 +79,12 @@ def test_outlines_that_grow_are_found_with_their_reach(tmp_path: Path) -> None:
 
 
 def test_outlines_that_grow_at_high_steps_alone_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A matcher that follows slopes as others break at them: what it takes for a step is in no measurement."""
+    """The matcher follows low steps like slopes; the measurement does not say which height it takes for a step."""
     monkeypatch.setattr(stereo_effects, "_STEP_PX", 4.0)
     there, residuals, truth = case = made(tmp_path, "stereo", ("edge_fattening",), 4)
     raster = DisparityRaster.of(there, residuals.geometry)
     assert raster is not None
-    assert raster.jump_px < 2
+    assert raster.depth_step_px < 2
     found = shapes_of(case)["edge_fattening"]
     assert isinstance(found.effect, EdgeFattening)
     assert 2 < found.effect.step_px < 8
@@ -88,37 +92,35 @@ def test_outlines_that_grow_at_high_steps_alone_are_found(tmp_path: Path, monkey
 
 
 def test_a_low_pass_takes_the_relief_off_what_a_move_changes(tmp_path: Path) -> None:
-    """The Jacobian of the pose, of low-passed disparities, predicts what a small move of the cameras changes.
-
-    It is compared with moving the cameras and filtering the reference anew, on a wall with ledges and relief. The move has mm and
-    tens of microradians, where the change is linear. Points beside pixels without a hit are left out, because the low-pass does
-    not know what is there.
+    """The derivatives by the pose are compared with moving the cameras and smoothing the reference again, on a wall with ledges
+    and relief. Moves of millimetres and tens of microradians are small enough to be linear. Points beside what no pixel sees are
+    left out, because the smoothing does not know it.
     """
     make(Case(0, (5, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     read = read_measurement(tmp_path / "case")
     there = read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 40.0}]))
-    plain, found = residuals_of(read), residuals_of(there)
+    plain, found = compute_residuals(read), compute_residuals(there)
     step = np.array([2e-3, 0, 1e-3, 0, 2e-5, 0])
-    moved = residuals_of(there.moved(step))
-    inner = ~DisparityRaster.of(read, plain.geometry).beside_border(60.0)[np.searchsorted(plain.index, found.index)]
-    both, ours, theirs = np.intersect1d(found.index[found.smooth & inner], moved.index, return_indices=True)
-    rows = np.flatnonzero(found.smooth & inner)[ours]
+    moved = compute_residuals(there.moved(step))
+    inner = ~DisparityRaster.of(read, plain.geometry).near_border(60.0)[np.searchsorted(plain.index, found.index)]
+    both, ours, theirs = np.intersect1d(found.index[found.usable & inner], moved.index, return_indices=True)
+    rows = np.flatnonzero(found.usable & inner)[ours]
     assert len(both) > 3000
     change = found.value[rows] - moved.value[theirs]
-    low_passed, raw = (float(np.std(change - each.pose[rows] @ step)) for each in (found, plain))
+    low_passed, raw = (float(np.std(change - each.pose_jacobian[rows] @ step)) for each in (found, plain))
     assert low_passed < 0.1 * np.std(change)
     assert low_passed < 0.3 * raw
 
 
 def test_a_cut_cloud_has_the_low_pass_of_the_whole_picture(tmp_path: Path) -> None:
-    """Clouds are cut, and matched before: beside the cut a low-pass sees what was cut off."""
+    """Clouds are matched first and cut then: at a cut, the smoothing has seen what was cut off."""
     make(Case(0, (5, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     read = read_measurement(tmp_path / "case")
     there = read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 30.0}]))
-    whole = residuals_of(there)
+    whole = compute_residuals(there)
     u = whole.geometry.u
     kept = whole.index[(u > np.quantile(u, 0.3)) & (u < np.quantile(u, 0.7))]
-    part = residuals_of(there.part(kept))
+    part = compute_residuals(there.part(kept))
     both, ours, theirs = np.intersect1d(kept[part.index], whole.index, return_indices=True)
     assert len(both) > 4000
     np.testing.assert_allclose(part.geometry.shaped[ours], whole.geometry.shaped[theirs], atol=1e-3)
@@ -128,7 +130,7 @@ def test_a_cut_cloud_has_the_low_pass_of_the_whole_picture(tmp_path: Path) -> No
 def test_nothing_is_matched_outside_of_the_right_picture(tmp_path: Path) -> None:
     make(Case(0, (5, 1), "none", "stereo", (), 8_000, 8_000), tmp_path / "case", tmp_path / "truth.json")
     there = read_measurement(tmp_path / "case")
-    geometry = residuals_of(there).geometry
+    geometry = compute_residuals(there).geometry
     right = there.cameras.right
     column = right.width // 2
     narrow = there.changed(cameras=replace(there.cameras, right=replace(right, width=column, cx_px=right.cx_px + column / 2)))
@@ -144,10 +146,10 @@ def test_nothing_is_matched_outside_of_the_right_picture(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("sigma_px", [4.0, 10.0])
 def test_a_low_pass_sees_over_a_straight_border_from_so_many_sigmas(sigma_px: float) -> None:
-    """More than a hundredth of a Gaussian lies beyond 2.326 standard deviations; cells' middles are half a cell inside."""
+    """More than a hundredth of a Gaussian lies beyond 2.326 standard deviations; cell centres are half a cell inside."""
     row, column = (np.ravel(each) for each in np.indices((120, 120)))
     raster = DisparityRaster(1.0, np.full((120, 120), 30.0), np.zeros((120, 120), dtype=bool), row, column)
-    away, found = np.minimum(column, 119 - column) + 0.5, raster.beside_border(sigma_px)
+    away, found = np.minimum(column, 119 - column) + 0.5, raster.near_border(sigma_px)
     middle = np.abs(row - 59.5) < 20
     np.testing.assert_array_equal(found[middle], away[middle] < 2.326 * sigma_px)
 
@@ -157,18 +159,18 @@ def test_a_raster_too_large_for_shapes_is_told(tmp_path: Path, monkeypatch: pyte
     there, residuals, _ = made(tmp_path, "stereo", (), 1)
     assert any("more than 1,000 cells" in note for note in residuals.notes)
     monkeypatch.undo()
-    assert not any("cells" in note for note in residuals_of(there).notes)
+    assert not any("cells" in note for note in compute_residuals(there).notes)
 
 
 def banded(monkeypatch: pytest.MonkeyPatch, cells: int, rows: int) -> None:
-    """Searches look among so many cells, in bands of at least so many rows."""
+    """Make searches use at most `cells` cells, in bands of at least `rows` rows."""
     monkeypatch.setattr(disparity_raster, "_SEARCHED", cells)
     monkeypatch.setattr(disparity_raster, "_LEAST_ROWS", rows)
 
 
 @pytest.mark.parametrize("shape", [(700, 300), (120, 400), (40, 3000)])
 def test_bands_of_a_large_raster_hold_what_the_whole_does(shape: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Bands far apart, that meet, and that are all of the picture; effects that reach 32 cells at the most."""
+    """The bands are far apart, touch, or cover the whole image; effects reach 32 cells at most."""
     banded(monkeypatch, 20_000, 20)
     random, (row, column) = np.random.default_rng(5), np.indices(shape)
     disparity = 40 + row / 50 + 6.0 * (np.sin(row / 17) * np.cos(column / 23) > 0.3)
@@ -176,19 +178,21 @@ def test_bands_of_a_large_raster_hold_what_the_whole_does(shape: tuple[int, int]
     disparity[hidden] = np.nan
     points = np.flatnonzero(random.random(shape).ravel() < 0.5)
     raster = DisparityRaster(1.0, disparity, hidden, row.ravel()[points], column.ravel()[points])
-    part, rows = raster.searched()
+    part, rows = raster.search_part()
     assert len(np.unique(rows)) == len(rows)
     assert len(rows) < len(points) or shape[0] < 80
     assert len(np.unique(part.row)) == len(np.unique(raster.row[rows]))
     np.testing.assert_array_equal(part.at_points(part.disparity), raster.at_points(raster.disparity)[rows])
-    np.testing.assert_array_equal(part.filled([]), raster.filled([])[rows])
+    np.testing.assert_array_equal(part.in_filled_occlusions([]), raster.in_filled_occlusions([])[rows])
     believed = raster.at_points(raster.disparity)
     for effect in (EdgeFattening(radius_px=6.5), Smoothing(sigma_px=8.0), OcclusionFill(reach_px=30.0)):
-        np.testing.assert_allclose(part.moved([effect], believed[rows]), raster.moved([effect], believed)[rows], atol=1e-9)
+        np.testing.assert_allclose(part.added_by([effect], believed[rows]), raster.added_by([effect], believed)[rows], atol=1e-9)
 
 
 def test_filled_gaps_show_as_copies_of_their_neighbours() -> None:
-    """Runs of equal disparities, to a thousandth of the noise; neighbours in a column, and across a gap, are none."""
+    """Copies are runs of equal disparities in a row, to a thousandth of the noise; neighbours in a column or across a gap are
+    none.
+    """
     random = np.random.default_rng(7)
     cells = random.normal(scale=0.3, size=(40, 60))
     cells[5, 10:14] = cells[5, 9]
@@ -198,7 +202,9 @@ def test_filled_gaps_show_as_copies_of_their_neighbours() -> None:
     known = ~((row == 30) & (column == 41))
     there = DisparityRaster(1.0, np.zeros(cells.shape), np.zeros(cells.shape, dtype=bool), row[known], column[known])
     copies = np.zeros(cells.shape, dtype=bool)
-    copies[row[known], column[known]] = there.copies(cells.ravel()[known] + 1e-4 * random.uniform(size=int(known.sum())), 3e-4)
+    copies[row[known], column[known]] = there.copied_from_neighbour(
+        cells.ravel()[known] + 1e-4 * random.uniform(size=int(known.sum())), 3e-4
+    )
     assert copies[5, 9:14].all()
     assert not copies[20:23, 30].any()
     assert not copies[30, [40, 42]].any()
@@ -206,7 +212,9 @@ def test_filled_gaps_show_as_copies_of_their_neighbours() -> None:
 
 
 def test_outlines_in_few_places_agree_by_signs() -> None:
-    """A block of 60 points and 14 of two, all for it: 15 of 15 signs are 3.9 deviations, the sums, of which one is most, 1.5."""
+    """One block of 60 points and 14 of two all agree: 15 of 15 signs are 3.9 standard deviations; the sums, of which one is
+    largest, are only 1.5.
+    """
     number = np.repeat(np.arange(15), [60, *[2] * 14])
     blocks, gains = WallBlocks(number), np.full(len(number), 2.0)
     assert blocks.total_if_agreed(gains) is None
@@ -219,14 +227,14 @@ def test_outlines_in_few_places_agree_by_signs() -> None:
 def test_shapes_are_found_in_bands_of_a_large_raster(
     tmp_path: Path, kind: str, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As in the whole, and with the points that they touch in all of it."""
+    """The values agree with those of the whole raster, and the touched points are found in all of it."""
     case = made(tmp_path, "stereo", (kind,), seed)
     whole = shapes_of(case)[kind]
     banded(monkeypatch, 8_000, 16)
     there, residuals, _ = case
     raster = DisparityRaster.of(there, residuals.geometry)
     assert raster is not None
-    assert len(raster.searched()[1]) < 0.6 * len(residuals)
+    assert len(raster.search_part()[1]) < 0.6 * len(residuals)
     found = shapes_of(case)[kind]
     (name,) = whole.std
     least = np.hypot(found.std[name], whole.std[name])
@@ -246,13 +254,13 @@ def test_a_wall_without_effects_shows_no_shape(tmp_path: Path, seed: int) -> Non
 
 def test_points_that_are_held_out_have_no_say(tmp_path: Path) -> None:
     there, residuals, _ = made(tmp_path, "stereo", ("smoothing",), 1)
-    assert not find_disparity_edge_effects(there, residuals, registered(residuals)[0], np.ones(len(residuals), dtype=bool))
+    assert not find_disparity_edge_effects(there, residuals, fit_pose_robustly(residuals)[0], np.ones(len(residuals), dtype=bool))
 
 
 @pytest.mark.parametrize("seed", [2, 3])
 def test_a_footprint_is_found_with_divergence_and_mode(tmp_path: Path, seed: int) -> None:
     there, residuals, truth = made(tmp_path, "tls", ("beam_divergence",), seed)
-    rough, _, scale = registered(residuals)
+    rough, _, scale = fit_pose_robustly(residuals)
     (found,) = find_footprint(there, residuals, rough, scale, np.zeros(len(residuals), dtype=bool))
     assert isinstance(found.effect, BeamDivergence)
     # the generator's beam has other sub-rays: 15 %
@@ -262,12 +270,12 @@ def test_a_footprint_is_found_with_divergence_and_mode(tmp_path: Path, seed: int
 
 def test_modes_that_share_their_sub_rays_record_what_each_would_alone(tmp_path: Path) -> None:
     there, residuals, _ = made(tmp_path, "tls", ("beam_divergence",), 2)
-    random, modes, plain = KeyedRandom(0), ("strongest", "mean", "first"), mean_model(there.model)
+    random, modes, plain = KeyedRandom(0), ("strongest", "mean", "first"), systematic_part(there.model)
     beams = {
         mode: plain.model_copy(update={"effects": (*plain.effects, BeamDivergence(divergence_rad=2e-3, mode=mode))})
         for mode in modes
     }
-    together = simulate_modes(there, beams["mean"], modes, residuals.geometry, random)
+    together = simulate_ranges_by_mode(there, beams["mean"], modes, residuals.geometry, random)
     for mode in modes:
         np.testing.assert_array_equal(together[mode], simulate_ranges(there, beams[mode], residuals.geometry, random))
     assert np.nanmax(np.abs(together["first"] - together["mean"])) > 1e-3
@@ -276,20 +284,18 @@ def test_modes_that_share_their_sub_rays_record_what_each_would_alone(tmp_path: 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_thin_beam_shows_no_footprint(tmp_path: Path, seed: int) -> None:
     there, residuals, _ = made(tmp_path, "tls", (), seed)
-    rough, _, scale = registered(residuals)
+    rough, _, scale = fit_pose_robustly(residuals)
     assert not find_footprint(there, residuals, rough, scale, np.zeros(len(residuals), dtype=bool))
 
 
 def test_the_noise_of_angles_is_no_footprint(tmp_path: Path) -> None:
-    """Noise of the beam's direction does not pass for a beam footprint if the model contains it.
-
-    A beam without width scatters by 55 microradians on ledges. At edges it records on average what a beam of four times that
-    divergence does. The case is a quiet one of the second generator, which simulated no footprint.
+    """A beam without a footprint, whose directions scatter by 55 microradians, hits ledges: at edges it records on average what a
+    beam of four times that divergence does (a case of the second generator, which has no footprints).
     """
     build(schedule(78, 40)[26], 78, tmp_path / "case")
-    there, residuals, _ = settled(read_measurement(tmp_path / "case"))
+    there, residuals, _ = align(read_measurement(tmp_path / "case"))
     assert isinstance(there, TlsMeasurement)
-    rough, _, scale = registered(residuals)
+    rough, _, scale = fit_pose_robustly(residuals)
     assert not find_footprint(there, residuals, rough, scale, np.zeros(len(residuals), dtype=bool))
     unaware = there.changed(model=there.model.without_noise())
     (feigned,) = find_footprint(unaware, residuals, rough, scale, np.zeros(len(residuals), dtype=bool))
@@ -300,14 +306,14 @@ def test_the_noise_of_angles_is_no_footprint(tmp_path: Path) -> None:
 @pytest.mark.parametrize("every", [1, 2])
 @pytest.mark.parametrize(("kind", "seed"), [("parallax_noise", 2), ("regularization_noise", 9)])
 def test_white_noise_and_noise_on_a_grid_are_told_apart(tmp_path: Path, kind: str, seed: int, every: int) -> None:
-    """Also where rows lie twice as far apart as columns, as of a map of which every second row is compared."""
+    """Also where rows lie twice as far apart as columns, because every second row of a map is compared."""
     there, residuals, truth = made(tmp_path, "stereo", (kind,), seed)
-    row = residuals.geometry.plane[:, 1]
-    step = spacing(row)
+    row = residuals.geometry.sensor_coordinates[:, 1]
+    step = raster_spacing_px(row)
     assert step is not None
-    part = residuals.part(residuals.smooth & (np.rint((row - row.min()) / step) % every == 0))
-    value = registered(part)[0]
-    spread, _, _ = fit_variance_model(part, Cells.over(part.at), value, KeyedRandom(1))
+    part = residuals.part(residuals.usable & (np.rint((row - row.min()) / step) % every == 0))
+    value = fit_pose_robustly(part)[0]
+    spread, _, _ = fit_variance_model(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
     assert isinstance(there.model, StereoModel)
     (found,) = separate_white_and_grid_noise(spread, part, value, there.model)
     assert found.name == kind
@@ -317,11 +323,13 @@ def test_white_noise_and_noise_on_a_grid_are_told_apart(tmp_path: Path, kind: st
 
 @pytest.mark.parametrize(("kind", "seed", "empirical"), [("parallax_noise", 2, True), ("regularization_noise", 9, False)])
 def test_noise_on_a_grid_goes_before_an_empirical_term(tmp_path: Path, kind: str, seed: int, empirical: bool) -> None:
-    """Of few nodes some are noisier by chance, whatever covariate they are sorted by; white noise keeps its empirical term."""
+    """Some of few nodes are noisier by chance, whichever covariate sorts them, so grid noise replaces an empirical term; white
+    noise keeps it.
+    """
     there, residuals, _ = made(tmp_path, "stereo", (kind,), seed)
-    part = residuals.part(residuals.smooth)
-    value = registered(part)[0]
-    spread, _, _ = fit_variance_model(part, Cells.over(part.at), value, KeyedRandom(1))
+    part = residuals.part(residuals.usable)
+    value = fit_pose_robustly(part)[0]
+    spread, _, _ = fit_variance_model(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
     assert isinstance(there.model, StereoModel)
     described = [replace(each, name="variance by disparity", empirical=True) for each in spread]
     (found,) = separate_white_and_grid_noise(described, part, value, there.model)
@@ -330,11 +338,11 @@ def test_noise_on_a_grid_goes_before_an_empirical_term(tmp_path: Path, kind: str
 
 
 def test_noise_on_a_coarse_grid_is_found_where_no_point_is_noisier_than_it_should_be(tmp_path: Path) -> None:
-    """Nodes 64 px apart, 0.23 px: within a cell of the search all points err alike."""
+    """Nodes are 64 px apart, with 0.23 px: within a cell of the search all points have the same error."""
     there, residuals, truth = made(tmp_path, "stereo", ("regularization_noise",), 8)
-    part = residuals.part(residuals.smooth)
+    part = residuals.part(residuals.usable)
     assert isinstance(there.model, StereoModel)
-    found, _ = find_grid_noise(part, registered(part)[0], there.model, KeyedRandom(1))
+    found, _ = find_grid_noise(part, fit_pose_robustly(part)[0], there.model, KeyedRandom(1))
     assert found is not None
     assert found.parameters["step_px"] == pytest.approx(truth["step_px"], rel=0.5)
     assert found.parameters["sigma_px"] == pytest.approx(truth["sigma_px"], rel=0.2)
@@ -346,14 +354,12 @@ def _few_families(measurement: Measurement, part: Residuals) -> list[Candidate |
 
 
 def test_noise_on_a_coarse_grid_counts_as_no_error_of_the_reference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After grid-correlated noise is named, the systematic effects are selected again with it in the model.
-
-    Noise that is shared over whole cells had passed for an error of the reference of that size. With its name the model then
-    predicted too large a scatter of patches, and the right name was dropped.
+    """Effects are selected again beside the grid noise. Otherwise the noise passes for an equal error of the reference; then,
+    with the noise named, the model predicts too wide a scatter of patches, and the right name is lost.
     """
     there, residuals, _ = made(tmp_path, "stereo", (), 1)
     left = residuals.covariates["image_x"]
-    part = residuals.part(residuals.smooth & (left < np.median(left)))
+    part = residuals.part(residuals.usable & (left < np.median(left)))
     x, y = (part.covariates[name] for name in ("image_x", "image_y"))
     lines = [np.arange(place.min() - 64, place.max() + 128, 64.0) for place in (x, y)]
     nodes = 0.4 * np.random.default_rng(5).standard_normal([len(line) for line in lines])
@@ -363,7 +369,7 @@ def test_noise_on_a_coarse_grid_counts_as_no_error_of_the_reference(tmp_path: Pa
         "candidate_families",
         lambda *known: [each for each in candidate_families(*known) if isinstance(each, Candidate)][:3],
     )
-    named, naming = steps.select_effects(there, part, registered(part)[2], KeyedRandom(1))
+    named, naming = steps.select_effects(there, part, fit_pose_robustly(part)[2], KeyedRandom(1))
     assert [item.name for item in named] == ["stereo.regularization_noise"]
     assert naming.p_value is not None
     assert naming.p_value > 0.01
@@ -373,26 +379,28 @@ def test_noise_on_a_coarse_grid_counts_as_no_error_of_the_reference(tmp_path: Pa
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
 def test_the_reference_error_is_not_taken_for_noise_on_a_grid(tmp_path: Path, seed: int) -> None:
-    """A few millimetres, correlated over metres."""
+    """The reference's error is a few millimetres, correlated over metres."""
     there, residuals, _ = made(tmp_path, "stereo", (), seed)
-    part = residuals.part(residuals.smooth)
+    part = residuals.part(residuals.usable)
     assert isinstance(there.model, StereoModel)
-    assert find_grid_noise(part, registered(part)[0], there.model, KeyedRandom(1))[0] is None
+    assert find_grid_noise(part, fit_pose_robustly(part)[0], there.model, KeyedRandom(1))[0] is None
 
 
 @pytest.mark.parametrize(("off_m", "length_m", "found"), [(0.012, 0.8, False), (0.015, 0.3, True), (0.0, 0.3, False)])
 def test_noise_that_neighbours_share_is_the_reference_s_error_only_where_that_may_be_so(
     tmp_path: Path, off_m: float, length_m: float, found: bool
 ) -> None:
-    """A reference is wrong by centimetres over metres, not over decimetres; an error of it that is let stand is spoken of."""
+    """A reference may be wrong by centimetres over metres, but not over decimetres; if an error is attributed to it, the note
+    says so.
+    """
     there, residuals, _ = made(tmp_path, "stereo", (), 1)
-    part = residuals.part(residuals.smooth)
+    part = residuals.part(residuals.usable)
     random = np.random.default_rng(3)
     k = random.normal(scale=1 / length_m, size=(400, 2))  # spectrum of a Gaussian correlation exp(-h^2 / 2 l^2)
     phase = random.uniform(0, 2 * np.pi, 400)
-    field = np.sqrt(2 / 400) * np.cos(part.at @ k.T + phase).sum(axis=1)
+    field = np.sqrt(2 / 400) * np.cos(part.wall_xy @ k.T + phase).sum(axis=1)
     part = replace(part, value=part.value + off_m * field / part.unit_m)
     assert isinstance(there.model, StereoModel)
-    nodes, words = find_grid_noise(part, registered(part)[0], there.model, KeyedRandom(1))
+    nodes, words = find_grid_noise(part, fit_pose_robustly(part)[0], there.model, KeyedRandom(1))
     assert (nodes is not None) == found
     assert ("attributed to the reference" in words) == (off_m > 0 and not found)

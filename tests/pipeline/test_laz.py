@@ -1,4 +1,4 @@
-"""LAS and LAZ: what is read back is what was written, laspy reads it too, and damaged files are told."""
+"""LAS and LAZ: what is read back is what was written, laspy reads it too, and damaged files are reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Points that a file has rounded: told from a tenth of the model's noise on, refused above it."""
+"""Points that a file has rounded: reported from a tenth of the model's noise on, refused above the noise."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from pipeline.formats.measurements.rounded_points import check_rounded_points
 from pipeline.formats.meshes.ply import read_ply_points, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points.laz import write_laz
-from pipeline.gap.residuals.registration import residuals_of
+from pipeline.gap.residuals.alignment import compute_residuals
 from scene.common.errors import InputError
 
 
 def rounded(folder: Path, steps: list[float]) -> Measurement:
-    """A measurement whose points are rounded to steps along x, y and z of the scanner, m."""
+    """Write a measurement whose points are rounded to steps along the scanner's x, y and z, m."""
     write_scan(folder, 1, step_rad=0.02)
     cloud = read_ply_points(folder / "scan_0.ply")
     write_ply_points(folder / "scan_0.ply", replace(cloud, points=np.rint(cloud.points / steps) * steps))
@@ -45,7 +45,7 @@ def test_a_centimetre_is_told_and_a_millimetre_is_not(tmp_path: Path) -> None:
     (note,) = found.notes
     assert note.startswith("scan_0.ply: the coordinates are rounded, x in steps of 0.01 m")
     assert "2.9 mm along the lines of sight, and the model has a noise of 3 mm" in note
-    assert note in residuals_of(found).notes
+    assert note in compute_residuals(found).notes
     assert rounded(tmp_path, [0.001, 0.001, 0.001]).notes == ()
 
 

@@ -1,0 +1,283 @@
+"""Describe how the sensor saw the points: their directions, their neighbours there, and the solid angle of each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import Delaunay, cKDTree
+
+from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
+from pipeline.gap.residuals.nominal_pair import NominalPair
+from pipeline.gap.residuals.residuals import Residuals, Rows
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
+from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from scene.common.threads import map_in_threads
+from scene.geometry.mesh import FloatArray, area_normals
+
+NEIGHBOURS = 8
+"""Neighbours of a point: the ring around it in a raster."""
+_FARTHEST = 3.0
+"""Point spacings above which two points are no neighbours."""
+_SAMPLE, _NEAR, _ROUNDS = 2000, 48, 6
+"""To scale the axes: points and neighbours of each that are sampled, and most rounds."""
+_AT_ONCE = 100_000
+"""Points processed together (7 MB of values), whatever the number of threads."""
+_AROUND = 24
+"""Neighbours from which the solid angle of a point is computed: two rings."""
+_LARGEST_CELL = 4.0
+"""Largest area of a Delaunay triangle, in median ones."""
+_FROM_AFAR, _STEEPEST = 1000.0, 0.2
+"""A surface without cameras is viewed along its plane's normal from this many times as far; and the smallest cosine of its slope.
+"""
+
+
+@dataclass(frozen=True)
+class SensorView:
+    """How the sensor saw n points.
+
+    Attributes
+    ----------
+    coordinates : (n, 2) direction of each point: azimuth and zenith, rad, or column and row, px. Several scans lie side by side.
+    epoch : (n,) number of the point's epoch.
+    origin : (3,) origin of the rays, or (n, 3) for several scans, wall frame, m.
+    ray : (n, 3) unit directions of the rays, wall frame.
+    reference_m : (n,) range to the reference along the rays, m.
+    disparity : (n,) disparity of the reference minus that at infinity, px; None if ranges were measured.
+    slant : (n,) change of range per metre of residual; only for a surface without cameras, which is viewed from far away.
+    """
+
+    coordinates: FloatArray
+    epoch: NDArray[np.int64]
+    origin: FloatArray
+    ray: FloatArray
+    reference_m: FloatArray
+    disparity: FloatArray | None = None
+    slant: FloatArray | None = None
+
+    @classmethod
+    def of(cls, measurement: Measurement, residuals: Residuals) -> SensorView:
+        """Describe the view of a measurement. A stereo pair views the wall from its left camera.
+
+        Parameters
+        ----------
+        measurement : The measurement.
+        residuals : Residuals of the points to describe.
+
+        Raises
+        ------
+        TypeError
+            If both are of different sensors.
+        """
+        origin, reference, disparity, slant = measurement.viewpoint, None, None, None
+        match measurement, residuals:
+            case StereoMeasurement(), StereoResiduals(geometry=pixels):
+                towards = pixels.point - origin
+                disparity = pixels.disparity - NominalPair.of(measurement).geometry.offset
+            case TlsMeasurement(), TlsResiduals(geometry=rays):
+                origin = _origins(measurement, residuals.index) if measurement.scans else origin
+                towards, reference = measurement.cloud.points[residuals.index] - origin, rays.range_m
+            case SurfaceMeasurement(), SurfaceResiduals(geometry=places):
+                origin = measurement.centre + _FROM_AFAR * (origin - measurement.centre)
+                towards, slant = places.point - origin, -1 / np.maximum(places.normal[:, 2], _STEEPEST)
+            case _:
+                raise TypeError("measurement and residuals are of different sensors")
+        length = np.linalg.norm(towards, axis=1)
+        epoch, plane = measurement.epochs[residuals.index], residuals.geometry.sensor_coordinates
+        if isinstance(measurement, TlsMeasurement) and measurement.scans:
+            plane = _side_by_side(plane, measurement.scan_of[residuals.index])
+        reference = length if reference is None else reference
+        return cls(plane, epoch, origin, towards / length[:, None], reference, disparity, slant)
+
+    def part(self, rows: Rows) -> SensorView:
+        """Return the view of some of the points."""
+        return replace(
+            self,
+            coordinates=self.coordinates[rows],
+            epoch=self.epoch[rows],
+            ray=self.ray[rows],
+            origin=self.origin if self.origin.ndim == 1 else self.origin[rows],
+            reference_m=self.reference_m[rows],
+            disparity=None if self.disparity is None else self.disparity[rows],
+            slant=None if self.slant is None else self.slant[rows],
+        )
+
+    def range_at_residual(self, rows: NDArray[np.int64], residual: FloatArray) -> FloatArray:
+        """Return the range at which a point lies if it has a given residual; for disparities R d / (d + residual).
+
+        Parameters
+        ----------
+        rows : (m,) rows of the points.
+        residual : (m,) residuals, m of range or px of disparity.
+
+        Returns
+        -------
+        (m,) ranges, m.
+        """
+        if self.slant is not None:
+            return np.asarray(self.reference_m[rows] + residual * self.slant[rows])
+        if self.disparity is None:
+            return np.asarray(self.reference_m[rows] + residual)
+        return np.asarray(self.reference_m[rows] * self.disparity[rows] / (self.disparity[rows] + residual))
+
+    def points_at(self, rows: NDArray[np.int64], range_m: FloatArray) -> FloatArray:
+        """Return places on the rays.
+
+        Parameters
+        ----------
+        rows : (m,) rows of the points.
+        range_m : (m,) ranges, m.
+
+        Returns
+        -------
+        (m, 3) places, wall frame, m.
+        """
+        origin = self.origin if self.origin.ndim == 1 else self.origin[rows]
+        return np.asarray(origin + range_m[:, None] * self.ray[rows])
+
+    @cached_property
+    def scaled_coordinates(self) -> FloatArray:
+        """(n, 2) coordinates scaled so that the spacing of neighbouring points is 1 along both axes."""
+        plane = (self.coordinates - self.coordinates.min(axis=0)) / np.maximum(np.ptp(self.coordinates, axis=0), 1e-300)
+        rows = np.flatnonzero(self.epoch == self.epoch.min())
+        apart = _axis_spacings(plane[rows])
+        for _ in range(_ROUNDS):
+            if abs(np.log(apart[0] / apart[1])) < 0.02:
+                break
+            plane = plane / apart
+            apart = _axis_spacings(plane[rows])
+        return np.asarray(plane / apart)
+
+    @cached_property
+    def _trees(self) -> list[tuple[NDArray[np.int64], cKDTree]]:
+        """For each epoch the rows of its points and a search tree of their scaled coordinates."""
+        groups = [np.flatnonzero(self.epoch == number) for number in np.unique(self.epoch)]
+        return [(rows, cKDTree(self.scaled_coordinates[rows])) for rows in groups]
+
+    def neighbour_pairs(self, rows: NDArray[np.int64], count: int = NEIGHBOURS) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Pair points with their nearest neighbours in the same epoch, and with the point at their place in the next epoch.
+
+        Parameters
+        ----------
+        rows : Rows of the points.
+        count : Neighbours of each point.
+
+        Returns
+        -------
+        (k,) and (k,) rows of the first and of the second point of each pair.
+        """
+        pairs = [np.empty((2, 0), dtype=np.int64)]
+        wanted = np.zeros(len(self.coordinates), dtype=bool)
+        wanted[rows] = True
+        for number, (group, tree) in enumerate(self._trees):
+            own = group[wanted[group]]
+            pairs.append(
+                _pairs_from_query(
+                    own, group, *tree.query(self.scaled_coordinates[own], count + 1, distance_upper_bound=_FARTHEST)
+                )
+            )
+            if number + 1 < len(self._trees):
+                following, other = self._trees[number + 1]
+                pairs.append(
+                    _pairs_from_query(own, following, *other.query(self.scaled_coordinates[own], [1], distance_upper_bound=1.0))
+                )
+        first, second = np.concatenate(pairs, axis=1)
+        return first[first != second], second[first != second]
+
+    def neighbour_median(self, z: FloatArray) -> FloatArray:
+        """Return the (n,) median of the values `z` (n,) of each point and its ring of neighbours."""
+        found = np.empty(len(z))
+        for group, near in self._rings:
+            own = z[group]
+            parts = [near[start : start + _AT_ONCE] for start in range(0, len(near), _AT_ONCE)]
+            found[group] = np.concatenate(map_in_threads(partial(_medians_of, own), parts))
+        return found
+
+    @cached_property
+    def _rings(self) -> list[tuple[NDArray[np.int64], NDArray[np.int32]]]:
+        """For each epoch the rows of its points, and for each point itself and its neighbours, numbered among those rows."""
+        counts = [min(NEIGHBOURS + 1, len(group)) for group, _ in self._trees]
+        return [
+            (group, tree.query(self.scaled_coordinates[group], count, workers=-1)[1].astype(np.int32))
+            for (group, tree), count in zip(self._trees, counts, strict=True)
+        ]
+
+    def near(self, rows: NDArray[np.int64], spacings: float) -> NDArray[np.bool_]:
+        """Return (n,) whether each point lies within some point spacings of any of the points `rows`, in any epoch."""
+        distance = cKDTree(self.scaled_coordinates[rows]).query(
+            self.scaled_coordinates, distance_upper_bound=spacings, workers=-1
+        )[0]
+        return np.asarray(np.isfinite(distance))
+
+    def solid_angles(self, rows: NDArray[np.int64]) -> FloatArray:
+        """Compute the solid angle of some points: a third of the Delaunay triangles of which each is a corner.
+
+        The points of one epoch thus share the area between them, including that of lost returns. Triangles across larger gaps
+        count at most four times the median area.
+
+        Parameters
+        ----------
+        rows : (m,) rows of the points.
+
+        Returns
+        -------
+        (m,) solid angles, sr.
+        """
+        total = np.zeros(len(self.coordinates))
+        wanted = np.zeros(len(self.coordinates), dtype=bool)
+        wanted[rows] = True
+        for group, tree in self._trees:
+            own = group[wanted[group]]
+            if not len(own):
+                continue
+            near = np.unique(tree.query(self.scaled_coordinates[own], min(_AROUND, len(group)))[1])
+            chosen = group[near.ravel()]
+            corners = chosen[Delaunay(self.scaled_coordinates[chosen], qhull_options="Qbb QJ").simplices]
+            area = 0.5 * np.linalg.norm(area_normals(self.ray[corners]), axis=1)
+            touching = wanted[corners].any(axis=1)
+            area = np.minimum(area, _LARGEST_CELL * np.median(area[touching]))
+            total += np.bincount(corners.ravel(), np.repeat(area / 3, 3), len(total))
+        return total[rows]
+
+
+def _medians_of(values: FloatArray, rows: NDArray[np.int32]) -> FloatArray:
+    """(m,) medians of the values at some rows (m, k)."""
+    return np.asarray(np.median(values[rows], axis=1))
+
+
+def _origins(measurement: TlsMeasurement, index: NDArray[np.int64]) -> FloatArray:
+    """(n, 3) origins of the rays of points of several scans, m."""
+    return np.stack([scan.pose[0] for scan in measurement.scans])[measurement.scan_of[index]]
+
+
+def _side_by_side(plane: FloatArray, scan: NDArray[np.int64]) -> FloatArray:
+    """(n, 2) coordinates with the scans side by side, so that points of different scans are never neighbours."""
+    found, start = plane.copy(), 0.0
+    for number in np.unique(scan):
+        rows = scan == number
+        width = float(np.ptp(plane[rows, 0]))
+        found[rows, 0] += start - plane[rows, 0].min()
+        found[rows, 1] -= plane[rows, 1].min()
+        start += 1.25 * width + 1e-6
+    return found
+
+
+def _axis_spacings(plane: FloatArray) -> FloatArray:
+    """(2,) median distance to the nearest point along each axis, among neighbours that lie mostly along that axis."""
+    some = plane[:: max(len(plane) // _SAMPLE, 1)]
+    rows = cKDTree(plane).query(some, min(_NEAR, len(plane)))[1]
+    offset = np.abs(plane[rows[:, 1:]] - some[:, None])
+    along = [np.where(offset[..., axis] >= offset[..., 1 - axis], offset[..., axis], np.inf).min(axis=1) for axis in (0, 1)]
+    found = np.median(along, axis=1)
+    return np.where(np.isfinite(found), np.maximum(found, 1e-12), offset.max())
+
+
+def _pairs_from_query(
+    own: NDArray[np.int64], group: NDArray[np.int64], distance: FloatArray, position: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """(2, k) pairs of the points `own` and of those that a tree of `group` found for them."""
+    hit = np.isfinite(distance)
+    return np.stack([np.repeat(own, hit.sum(axis=1)), group[position[hit]]])

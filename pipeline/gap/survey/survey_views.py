@@ -1,0 +1,358 @@
+"""Describe a survey before there are data: where the rays of each station or stereo pair would hit the wall.
+
+The sensor simulation observes the wall without noise, on a subsample of its raster; the number of points of the whole survey
+is kept with it. Further stations, a second face and further pairs are added in the same way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.config.simulation import SensorName, SimulationConfig
+from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
+from pipeline.formats.point_cloud import PointCloud
+from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals, stereo_residuals
+from pipeline.gap.residuals.tls_residuals import TlsResiduals, tls_residuals
+from pipeline.run.site import prepare_site
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from scene.ray_casting.raycast import RayCaster
+from sensors.cameras.camera import Camera, CameraPair
+from sensors.laser.tls import LaserScanner, ScannerConfig
+from sensors.models.sensor_model import StereoModel, TlsModel, TlsNoise
+from sensors.stereo.exchanged import pair_of
+from sensors.stereo.stereo_pair import REDUCTION, Quality, StereoPair
+
+_MOST_PULSES = 30_000
+"""Most pulses or pixels of a view's subsample."""
+_FEWEST_POINTS = 300
+"""Fewest points on smooth parts of the wall."""
+_ALBEDO_SPREAD = 0.3
+"""Standard deviation of ln(albedo) between points, for a wall without albedo."""
+_QUIET_TLS = TlsModel(noise=TlsNoise(range_sigma_m=0.0, range_ppm=0.0, angle_sigma_rad=0.0))
+"""Sensor models without noise or effects."""
+_QUIET_STEREO = StereoModel(noise={"parallax_sigma_px": 0.0, "regularization_sigma_px": 0.0})
+Pose = tuple[FloatArray, FloatArray]
+"""Position (3,), m, and rotation (3, 3) from the scanner to the wall frame."""
+
+
+@dataclass(frozen=True)
+class SurveyView:
+    """What one station or one stereo pair sees of the wall.
+
+    Attributes
+    ----------
+    residuals : Geometry of a subsample of the points; the residual values have no meaning.
+    point_count : Number of points of the full view.
+    station : Number of its pose.
+    measurement : A measurement with its pose or cameras.
+    """
+
+    residuals: Residuals
+    point_count: int
+    station: int
+    measurement: Measurement
+
+    @classmethod
+    def of(cls, found: Residuals, whole: int, number: int, measurement: Measurement) -> Self:
+        """Make a view of the points on smooth parts of the wall.
+
+        Parameters
+        ----------
+        found : Geometry of the subsample.
+        whole : Number of points of the full view.
+        number : Number of the pose.
+        measurement : A measurement with that pose.
+
+        Raises
+        ------
+        InputError
+            If fewer than 300 points of the subsample lie on smooth parts of the wall.
+        """
+        smooth = np.flatnonzero(found.usable)
+        if len(smooth) < _FEWEST_POINTS:
+            raise InputError(
+                f"{len(smooth)} of {len(found)} points lie on smooth parts of the wall, {_FEWEST_POINTS} are needed",
+                where="station" if found.sensor == "tls" else "cameras",
+                remedy="aim at the wall, or scan with a finer step",
+            )
+        return cls(found.part(smooth), int(whole * len(smooth) / len(found)), number, measurement)
+
+    @property
+    def sigma(self) -> FloatArray:
+        """(n,) predicted sigma, reduced so that the subsample has the weight of all points."""
+        return self.residuals.sigma * np.sqrt(len(self.residuals) / max(self.point_count, 1))
+
+
+@dataclass(frozen=True)
+class TlsView(SurveyView):
+    """What one scanner station sees."""
+
+    residuals: TlsResiduals
+    measurement: TlsMeasurement
+
+
+@dataclass(frozen=True)
+class StereoView(SurveyView):
+    """What one stereo pair sees."""
+
+    residuals: StereoResiduals
+    measurement: StereoMeasurement
+
+
+@dataclass(frozen=True)
+class TlsSurvey:
+    """Views of one wall by a laser scanner.
+
+    Attributes
+    ----------
+    views : One for each station.
+    centre : (3,) centre of the wall, m.
+    observe : Function that makes a further view, from a measurement with its pose and a number.
+    """
+
+    views: tuple[TlsView, ...]
+    centre: FloatArray
+    observe: Callable[[TlsMeasurement, int], TlsView]
+    sensor: ClassVar[SensorName] = "tls"
+    place: ClassVar[str] = "station"
+
+    def moved(self, scale: float, turn_rad: float, number: int) -> TlsView:
+        """Move the station of the first view.
+
+        Parameters
+        ----------
+        scale : New distance from the wall's centre, relative to the present one.
+        turn_rad : Rotation about the vertical through the wall's centre, rad.
+        number : Number of the new pose.
+
+        Raises
+        ------
+        InputError
+            If too little of the wall is seen from there.
+        """
+        base = self.views[0].measurement
+        turn = _about_vertical(base, turn_rad)
+        position = self.centre + scale * turn @ (base.station[0] - self.centre)
+        return self.observe(base.changed(station=(position, turn @ base.station[1])), number)
+
+    def repeated(self, number: int) -> tuple[str, TlsView]:
+        """Repeat the first scan in the other face of the instrument.
+
+        Azimuths increase by pi, and zenith angles become 2 pi minus themselves. The pose stays that of the first view,
+        whatever `number`.
+
+        Returns
+        -------
+        A description in words, and the view.
+        """
+        first = self.views[0]
+        g = first.residuals.geometry
+        turned = replace(g, azimuth=g.azimuth + np.pi, zenith=2 * np.pi - g.zenith, by_zenith=-g.by_zenith)
+        return "the scan repeated in the second face", replace(first, residuals=replace(first.residuals, geometry=turned))
+
+
+@dataclass(frozen=True)
+class StereoSurvey:
+    """Views of one wall by stereo pairs.
+
+    Attributes
+    ----------
+    views : One for each pair.
+    centre : (3,) centre of the wall, m.
+    observe : Function that makes a further view, from a measurement with its cameras and a number.
+    """
+
+    views: tuple[StereoView, ...]
+    centre: FloatArray
+    observe: Callable[[StereoMeasurement, int], StereoView]
+    sensor: ClassVar[SensorName] = "stereo"
+    place: ClassVar[str] = "pair of exposures"
+
+    def moved(self, scale: float, turn_rad: float, number: int) -> StereoView:
+        """Move the pair of the first view.
+
+        Parameters
+        ----------
+        scale : New distance from the wall's centre, relative to the present one.
+        turn_rad : Rotation about the vertical through the wall's centre, rad.
+        number : Number of the new pose.
+
+        Raises
+        ------
+        InputError
+            If too little of the wall is seen from there.
+        """
+        base = self.views[0].measurement
+        turn = _about_vertical(base, turn_rad)
+        world, middle = base.frame.rotation.T @ turn @ base.frame.rotation, base.frame.to_world(self.centre[None])[0]
+
+        def place(camera: Camera) -> Camera:
+            position = middle + scale * world @ (camera.position - middle)
+            return replace(camera, position=position, rotation=world @ camera.rotation)
+
+        pair = CameraPair(place(base.cameras.left), place(base.cameras.right))
+        return self.observe(base.changed(cameras=pair), number)
+
+    def repeated(self, number: int) -> tuple[str, StereoView]:
+        """Repeat the first pair with its cameras rolled by 45 degrees in opposite directions.
+
+        Returns
+        -------
+        A description in words, and the view.
+        """
+        base = self.views[0].measurement
+        pair = base.cameras.rotated("left", 2, np.pi / 4).rotated("right", 2, -np.pi / 4)
+        return "the pair repeated with its cameras rolled by 45 degrees in opposite directions", self.observe(
+            base.changed(cameras=pair), number
+        )
+
+
+Survey = TlsSurvey | StereoSurvey
+
+
+def planned_survey(config: SimulationConfig, sensor: SensorName) -> Survey:
+    """Simulate the survey that a config describes.
+
+    Parameters
+    ----------
+    config : The simulation config.
+    sensor : The sensor.
+
+    Raises
+    ------
+    InputError
+        If the sensor sees too little of the wall.
+    """
+    site = prepare_site(config, sensor, KeyedRandom(config.seed))
+    nothing, mesh, frame, centre = PointCloud(np.empty((0, 3))), site.mesh, site.frame, site.mesh.bounds.mean(axis=0)
+    if not isinstance(site.sensor, LaserScanner):
+        model, cameras = config.stereo_model(), pair_of(site.sensor).cameras
+        pair = StereoMeasurement(cloud=nothing, reference=mesh, frame=frame, model=model, cameras=cameras)
+        expose = _pair_observer(config.depth_map)
+        return StereoSurvey((expose(pair, 0),), centre, expose)
+    poses = [(scanner.position, scanner.rotation) for scanner in (site.sensor, *site.further_stations)]
+    base = TlsMeasurement(cloud=nothing, reference=mesh, frame=frame, model=config.tls_model(), station=poses[0])
+    observe = _scan_observer(config.scanner)
+    views = tuple(observe(base.changed(station=pose), number) for number, pose in enumerate(poses))
+    return TlsSurvey(views, centre, observe)
+
+
+def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Survey:
+    """Describe the survey of an existing measurement; only the positions of its points count.
+
+    Parameters
+    ----------
+    measurement : The measurement.
+    most : Most points of each view's subsample.
+
+    Raises
+    ------
+    InputError
+        If the measurement has no cameras or station.
+    """
+    centre = measurement.reference.bounds.mean(axis=0)
+    if isinstance(measurement, StereoMeasurement):
+        seen = stereo_residuals(measurement)
+        pair = StereoView(seen.part(_subsample_rows(seen, most)), int(seen.usable.sum()), 0, measurement)
+        return StereoSurvey((pair,), centre, _pair_observer("medium"))
+    if isinstance(measurement, SurfaceMeasurement):
+        raise InputError(
+            "the measurement has no cameras, so no effect can be analysed", where="--identifiability", remedy="add `cameras`"
+        )
+    measurement = measurement.changed(order=None)
+    set_ups = [(scan.set_up, one) for scan, rows, one in measurement.each_scan() if len(rows)]
+    found, *others = [(number, one, tls_residuals(one)) for number, one in set_ups or [(0, measurement)]]
+    views = tuple(
+        TlsView(each.part(_subsample_rows(each, most)), int(each.usable.sum()), number, one)
+        for number, one, each in (found, *others)
+    )
+    _, measurement, residuals = found
+    view = views[0]
+    step = float(np.sqrt(np.prod(np.ptp(measurement.cloud.points[:, :2], axis=0)) / max(view.point_count, 1)))
+    reach = float(np.median(residuals.geometry.range_m))
+    steps = {"azimuth_step_rad": step / reach, "zenith_step_rad": step / reach}  # coarser than the scan on near parts
+    scanner = ScannerConfig(zenith_limits_rad=(0.05, 3.09)).model_copy(update=steps)
+    return TlsSurvey(views, centre, _scan_observer(scanner))
+
+
+def _subsample_rows(found: Residuals, most: int) -> NDArray[np.int64]:
+    """Rows of a subsample on smooth parts of the wall."""
+    rows = np.flatnonzero(found.usable)
+    return rows[:: max(len(rows) // most, 1)]
+
+
+def _scan_observer(scanner: ScannerConfig) -> Callable[[TlsMeasurement, int], TlsView]:
+    """Return a function that scans the wall from a measurement's pose. The scan covers the whole wall, unless the config has a
+    window.
+    """
+
+    def observe(base: TlsMeasurement, number: int) -> TlsView:
+        world = base.frame.to_world(base.station[0][None])[0], base.frame.rotation.T @ base.station[1]
+        instrument = LaserScanner.aimed(world, base.frame, base.reference.vertices, scanner, _QUIET_TLS)
+        pattern = instrument.pattern
+        stride = max(int(np.sqrt(pattern.lines * pattern.pulses / _MOST_PULSES)), 1)
+        subsampled = replace(
+            pattern,
+            azimuth_step=stride * pattern.azimuth_step,
+            zenith_step=stride * pattern.zenith_step,
+            lines=max(pattern.lines // stride, 1),
+            pulses=max(pattern.pulses // stride, 1),
+        )
+        seen = replace(instrument, pattern=subsampled).observe(base.scene, KeyedRandom(0, ("gap", "planned")))
+        valid = seen.valid.ravel()
+        power = (
+            None
+            if seen.intensity is None
+            else _with_albedo(np.asarray(seen.intensity.ravel()[valid], dtype=np.float64), base.scene)
+        )
+        cloud = PointCloud(seen.points.reshape(-1, 3)[valid], power, np.flatnonzero(valid).astype(float))
+        measurement = base.changed(cloud=cloud)
+        found = tls_residuals(measurement)
+        lines = found.geometry.line
+        geometry = found.geometry if lines is None else replace(found.geometry, line=stride * lines)
+        return TlsView.of(replace(found, geometry=geometry), int(valid.sum()) * stride**2, number, measurement)
+
+    return observe
+
+
+def _with_albedo(power: FloatArray, scene: RayCaster) -> FloatArray:
+    """Powers with a random albedo, if the wall has none of its own."""
+    if scene.mesh.vertex_albedo is not None:
+        return power
+    random = KeyedRandom(0, ("gap", "albedo")).generator()
+    return np.asarray(power * np.exp(_ALBEDO_SPREAD * random.standard_normal(len(power))), dtype=np.float64)
+
+
+def _pair_observer(quality: Quality) -> Callable[[StereoMeasurement, int], StereoView]:
+    """Return a function that observes the wall with a measurement's cameras, at the coarsest depth map."""
+
+    def observe(base: StereoMeasurement, number: int) -> StereoView:
+        pair = StereoPair(base.cameras, base.frame, _QUIET_STEREO, "low")
+        points = pair.observe(base.scene, KeyedRandom(0, ("gap", "planned"))).points
+        step = REDUCTION["low"]
+        stride = max(int(np.sqrt(points.shape[0] * points.shape[1] / _MOST_PULSES)), 1)
+        rows, columns = np.mgrid[0 : points.shape[0] : stride, 0 : points.shape[1] : stride]
+        some = points[rows, columns].reshape(-1, 3)
+        valid = np.isfinite(some).all(axis=1)
+        pixels = {"pixel_x": (columns.ravel() + 0.5) * step, "pixel_y": (rows.ravel() + 0.5) * step}
+        cloud = PointCloud(some[valid], extra={name: values[valid] for name, values in pixels.items()})
+        measurement = base.changed(cloud=cloud, surroundings=None)
+        whole = int(valid.sum() * stride**2 * (step / REDUCTION[quality]) ** 2)
+        return StereoView.of(stereo_residuals(measurement), whole, number, measurement)
+
+    return observe
+
+
+def _about_vertical(measurement: Measurement, angle: float) -> FloatArray:
+    """(3, 3) rotation about the world's vertical, in the wall frame (Rodrigues)."""
+    x, y, z = measurement.frame.rotation[:, 2]
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew)
