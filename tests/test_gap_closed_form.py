@@ -170,8 +170,9 @@ def made(folder: Path, seed: int, stratum: str, sensor: str, kinds: tuple[str, .
 
 
 def test_what_a_pose_leaves_of_an_effect_is_what_the_best_pose_leaves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A principal point is wrong by 10 px. What remains must be within a tenth of what scipy's trust region over the six pose
-    parameters leaves.
+    """A principal point is wrong by 10 px.
+
+    What remains must be within a tenth of what scipy's trust region over the six pose parameters leaves.
 
     Linearised at the calibrated pose, more than three times that remains beside ledges.
     """
@@ -314,8 +315,10 @@ def test_powers_and_slopes_are_part_of_a_ray() -> None:
 
 @pytest.mark.slow
 def test_a_small_run_over_all_strata_and_both_sensors(tmp_path: Path) -> None:
-    """8 cases of a few thousand points. The limits leave room for chance: at the target rates (1 % false alarms, 2 % wrong names)
-    each limit fails in less than 4 % of draws; the seed is fixed.
+    """8 cases of a few thousand points.
+
+    The limits leave room for chance: at the target rates (1 % false alarms, 2 % wrong names) each limit fails in less than 4 % of
+    draws; the seed is fixed.
     """
     found = run(8, 20, 1, tmp_path, small=True)
     rows = found["rows"]

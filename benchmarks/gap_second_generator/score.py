@@ -1,5 +1,6 @@
-"""Score answers against truths and write the table: for each sensor, with binomial 95 % intervals, and every case that is not
-right.
+"""Score answers against truths and write the table for each sensor, with binomial 95 % intervals.
+
+Every case that is not right is listed.
 """
 
 from __future__ import annotations
@@ -106,8 +107,9 @@ def _short(name: str) -> str:
 
 
 def intervals(truth: dict[str, Any], effect: dict[str, Any]) -> list[tuple[str, bool]]:
-    """Return, for each parameter of a named effect that may be checked, the statement and whether the 90 % interval contains the
-    truth.
+    """Return whether the 90 % intervals of a named effect contain the truth.
+
+    There is one statement and one answer for each parameter that may be checked.
     """
     name = _short(effect["name"])
     known = {**laser_effects.CATALOGUE, **stereo_effects.CATALOGUE}.get(name)

@@ -57,8 +57,9 @@ def _turned(answer: dict[str, np.ndarray], axes: tuple[int, ...]) -> dict[str, n
 
 @pytest.mark.parametrize("mirrored", VIEWS)
 def test_a_mirrored_map_has_mirrored_answers_where_its_mirror_images_are_looked_at(mirrored, model, images):
-    """The mean over a group of views is mirrored with the map. The network alone does not have this property, nor have views that
-    lack one mirror image.
+    """The mean over a group of views is mirrored with the map.
+
+    The network alone does not have this property, nor have views that lack one mirror image.
     """
     model.config = weights.with_head(SMALL, mirrored=mirrored)
     answers = {name: np.asarray(values) for name, values in model({"image": images}).items()}

@@ -275,8 +275,9 @@ def test_scores_are_shifted_by_the_size_of_the_box(eager):
 
 
 def test_the_shifts_are_those_with_which_blocks_are_found_best():
-    """Small blocks are right from a score of 0.6 on, large ones from 0.9 on, so no single score separates both. After the shifts,
-    0.95 separates all. Where no detection is wrong, no shift by size is needed.
+    """Small blocks are right from a score of 0.6 on, large ones from 0.9 on, so no single score separates both.
+
+    After the shifts, 0.95 separates all. Where no detection is wrong, no shift by size is needed.
     """
     right = [_square(number, 4, score) for number, score in enumerate((0.6, 0.7, 0.8))]
     right += [_square(number, 32, score) for number, score in enumerate((0.9, 0.97), start=3)]

@@ -190,8 +190,9 @@ def test_maps_in_windows_have_the_statistics_of_the_whole_simulation(sensor: str
 
 @pytest.mark.parametrize("count", [1, 5])
 def test_few_windows_have_no_modes_of_deformation(count: int) -> None:
-    """With fewer windows than twice the plane's terms only the RMS of the windows' medians (here 1, 2, ... mm in turn) is
-    computed.
+    """With fewer windows than twice the plane's terms only the RMS of the windows' medians (here 1, 2, ...
+
+    mm in turn) is computed.
     """
     corner = np.array([[0, 32 * number] for number in range(count)], dtype=np.int32)
     windows = Windows(Grid(0.0, 1.0, 0.02, 200, 50), corner, 24, np.ones((count, 24, 24), dtype=bool))
@@ -241,8 +242,10 @@ def test_a_model_that_cannot_make_the_measurement_is_told() -> None:
 
 
 def test_a_search_that_went_astray_starts_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second parameter is too small to matter at first, so nothing leads back. The final estimate is within five standard
-    deviations, although the first search, without the second parameter, ends more than ten away.
+    """The second parameter is too small to matter at first, so nothing leads back.
+
+    The final estimate is within five standard deviations, although the first search, without the second parameter, ends more than
+    ten away.
     """
     known = Known(np.array([[1.0, 0.1], [1.0, 0.3], [0.6, 1.0], [0.1, 1.0], [0.4, 0.4]]))
     search, truth = known.search(1), np.log([1.0, 0.6])

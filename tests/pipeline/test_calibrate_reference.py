@@ -51,8 +51,9 @@ def wall(rng: np.random.Generator, count: int = 40) -> TriangleMesh:
 
 @pytest.mark.parametrize("shared", [True, False])
 def test_points_lie_as_far_from_the_wall_as_from_one_whose_vertices_are_wrong(shared: bool) -> None:
-    """For noise, distances are compared with ray casting on that wall, to 1 % of the noise. For relief, which neighbours do not
-    share, the variance is the sum of the squared weights, within 3 standard errors.
+    """For noise, distances are compared with ray casting on that wall, to 1 % of the noise.
+
+    For relief, which neighbours do not share, the variance is the sum of the squared weights, within 3 standard errors.
     """
     mesh, rng = wall(np.random.default_rng(1)), np.random.default_rng(2)
     caster, sigma = RayCaster(mesh), 1e-3

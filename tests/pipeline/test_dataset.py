@@ -1,5 +1,6 @@
-"""Data sets: the folder and the libraries that load it, splits that do not overlap, repair, merging, splitting. Whole, small
-sets.
+"""Data sets: the folder and the libraries that load it, splits that do not overlap, repair, merging, splitting.
+
+Whole, small sets.
 """
 
 from __future__ import annotations
@@ -255,8 +256,9 @@ def test_the_loaders_leave_the_simulation_alone() -> None:
 
 
 def test_tf_data(made: Path) -> None:
-    """In a process of its own, because TensorFlow and the ray tracer each bring LLVM. TensorFlow reads tiles in several threads,
-    in which PROJ would crash.
+    """In a process of its own, because TensorFlow and the ray tracer each bring LLVM.
+
+    TensorFlow reads tiles in several threads, in which PROJ would crash.
     """
     pytest.importorskip("tensorflow")
     program = f"""

@@ -63,8 +63,10 @@ def test_many_blocks_tell_the_curve() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_gap_between_the_sizes_is_told_and_no_number_made_up(seed: int) -> None:
-    """Complete separation: all blocks of 5 cm are missed, all of 30 cm detected. The likelihood is 1 for any size between them,
-    to a tenth, because the curve's least width of 0.02 keeps it away from the blocks themselves.
+    """Complete separation: all blocks of 5 cm are missed, all of 30 cm detected.
+
+    The likelihood is 1 for any size between them, to a tenth, because the curve's least width of 0.02 keeps it away from the
+    blocks themselves.
     """
     spread = np.exp(KeyedRandom(seed).generator().normal(0, 0.1, 60))
     size = np.repeat([0.05, 0.3], 30) * spread

@@ -89,8 +89,10 @@ def test_a_jump_in_azimuth_is_unknown(tmp_path: Path) -> None:
 
 
 def test_a_range_error_that_jumps_is_folded_with_its_high_overtones(tmp_path: Path) -> None:
-    """A square wave is first found as the sine of a cyclic error. With overtones up to the fifth, 6.7 % of its variance remain
-    (correlation 0.966), which used to be taken for noise; up to the eleventh, 3.4 % remain (0.983).
+    """A square wave is first found as the sine of a cyclic error.
+
+    With overtones up to the fifth, 6.7 % of its variance remain (correlation 0.966), which used to be taken for noise; up to the
+    eleventh, 3.4 % remain (0.983).
     """
     length = 2.6
 
@@ -166,8 +168,9 @@ def test_a_model_that_is_too_noisy_is_told_so(tmp_path: Path) -> None:
 
 
 def test_noise_by_incidence_is_told_from_noise_of_the_angles(tmp_path: Path) -> None:
-    """Each cell has nine points, quiet ones beside noisy ones. Without weights the noisy points tilt the cell's plane, and the
-    quiet ones seem noisy too.
+    """Each cell has nine points, quiet ones beside noisy ones.
+
+    Without weights the noisy points tilt the cell's plane, and the quiet ones seem noisy too.
     """
     noisy = found_in(
         tmp_path,

@@ -125,8 +125,9 @@ def test_two_effects_that_only_make_up_for_each_other_both_fail(tmp_path: Path) 
 
 
 class _Scripted:
-    """A fake search. The script maps the set of known effects to the scores of the others, by name and form ("" for
-    an effect).
+    """A fake search.
+
+    The script maps the set of known effects to the scores of the others, by name and form ("" for an effect).
     """
 
     def __init__(self, scores: Callable[[set[str]], dict[tuple[str, str], float]]) -> None:
@@ -207,8 +208,9 @@ def test_a_name_says_more_than_mere_places_do(places: float, named: set[str]) ->
 
 @pytest.mark.parametrize(("surface", "named"), [(10.0, {"camera_shift", "radius"}), (35.0, {"radius"})])
 def test_an_effect_beside_a_free_form_says_more_than_a_form_of_two_covariates(surface: float, named: set[str]) -> None:
-    """A bump in the image is no function of the radius alone. Both an effect and a surface explain what such a
-    function leaves.
+    """A bump in the image is no function of the radius alone.
+
+    Both an effect and a surface explain what such a function leaves.
     """
 
     def scores(known: set[str]) -> dict[tuple[str, str], float]:

@@ -124,8 +124,9 @@ def test_slopes_are_the_true_ones_where_all_effects_together_fit_best(
 def test_noise_beside_effects_is_asked_for_with_these_in_the_model(
     turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]],
 ) -> None:
-    """If the effects, hundreds of times the noise, are not in the model, they are found as noise of some pixels. With them in the
-    model no noise is found, and the residuals' NMAD is as predicted; it is known to 2 % from 3,000 values.
+    """If the effects, hundreds of times the noise, are not in the model, they are found as noise of some pixels.
+
+    With them in the model no noise is found, and the residuals' NMAD is as predicted; it is known to 2 % from 3,000 values.
     """
     points, _ = turned_and_zoomed
     asked: list[Residuals] = []

@@ -41,8 +41,9 @@ def test_disparities_of_a_rough_wall_show_none() -> None:
 
 
 def test_a_small_amplitude_is_told_from_noise_by_how_much_of_it_there_may_be() -> None:
-    """Of 0.115 px beside noise of 0.22 px only the first harmonic shows. In twenty draws the mean is within 8 %, and 18 or more
-    intervals of 1.645 standard deviations contain the truth.
+    """Of 0.115 px beside noise of 0.22 px only the first harmonic shows.
+
+    In twenty draws the mean is within 8 %, and 18 or more intervals of 1.645 standard deviations contain the truth.
     """
     found = []
     for seed in range(20):
@@ -58,8 +59,10 @@ def test_a_small_amplitude_is_told_from_noise_by_how_much_of_it_there_may_be() -
 
 
 def test_an_amplitude_that_folds_disparities_over_is_not_taken_for_a_small_one() -> None:
-    """A tenth of the disparities is snapped to whole pixels beside 0.12 px of locking. The first harmonic alone would also fit
-    0.46 px, which no matcher makes. Snapping is no sine, so the amplitude is only known to a sixth.
+    """A tenth of the disparities is snapped to whole pixels beside 0.12 px of locking.
+
+    The first harmonic alone would also fit 0.46 px, which no matcher makes. Snapping is no sine, so the amplitude is only known
+    to a sixth.
     """
     rng = np.random.default_rng(3)
     plain = rng.uniform(0, 80, 60_000)

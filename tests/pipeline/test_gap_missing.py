@@ -82,8 +82,9 @@ def test_a_shrub_before_the_wall_is_none() -> None:
 
 
 def test_lines_that_the_scanner_dropped_are_none() -> None:
-    """There are nine gaps of a few lines and a fifth of their height. One of 20 draws may be taken for a sector's losses; two
-    would have a chance of 2 % if each has 1 %.
+    """There are nine gaps of a few lines and a fifth of their height.
+
+    One of 20 draws may be taken for a sector's losses; two would have a chance of 2 % if each has 1 %.
     """
     _, _, covariates = pulses()
     azimuth, zenith = covariates["azimuth"], covariates["zenith"]

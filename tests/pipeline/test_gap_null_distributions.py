@@ -66,8 +66,10 @@ def of_the_mean(count: int, reference: float, length_m: float, added: float = 0.
 
 @pytest.mark.parametrize(("reference", "length_m"), [(0.0, 1.0), (0.002, 1.0)])
 def test_of_a_mean_of_ranges(monkeypatch: pytest.MonkeyPatch, reference: float, length_m: float) -> None:
-    """Cells of 0.5 m, ranges of 3 mm; the reference's error (m) is correlated over two cells. The second is what is reached: it
-    passes, but 11 of its 40 lie below 0.05."""
+    """Cells of 0.5 m, ranges of 3 mm; the reference's error (m) is correlated over two cells.
+
+    The second is what is reached: it passes, but 11 of its 40 lie below 0.05.
+    """
     monkeypatch.setattr(wall_blocks, "_MOST_CELLS", 100)
     found = of_the_mean(40, reference, length_m)
     assert kstest(found, "uniform").pvalue > 0.001, sorted(found)

@@ -110,8 +110,10 @@ def test_a_sine_stays_a_sine() -> None:
 
 @pytest.mark.parametrize("lines", [3, 4, 5])
 def test_offsets_of_every_few_columns_are_found_with_their_number(lines: int) -> None:
-    """The columns are offset by 0, 1, -0.6, 0.3 and -0.2 times 0.1 px, in turn, as no sine of any period is. Planes fitted to
-    cells of five columns absorb most of the differences: 0.19 of their scatter remain, and 0.04 for cells of three.
+    """The columns are offset by 0, 1, -0.6, 0.3 and -0.2 times 0.1 px, in turn, as no sine of any period is.
+
+    Planes fitted to cells of five columns absorb most of the differences: 0.19 of their scatter remain, and 0.04 for cells of
+    three.
     """
     column = PIXELS[:, 0] / STRIDE
     error = 0.1 * np.array([0.0, 1.0, -0.6, 0.3, -0.2])[(column % lines).astype(int)]
@@ -145,8 +147,9 @@ def test_a_matcher_that_is_off_alike_at_each_half_of_a_pixel_is_found(scale: flo
 
 @pytest.mark.parametrize(("points", "least"), [(12_000, 34), (300, 0)])
 def test_waves_along_the_columns_are_tried_as_far_as_the_raster_shows_them(tmp_path: Path, points: int, least: int) -> None:
-    """A block-wise read-out may repeat tens of times over an image, while a wall's shape may do so twelve times. A raster with
-    fewer than two columns per cycle shows another wave.
+    """A block-wise read-out may repeat tens of times over an image, while a wall's shape may do so twelve times.
+
+    A raster with fewer than two columns per cycle shows another wave.
     """
     make(Case(0, (3, 1), "none", "stereo", (), points, 6_000), tmp_path / "case", tmp_path / "truth.json")
     measurement = read_measurement(tmp_path / "case")

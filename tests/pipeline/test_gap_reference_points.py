@@ -73,8 +73,10 @@ def test_noise_of_points_is_told_from_relief() -> None:
 
 
 def test_chords_across_a_ball_are_bent_back(tmp_path: Path) -> None:
-    """Seen from the centre every range is 5 m. The middle of a chord of length c lies c^2 / 8 r inside (31 micrometres for 3.5
-    cm), and a triangle on average at least two thirds of that.
+    """Seen from the centre every range is 5 m.
+
+    The middle of a chord of length c lies c^2 / 8 r inside (31 micrometres for 3.5 cm), and a triangle on average at least two
+    thirds of that.
     """
     sweeps = 0.0035 * np.arange(180), 1.2 + 0.0035 * np.arange(180)
     azimuth, zenith = (each.ravel() for each in np.meshgrid(*sweeps, indexing="ij"))
@@ -102,8 +104,10 @@ def test_draws_of_the_vertices_errors_have_the_stated_variances(residuals: TlsRe
 
 
 def test_slopes_do_not_share_the_noise_of_the_ranges(tmp_path: Path) -> None:
-    """Level ground 1.7 m below has no slope by azimuth. The slope of a triangle comes from the noise of its corners, as does the
-    range to it: their correlation of 4.6 standard deviations would pass for an error of the azimuth. Fitted planes avoid it.
+    """Level ground 1.7 m below has no slope by azimuth.
+
+    The slope of a triangle comes from the noise of its corners, as does the range to it: their correlation of 4.6 standard
+    deviations would pass for an error of the azimuth. Fitted planes avoid it.
     """
     rng = np.random.default_rng(8)
     azimuth, zenith = (

@@ -96,8 +96,9 @@ def test_where_a_free_form_fails_all_is_named_again_without_any(
 
 
 def test_a_simulation_without_noise_departs_nowhere_from_the_surface(tmp_path: Path) -> None:
-    """Depth maps have cells of two pixels or more, whose centres differ by half a pixel from the measurement's pixels. What the
-    surface does between them must not count as an error of the sensor.
+    """Depth maps have cells of two pixels or more, whose centres differ by half a pixel from the measurement's pixels.
+
+    What the surface does between them must not count as an error of the sensor.
     """
     make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     there, residuals, _ = align(read_measurement(tmp_path / "case"))
@@ -212,8 +213,9 @@ def test_a_low_pass_is_tried_where_the_sensor_stays_unless_one_effect_explains_a
 
 
 def test_an_unknown_without_a_name_says_what_remains_is_most_like() -> None:
-    """The note names the largest form that was tried, except steps at a place, with its size. There is no note if chance explains
-    as much or if an effect was found.
+    """The note names the largest form that was tried, except steps at a place, with its size.
+
+    There is no note if chance explains as much or if an effect was found.
     """
 
     def item(name: str, score: float, form: str) -> Any:

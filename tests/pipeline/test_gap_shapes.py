@@ -354,8 +354,10 @@ def _few_families(measurement: Measurement, part: Residuals) -> list[Candidate |
 
 
 def test_noise_on_a_coarse_grid_counts_as_no_error_of_the_reference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Effects are selected again beside the grid noise. Otherwise the noise passes for an equal error of the reference; then,
-    with the noise named, the model predicts too wide a scatter of patches, and the right name is lost.
+    """Effects are selected again beside the grid noise.
+
+    Otherwise the noise passes for an equal error of the reference; then, with the noise named, the model predicts too wide a
+    scatter of patches, and the right name is lost.
     """
     there, residuals, _ = made(tmp_path, "stereo", (), 1)
     left = residuals.covariates["image_x"]

@@ -144,8 +144,9 @@ def p_values(seeds: int, monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_noise_that_neighbours_share_is_not_said_to_be_too_large_since_cells_take_some_of_it(seed: int) -> None:
-    """Its mean square within cells is below that of white noise (the control). A measurement that is less noisy is reported so:
-    with about 150 nodes the share scatters by 6 %; 20 % are allowed.
+    """Its mean square within cells is below that of white noise (the control).
+
+    A measurement that is less noisy is reported so: with about 150 nodes the share scatters by 6 %; 20 % are allowed.
     """
     pixels = raster(100)
     field = GridCorrelatedNoise((NOISE,), pixels).node_field(len(pixels))

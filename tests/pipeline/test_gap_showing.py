@@ -91,8 +91,9 @@ def test_drops_are_no_harm_to_ranges_on_the_wall(tmp_path: Path) -> None:
 
 
 def test_harm_is_that_of_the_same_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An effect brings points near that were too far off to count: without it all of these score 7 mm, with it 3. That the others
-    score 1 mm alone, and a few validation edges score worse, does not count against it.
+    """An effect brings points near that were too far off to count: without it all of these score 7 mm, with it 3.
+
+    That the others score 1 mm alone, and a few validation edges score worse, does not count against it.
     """
     validation = _validation(tmp_path, _biased(0.003))
     with_it, alone = {True: (0.009, 0.011), False: (0.007, 0.003)}, {True: (0.001, 0.001), False: (0.001, 0.001)}
@@ -109,8 +110,9 @@ def test_harm_is_that_of_the_same_points(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_a_few_points_far_off_do_not_stand_for_the_wall(tmp_path: Path) -> None:
-    """A term moves a strip of 4 % of the wall by 30 cm, where half of the points are: it neither improves nor harms. The gap
-    shows a bias of some millimetres beside it; the strip's own points would make it 23 mm.
+    """A term moves a strip of 4 % of the wall by 30 cm, where half of the points are: it neither improves nor harms.
+
+    The gap shows a bias of some millimetres beside it; the strip's own points would make it 23 mm.
     """
     middle, half = 1.5, 0.02
 

@@ -123,8 +123,9 @@ def test_colmap_reads_the_workspace(pycolmap: Any, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("lens", [None, LENS])
 def test_colmap_gives_a_plane_back(pycolmap: Any, lens: dict[str, float] | None) -> None:
-    """A cell is 0.25 m wide; an error of half a pixel would move the plane by 25 mm. The border, where Poisson ends,
-    is excluded.
+    """A cell is 0.25 m wide; an error of half a pixel would move the plane by 25 mm.
+
+    The border, where Poisson ends, is excluded.
     """
     left, right = maps(lens)
     mesh = colmap_surface(left, right, *labels(left), SurfaceConfig(), FusionConfig())

@@ -185,8 +185,9 @@ def test_smooth_noise_with_heavy_tails_is_not_white() -> None:
 )
 @pytest.mark.parametrize("side", [20, 80, 200])
 def test_the_mean_of_a_square_has_the_variance_that_its_pairs_give(effect: MatchingNoise, side: int) -> None:
-    """side: px; means over the squares of 20 images, at least 2,000 of them. 20 % are allowed: the error for bilinear nodes half
-    a step apart (heavy tails: 8 %) and four times the scatter.
+    """side: px; means over the squares of 20 images, at least 2,000 of them.
+
+    20 % are allowed: the error for bilinear nodes half a step apart (heavy tails: 8 %) and four times the scatter.
     """
     cells = side // REDUCTION
     count = CELLS // cells
