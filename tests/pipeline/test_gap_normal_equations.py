@@ -93,7 +93,8 @@ def test_the_pose_is_that_of_least_squares_however_many_points(design: Design, t
 
 def test_covariances_that_are_kept_are_those_that_were_likely(design: Design) -> None:
     """Of a reference that is wrong by waves of 3.5 cells some forms of correlation are left out; with those that stay the largest
-    likelihood with the pose alone is what it was with all of them."""
+    likelihood with the pose alone is what it was with all of them.
+    """
     random, at = np.random.default_rng(2), design.residuals.wall_xy
     angle, phase = random.uniform(0, 2 * np.pi, (2, 12))
     waves = np.cos(2 * np.pi / (3.5 * design.cells.side_m) * (at @ np.stack([np.cos(angle), np.sin(angle)])) + phase)

@@ -1,5 +1,4 @@
-"""Every stereo effect: its equation against an independent calculation or a slow loop, no effect at zero, the order of the
-stages.
+"""Every stereo effect: its equation against an independent calculation, no effect at zero, and the order of the stages.
 
 The independent calculation shares no code with `sensors/`: Metashape's equations and their inverse by fixed-point iteration,
 Bouguet's rectification with SciPy's rotations, triangulation in NumPy.
