@@ -102,7 +102,7 @@ def as_set(masks: list[np.ndarray]) -> set[bytes]:
 @pytest.mark.parametrize("shape", [(64, 64), (50, 300), (65, 64), (150, 233)])
 @pytest.mark.parametrize("smaller_better", [False, True])
 def test_every_mark_is_found_once_and_whole(shape, smaller_better):
-    """Each mark is found once even if a part of a mark has a better score than the whole mark; places and masks agree to the pixel."""
+    """Each is found once even if a part of it has a better score than the whole; places and masks agree to the pixel."""
     marks = scattered(shape)
     for axis in (0, 1):
         spans = [np.flatnonzero(mark.any(axis=1 - axis))[[0, -1]] for mark in marks]

@@ -47,9 +47,8 @@ HUNDREDTH_MM = 1e-5
 
 def rig() -> CameraPair:
     """A converging pair 28 m apart, 105 m from the wall, with every interior parameter except k4 in use."""
-    front = TriangleMesh(
-        FRAME.to_world(plane(np.array([0, 0, 1.0]), np.zeros(3)).vertices), np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    )
+    corners = FRAME.to_world(plane(np.array([0, 0, 1.0]), np.zeros(3)).vertices)
+    front = TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
     pair = RigConfig(width=1840, height=1228, k1=-0.05, k2=0.03).place(Target(front))
     lens = {"cx_px": 7.0, "cy_px": -4.0, "b1": 0.8, "b2": -0.5, "k3": 0.01, "p1": 2e-4, "p2": -3e-4}
     return CameraPair(replace(pair.left, **lens), replace(pair.right, **lens))
