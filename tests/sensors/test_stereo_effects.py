@@ -1,5 +1,6 @@
-"""Every stereo effect: its equation against an independent calculation or a slow loop, no effect at zero, the order of the
-stages.
+"""Test every stereo effect: its equation against an independent calculation or a slow loop.
+
+Tested are also that it has no effect at zero, and the order of the stages.
 
 The independent calculation shares no code with `sensors/`: Metashape's equations and their inverse by fixed-point iteration,
 Bouguet's rectification with SciPy's rotations, triangulation in NumPy.
@@ -103,8 +104,10 @@ def bouguet(left: Camera, right: Camera) -> tuple[FloatArray, FloatArray, float]
 
 @dataclass(frozen=True)
 class Change:
-    """Real minus nominal camera: interior, rotation vector in its own frame, shift in the world; row jitter (amplitude, period,
-    phase).
+    """Real minus nominal camera.
+
+    It has the interior orientation, a rotation vector in the camera's own frame, a shift in the world, and row jitter (amplitude,
+    period, phase).
     """
 
     interior: dict[str, float]
@@ -130,8 +133,9 @@ NONE = Change({})
 
 
 def recorded(pair: CameraPair, left: Change, right: Change, normal: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
-    """Return the points (n, 3), wall frame, that a matcher with the nominal calibration reports for left pixels of a plane
-    through 0.
+    """Return the points (n, 3), wall frame, that a matcher reports for left pixels of a plane through 0.
+
+    The matcher has the nominal calibration.
     """
     nominal = pair.in_wall_frame(FRAME)
     real_left, real_right = left.apply(nominal.left), right.apply(nominal.right)
