@@ -104,11 +104,7 @@ def bouguet(left: Camera, right: Camera) -> tuple[FloatArray, FloatArray, float]
 
 @dataclass(frozen=True)
 class Change:
-    """Real minus nominal camera.
-
-    It has the interior orientation, a rotation vector in the camera's own frame, a shift in the world, and row jitter (amplitude,
-    period, phase).
-    """
+    """Real minus nominal camera: interior, turn (own frame), shift (world), row jitter (amplitude, period, phase)."""
 
     interior: dict[str, float]
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -133,10 +129,7 @@ NONE = Change({})
 
 
 def recorded(pair: CameraPair, left: Change, right: Change, normal: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
-    """Return the points (n, 3), wall frame, that a matcher reports for left pixels of a plane through 0.
-
-    The matcher has the nominal calibration.
-    """
+    """Return points (n, 3), wall frame, that the nominal cameras report for left pixels of a plane through 0."""
     nominal = pair.in_wall_frame(FRAME)
     real_left, real_right = left.apply(nominal.left), right.apply(nominal.right)
     sight = ray(real_left, u - left.displacement(v), v) @ real_left.rotation.T
