@@ -1,5 +1,4 @@
-"""Define the measurement that `scarpsim gap` analyses (points, reference, instrument, sensor model), and read it from a folder.
-"""
+"""Define the measurement that `scarpsim gap` analyses (points, reference, instrument, sensor model), and read it."""
 
 from __future__ import annotations
 
