@@ -84,8 +84,9 @@ def waves(x: Array, z: Array, length_m: float, rng: np.random.Generator) -> Arra
 
 
 def noise(of: Scan, outliers: float, reference_m: float, rng: np.random.Generator) -> Array:
-    """Return errors (n,), m: white noise, an error of the reference correlated over 3 m, and a share of outliers of up
-    to metres.
+    """Return errors (n,), m, of a measurement without changes.
+
+    They are white noise, an error of the reference that is correlated over 3 m, and a share of outliers of up to metres.
     """
     at = of.plane[:, None] * of.ray
     white = SIGMA * rng.standard_normal(len(at)) + reference_m * waves(at[:, 0], at[:, 2], 3.0, rng)

@@ -1,5 +1,6 @@
-"""Find the commands that README.md and docs/ show, parse them, and resolve their configs like the program, without
-running them.
+"""Find the commands that README.md and docs/ show, parse them, and resolve their configs.
+
+They are treated as by the program, without running them.
 """
 
 from __future__ import annotations
@@ -87,8 +88,9 @@ def resolved(command: str) -> Iterator[dict[str, Any]]:
 
 
 def check_overrides(command: str) -> None:
-    """Assert that each `--set` of a command changes the resolved config: a preset by the scanner's name, a model by
-    its values.
+    """Assert that each `--set` of a command changes the resolved config.
+
+    A preset shows by the scanner's name, a model by its values.
     """
     _, given = parsed(command)
     for config in resolved(command):
@@ -119,8 +121,9 @@ def check_override(config: Mapping[str, Any], override: Override) -> None:
 
 
 def holds(found: Any, given: Any) -> bool:
-    """Return whether resolved values contain the given ones: sections may have more keys, numbers become floats, names become
-    paths.
+    """Return whether resolved values contain the given ones.
+
+    Sections may have more keys, numbers become floats, and names become paths.
     """
     if isinstance(given, Mapping):
         return isinstance(found, Mapping) and all(key in found and holds(found[key], given[key]) for key in given)

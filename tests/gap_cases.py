@@ -39,8 +39,9 @@ class Field:
         return n00 + a * by_x + b * by_z, by_x / STEP, by_z / STEP, inside
 
     def cast(self, origin: Array, ray: Array) -> tuple[Array, Array]:
-        """Return the distance along unit rays (NaN where Newton's method does not converge) and the cosine of the incidence
-        angle.
+        """Return the distance along unit rays and the cosine of the incidence angle.
+
+        The distance is NaN where Newton's method does not converge.
         """
         t = (self.nodes.mean() - origin[1]) / ray[:, 1]
         for _ in range(25):

@@ -8,8 +8,9 @@ from scene.common.backend import dr
 
 
 def kernels(work: Callable[[], object]) -> dict[str, int]:
-    """Run `work` and return the number of operations of each kernel, keyed by its hash: what an empty cache would have to
-    compile.
+    """Run `work` and return the number of operations of each kernel, by its hash.
+
+    This is what an empty cache would have to compile.
     """
     dr.kernel_history_clear()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):

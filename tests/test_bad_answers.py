@@ -1,5 +1,6 @@
-"""Bad inputs that crashed, hung or filled the memory when they were first tried, given directly to a single reader
-or equation.
+"""Test bad inputs that crashed, hung or filled the memory when they were first tried.
+
+They are given directly to a single reader or equation.
 """
 
 from __future__ import annotations

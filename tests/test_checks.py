@@ -1,5 +1,6 @@
-"""The page of checks, compared with what the commands do: each kind of fault is found by each command, and a good file is
-accepted.
+"""Compare the page of checks with what the commands do.
+
+Each kind of fault is found by each command, and a good file is accepted.
 """
 
 from __future__ import annotations

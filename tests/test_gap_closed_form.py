@@ -266,8 +266,9 @@ def test_right_answers_score_well() -> None:
 
 
 def test_the_control_is_shown_beside_what_the_angle_lets_a_wrong_effect_close() -> None:
-    """With S/N 30, of which 20 differ from the nearest other effect, that effect can explain 1 - (20 / 30)^2 of the sum of
-    squares.
+    """The nearest other effect can explain 1 - (20 / 30)^2 of the sum of squares.
+
+    The true effect has S/N 30, of which 20 differ from that other effect.
     """
     near, far = pair("one", "a", "a", ("c",)), pair("one", "a", "a", ("c",))
     far[0]["effects"][0]["snr_sin_angle"] = 29.8

@@ -1,5 +1,6 @@
-"""Varied settings (benchmarks/varied.py): a value that carries alternatives notes the decisions made with it, and what it cannot
-follow.
+"""Test varied settings (benchmarks/varied.py).
+
+A value that carries alternatives notes the decisions made with it, and what it cannot follow.
 """
 
 from __future__ import annotations

@@ -155,10 +155,7 @@ def difference_figure(difference: NDArray[np.floating], grid: Grid, block: IntAr
 
 
 def block_boxes(block: IntArray) -> dict[int, tuple[int, int, int, int]]:
-    """Return left, right, bottom, top of the pixels of each label in (h, w), px from the top-left corner.
-
-    Right and bottom are exclusive.
-    """
+    """Return left, right, bottom, top of each label's pixels in (h, w), px from the top-left corner; ends are exclusive."""
     rows, columns = np.nonzero(block != WALL)
     if not len(rows):
         return {}
@@ -261,10 +258,7 @@ def _count_scale(known: NDArray[np.floating]) -> Normalize:
 
 
 def _scale(known: NDArray[np.floating]) -> Normalize:
-    """Return the colour scale of a map's values (n,), from their 1 to their 99 % quantile.
-
-    It is logarithmic if half of the values are near its lower end.
-    """
+    """Return the colour scale for values (n,): 1 to 99 % quantiles, logarithmic if half are near the lower end."""
     low, middle, high = np.quantile(known, [0.01, 0.5, 0.99]).tolist() if known.size else (0.0, 0.5, 1.0)
     crowded = low > 0 and middle - low < _CROWDED * (high - low)
     return LogNorm(low, high) if crowded else Normalize(low, high)
@@ -397,10 +391,7 @@ def _map_figure(grid: Grid, title: str, *, bar: bool = True, size: float = 1.0) 
 
 
 def label_map_axes(axes: Axes, left: float, bottom: float) -> None:
-    """Label the axes of a map over a wall.
-
-    Coordinates far from zero, m, are given relative to round numbers, which the label states.
-    """
+    """Label the axes of a map over a wall; coordinates far from zero, m, are relative to round numbers."""
     offsets = [_shortened(axis, low) for axis, low in ((axes.xaxis, left), (axes.yaxis, bottom))]
     far = f" (from x {offsets[0]:,.0f}, y {offsets[1]:,.0f})" if any(offsets) else ""
     label_axes(axes, f"x along the wall, m{far}", "y up the wall, m")

@@ -1,5 +1,6 @@
-"""The detector's input and output without a network: normalisation, COCO folders, tiles, merging across tile borders, masks,
-events, the baseline.
+"""Test the detector's input and output without a network.
+
+This covers normalisation, COCO folders, tiles, merging across tile borders, masks, events and the baseline.
 """
 
 from __future__ import annotations

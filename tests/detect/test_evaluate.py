@@ -135,8 +135,9 @@ def _counts_of_pycocotools(truth, found, thresholds, kind):
 
 
 def test_each_category_has_a_table_of_its_own_beside_the_total(truth, found, tmp_path):
-    """All detections have the category vegetation where the truth has rockfall: none is right in any table or in
-    COCO's summary.
+    """Detections of another category than the truth's are right in no table, nor in COCO's summary.
+
+    All detections have the category vegetation where the truth has rockfall.
     """
     truth["categories"].append({"id": 2, "name": "vegetation"})
     truth["annotations"].append({**_item(9, 2, 40, 40, 8, 8), "category_id": 2})

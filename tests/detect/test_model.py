@@ -220,8 +220,9 @@ def test_masks_have_the_size_of_the_config(size):
 
 
 class _SeesADisc(MaskRCNN):
-    """A fake network whose one box is smaller than the disc it sees, like a small block's box that is wrong by a fraction of a
-    pixel.
+    """A fake network whose one box is smaller than the disc it sees.
+
+    A small block's box is wrong like this, by a fraction of a pixel.
     """
 
     centre, radius, box = (40.3, 60.8), 6.0, (35.0, 56.0, 45.0, 66.0)
@@ -308,8 +309,9 @@ def test_boxes_stay_as_found_where_masks_have_a_margin(eager):
 
 @pytest.mark.parametrize(("name", "millions"), [("resnet50", 23.5), ("resnet101", 42.5)])
 def test_the_backbones_are_the_papers(name, millions):
-    """The number of convolution parameters is that of He et al. without the classifier; the first layer has one channel instead
-    of three.
+    """The number of convolution parameters is that of He et al. without the classifier.
+
+    The first layer has one channel instead of three.
     """
     from pipeline.detection.network.backbone import feature_pyramid
 

@@ -26,8 +26,9 @@ def _set(scores: np.ndarray, there: np.ndarray) -> tuple[dict, list[dict]]:
 
 
 def test_shares_by_hand():
-    """Two of three detections between 0.9 and 0.95 are right, none of one below 0.1; scores of 0.99 and 1 are in the
-    last class.
+    """Two of three detections between 0.9 and 0.95 are right, none of one below 0.1.
+
+    Scores of 0.99 and 1 are in the last class.
     """
     truth, found = _set(np.array([0.92, 0.9, 0.94, 0.05, 0.99, 1.0]), np.array([1, 1, 0, 0, 1, 1]))
     every, first = reliability(truth, found, {"all": range(6), "first": [0]})

@@ -102,7 +102,10 @@ def as_set(masks: list[np.ndarray]) -> set[bytes]:
 @pytest.mark.parametrize("shape", [(64, 64), (50, 300), (65, 64), (150, 233)])
 @pytest.mark.parametrize("smaller_better", [False, True])
 def test_every_mark_is_found_once_and_whole(shape, smaller_better):
-    """Each is found once even if a part of it has a better score than the whole; places and masks agree to the pixel."""
+    """Each mark is found once, even if a part of it has a better score than the whole mark.
+
+    Places and masks agree to the pixel.
+    """
     marks = scattered(shape)
     for axis in (0, 1):
         spans = [np.flatnonzero(mark.any(axis=1 - axis))[[0, -1]] for mark in marks]
@@ -216,8 +219,9 @@ def test_every_kind_of_input_is_searched_to_its_last_corner(kind, tmp_path, monk
 
 @pytest.mark.slow
 def test_the_detector_that_comes_along_searches_the_whole_map(tmp_path, eager):
-    """40 niches of 30 px and twenty times the noise, on a grid over 600 x 1400 px (2 x 5 tiles), are so clear that each must be
-    found, with a mask of its own that covers most of it.
+    """The bundled detector finds each of 40 clear niches in a map of 2 x 5 tiles, by a mask that covers most of it.
+
+    The niches have 30 px, are twenty times as deep as the noise, and lie on a grid over 600 x 1400 px.
     """
     shape = (600, 1400)
     y, x = np.mgrid[: shape[0], : shape[1]]

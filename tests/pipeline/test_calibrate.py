@@ -1,5 +1,7 @@
-"""Calibration of the noise: windows, the fast simulation against the whole one, the search against closed forms, recovery of
-known noise.
+"""Test the calibration of the noise.
+
+This covers the windows, the fast simulation against the whole one, the search against closed forms, and the recovery of known
+noise.
 """
 
 from __future__ import annotations

@@ -120,8 +120,9 @@ def test_all_comments_of_init_can_become_keys(name: str, text: str) -> None:
 
 
 def uncommented_alone(lines: list[str]) -> Iterator[str]:
-    """Yield the text with each commented key, of sections that are present, turned into a key, one at a time with
-    its sub-keys.
+    """Yield the text with one commented key at a time turned into a key, with its sub-keys.
+
+    The keys are those of sections that are present.
     """
     for number, line in enumerate(lines):
         indent = len(line) - len(line.lstrip())

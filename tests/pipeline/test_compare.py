@@ -120,8 +120,9 @@ def test_too_many_epochs_are_refused_before_anything_is_done(
 def test_one_epoch_of_small_blocks_and_a_name_with_dollars(
     site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The scanner sees less than half of the blocks of 5 cm, so a figure has no data; $x^$ in a name must not become
-    a formula.
+    """A figure without data is drawn, and $x^$ in a name does not become a formula.
+
+    The scanner sees less than half of the blocks of 5 cm, so one figure has no data.
     """
     named, out = tmp_path / "a $x^$ \\frac.yaml", tmp_path / "out"
     named.write_text(yaml.safe_dump(SMALL | {"sensor": [SMALL["sensor"][1]]}))

@@ -75,8 +75,9 @@ def node_of(entry: laspy.copc.Entry, key: laspy.copc.VoxelKey) -> laspy.copc.Oct
 
 
 def test_a_query_by_resolution_has_a_point_in_each_cell(path: Path) -> None:
-    """On a flat wall of points 4 cm apart, the levels up to k have one point in each cell of spacing / 2^k; all levels have all
-    points.
+    """The levels up to k have one point in each cell of spacing / 2^k; all levels have all points.
+
+    The points lie on a flat wall, 4 cm apart.
     """
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(0, 32, 0.04), np.arange(0, 16, 0.04)))
     wall = path.with_name("wall.copc.laz")

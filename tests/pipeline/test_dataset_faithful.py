@@ -1,5 +1,6 @@
-"""Data sets that repeat the reference's (thesis) choices: what noise levels scale, measurement at vertices, the
-card's samples.
+"""Test data sets that repeat the choices of the reference (thesis).
+
+This covers what noise levels scale, measurement at vertices, and the card's samples.
 """
 
 from __future__ import annotations

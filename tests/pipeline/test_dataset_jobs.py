@@ -69,9 +69,7 @@ def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str], seco
 
 
 def test_a_killed_job_is_finished_by_the_next_with_the_same_checksums(made: Path, tmp_path: Path) -> None:
-    """First kill -9 while an epoch's tiles are written, before its record; then for a job whose workers outlive it for
-    a while.
-    """
+    """Kill a job while it writes an epoch's tiles, before its shard; then one whose workers outlive it for a while."""
     out = tmp_path / "set"
     for moment, workers in (
         (lambda: any((out / ".staging").glob("*/*/*.tif")), 0),

@@ -1,5 +1,6 @@
-"""A data set without a tile is explained with numbers: the wall's size in pixels, the validation region, or pixels
-without data.
+"""Test that a data set without a tile is explained with numbers.
+
+They are the wall's size in pixels, the validation region, or pixels without data.
 """
 
 from __future__ import annotations

@@ -101,8 +101,9 @@ def test_the_stereo_pair_detects_as_many_niches_as_predicted(noise: dict[str, fl
 
 @pytest.mark.parametrize("lines", [2, 3, 4, 10])
 def test_on_a_whole_lattice_it_is_the_noncentral_t_distribution(lines: int) -> None:
-    """A block that is exactly `lines` steps wide has lines^2 = N points in both epochs: Welch's test is Student's with 2 (N
-    - 1).
+    """The detection probability is that of Student's test with 2 (N - 1) degrees of freedom.
+
+    A block that is exactly `lines` steps wide has lines^2 = N points in both epochs, so that Welch's test is Student's.
     """
     side, points = lines * 0.02, lines**2
     white = np.linspace(0.005, 0.2, 40)
@@ -123,8 +124,9 @@ def test_for_many_points_the_change_exceeds_a_known_level_of_detection() -> None
 
 
 def test_the_mean_of_smooth_noise_has_the_variance_of_interpolated_nodes() -> None:
-    """Without white noise the change of a patch's mean is normal with variance 2 c_m^2, found here by brute force over phases and
-    nodes.
+    """Without white noise the change of a patch's mean is normal with variance 2 c_m^2.
+
+    The variance is found here by brute force over phases and nodes.
 
     20,000 draws give a standard deviation to 0.5 %; 2.5 % holds with a false-failure rate below 1e-5.
     """
@@ -158,8 +160,9 @@ def test_a_block_of_the_smallest_size_is_seen_with_the_probability_asked_for() -
 
 
 def test_the_smallest_findable_block_is_that_of_the_closed_form() -> None:
-    """White noise w on a lattice a x b: S/N = r s^2 / (w sqrt(2 a b)), with r = depth over side, and at least one point on the
-    block.
+    """The signal-to-noise ratio is r s^2 / (w sqrt(2 a b)), with r the depth over the side s.
+
+    The white noise is w on a lattice a x b, with at least one point on the block.
     """
     white, a, b = np.array([0.003, 0.01, 0.05]), np.array([0.02, 0.03, 0.1]), np.array([0.02, 0.05, 0.1])
     cases = sampling(white=white, step_a=a, step_b=b, shadow_a=0.0, shadow_b=0.0)
@@ -187,8 +190,9 @@ def test_the_points_on_a_block_are_its_area_times_the_cosine_over_the_squared_sp
 
 
 def test_from_aside_and_below_the_rim_of_an_upright_niche_hides_what_both_tangents_say() -> None:
-    """The block is 20 m above the scanner, 30 m to its side and 40 m away, where lines of equal zenith run obliquely over the
-    wall.
+    """The niche's rim hides a part of its floor that depends on both tangents of the view.
+
+    The block is 20 m above the scanner, 30 m to its side and 40 m away, where lines of equal zenith run obliquely over the wall.
     """
     sensor = scanner(OBLIQUE, range_sigma_m=0.01)
     places = Places(np.array([[6.0, 24.0, 0.0]]), np.array([[0.0, 0.0, 1.0]]), np.array([0.5]))

@@ -81,8 +81,9 @@ def test_a_gap_between_the_sizes_is_told_and_no_number_made_up(seed: int) -> Non
 
 
 def test_separation_without_a_gap_has_its_number_between() -> None:
-    """Sizes are 2 % apart: the estimate lies between the largest missed and the smallest detected block, to a grid step of
-    2.5 %.
+    """The estimate lies between the largest missed and the smallest detected block, 2 % apart.
+
+    The tolerance is a grid step of 2.5 %.
     """
     size = np.geomspace(0.05, 0.8, 141)
     curve = fitted(size, size > 0.2)

@@ -1,5 +1,6 @@
-"""Errors of the recorded angles that the catalogue lacks: they are described as empirical curves of an angle, exactly in the
-model.
+"""Test errors of the recorded angles that the catalogue lacks.
+
+They are described as empirical curves of an angle, exactly in the model.
 """
 
 from __future__ import annotations

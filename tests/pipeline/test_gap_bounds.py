@@ -1,5 +1,6 @@
-"""A best value outside an effect's bounds, which no config may hold, excludes the effect; the diagnosis still ends in
-a verdict.
+"""Test that a best value outside an effect's bounds excludes the effect.
+
+No config may hold such a value; the diagnosis still ends in a verdict.
 """
 
 from __future__ import annotations
@@ -48,8 +49,9 @@ def _named(sensor: str, name: str, values: dict[str, Any]) -> NamedEffect:
 
 
 def test_noise_whose_coefficient_no_config_may_hold_ends_in_a_verdict(tmp_path: Path) -> None:
-    """The intensities are a recorder's counts instead of relative powers, so noise by intensity would need a coefficient of
-    40 m.
+    """The diagnosis ends in a verdict although noise by intensity would need a coefficient of 40 m.
+
+    The intensities are a recorder's counts instead of relative powers.
     """
 
     def ranges(scan: Scan) -> Any:

@@ -44,8 +44,9 @@ def touches(box: Box, change: SceneChange) -> bool:
 
 
 def check(seen: Scan, boxes: list[Box], found: list[SceneChange]) -> None:
-    """Assert that each block with at least five points and five sigmas is exactly one change, and that each change is on one
-    block.
+    """Assert that each clear block is exactly one change, and that each change is on one block.
+
+    A clear block has at least five points and five sigmas.
     """
     owners = np.array([[touches(box, change) for change in found] for box in boxes]).reshape(len(boxes), len(found))
     assert (owners.sum(axis=0) == 1).all()
@@ -88,8 +89,9 @@ def test_a_large_block_stays_whole(step_rad: float) -> None:
 
 @pytest.mark.parametrize("stretch", [1.0, 3.0])
 def test_blocks_some_points_apart_are_not_merged(stretch: float) -> None:
-    """Four points of wall lie between the blocks, on a raster that may be three times as wide in one direction as in
-    the other.
+    """Blocks with four points of wall between them are separate changes.
+
+    The raster may be three times as wide in one direction as in the other.
     """
     step = 2e-3
     spacing = 30 * step
@@ -110,7 +112,9 @@ def test_a_change_in_two_epochs_is_one() -> None:
 
 @pytest.mark.parametrize("outliers", [0.0, 0.02])
 def test_nothing_is_found_on_a_quiet_wall(outliers: float) -> None:
-    """By construction, false changes number at most 0.01 per wall by points and 0.01 by medians: at most a third of other seeds
+    """No change is found on a wall without changes.
+
+    By construction, false changes number at most 0.01 per wall by points and 0.01 by medians: at most a third of other seeds
     fail.
     """
     for seed in range(20):
@@ -127,8 +131,9 @@ def test_nothing_is_found_on_a_wall_whose_reference_is_wrong_by_more_than_the_no
 
 
 def test_nine_small_rockfalls_of_a_whole_scan(tmp_path: Path) -> None:
-    """The rockfalls are pyramids over one node of the wall, with five to eight points of 90 to 200 mm, which the
-    reference lacks.
+    """Nine rockfalls of five to eight points are found in a whole scan.
+
+    They are pyramids over one node of the wall, of 90 to 200 mm, which the reference lacks.
     """
     nodes = [(25, 20), (35, 60), (45, 35), (55, 15), (60, 50), (70, 70), (75, 30), (95, 20), (100, 60)]
     blocks = [(i, j, 0.24 + 0.02 * number) for number, (i, j) in enumerate(nodes)]
@@ -162,8 +167,9 @@ def test_where_much_of_the_wall_moved_nothing_is_said_of_the_sensor(tmp_path: Pa
 
 @pytest.mark.parametrize(("half", "depth", "reference"), [((0.1, 0.4), (0.02, 0.05), 1e-3), ((0.3, 0.9), (0.1, 0.4), 4e-4)])
 def test_volumes_are_known_as_well_as_is_said(half: Any, depth: Any, reference: float) -> None:
-    """The errors of 48 volumes over their stated standard deviations have a root mean square of 0.6 to 1.25 (chance changes it by
-    0.1).
+    """The errors of 48 volumes agree with their stated standard deviations.
+
+    The ratios have a root mean square of 0.6 to 1.25; chance changes it by 0.1.
     """
     off = []
     for seed in range(8):
@@ -178,8 +184,10 @@ def test_volumes_are_known_as_well_as_is_said(half: Any, depth: Any, reference: 
 
 
 def test_a_large_noise_is_no_wall_that_moved(tmp_path: Path) -> None:
-    """The noise is 8 cm where the model has 3 mm, so on half of the wall medians of nine points are off by more than three
-    predicted sigmas and 2 cm.
+    """Noise that is much larger than the model's does not pass for a moved wall.
+
+    The noise is 8 cm where the model has 3 mm, so on half of the wall medians of nine points are off by more than three predicted
+    sigmas and 2 cm.
     """
     write_scan(tmp_path, 9, ranges=lambda scan: scan.R + 0.08 * scan.rng.standard_normal(len(scan.R)), step_rad=0.009)
     found = diagnose(read_measurement(tmp_path))

@@ -1,5 +1,6 @@
-"""Measurements that `gap` cannot use: each is refused in one line that says what is wrong and where, and no files are left
-behind.
+"""Test measurements that `gap` cannot use.
+
+Each is refused in one line that says what is wrong and where, and no files are left behind.
 """
 
 from __future__ import annotations
@@ -177,8 +178,9 @@ def test_a_line_is_bounded_wherever_it_stands(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("sensor", "off_m", "good"), [("tls", 4.0, False), ("stereo", 4.0, True), ("stereo", 8.0, False)])
 def test_a_pair_may_be_off_by_what_a_turned_camera_does(sensor: Sensor, off_m: float, good: bool) -> None:
-    """A camera that is turned by 3.5 mrad (up to 4 in the catalogue) moves points at 100 m, ten base lengths away, by 3.5 m and
-    more.
+    """Points that a rotated camera moves by 3.5 m and more are accepted.
+
+    The camera is rotated by 3.5 mrad (up to 4 in the catalogue), and the points are at 100 m, ten base lengths away.
     """
     x, y = np.meshgrid(np.linspace(-10, 10, 21), np.linspace(-10, 10, 21))
     points = np.stack([x.ravel(), y.ravel(), np.full(x.size, -100.0)], axis=1)

@@ -1,5 +1,7 @@
-"""What must not count as evidence for or against an effect: debris on validation blocks, an error of the reference, what a free
-form leaves unexplained, and what another effect compensates.
+"""Test what must not count as evidence for an effect.
+
+This is debris in validation blocks, an error of the reference, what a non-parametric term misses, and what another effect
+compensates for.
 """
 
 from __future__ import annotations
@@ -79,8 +81,9 @@ def test_an_effect_beside_others_whose_one_value_may_be_none_is_only_mentioned(
 def test_noise_differs_between_neighbours_and_an_error_of_the_reference_does_not(
     tmp_path: Path, length_m: float, count: int
 ) -> None:
-    """An error of 2 mm beside noise of 3 mm is range noise if it is white; if it is correlated over 1.2 m, which is less than a
-    cell of the search, it is not.
+    """An error of 2 mm beside noise of 3 mm is range noise only if it is white.
+
+    If it is correlated over 1.2 m, which is less than a cell of the search, it is an error of the reference.
     """
     write_scan(tmp_path, 3, step_rad=0.005)
     _, residuals, _ = align(read_measurement(tmp_path))
@@ -159,8 +162,10 @@ class _Scripted:
 
 
 class _Cameras(_Scripted):
-    """A fake search in which tangential_distortion of the left camera scores best alone and beside focal_length, and that of the
-    right camera beside camera_shift.
+    """A search whose best explanation depends on which effects are fitted together.
+
+    The tangential distortion of the left camera explains more alone and beside a focal length; that of the right camera explains
+    more beside a camera shift.
     """
 
     _SCORES: ClassVar = {

@@ -77,8 +77,9 @@ def test_the_simulation_takes_the_same_incidence(level: TlsMeasurement) -> None:
 
 
 def test_a_bias_of_the_incidence_is_named_on_half_of_a_scan(tmp_path: Path) -> None:
-    """The bias of 6 mm is in the half that is compared; the waves have 2 cm, and triangle edges are 13 cm long at grazing
-    incidence.
+    """A bias of 6 mm in the half of the scan that is compared is named.
+
+    The waves have 2 cm, and triangle edges are 13 cm long at grazing incidence.
     """
     quiet, biased = (scan(tmp_path / f"{name}.xyz", bias, swell_m=0.02) for name, bias in (("quiet", 0.0), ("biased", 0.006)))
     build(Request([quiet], "half", "riegl_vz400i", position=(0.0, 0.0, 0.0)), tmp_path / "out")

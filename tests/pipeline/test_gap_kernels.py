@@ -20,7 +20,9 @@ from pipeline.gap.naming.workflow import diagnose
 def test_a_diagnosis_compiles_few_small_kernels(
     sensor: str, kind: str, most: int, operations: int, largest: int, tmp_path: Path
 ) -> None:
-    """An earlier version compiled, for about 75,000 points, 76 kernels of 264,000 operations in all, the largest of 11,300 (laser
+    """A diagnosis compiles few kernels with few operations.
+
+    An earlier version compiled, for about 75,000 points, 76 kernels of 264,000 operations in all, the largest of 11,300 (laser
     scan), and 83 of 44,000 (stereo).
     """
     make(Case(0, (1, 1), "one", sensor, (kind,), 5_000, 15_000), tmp_path / "case", tmp_path / "truth.json")

@@ -52,8 +52,9 @@ class _Strong(Target):
 
 @pytest.mark.parametrize("kind", ["camera_phi", "camera_omega"])
 def test_a_large_turn_of_a_camera_is_one_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
-    """A turn of a few milliradians moves the registered pair by metres: linearised, half the angle and further effects would be
-    found.
+    """A camera rotation of some milliradians, which moves the registered pair by metres, is named alone.
+
+    The linearised model gives half of the angle, and adds other effects for the rest.
     """
     monkeypatch.setattr(stereo_cases, "Target", _Strong)
     make(Case(0, (3, 1), "one", "stereo", (kind,), 4_000, 4_000), tmp_path / "case", tmp_path / "truth.json")
@@ -69,8 +70,10 @@ def test_a_large_turn_of_a_camera_is_one_effect(tmp_path: Path, monkeypatch: pyt
 
 
 def test_whose_principal_point_is_off_shows_with_it_in_the_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A principal point wrong by 10 px turns the registered pair by a few milliradians: linearised, it would be attributed to the
-    other camera, with a focal length beside it.
+    """An error of 10 px is attributed to the camera that has it, once the effect is in the model.
+
+    It rotates the registered pair by some milliradians. The linearised model attributes it to the other camera, and adds a focal
+    length for the rest.
     """
     monkeypatch.setattr(stereo_cases, "Target", _Strong)
     make(Case(0, (77, 1), "one", "stereo", ("principal_point_x",), 4_000, 4_000), tmp_path / "case", tmp_path / "truth.json")
@@ -83,8 +86,9 @@ def test_whose_principal_point_is_off_shows_with_it_in_the_model(tmp_path: Path,
 
 @pytest.fixture(scope="module")
 def turned_and_zoomed(tmp_path_factory: pytest.TempPathFactory) -> tuple[SearchInput, dict[str, dict[str, Any]]]:
-    """The search input of a pair with a turned camera (4 mrad) and a wrong focal length (8 px), and the parameters of both
-    effects.
+    """The search input of a pair with two large errors, and the parameters of both.
+
+    One camera is rotated by 4 mrad, and a focal length is wrong by 8 px.
     """
     folder = tmp_path_factory.mktemp("large")
     kinds = ("camera_kappa", "focal_length")
@@ -101,8 +105,9 @@ def turned_and_zoomed(tmp_path_factory: pytest.TempPathFactory) -> tuple[SearchI
 def test_slopes_are_the_true_ones_where_all_effects_together_fit_best(
     turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]],
 ) -> None:
-    """Linearised at the joint fit, least squares finds both values to 15 % (two to three standard errors); linearised at the
-    model, one is wrong by a third.
+    """With the Jacobian at the joint fit, least squares finds both effects to 15 %, two to three standard errors.
+
+    With the Jacobian at the model without effects, it misses a third of one of them.
     """
     points, truth = turned_and_zoomed
 
@@ -144,8 +149,10 @@ def test_noise_beside_effects_is_asked_for_with_these_in_the_model(
 def test_the_class_of_an_effect_taken_exactly_is_by_exact_likelihoods(
     turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With an unlimited margin all exactly fitted effects are in the class; with margin zero, only those that the linearised
-    search put there and that were not fitted exactly.
+    """The equivalence class of a refitted effect contains the refitted effects within the margin.
+
+    With any margin these are all that were refitted. With none, only those remain that the linearised search put there and that
+    were not refitted.
     """
     points, _ = turned_and_zoomed
     first = MeanSearch(with_fitted_variance(points.part, [], 1.0), points.families, KeyedRandom(1))
@@ -162,8 +169,9 @@ def test_the_class_of_an_effect_taken_exactly_is_by_exact_likelihoods(
 def test_slopes_do_not_serve_where_what_they_miss_is_as_much_as_something_gains(
     turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first effect is fitted exactly only if the error of its linearisation is as large as the gain of a weak
-    second effect.
+    """The first effect is fitted exactly only if its linearisation is poor.
+
+    Poor means that its error is as large as the gain of a weak second effect.
     """
     points, _ = turned_and_zoomed
     first = MeanSearch(with_fitted_variance(points.part, [], 1.0), points.families, KeyedRandom(1))
@@ -196,8 +204,9 @@ def test_two_large_effects_are_found_where_all_together_fit_best(
 
 
 def test_what_is_known_before_shrinks_a_coefficient_as_bayes_says() -> None:
-    """With one column, equal for all points of a cell, and white noise, the estimate is (x'x + k)^-1 x'y, with that inverse as
-    variance.
+    """The estimate is (x'x + k)^-1 x'y, with that inverse as variance.
+
+    There is one column, equal for all points of a cell, and white noise; k is the precision of the prior.
     """
     rng = np.random.default_rng(1)
     at = rng.uniform(0, 20, (4000, 2))
@@ -215,8 +224,9 @@ def test_what_is_known_before_shrinks_a_coefficient_as_bayes_says() -> None:
 
 
 def test_what_is_known_of_one_effect_holds_beside_another(tmp_path: Path) -> None:
-    """A column about which the data say almost nothing (prior standard deviation 0.2) overlaps with one that the
-    data determine.
+    """The prior of one effect also acts when another is fitted beside it.
+
+    A column about which the data say almost nothing (prior standard deviation 0.2) overlaps with one that the data determine.
     """
     write_scan(tmp_path, 8, ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1), step_rad=0.012)
     there, residuals, _ = align(read_measurement(tmp_path))

@@ -30,8 +30,9 @@ def test_amplitude_period_and_phase_are_found_through_noise(amplitude: float, pe
 
 
 def test_disparities_of_a_rough_wall_show_none() -> None:
-    """200 walls of ten facets each; the significance level is 1e-4 for each, so one in fifty seeds of this test fails
-    by chance.
+    """No locking is found on 200 walls of ten facets each.
+
+    The significance level is 1e-4 for each, so one in fifty seeds of this test fails by chance.
     """
     rng = np.random.default_rng(4)
     for _ in range(200):
@@ -75,8 +76,9 @@ def test_an_amplitude_that_folds_disparities_over_is_not_taken_for_a_small_one()
 
 @pytest.mark.parametrize(("tilt", "amplitude"), [(0.06, 0.3), (-0.04, 0.08)])
 def test_a_matcher_whose_rectification_is_turned_about_the_base_is_seen_through(tilt: float, amplitude: float) -> None:
-    """The disparities f B / Z' belong to another rectification, Z' = Z cos w + Y sin w, in pixels of its own
-    principal distance.
+    """Locking is found in the pixels of another rectification.
+
+    Its disparities are f B / Z' with Z' = Z cos w + Y sin w, in pixels of its own principal distance.
     """
     rng = np.random.default_rng(5)
     tangent, beyond, infinity = rng.uniform(-0.35, 0.3, 20_000), rng.uniform(400, 700, 20_000), -350.0

@@ -107,8 +107,9 @@ def test_drops_scatter_and_what_stands_before_the_wall_does_not() -> None:
 
 
 def test_the_score_of_losses_closes_the_gap_of_the_true_chance() -> None:
-    """The Brier score of a probability p is p (1 - p) on average, so with the true probability the gap is zero within 3.3
-    standard errors.
+    """With the true probability of losses the gap is zero within 3.3 standard errors.
+
+    The Brier score of a probability p is p (1 - p) on average.
     """
     x, y, covariates = pulses()
     chance = np.where(covariates["zenith"] < 1.2, 0.62, 0.02)

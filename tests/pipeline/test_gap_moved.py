@@ -22,8 +22,9 @@ POSITION = (547449.975, 149565.052, 724.844)
 
 @pytest.fixture(scope="module")
 def epochs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """before.xyz: every second point; after.xyz: the others, with twelve of the largest patches pushed back, most in their
-    middle.
+    """Write two epochs: before.xyz with every second point, after.xyz with the others.
+
+    In the second epoch twelve of the largest patches are pushed back, most in their middle.
     """
     points = np.loadtxt(ROCKS)
     pairs = cKDTree(points[:, :3]).query_pairs(0.6, output_type="ndarray")

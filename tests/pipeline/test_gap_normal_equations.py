@@ -37,8 +37,10 @@ def design(families: list[Candidate | SineGrid]) -> Design:
 
 
 def test_every_explanation_gains_beside_others_what_a_fit_of_both_gains(design: Design, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beside nothing, an effect, a free form and a sine, the likelihoods of all sets by elimination equal those of all columns
-    solved together. Only every fiftieth sine is compared, because fixed sines take another path through the code.
+    """The likelihoods of all sets, computed by elimination, are those of all columns solved together.
+
+    The candidates stand beside nothing, an effect, a non-parametric term and a sine. Of the sines every fiftieth is tested; their
+    products are computed in another way once they are fixed.
     """
 
     def unmoved(_: Design, candidates: list[Candidate]) -> tuple[list[Candidate], MeanFit | None]:
@@ -92,8 +94,9 @@ def test_the_pose_is_that_of_least_squares_however_many_points(design: Design, t
 
 
 def test_covariances_that_are_kept_are_those_that_were_likely(design: Design) -> None:
-    """Of a reference that is wrong by waves of 3.5 cells some forms of correlation are left out; with those that stay the largest
-    likelihood with the pose alone is what it was with all of them.
+    """Leaving out unlikely covariances of the reference's error keeps the largest likelihood.
+
+    The reference is wrong by waves of 3.5 cells. The likelihood is that with the pose alone.
     """
     random, at = np.random.default_rng(2), design.residuals.wall_xy
     angle, phase = random.uniform(0, 2 * np.pi, (2, 12))

@@ -89,8 +89,10 @@ def square(x: FloatArray, period: float) -> FloatArray:
 
 @pytest.mark.parametrize(("period", "least"), [(PERIOD, 0.93), (96.0, 0.96)])
 def test_a_square_wave_is_folded_over_its_period_in_pixels(period: float, least: float) -> None:
-    """A square wave has odd overtones: beyond the fifth 7 % of its variance remain (correlation 0.97 without noise), beyond the
-    eleventh 3 % (0.983); 16 columns per period show none beyond the eighth.
+    """A square wave is described by its odd overtones, as far as the raster shows them.
+
+    Beyond the fifth, 7 % of its variance are left (a correlation of 0.97 without noise), beyond the eleventh 3 % (0.983). With 16
+    columns a period none beyond the eighth is visible.
     """
     found = residuals(square(PIXELS[:, 0], period))
     _, estimate = best(found, [])
@@ -129,8 +131,10 @@ def test_offsets_of_every_few_columns_are_found_with_their_number(lines: int) ->
 
 @pytest.mark.parametrize("scale", [1.0, 0.985])
 def test_a_matcher_that_is_off_alike_at_each_half_of_a_pixel_is_found(scale: float) -> None:
-    """The error has two cycles per pixel, of a rectification that may have another principal distance, on a wall of 40 px of
-    disparity; the amplitude of 0.1 px is known to 0.2 sqrt(2 / 10,000) = 3 %.
+    """An error of two cycles a pixel is found on a wall of 40 px of disparity.
+
+    The matcher's rectification may have another principal distance. The sine's amplitude of 0.1 px has a standard error of 0.2
+    sqrt(2 / 10,000), 3 %.
     """
     x, y = PIXELS.T / (STRIDE * SIDE)
     disparity = 500 + 40 * (x + 0.3 * np.sin(5 * y) + 0.1 * np.sin(9 * x * y))
@@ -164,8 +168,9 @@ def test_waves_along_the_columns_are_tried_as_far_as_the_raster_shows_them(tmp_p
 
 @pytest.mark.parametrize(("lines", "cycles"), [(300, 0.3), (2000, 0.3), (8000, 1.0)])
 def test_periods_are_tried_as_finely_as_the_lines_tell_them_apart(tmp_path: Path, lines: int, cycles: float) -> None:
-    """Neighbouring trial periods differ by less than the resolvable part of a cycle over all lines, so each wobble is
-    near one.
+    """Each wobble is near one of the trial periods.
+
+    Neighbouring trial periods differ by less than the resolvable part of a cycle over all lines.
     """
     write_scan(tmp_path, 3, step_rad=0.01)
     measurement = read_measurement(tmp_path)

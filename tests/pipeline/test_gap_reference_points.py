@@ -58,8 +58,9 @@ def changed(folder: Path, out: Path, model: Path, **keys: object) -> Path:
 
 
 def test_noise_of_points_is_told_from_relief() -> None:
-    """3 mm of noise on part of a sphere of 5 m, with points 2 cm apart, is found to 5 % (10,000 points allow 1 %); on waves of 1
-    m without noise none is found.
+    """Noise of the points is estimated to 5 %, and relief without noise gives none.
+
+    The noise is 3 mm on part of a sphere of 5 m, with points 2 cm apart; 10,000 points allow 1 %. The relief has waves of 1 m.
     """
     rng = np.random.default_rng(2)
     radial = workshop.rays(*rng.uniform([[0.0], [1.3]], [[0.6], [1.9]], (2, 20_000)))

@@ -61,8 +61,9 @@ def few(tmp_path_factory: pytest.TempPathFactory) -> tuple[GapDiagnosis, Measure
     ],
 )
 def test_noises_are_split_by_what_they_depend_on(name: str, alike: str, expected: str) -> None:
-    """The proposed measurement varies what tells two noises apart; a second distance does not tell white from smoothed
-    disparities.
+    """The proposed measurement varies what tells two noises apart.
+
+    A second distance does not tell white from smoothed disparities.
     """
     item = NamedEffect(name, "physical", {"name": name.partition(".")[2]}, {}, (alike,), 0.002, 80.0)
     assert measurement_separating_noises(item, name.partition(".")[0]).startswith(expected)
@@ -99,8 +100,9 @@ def test_every_verdict_has_a_report(
 
 
 def test_what_is_closed_is_said_by_the_thresholds_of_the_diagnosis(few: tuple[GapDiagnosis, Measurement]) -> None:
-    """The thresholds of the diagnosis apply wherever it is written: with a minimum of 1000 standard errors a gap of 500
-    is none.
+    """The thresholds of the diagnosis apply wherever it is written.
+
+    With a minimum of 1000 standard errors a gap of 500 is none.
     """
     found, measurement = few
     gap = Gap(before=0.006, after=0.001, floor=0.001, error=1e-5, floor_error=1e-5, points=100)
@@ -158,8 +160,9 @@ def _keep(path: Path, count: int) -> None:
 
 @pytest.mark.parametrize("sensor", ["tls", "stereo"])
 def test_missing_rock_is_positive_of_both_sensors(few: tuple[GapDiagnosis, Measurement], sensor: str, tmp_path: Path) -> None:
-    """A surface 20 mm behind the reference: the ranges are 20 mm longer, the disparities smaller by 20 mm over the depth of a
-    pixel.
+    """A surface 20 mm behind the reference has positive residuals in both sensors.
+
+    The ranges are 20 mm longer, the disparities smaller by 20 mm over the depth of a pixel.
     """
     found, measurement = few
     unit = 1.0 if sensor == "tls" else 0.25
@@ -238,9 +241,11 @@ def test_a_value_ends_where_its_uncertainty_does(key: str, value: float, std: fl
 
 
 def test_losses_behind_shrubs_are_told_from_losses_by_a_covariate(few: tuple[GapDiagnosis, Measurement]) -> None:
-    """24,000 pulses on 40 m x 20 m, of which one in a hundred is lost, and all of about 60 behind each of six shrubs of 0.8 m: 8
-    standard deviations of as many independent pulses as a bin has. Of 60 draws at most 3 may have a p-value below 0.01; with this
-    seed none has. A loss that is 20 % larger in half of the wall is found in each draw, shrubs included.
+    """Losses behind shrubs do not pass for losses that depend on a covariate.
+
+    There are 24,000 pulses on 40 m x 20 m, one in a hundred lost. Behind each of six shrubs of 0.8 m all of about 60 are lost,
+    which is 8 standard deviations of as many independent pulses as a bin has. Of 60 draws at most 3 may have a p-value below
+    0.01; with this seed none has. A loss of 20 % more in half of the wall shows in each draw, with the shrubs before it.
     """
     random = np.random.default_rng(6)
     few_found, _ = few

@@ -95,8 +95,9 @@ def test_scans_lie_apart_as_the_scanner_sees_them(pair: TlsMeasurement, residual
 
 
 def test_the_second_face_counts_angles_on(tmp_path: Path) -> None:
-    """Azimuths are turned by pi and zenith angles become 2 pi minus theirs: derivatives by the zenith change sign, those by the
-    pose do not.
+    """In the second face derivatives by the zenith change sign, those by the pose do not.
+
+    Azimuths are rotated by pi, and zenith angles become 2 pi minus theirs.
     """
     both = of(tmp_path / "faces", (HERE, 1), (HERE, 2), step_rad=0.02)
     found = compute_residuals(both)
@@ -142,8 +143,9 @@ def test_poses_that_are_not_one_for_each_file_are_refused(keys: dict[str, Any], 
 
 
 def test_raw_scans_from_two_places_are_one_measurement(tmp_path: Path) -> None:
-    """The E57 scans have poses: the folder gets `scanners`, and a message says so; half of one scan is no reference for the
-    other.
+    """Two E57 scans with poses become one measurement with `scanners`, and a message says so.
+
+    Half of one scan is no reference for the other.
     """
     write_scan(tmp_path, 5, scans=[(HERE, 1), (NEAR, 1)], step_rad=0.02)
     files = []

@@ -1,4 +1,6 @@
-"""Where a first answer does not hold: effects that turn rays off the wall, free forms that fail validation, edge effects that are
+"""Test where a first answer of the diagnosis does not hold.
+
+This covers effects that turn rays off the wall, non-parametric terms that fail validation, and edge effects that are
 reconsidered.
 """
 
@@ -132,8 +134,9 @@ def test_outlines_grow_among_the_measurement_s_own_pixels_when_it_is_simulated(t
 
 
 def test_outlines_grow_where_a_turned_camera_sees_them_when_they_are_simulated(tmp_path: Path) -> None:
-    """Where outlines grow, the simulation agrees to half a pixel with what the residuals subtract; seen by the nominal camera
-    only 18 % did.
+    """Where outlines grow, the simulation agrees to half a pixel with what the residuals subtract.
+
+    As seen by the nominal camera only 18 % did.
     """
     make(
         Case(0, (6, 1), "two", "stereo", ("edge_fattening", "camera_omega"), 5000, 5000),
@@ -182,8 +185,9 @@ def test_a_low_pass_that_others_feign_takes_no_outlines_along(monkeypatch: pytes
 def test_a_low_pass_is_tried_where_the_sensor_stays_unless_one_effect_explains_all(
     monkeypatch: pytest.MonkeyPatch, smooth: tuple[int, int], spreads: float, expected: set[str]
 ) -> None:
-    """The search at the initial pose is skipped if a single effect explains the residuals without more spread; the simplest
-    result wins.
+    """The search at the initial pose is skipped if a single effect explains the residuals.
+
+    This must need no larger standard deviation; the simplest result wins.
     """
     asked: dict[str, tuple[tuple[int, int], float]] = {
         "with_edge_effects": ((1, 3), 1.0),
@@ -234,8 +238,9 @@ def test_an_unknown_without_a_name_says_what_remains_is_most_like() -> None:
 
 
 def test_what_shapes_do_is_found_once_for_a_search(tmp_path: Path) -> None:
-    """The search takes the edge effects' change from the whole raster, including points that miss the reference, and passes it on
-    to its trials.
+    """The search computes the change by edge effects once and passes it on to its trials.
+
+    It takes it from the whole raster, including points that miss the reference.
     """
     make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     read = read_measurement(tmp_path / "case")

@@ -1,5 +1,6 @@
-"""Edge effects (smoothing, grown outlines, filled strips, beam footprints) and grid noise, on the closed-form
-generator's cases.
+"""Test edge effects and grid noise on the closed-form generator's cases.
+
+Edge effects are smoothing, grown outlines, filled strips and beam footprints.
 """
 
 from __future__ import annotations
@@ -92,9 +93,11 @@ def test_outlines_that_grow_at_high_steps_alone_are_found(tmp_path: Path, monkey
 
 
 def test_a_low_pass_takes_the_relief_off_what_a_move_changes(tmp_path: Path) -> None:
-    """The derivatives by the pose are compared with moving the cameras and smoothing the reference again, on a wall with ledges
-    and relief. Moves of millimetres and tens of microradians are small enough to be linear. Points beside what no pixel sees are
-    left out, because the smoothing does not know it.
+    """The Jacobian of the pose, of low-passed disparities, predicts what a small move of the cameras changes.
+
+    It is compared with moving the cameras and filtering the reference anew, on a wall with ledges and relief. The move has mm and
+    tens of microradians, where the change is linear. Points beside pixels without a hit are left out, because the low-pass does
+    not know what is there.
     """
     make(Case(0, (5, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     read = read_measurement(tmp_path / "case")
@@ -190,8 +193,9 @@ def test_bands_of_a_large_raster_hold_what_the_whole_does(shape: tuple[int, int]
 
 
 def test_filled_gaps_show_as_copies_of_their_neighbours() -> None:
-    """Copies are runs of equal disparities in a row, to a thousandth of the noise; neighbours in a column or across a gap are
-    none.
+    """Copies are runs of equal disparities in a row, to a thousandth of the noise.
+
+    Equal neighbours in a column or across a gap are none.
     """
     random = np.random.default_rng(7)
     cells = random.normal(scale=0.3, size=(40, 60))
@@ -212,8 +216,10 @@ def test_filled_gaps_show_as_copies_of_their_neighbours() -> None:
 
 
 def test_outlines_in_few_places_agree_by_signs() -> None:
-    """One block of 60 points and 14 of two all agree: 15 of 15 signs are 3.9 standard deviations; the sums, of which one is
-    largest, are only 1.5.
+    """Outlines in few places are found by the signs of their contributions.
+
+    One block of 60 points and 14 of two all agree: 15 of 15 signs are 3.9 standard deviations; the sums, of which one is largest,
+    are only 1.5.
     """
     number = np.repeat(np.arange(15), [60, *[2] * 14])
     blocks, gains = WallBlocks(number), np.full(len(number), 2.0)
@@ -289,8 +295,10 @@ def test_a_thin_beam_shows_no_footprint(tmp_path: Path, seed: int) -> None:
 
 
 def test_the_noise_of_angles_is_no_footprint(tmp_path: Path) -> None:
-    """A beam without a footprint, whose directions scatter by 55 microradians, hits ledges: at edges it records on average what a
-    beam of four times that divergence does (a case of the second generator, which has no footprints).
+    """Noise of the beam's direction does not pass for a beam footprint if the model contains it.
+
+    A beam without width scatters by 55 microradians on ledges. At edges it records on average what a beam of four times that
+    divergence does. The case is a quiet one of the second generator, which simulated no footprint.
     """
     build(schedule(78, 40)[26], 78, tmp_path / "case")
     there, residuals, _ = align(read_measurement(tmp_path / "case"))
@@ -323,8 +331,9 @@ def test_white_noise_and_noise_on_a_grid_are_told_apart(tmp_path: Path, kind: st
 
 @pytest.mark.parametrize(("kind", "seed", "empirical"), [("parallax_noise", 2, True), ("regularization_noise", 9, False)])
 def test_noise_on_a_grid_goes_before_an_empirical_term(tmp_path: Path, kind: str, seed: int, empirical: bool) -> None:
-    """Some of few nodes are noisier by chance, whichever covariate sorts them, so grid noise replaces an empirical term; white
-    noise keeps it.
+    """Grid noise replaces an empirical variance term; white noise keeps it.
+
+    Some of few nodes are noisier by chance, whichever covariate sorts them.
     """
     there, residuals, _ = made(tmp_path, "stereo", (kind,), seed)
     part = residuals.part(residuals.usable)
@@ -392,8 +401,9 @@ def test_the_reference_error_is_not_taken_for_noise_on_a_grid(tmp_path: Path, se
 def test_noise_that_neighbours_share_is_the_reference_s_error_only_where_that_may_be_so(
     tmp_path: Path, off_m: float, length_m: float, found: bool
 ) -> None:
-    """A reference may be wrong by centimetres over metres, but not over decimetres; if an error is attributed to it, the note
-    says so.
+    """A reference may be wrong by centimetres over metres, but not over decimetres.
+
+    If an error is attributed to it, the note says so.
     """
     there, residuals, _ = made(tmp_path, "stereo", (), 1)
     part = residuals.part(residuals.usable)

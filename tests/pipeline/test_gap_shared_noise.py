@@ -70,8 +70,9 @@ def _planes(model: MeanModel, count: int) -> FloatArray:
 
 @pytest.mark.parametrize("step_px", [16.0, 48.0])
 def test_noise_of_two_makers_is_that_of_both_on_one_grid_of_nodes(step_px: float) -> None:
-    """The finer grid also represents the coarser noise, with a root mean square error of 4 % of the variance; one alone has
-    5 %.
+    """The finer grid also represents the coarser noise.
+
+    Its root mean square error is 4 % of the variance; one noise alone has 5 %.
     """
     pixels = raster(32)
     makers = NOISE, RegularizationNoise(sigma_px=0.2, step_px=step_px)

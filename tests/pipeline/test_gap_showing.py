@@ -68,16 +68,19 @@ def test_a_harmful_effect_is_taken_out_and_a_true_one_stays(tmp_path: Path) -> N
 def test_an_effect_that_does_little_harm_is_taken_out_too(
     tmp_path: Path, name: str, key: str, value: float, kind: str, kept: int
 ) -> None:
-    """Half as much noise again, no more than chance would make, is removed whether named or not, and so is a description that
-    clearly does harm; an equally small effect that is there is kept.
+    """An effect that does slight harm is dropped, and so is an empirical term that does clear harm.
+
+    Noise that is half as large again does no more harm than chance would, and is dropped whether it has a name or not. An effect
+    of that size that is real stays.
     """
     result, _ = _validation(tmp_path, _biased(0.003)).validate([replace(_named(name, key, value), kind=kind)])
     assert len(result.named) == kept
 
 
 def test_drops_are_no_harm_to_ranges_on_the_wall(tmp_path: Path) -> None:
-    """A fifth of what rain removes comes back as returns from drops before the wall, which say nothing about ranges on
-    the wall.
+    """Early returns from rain do no harm to the score of ranges on the wall.
+
+    A fifth of what rain removes comes back from drops before the wall, which say nothing about ranges on the wall.
     """
     true = _named("range_incidence_bias", "coefficient_m", 0.01)
     rain = {"name": "precipitation", "rate_per_m": 2e-3, "early_share": 0.2}

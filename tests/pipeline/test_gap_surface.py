@@ -179,8 +179,9 @@ def test_a_plane_tells_no_scale(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.8])
 def test_the_noise_of_a_cloud_is_found(share: float, wall: Path, tmp_path: Path) -> None:
-    """Both its size and the share that neighbours have in common: values on nodes 0.6 m apart, with the given share of the
-    variance.
+    """Both the size of the noise and the share that neighbours have in common are found.
+
+    The common part has values on nodes 0.6 m apart, with the given share of the variance.
     """
     rng = np.random.default_rng(5)
     nodes = rng.standard_normal((60, 60)) * 1.5 * SIGMA * np.sqrt(share)

@@ -88,8 +88,9 @@ def test_such_an_effect_stands_where_it_leaves_no_more_than_chance(
 
 
 def test_an_effect_that_is_not_believed_stays_in_the_class_of_what_looks_like_it() -> None:
-    """A camera turned by 23 times the typical size looks like a tangential distortion: whichever it is, neither is
-    named alone.
+    """A camera rotated by 23 times the typical size looks like a tangential distortion.
+
+    Whichever it is, neither is named alone.
     """
     turn: Any = SimpleNamespace(name="camera_omega", empirical=False)
     chosen = SelectedEffect(turn, ("tangential_distortion",), 0.002, 70.0, 67.0, ())
@@ -107,8 +108,9 @@ def test_an_effect_that_is_not_believed_stays_in_the_class_of_what_looks_like_it
 
 
 def test_what_is_named_in_the_place_of_an_effect_that_is_not_believed_shares_its_class() -> None:
-    """A tilt drift that is only what the implausible vertical index leaves joins its class; an offset that was there anyway does
-    not.
+    """A tilt drift that only explains what an implausible vertical index leaves joins its class.
+
+    An offset that was there anyway does not.
     """
     index: Any = SimpleNamespace(name="vertical_index", empirical=False)
     chosen = SelectedEffect(index, (), 0.002, 70.0, 67.0, ())

@@ -19,8 +19,9 @@ GAP = Path(__file__).parents[2] / "pipeline" / "gap"
 
 
 def _read() -> set[tuple[str, str]]:
-    """Return the thresholds that code reads: thresholds().group.key, or by.key where `by` was set to
-    thresholds().group before.
+    """Return the thresholds that code reads, from its syntax tree.
+
+    They appear as thresholds().group.key, or as by.key where `by` was set to thresholds().group before.
     """
     found: set[tuple[str, str]] = set()
     for path in GAP.rglob("*.py"):

@@ -215,8 +215,9 @@ def test_all_noise_is_lowered_alike(model: TlsModel | StereoModel, expected: dic
 
 @pytest.mark.parametrize(("error", "open_still"), [(0.0001, True), (0.004, False)])
 def test_a_gap_stays_open_only_beyond_its_uncertainty(error: float, open_still: bool) -> None:
-    """Rare edges may decide the score of few validation patches: 8.9 mm before and 10.9 mm after, uncertain by
-    some millimetres.
+    """A gap that grows by less than its uncertainty does not count as open.
+
+    Rare edges may decide the score of few validation patches: 8.9 mm before and 10.9 mm after, uncertain by some millimetres.
     """
     gap = Gap(before=0.0089, after=0.0109, floor=0.0006, error=error, floor_error=0.003, points=100)
     assert Evidence(gap, 0.3).stays_open == open_still
@@ -226,8 +227,9 @@ def test_a_gap_stays_open_only_beyond_its_uncertainty(error: float, open_still: 
 def test_names_with_which_the_gap_grows_while_nothing_says_that_chance_is_left_are_not_the_answer(
     p_value: float | None, open_still: bool, unsaid: bool
 ) -> None:
-    """On real photographs a principal point wrong by 3 px was named as a focal length wrong by 58 px, later as 47 px
-    and noise.
+    """Names with which the gap grows are not the answer if a misfit remains.
+
+    On real photographs a principal point wrong by 3 px was named as a focal length wrong by 58 px, later as 47 px and noise.
     """
     evidence = Evidence(Gap(before=0.0101, after=0.0122, floor=0.0102, error=0.002, floor_error=0.002, points=1000), p_value)
     assert evidence.stays_open is open_still

@@ -36,8 +36,9 @@ def wall() -> TriangleMesh:
 
 
 def test_the_true_pose_is_the_planted_one(wall: TriangleMesh) -> None:
-    """8,000 points with 3 mm of noise determine a shift across the wall to about 0.02 mm, and along it, by its roughness, to 0.1
-    mm.
+    """The true pose is found to the precision that the points allow.
+
+    8,000 points with 3 mm of noise determine a shift across the wall to about 0.02 mm, and along it, by its roughness, to 0.1 mm.
     """
     found = true_pose(EpochSurfaces(1, measured(wall, 1, PLANTED), wall), KeyedRandom(1)).after(PLANTED)
     assert found.translation == pytest.approx(np.zeros(3), abs=5e-4)

@@ -75,8 +75,9 @@ def test_the_scanners_labels_are_the_true_outlines() -> None:
 
 @pytest.mark.parametrize("reconstruction", ["direct", "vertices"])
 def test_labels_go_where_the_sensors_errors_put_the_niches(reconstruction: str) -> None:
-    """Both principal points are wrong by 12 px, which shifts the map by about 14 cm (105 m / 10,250 px each); no ICP corrects it
-    here.
+    """Labels move with the map if both principal points are wrong by 12 px.
+
+    This shifts the map by about 14 cm (105 m / 10,250 px each); no ICP corrects it here.
     """
     model = {**QUIET, "effects": [{"name": "principal_point_x", "camera": "both", "delta_px": 12.0}]}
     _, seen = epoch("stereo", model, 0.8, reconstruction=reconstruction, icp=None, depth_map="high", noisy_reference=True)

@@ -25,7 +25,10 @@ def labelled(*radii: float) -> np.ndarray:
 
 
 def test_in_white_noise_it_is_the_root_of_the_sum_of_squares() -> None:
-    """Rho = sqrt(sum t^2) / sigma; about 300 windows give the spectrum to 3 % at each frequency, and its mean much better."""
+    """In white noise rho = sqrt(sum t^2) / sigma.
+
+    The spectrum of some 300 windows is known to 3 % at each frequency, and its mean to far less.
+    """
     block, random = labelled(3, 12, 40), np.random.default_rng(1)
     change = np.where(block > 0, 0.02 + 0.03 * random.random(SHAPE), 0).astype(np.float32)
     difference = (change + random.normal(0, 0.025, SHAPE)).astype(np.float32)
@@ -35,7 +38,10 @@ def test_in_white_noise_it_is_the_root_of_the_sum_of_squares() -> None:
 
 
 def test_in_noise_with_grain_it_is_that_of_the_covariance_matrix() -> None:
-    """Rho = t' t / sqrt(t' C t) on a square of 16 px, with C of noise that is smoothed along both axes."""
+    """In correlated noise rho = t' t / sqrt(t' C t).
+
+    The square has 16 px, and C is the covariance of noise that is smoothed along both axes.
+    """
     kernel = np.array([1.0, 2.0, 3.0, 2.0, 1.0])
     kernel /= np.sqrt(np.sum(kernel**2))
     covariance = np.convolve(kernel, kernel[::-1])[4:]

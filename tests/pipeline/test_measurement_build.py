@@ -458,8 +458,10 @@ def test_a_real_scan_in_its_own_frame(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not ROCKS.exists(), reason=f"the real scan is not there: {ROCKS}")
 def test_a_real_scan_of_rounded_coordinates(tmp_path: Path) -> None:
-    """The coordinates have steps of 6 cm east and 1.6 cm north, and the scanner's position is unknown: the command asks for it,
-    and then treats the rounding as an error.
+    """A scan with rounded coordinates and an unknown scanner position can be measured.
+
+    The coordinates have steps of 6 cm east and 1.6 cm north. The command asks for the position, and then treats the rounding as
+    an error.
     """
     with pytest.raises(InputError, match="in front of them"):
         build(Request([ROCKS], "half", "riegl_vz400i"), tmp_path / "out")

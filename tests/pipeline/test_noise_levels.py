@@ -116,8 +116,9 @@ def test_maps_are_as_noisy_as_documented(level: str, stage: tuple[SimulationConf
 def test_by_vertices_and_against_a_silent_reference_the_printed_numbers_give_the_theses_noise(
     stage: tuple[SimulationConfig, SensorSite, RayCaster],
 ) -> None:
-    """Measured at vertices against a noiseless reference, matching alone gives 17 mm (docs/validation/noise.md); each map's
-    random orientation adds to it. The seeds are fixed.
+    """The printed noise gives the thesis's map noise, measured at vertices against a noiseless reference.
+
+    Matching alone gives 17 mm (docs/validation/noise.md); each map's random orientation adds to it. The seeds are fixed.
     """
     config, site, caster = stage
     config = config.model_copy(update={"reconstruction": "vertices", "noisy_reference": False})

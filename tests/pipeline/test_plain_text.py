@@ -39,7 +39,10 @@ def test_what_looks_like_a_formula_is_none(title: str, tmp_path: Path) -> None:
 
 
 def test_dollars_are_drawn() -> None:
-    """The text "$ii$" must be wider than "ii" by two characters, measured by the columns with ink."""
+    """Dollar signs are drawn: "$ii$" is wider than "ii" by two characters.
+
+    Width is the number of columns with ink.
+    """
 
     def inked(text: str) -> int:
         figure = Figure(figsize=(3, 1))

@@ -422,8 +422,9 @@ def test_a_ply_file_with_more_points_than_it_states_is_an_error(tmp_path: Path, 
 
 
 def test_a_comment_on_the_place_of_ply_points_is_said(tmp_path: Path) -> None:
-    """PLY has no field for a coordinate system or a shift; what programs write into comments is not applied, and a note
-    says so.
+    """What programs write into PLY comments is not applied, and a note says so.
+
+    PLY has no field for a coordinate system or a shift.
     """
     header = "ply\nformat ascii 1.0\ncomment made by hand\ncomment offset 345200 6389400 0\nelement vertex 2\n"
     axes = "".join(f"property double {axis}\n" for axis in "xyz")
@@ -435,8 +436,9 @@ def test_a_comment_on_the_place_of_ply_points_is_said(tmp_path: Path) -> None:
 
 
 def test_every_door_reads_the_unit_and_leaves_fillers_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`read_measurement` (gap, calibrate, compare --measured), Python's `measure`, and `surface` read one file in US
-    feet alike.
+    """All readers treat a file in US feet alike.
+
+    They are `read_measurement` (gap, calibrate, compare --measured), Python's `measure`, and `surface`.
     """
     case = tmp_path / "case"
     case.mkdir()

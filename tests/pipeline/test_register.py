@@ -1,5 +1,6 @@
-"""ICP against known transforms, a slow reference implementation of one step, closed-form uncertainty, and each parameter's
-effect.
+"""Test ICP against known transforms, a slow reference implementation of one step, and closed forms.
+
+Tested are also the uncertainty and each parameter's effect.
 """
 
 from __future__ import annotations
@@ -48,8 +49,9 @@ def grid(spacing: float) -> tuple[FloatArray, FloatArray]:
 
 
 def sample(count: int, random: KeyedRandom, sigma: float = SIGMA) -> tuple[FloatArray, FloatArray]:
-    """Return points at random places at least a metre inside the reference's edge, with noise along the normals, and
-    the normals.
+    """Return points at random places, with noise along the normals, and the normals.
+
+    The places are at least a metre inside the reference's edge.
     """
     generator = random.generator()
     x, y = generator.uniform(1, WIDTH - 1, count), generator.uniform(1, HEIGHT - 1, count)

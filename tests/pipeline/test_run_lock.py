@@ -72,7 +72,7 @@ def test_what_stands_where_the_lock_should_is_refused_and_stays(make: Callable[[
 
 
 def test_the_lock_goes_with_its_process(tmp_path: Path) -> None:
-    """Kill -9 leaves the lock's file behind, but nobody holds the lock."""
+    """A killed process leaves the lock's file, but nobody holds the lock."""
     program = (
         "import sys, pathlib, os; from pipeline.formats.files.lock import locked\n"
         "with locked(pathlib.Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"

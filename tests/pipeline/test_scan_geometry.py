@@ -150,7 +150,9 @@ def test_points_without_a_pattern_are_named(points: np.ndarray, message: str) ->
 
 
 def test_an_origin_that_is_off_shows_in_the_residuals() -> None:
-    """An error of 0.5 m at 50 m bends the pattern of a nearly flat wall by a tenth of a milliradian; with the right origin only
+    """An error of the origin shows in the residuals of the pattern.
+
+    An error of 0.5 m at 50 m bends the pattern of a nearly flat wall by a tenth of a milliradian; with the right origin only
     rounding remains.
     """
     seen, _ = scan()

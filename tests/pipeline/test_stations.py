@@ -68,9 +68,10 @@ def misfit(found: RigidTransform, true: RigidTransform) -> FloatArray:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_stations_with_wrong_poses_are_registered_to_the_noise_over_the_root_of_the_points(seed: int) -> None:
-    """The tolerance is 40 sigma / sqrt(n), 0.3 mm here: relief (slopes about 0.3) determines shifts along the wall three times
-    less well than across, both stations have noise, neighbouring pairs share reference points, and the wall's worst corner
-    counts.
+    """Two stations with wrong poses are registered to 40 sigma / sqrt(n), 0.3 mm here, anywhere on the wall.
+
+    The relief (slopes of about 0.3) determines shifts along the wall three times less well than across. Both stations are noisy,
+    neighbouring pairs share reference points, and the wall's worst corner counts.
     """
     scanners = [station(LEFT), station(RIGHT, SECOND_POSE)]
     result = joined(scanners, seed)
@@ -100,8 +101,9 @@ def test_without_registration_the_surveyed_poses_stand() -> None:
 
 
 def test_the_merged_surface_covers_what_either_station_sees_and_is_the_better_ones_there() -> None:
-    """The stations each see two thirds of the wall: each pixel that has a height in either one has one, equal to one of them, and
-    close to a station equal to that station's.
+    """The merged surface has a height at each pixel that either station sees, equal to one of theirs.
+
+    Each station sees two thirds of the wall. Beside a station the height is that station's.
     """
     scanners = [station(LEFT), station(RIGHT)]
     random = KeyedRandom(4)

@@ -52,8 +52,9 @@ def test_all_pairs_of_a_raster_with_holes(direction: str) -> None:
 
 
 def test_planted_nugget_sill_and_range_are_found() -> None:
-    """The mean over four fields of 20 x 20 m; the sill of one field scatters by 5 %, its range by 8 %, so the limits are 3.5
-    sigma.
+    """Nugget, sill and range are found in the mean over four fields of 20 x 20 m.
+
+    The sill of one field scatters by 5 %, its range by 8 %, so the limits are 3.5 sigma.
     """
     fits = [fit_variogram(variogram(planted(TWO_PARTS, (200, 200), 0.1, KeyedRandom(seed)), 0.1)) for seed in range(4)]
     assert np.mean([fit.sill_m2 for fit in fits]) == pytest.approx(TWO_PARTS.sill_m2, rel=0.09)

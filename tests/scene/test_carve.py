@@ -201,8 +201,9 @@ def test_blocks_aligned_with_the_wall_edges() -> None:
 
 @pytest.mark.parametrize(("seed", "cell_m", "sigma"), [(4, 0.1, 0.1), (6, 0.05, 0.02)])
 def test_slivers_that_resist_the_simplest_collapse(seed: int, cell_m: float, sigma: float) -> None:
-    """Two walls, of some dozens tried, on which one sliver remained when the repair collapsed shortest sides in one direction
-    only.
+    """No sliver is left on two walls on which a simpler repair left one.
+
+    They are two of some dozens of walls; the simpler repair collapsed shortest sides in one direction only.
     """
     wall = rough_wall(14, 10, cell_m, seed=seed)
     irregular = {"count": 100, "irregularity": {"kind": "gaussian", "mean": 0, "sigma": sigma}}

@@ -33,8 +33,9 @@ def _wall_with_cube(inside_out: bool) -> TriangleMesh:
 
 
 def _distances(rays: FloatArray) -> FloatArray:
-    """Return the distance (n,) to the wall with the cube along unit vectors from EYE, in closed form (slabs of the cube; the
-    plane).
+    """Return the distance (n,) to the wall with the cube along unit vectors from EYE.
+
+    It is a closed form: slabs of the cube, and the plane.
     """
     with np.errstate(divide="ignore"):
         low, high = ((np.array(bound) - EYE) / rays for bound in ([-1, -1, 0], [1, 1, 2]))

@@ -68,8 +68,9 @@ def test_on_a_tilted_plane_the_range_is_the_axiss_to_second_order(mode: str) -> 
 
 @pytest.mark.parametrize(("count", "worst"), [(19, 0.11), (37, 0.07)])
 def test_a_mixed_pixel_is_the_centroid_of_what_the_edge_leaves_on_either_side(count: int, worst: float) -> None:
-    """A step of 0.3 m, within c tau / 2 = 0.45 m: the split by the error function to the sub-rays' bound, without bias over the
-    edge.
+    """A return at a step of 0.3 m is the centroid of both sides, weighted by the error function.
+
+    The step is within c tau / 2 = 0.45 m. The tolerance is the bound for sub-rays; there is no bias over the edge.
     """
     near, far, divergence = 0.3, 0.0, 2e-3
     seen = edge(step(near, far), divergence, sub_rays=count)
@@ -105,8 +106,9 @@ def axis_at(seen: Observation, z: float) -> tuple[FloatArray, FloatArray]:
 
 
 def centroid(seen: Observation, near: float, far: float, divergence: float) -> FloatArray:
-    """Return the range of the two planes' common return: energies by the error function of the angle from axis to edge,
-    over R^2.
+    """Return the range of the two planes' common return.
+
+    Energies follow the error function of the angle from axis to edge, over R^2.
     """
     (x, near_range), (_, far_range) = axis_at(seen, near), axis_at(seen, far)
     angle = np.arctan2(x, POSITION[2] - near)
@@ -135,8 +137,9 @@ def test_the_mean_of_all_returns_does_not_care_how_far_apart_they_are() -> None:
 
 
 def test_no_footprint_bias_on_a_rough_wall() -> None:
-    """The mean over 60,000 pulses equals that of a thin beam within 0.1 mm, five times the standard error of the beam's
-    smoothing.
+    """The mean over 60,000 pulses equals that of a thin beam within 0.1 mm.
+
+    This is five times the standard error of the beam's smoothing.
     """
     wall = heightfield(40.0, 30.0, 0.1, roughness=0.2)
     mesh = wall.with_vertices(wall.vertices - [20.0, 15.0, 0.0])

@@ -35,8 +35,9 @@ def test_a_cell_index_stays_in_its_array(kind: type, count: int) -> None:
 @pytest.mark.parametrize("period", [0.0, 2.5])
 @pytest.mark.parametrize("count", SIZES)
 def test_a_curve_is_held_beyond_its_ends_and_nan_stays_nan(count: int, period: float) -> None:
-    """Compared with the same lookup in NumPy on the host; huge places are left out for a periodic curve, where
-    rounding decides.
+    """The lookup on the device agrees with the same lookup in NumPy on the host.
+
+    Huge places are left out for a periodic curve, where rounding decides.
     """
     axis = Axis(low=-1.0, high=3.0, period=period)
     values = (tuple(np.sin(np.arange(count))),)

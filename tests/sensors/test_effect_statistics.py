@@ -87,8 +87,9 @@ def test_a_scanner_s_ranges_have_the_mean_and_the_variance_that_the_effect_state
 
 
 def _moves(effect: type[Effect]) -> bool:
-    """Return whether the effect has a mean: time walk has none here, because it is relative to the median power, which all pulses
-    have.
+    """Return whether the effect has a mean.
+
+    Time walk has none here, because it is relative to the median power, which all pulses have.
     """
     return "reference_power" not in effect.model_fields
 

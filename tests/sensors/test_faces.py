@@ -75,8 +75,9 @@ def test_the_mean_of_two_faces_has_a_noise_smaller_by_the_root_of_two() -> None:
 
 
 def test_faces_that_look_past_an_edge_on_either_side_are_not_averaged() -> None:
-    """A vertical index does not change the azimuth, but collimation does: at a vertical edge the faces may see near and far
-    surface.
+    """At a vertical edge the two faces may see near and far surface, and are then not averaged.
+
+    A vertical index does not change the azimuth, but collimation does.
     """
     sensor = scanner(effects=[{"name": "collimation", "angle_rad": 4 * ANGLE}], lines=100, pulses=20, step_rad=0.002)
     seen = seen_by(two_faced(sensor), step(1.5, 0.0))

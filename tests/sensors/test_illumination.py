@@ -71,8 +71,9 @@ def test_irradiance_of_an_open_plane_is_lambert_s() -> None:
 
 
 def test_a_step_casts_the_shadow_of_its_height_over_the_tangent_of_the_sun() -> None:
-    """The edge at x = 0 is 2 m high; the sun in the direction (0.6, 0, 0.8) leaves the ground from x = -1.5 m to the edge in
-    shadow.
+    """A step casts a shadow as long as its height over the tangent of the sun's elevation.
+
+    The edge at x = 0 is 2 m high; the sun in the direction (0.6, 0, 0.8) leaves the ground from x = -1.5 m to the edge in shadow.
 
     A wall closes the step: without it the sun would shine in under the upper half plane.
     """

@@ -57,8 +57,9 @@ def test_a_step_within_the_pulses_length_gives_one_merged_centroid() -> None:
 
 @pytest.mark.parametrize("width", [3e-9, 8e-9])
 def test_all_returns_together_are_those_of_the_other_modes(width: float) -> None:
-    """The grid is that of `strongest`; number 1 is `first`; powers add up to those of `mean`, and so do ranges weighted
-    by power.
+    """The grid of `multiple` is that of `strongest`, and its return number 1 is `first`.
+
+    Powers add up to those of `mean`, and so do ranges weighted by power.
     """
     seen, first, strongest, mean = (on_terraces(mode, width=width) for mode in ("multiple", "first", "strongest", "mean"))
     further = further_of(seen)

@@ -1,5 +1,6 @@
-"""The stereo pair measured vertex by vertex: exact without noise, the analytic covariance, and agreement with the
-ray-traced way.
+"""Test the stereo pair measured vertex by vertex.
+
+It is exact without noise, has the analytic covariance, and agrees with the ray-traced way.
 """
 
 from __future__ import annotations

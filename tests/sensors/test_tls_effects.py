@@ -248,8 +248,9 @@ def test_the_detection_limit_cuts_by_the_range_equation() -> None:
 
 
 def test_precipitation_loses_and_shortens_returns_as_its_equations_say() -> None:
-    """Losses and early returns agree within their binomial variances, the drops' ranges with their distribution from 1 m to the
-    wall.
+    """Losses and early returns agree within their binomial variances.
+
+    The drops' ranges agree with their distribution from 1 m to the wall.
     """
     rate, share = 0.005, 0.4
     seen, oracle = look([{"name": "precipitation", "rate_per_m": rate, "early_share": share}])

@@ -411,8 +411,9 @@ def test_the_page_answers_to_this_machine_s_names_only(address: str) -> None:
 
 
 def test_the_page_answers_to_those_who_know_the_token_only(address: str) -> None:
-    """Another user of the machine who finds the port is refused; the address that the command prints sets a cookie and shows no
-    token.
+    """Another user of the machine who finds the port is refused.
+
+    The address that the command prints sets a cookie and shows no token.
     """
     name = cookie_name(address)
     for place in ("/", "/_dash-layout", "/_dash-update-component", "/?token=", "/?token=another", "/assets/page.css"):

@@ -1,7 +1,4 @@
-"""Define the measurement that `scarpsim gap` analyses, and read it from a folder.
-
-A measurement holds points, reference surface, instrument and sensor model.
-"""
+"""Define the measurement that `scarpsim gap` analyses (points, reference, instrument, sensor model), and read it."""
 
 from __future__ import annotations
 
@@ -71,11 +68,7 @@ class _ModelFile(Config):
 
 @dataclass(frozen=True, kw_only=True)
 class MeasurementBase(ABC):
-    """A measurement with everything that predicts it; base class of the three kinds.
-
-    cloud: points, wall frame; reference: reference surface, wall frame; frame: the wall frame; stable_areas: where the scene did
-    not change (empty: everywhere); notes: on the files.
-    """
+    """A measurement and all that predicts it, wall frame. stable_areas: where the scene did not change (empty: everywhere)."""
 
     sensor: ClassVar[Sensor]
     cloud: PointCloud
@@ -126,10 +119,7 @@ class MeasurementBase(ABC):
         return self.changed(cloud=self.cloud.part(rows))
 
     def moved(self, pose: FloatArray) -> Self:
-        """Shift (m) and rotate (rad) the sensor and its points by a pose (6,), wall frame.
-
-        A camera pair rotates about its left camera.
-        """
+        """Shift (m) and rotate (rad) sensor and points by a pose (6,), wall frame; cameras about the left one."""
         turn, centre = rotation_matrix(pose[3:]), self.viewpoint
         points = (self.cloud.points - centre) @ turn.T + centre + pose[:3]
         return self.changed(cloud=replace(self.cloud, points=points), **self._moved_sensor(turn, pose[:3]))
@@ -143,11 +133,10 @@ class MeasurementBase(ABC):
 class TlsMeasurement(MeasurementBase):
     """A laser scan, or several epochs of it.
 
-    station, face: pose of the first scan, scanner to wall frame, and its face; scans: each of several scans, whose numbers are
-    the points' channel `scan`; pattern: nominal directions, None if unknown; pulses: (m,) pulses of the pattern that the points
-    are part of, None for all; order: (n,) scan line and (n,) share of the scan's duration of each point, None if unknown (see
-    `with_order`); planes: planes through the reference's vertices to which incidence angles refer, None for triangles;
-    reference_error_m: standard deviation of each vertex along the rays, m.
+    station, face: pose of the first scan (scanner to wall frame) and its face; scans: several scans, whose numbers are the
+    points' channel `scan`; pattern: nominal directions, if known; pulses: (m,) pulses of the pattern that the points are part of
+    (None: all); order: (n,) scan line and (n,) share of the scan's duration, if known (see `with_order`); planes: through the
+    reference's vertices, for incidence angles (None: triangles); reference_error_m: sigma of each vertex along the rays, m.
     """
 
     sensor = "tls"
@@ -312,20 +301,10 @@ def sensor_model(values: Any, where: str) -> TlsModel | StereoModel:
 
 @dataclass(frozen=True)
 class Material:
-    """The parts of a measurement in memory, from which `assembled` makes it.
+    """The parts of a measurement in memory, which `assembled` joins.
 
-    Attributes
-    ----------
-    reference : TriangleMesh
-        Reference surface, world frame, m.
-    points : dict of PointCloud
-        Clouds by file name, one for each epoch, in the frame of the config.
-    model : TlsModel or StereoModel
-        Sensor model.
-    cameras : CameraPair, optional
-        Stereo pair, world frame, if known.
-    notes : tuple of str
-        Notes on the reference surface.
+    reference, cameras: world frame, m (None: unknown); points: clouds by file name, one for each epoch, in the frame of the
+    config; notes: on the reference.
     """
 
     reference: TriangleMesh
@@ -362,19 +341,7 @@ def _mended(config: MeasurementConfig, values: Any) -> tuple[str, ...]:
 def assembled(config: MeasurementConfig, material: Material, reference: str, where: str) -> Measurement:
     """Make a measurement from its parts in memory, ignoring the config's paths.
 
-    Parameters
-    ----------
-    config : MeasurementConfig
-        Content of measurement.yaml.
-    material : Material
-        The parts.
-    reference, where : str
-        Names of the reference's file and of the config, for errors.
-
-    Raises
-    ------
-    InputError
-        If the parts do not fit together.
+    reference, where: names of mesh and config, for errors. Raises InputError if the parts do not fit together.
     """
     mesh, model, cameras = material.reference, material.model, material.cameras
     _check_sensor(config, model, where)

@@ -272,16 +272,7 @@ def _describe_shared_variance(excess: float, unshared: float, sigma: FloatArray)
 def _unshared_share(residuals: Residuals, value: FloatArray, used: BoolArray, added: FloatArray) -> float:
     """Return the share of an added variance that shows in the differences of neighbouring points.
 
-    Parameters
-    ----------
-    residuals : Residuals
-        Residuals.
-    value : (n,) array
-        Values of the points.
-    used : (n,) bool array
-        Points to use.
-    added : (n,) array
-        Added variance over the predicted one.
+    value: (n,) residuals after the systematic effects; used: (n,) points to use; added: (n,) added over predicted variance.
     """
     part = residuals.part(used)
     value, predicted = value[used], part.sigma**2
