@@ -86,8 +86,10 @@ def trial(sensor: Any, number: int) -> dict[str, Any]:
 
 
 def table(found: list[dict[str, Any]]) -> list[str]:
-    """Return, for each parameter, the coverage of the intervals with its 95 % binomial interval (Clopper and Pearson 1934), the
-    median width, and the RMS error of the logarithm.
+    """Return the rows of the table: how well the calibrations recover each parameter.
+
+    They state the coverage of the intervals with its 95 % binomial interval (Clopper and Pearson 1934), the median width, and the
+    RMS error of the logarithm.
     """
     rows = [f"| {len(found)} trials | in the interval of 95 % (bounds of the share) | RMS error | median half width |"]
     rows.append("|" + "---|" * 4)

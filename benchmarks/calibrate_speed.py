@@ -1,5 +1,6 @@
-"""Measure the observations per second of a Glendale calibration, compared with casting as many rays and with simulating whole
-maps.
+"""Measure the observations per second of a Glendale calibration.
+
+They are compared with casting as many rays and with simulating whole maps.
 
     python benchmarks/calibrate_speed.py [--site glendale]
 

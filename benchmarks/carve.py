@@ -36,7 +36,7 @@ MEMORY_GB = {False: 3.0, True: 6.0}
 
 
 def rough_wall(cell_m: float) -> TriangleMesh:
-    """A heightfield with relief from metres down to the cell, as a sum of waves; the same relief for every cell size."""
+    """Return a heightfield with relief from metres down to the cell, as a sum of waves; the same relief for every cell size."""
     random = np.random.default_rng(1)
     x, y = np.arange(0, WIDTH_M, cell_m), np.arange(0, HEIGHT_M, cell_m)
     z = np.zeros((len(y), len(x)))

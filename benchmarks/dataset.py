@@ -36,8 +36,9 @@ SIZES = ("small", "medium", "large")
 
 
 def timed(config: DatasetConfig, workers: int) -> tuple[float, DatasetSummary]:
-    """Return the wall time of a whole set by some workers with one core each, s, including the start of processes and
-    the card.
+    """Return the wall time, s, of making a whole set by some workers with one core each, and its summary.
+
+    The time includes the start of processes and the card.
     """
     cores = os.sched_getaffinity(0)
     if workers:
@@ -58,8 +59,16 @@ def stage_seconds(made: Sequence[dict[str, Any]]) -> dict[str, float]:
 
 
 def of_glendale(epochs: int, sensors: Sequence[str], *others: dict[str, Any]) -> DatasetConfig:
-    """Return rockfall_9 reduced to `epochs` training epochs of each sensor and size on Glendale at high noise, and to other
-    parts.
+    """Return rockfall_9 reduced to few epochs on Glendale at high noise, and to other parts.
+
+    Parameters
+    ----------
+    epochs : int
+        Number of training epochs of each sensor and size.
+    sensors : sequence of str
+        Sensors to keep.
+    *others : dict
+        Other parts.
     """
     values = load_dataset_config(bundled_config("datasets", "rockfall_9")).model_dump(mode="json")
     part = {"walls": ["glendale"], "noise": ["high"], "sizes": SIZES, "train": epochs}

@@ -1,5 +1,6 @@
-"""Measure the noise outside blocks of a data set's difference maps, by wall and noise level; the config's scales are chosen by
-it.
+"""Measure the noise outside blocks of a data set's difference maps, by wall and noise level.
+
+The config's scales are chosen by it.
 
     python benchmarks/dataset_noise.py [CONFIG] [--maps 4] [--sensor stereo|tls] [--unit]
 
@@ -52,7 +53,7 @@ def _with_model(site: SensorSite, model: object) -> SensorSite:
 
 
 def unscaled(config: DatasetConfig) -> DatasetConfig:
-    """The config with every scale at 1."""
+    """Return the config with every scale at 1."""
     values = config.model_dump(mode="json")
     for level in values["noise"].values():
         for model in level.values():

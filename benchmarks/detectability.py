@@ -28,7 +28,7 @@ STEP_RAD = 6e-4
 
 
 def flat_wall() -> TriangleMesh:
-    """z = 0 from (0, 0) to the size, as 0.25 m squares."""
+    """Return the wall z = 0 from (0, 0) to its size, as 0.25 m squares."""
     x, y = np.meshgrid(np.arange(0, WIDTH_M + 0.1, 0.25), np.arange(0, HEIGHT_M + 0.1, 0.25))
     number = np.arange(x.size, dtype=np.int32).reshape(x.shape)
     a, b, c, d = number[:-1, :-1].ravel(), number[:-1, 1:].ravel(), number[1:, 1:].ravel(), number[1:, :-1].ravel()

@@ -39,7 +39,7 @@ def processor_seconds(*works: Callable[[], object]) -> list[float]:
 
 
 def examples(count: int, size: int, most_blocks: int, channels: int) -> dict[str, np.ndarray]:
-    """A batch as `pipeline.detection.network.data.batches` makes it."""
+    """Return a batch as `pipeline.detection.network.data.batches` makes it."""
     random = np.random.default_rng(1)
     image = random.normal(0, 0.3, (count, size, size, channels)).astype(np.float32)
     boxes, valid = np.zeros((count, most_blocks, 4), np.float32), np.zeros((count, most_blocks), np.float32)
@@ -55,7 +55,7 @@ def examples(count: int, size: int, most_blocks: int, channels: int) -> dict[str
 
 
 def bare(pyramid: Any, image: np.ndarray, *, backward: bool) -> Callable[[], object]:
-    """The backbone with its pyramid alone, compiled."""
+    """Return the backbone with its pyramid alone, compiled, to be timed."""
     import tensorflow as tf
 
     def work(values: Any) -> Any:

@@ -1,5 +1,6 @@
-r"""Measure what single choices of the detector's training contribute: short trainings of equal length, each with one choice
-undone.
+r"""Measure what single choices of the detector's training contribute.
+
+Trainings are short and of equal length; each has one choice undone.
 
     python benchmarks/detector_ablation.py --set sets/mixed --test sets/detector_test --test sets/detector_test_mean \
         --out runs/ablation [--epochs 8] [--seeds 1 2] [--write]
@@ -133,12 +134,12 @@ def part(folder: Path, out: Path, *, ignore: bool = True, wanted: Callable[[Coco
 
 
 def content(folder: Path) -> Coco:
-    """A folder's annotations."""
+    """Return a folder's annotations."""
     return dict(json.loads((folder / "annotations.json").read_text(encoding="utf-8")))
 
 
 def rows(arguments: argparse.Namespace) -> Iterator[str]:
-    """The table's, in Markdown, as they are made."""
+    """Yield the rows of the table, in Markdown, as they are made."""
     heads = [f"{size}: {', '.join(f'{overlap:g}' for overlap in OVERLAPS)}" for size in SIZES]
     yield f"| change | {' | '.join(heads)} | against the first row |"
     yield "|---" * (2 + len(SIZES)) + "|"

@@ -35,7 +35,7 @@ def f1(test: Tested, bar: Bar, size: str) -> float:
 
 
 def rows(folders: Sequence[Path], detectors: Sequence[str]) -> Iterator[str]:
-    """The table's, in Markdown."""
+    """Yield the rows of the table, in Markdown."""
     yield f"| windows | {' | '.join(f'{placement_of(folder)}, {size}: 0.25, 0.75' for folder in folders for size in SIZES)} |"
     yield "|---" * (1 + len(folders) * len(SIZES)) + "|"
     for windows, _, model in (each.partition("=") for each in detectors):

@@ -85,7 +85,7 @@ def pasted(masks: NDArray[np.float32], boxes: Boxes, size: int) -> Masks:
 
 
 def scaled(boxes: Boxes, factor: float) -> Boxes:
-    """The same centres, sides times the factor."""
+    """Return boxes with the same centres and sides `factor` times as long."""
     middle, half = (boxes[:, :2] + boxes[:, 2:]) / 2, (boxes[:, 2:] - boxes[:, :2]) / 2
     return np.concatenate([middle - factor * half, middle + factor * half], axis=1)
 
@@ -183,7 +183,7 @@ def box_of(annotation: dict[str, Any]) -> tuple[float, float, float, float]:
 
 
 def rows(found: list[Block]) -> Iterator[str]:
-    """The table's, in Markdown."""
+    """Yield the rows of the table, in Markdown."""
     by_size = [[block for block in found if block.size == size] for size in SIZES]
     yield f"| | {' | '.join(SIZES)} |"
     yield "|---" * (1 + len(SIZES)) + "|"

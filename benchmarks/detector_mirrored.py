@@ -66,7 +66,7 @@ def moved(annotation: dict[str, Any], shift: float, slope: float) -> float:
 
 
 def rows(folder: CocoFolder, detector: Path) -> Iterator[str]:
-    """The table's, in Markdown, as they are made."""
+    """Yield the rows of the table, in Markdown, as they are made."""
     yield f"| map | {' | '.join(f'{size}: 0.25, 0.75' for size in SIZES)} | mean | time |"
     yield "|---" * (3 + len(SIZES)) + "|"
     plain = 0.0

@@ -108,7 +108,7 @@ class Cells:
     images: dict[str, list[int]]
 
     def network(self, bar: Bar) -> dict[str, Score]:
-        """The detector's scores by cell."""
+        """Return the detector's scores by cell."""
         return self._scores(self.tested.network, CONFIDENCE, bar)
 
     def baseline(self, bar: Bar) -> dict[str, Score]:
@@ -150,7 +150,7 @@ def tables(cells: Cells) -> Iterator[str]:
 
 
 def summary(network: dict[str, Score], baseline: dict[str, Score]) -> str:
-    """The comparison as a sentence, with the mean over the cells."""
+    """Return the comparison as a sentence, with the mean over the cells."""
     lowest = next(iter(baseline.values())).confidence
     beaten = sum(score.f1 < ENOUGH for score in baseline.values())
     worse = [key for key, score in baseline.items() if score.f1 < ENOUGH and network[key].f1 < score.f1]
@@ -189,7 +189,7 @@ def means(every: Sequence[Cells]) -> Iterator[str]:
 
 
 def total(cells: Cells) -> str:
-    """The means over all cells as a sentence."""
+    """Return the means over all cells as a sentence."""
     figures = [f"{100 * mean_f1(each(bar)):.1f}" for each in (cells.network, cells.baseline) for bar in (BARS[0], BARS[2])]
     return (
         f"{cells.tested.placement}, {cells.sensors} together, mean F1 of masks over {len(cells.images)} cells at 0.25 and 0.75: "
@@ -203,13 +203,13 @@ def bound_of(share: float) -> float:
 
 
 def thesis(cell: str) -> float:
-    """The thesis's F1 of a cell, %."""
+    """Return the thesis's F1 of a cell, %."""
     wall, noise, size = cell.split()
     return THESIS[wall][noise][SIZES.index(size)]
 
 
 def mean_f1(cells: dict[str, Score]) -> float:
-    """The mean over the cells."""
+    """Return the mean F1 over the cells."""
     return _mean(score.f1 for score in cells.values())
 
 

@@ -35,7 +35,7 @@ def cells_of_both(cut: Tested, whole: Tested) -> Iterator[tuple[Cells, Cells]]:
 
 
 def rows(cut: Cells, whole: Cells) -> Iterator[str]:
-    """The table's, in Markdown."""
+    """Yield the rows of the table, in Markdown."""
     both = [(cells.network(bar), cells.baseline(bar)) for bar in BARS if bar.kind == "segm" for cells in (cut, whole)]
     for name in cut.images:
         counts = [_blocks(network[name]) for network, _ in both[:2]]

@@ -1,5 +1,6 @@
-"""Measure the time of rasterising a surface (heights and labels, 3500 x 1500 pixels) against casting the same rays; target: at
-most 2.
+"""Measure the time of rasterising a surface against casting the same rays; target: at most 2 times.
+
+The raster of heights and labels has 3500 x 1500 pixels.
 """
 
 from __future__ import annotations

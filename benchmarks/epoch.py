@@ -1,5 +1,6 @@
-"""Measure the time of one whole Glendale epoch with 1,500 blocks and all products, against the sum of its bare casts and
-booleans.
+"""Measure the time of one whole Glendale epoch against the sum of its bare casts and booleans.
+
+The epoch has 1,500 blocks and all products.
 
     python benchmarks/epoch.py [stereo|tls]     (GSD 2 cm; target: at most 5 times the sum, about 30 s, 4 GB)
 

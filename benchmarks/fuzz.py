@@ -23,14 +23,14 @@ sys.path.insert(0, str(ROOT))
 
 
 def through(commands: list[str], examples: int) -> int:
-    """The number of bad answers among `examples` cases of each command."""
+    """Run `examples` cases of each command to the end, and return the number of bad answers."""
     from hypothesis import HealthCheck, Phase, given, settings
     from hypothesis import strategies as st
 
     from benchmarks.bad_inputs.case import Outcome, tried
-    from benchmarks.bad_inputs.drawn_cases import drawn
     from benchmarks.bad_inputs.materials import make_small
     from benchmarks.bad_inputs.preloaded import Preloaded
+    from benchmarks.bad_inputs.random_cases import drawn
     from benchmarks.bad_inputs.run import said
 
     same = settings(
@@ -71,7 +71,7 @@ def through(commands: list[str], examples: int) -> int:
 
 
 def main() -> int:
-    from benchmarks.bad_inputs.drawn_cases import SET_UPS
+    from benchmarks.bad_inputs.random_cases import SET_UPS
 
     parser = argparse.ArgumentParser(description="random damage to what readers and commands are given")
     parser.add_argument("examples", type=int, nargs="?", default=500)

@@ -56,7 +56,7 @@ def report(folder: Path) -> dict[str, Any]:
 
 
 def bare(measurement: Measurement) -> Callable[[], None]:
-    """The bare cast of one ray to every point."""
+    """Return the bare cast of one ray to every point, to be timed."""
     if isinstance(measurement, TlsMeasurement):
         origin = measurement.station[0]
     else:
@@ -65,9 +65,9 @@ def bare(measurement: Measurement) -> Callable[[], None]:
 
 
 def made(sensor: str, points: int, folder: Path) -> Path:
-    """A measurement in a folder, by a process of its own, whose memory does not count."""
+    """Make a measurement in a folder, in a process of its own, so that its memory does not count."""
     kind, seed = CASES[sensor]
-    code = "import sys; from pathlib import Path; from benchmarks.gap_challenge.cases import Case, make; " + (
+    code = "import sys; from pathlib import Path; from benchmarks.gap_closed_form.cases import Case, make; " + (
         f"make(Case(0, {seed}, 'one', {sensor!r}, ({kind!r},), {points}, 200_000), Path(sys.argv[1]), Path(sys.argv[2]))"
     )
     case = folder / "case"
@@ -76,7 +76,7 @@ def made(sensor: str, points: int, folder: Path) -> Path:
 
 
 def timed(case: Path) -> list[dict[str, Any]]:
-    """What `report` returns with an empty kernel cache and with what that left, each by a process of its own."""
+    """Time the diagnosis with an empty kernel cache and with a filled one, each in a process of its own."""
     rows, answer = [], case.with_name("times.json")
     with empty_kernel_cache() as environment:
         for cache in ("an empty", "a filled"):

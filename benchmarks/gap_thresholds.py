@@ -21,8 +21,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from benchmarks.gap_challenge.cases import Case, make, plan
-from benchmarks.gap_challenge.score import score
+from benchmarks.gap_closed_form.cases import Case, make, plan
+from benchmarks.gap_closed_form.score import score
 from benchmarks.varied import Setting, Varied
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import diagnose
@@ -215,7 +215,7 @@ def main() -> None:
 
 
 def _made_by(arguments: argparse.Namespace) -> str:
-    """The table of how the results were made."""
+    """Return the table of how the results were made."""
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
     words = f"python benchmarks/gap_thresholds.py --cases {arguments.cases} --seed {arguments.seed} --out DIR --table {_PAGE}"
     row = f"| {arguments.cases} | {arguments.seed} | {commit} | `{words}` |"
@@ -231,7 +231,7 @@ who wonder whether a default decides their case. `--set` changes a threshold for
     scarpsim gap my_measurement --set mean.class_margin=4 --set points.fewest=500 --out diagnosis
 
 Each threshold of `pipeline/gap/thresholds.py` was set to 0.7 and 1.4 times its value, on development cases of some thousand
-points of the [closed-form generator](gap_challenge.md). The table counts the cases that use the threshold, those whose
+points of the [closed-form generator](gap_closed_form.md). The table counts the cases that use the threshold, those whose
 answer (verdict or names) changes, and what becomes wrong or right. A threshold that no case uses, or that is newer than the
 run, is not listed. "-" means that the value is not allowed, or that the time was up.
 

@@ -42,7 +42,7 @@ def wall(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def cloud(purpose: str) -> tuple[FloatArray, FloatArray]:
-    """A million points of the wall, row by row, shaken off their grid; and their normals."""
+    """Return a million points of the wall, row by row, shaken off their grid; and their normals."""
     generator = RANDOM.child(purpose).generator()
     x, y = np.meshgrid((np.arange(COLUMNS) + 0.5) * WIDTH / COLUMNS, (np.arange(ROWS) + 0.5) * HEIGHT / ROWS)
     shake = generator.uniform(-0.02, 0.02, (2, x.size))

@@ -21,7 +21,7 @@ ROUNDS = 3
 
 
 def scan() -> PointCloud:
-    """A rough wall at 100 m in the order of a scan."""
+    """Return a rough wall at 100 m in the order of a scan."""
     random = np.random.default_rng(1)
     azimuth, zenith = np.meshgrid(np.linspace(-0.5, 0.5, LINES), np.linspace(1.2, 1.9, PULSES), indexing="ij")
     distance = 100 + 0.5 * np.sin(40 * azimuth) * np.sin(30 * zenith) + random.normal(0, 0.003, azimuth.shape)
@@ -37,7 +37,7 @@ def scan() -> PointCloud:
 
 
 def write_with_laspy(path: Path, cloud: PointCloud) -> None:
-    """The same file by laspy's high-level interface."""
+    """Write the same file by laspy's high-level interface."""
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.add_extra_dims([laspy.ExtraBytesParams(name, channel.dtype) for name, channel in cloud.extra.items()])
     header.scales, header.offsets = np.full(3, 1e-6), np.rint(cloud.points.mean(axis=0))

@@ -1,5 +1,6 @@
-"""Measure the agreement of M3C2 distances and difference maps on the same epochs: `python benchmarks/m3c2_agreement.py [--config
-FILE]`.
+"""Measure the agreement of M3C2 distances and difference maps on the same epochs.
+
+    python benchmarks/m3c2_agreement.py [--config FILE]
 
 Prints a table for docs/validation/m3c2.md: each sensor, along the wall's normal and along the surface's own.
 """

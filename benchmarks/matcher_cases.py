@@ -39,8 +39,14 @@ MATCHERS: dict[str, RefinementConfig | None] = {SGBM: None, REFINED: RefinementC
 
 @dataclass(frozen=True)
 class Case:
-    """One pair. true: (rows, columns), NaN where unknown or seen by one camera only; found: by matcher; reduction: frame px per
-    cell."""
+    """One pair of pictures with true and matched disparities.
+
+    Attributes
+    ----------
+    true : (rows, columns) disparities, NaN where unknown or seen by one camera only.
+    found : Matched disparities by matcher.
+    reduction : Frame px per cell.
+    """
 
     name: str
     true: Raster
@@ -48,7 +54,7 @@ class Case:
     reduction: int
 
     def middle(self) -> Case:
-        """The middle quarter of the pair."""
+        """Return the middle quarter of the pair."""
         rows, columns = (slice(size // 4, size // 4 + size // 2) for size in self.true.shape)
         found = {name: raster[rows, columns] for name, raster in self.found.items()}
         return replace(self, true=self.true[rows, columns], found=found)
@@ -67,7 +73,7 @@ class Case:
 
 
 def rendered(style: str, seed: int) -> Case:
-    """A wall at 50 m, base 13 m, at medium quality: the middle 3680 x 2456 px of the frame, 18 x 12 m."""
+    """Return a wall at 50 m, base 13 m, at medium quality: the middle 3680 x 2456 px of the frame, 18 x 12 m."""
     random = KeyedRandom(seed)
     world = ProceduralWall(style=style, width_m=24.0, height_m=15.0, resolution_m=0.03, seed=seed).mesh(random)
     rig = RigConfig(distance_m=50.0, base_m=13.0, width=3680, height=2456, sensor_width_m=0.01795)

@@ -52,8 +52,10 @@ def main() -> None:
 
 
 def model(values: Sequence[float], reduction: int) -> StereoModel:
-    """The sensor model, px of the frame, of parameters in px of the matched pictures: white noise, heavy-tailed noise (sigma,
-    step, tail), smoothing, fattening and, where there is any, locking."""
+    """Return the sensor model, px of the frame, of parameters in px of the matched pictures.
+
+    values: white noise; sigma, step and tail of heavy-tailed noise; smoothing; fattening; and locking, if there is any.
+    """
     white, sigma, step, tail, smoothing, radius, *rest = (float(value) for value in values)
     locking = rest[0] if rest else 0.0
     return StereoModel(
@@ -74,7 +76,7 @@ def describe(fitted: StereoModel) -> str:
 
 
 def fit(cases: Sequence[Case], matcher: str, generations: int) -> list[float]:
-    """The parameters of `model` whose errors are most like the matcher's in all of `cases`."""
+    """Return the parameters of `model` whose errors are most like the matcher's in all of `cases`."""
     from scipy.optimize import differential_evolution, minimize
 
     bounds = np.array(BOUNDS if matcher == SGBM else BOUNDS[:-1])
@@ -120,7 +122,7 @@ class Errors:
 
     @classmethod
     def of(cls, found: Raster, true: Raster, where: Raster) -> Errors:
-        """The errors of the cells where `where` is known too, so that matchers are compared on the same cells."""
+        """Return the errors of the cells where `where` is known too, so that matchers are compared on the same cells."""
         error = np.where(np.isnan(where), np.nan, found - true)
         window = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
         nearest = cv2.dilate(np.where(np.isnan(true), -np.inf, true), window)
@@ -128,7 +130,7 @@ class Errors:
         return cls(error, true, nearest - true > slope + 1)
 
     def features(self) -> np.ndarray:
-        """What the fit compares, each divided by the difference that counts as one."""
+        """Return what the fit compares, each divided by the difference that counts as one."""
         error = self.error[~np.isnan(self.error)]
         inner = np.where(np.abs(self.error) < 1, self.error, np.nan)
         sizes = np.percentile(np.abs(error), QUANTILES)
@@ -176,7 +178,7 @@ def correlation(error: Raster, lag: int) -> float:
 
 
 def report(case: Case, models: dict[str, list[float]], role: str) -> None:
-    """The rows of one pair: each matcher and its simulation; the model's defaults."""
+    """Print the rows of one pair: each matcher and its simulation, and the model's defaults."""
     for matcher, values in models.items():
         found = case.found[matcher]
         row(f"{case.name}, {role}", matcher, found, case, found)

@@ -56,13 +56,13 @@ def medians(*works: Callable[[], object], rounds: int = ROUNDS) -> list[float]:
 
 @contextmanager
 def empty_kernel_cache() -> Iterator[dict[str, str]]:
-    """The environment of a process that finds no compiled kernel, as a new user's, and keeps its own for the next one."""
+    """Yield the environment of a process that finds no compiled kernel, as a new user's, and keeps its own for the next one."""
     with tempfile.TemporaryDirectory() as folder:
         yield {**os.environ, "DRJIT_CACHE_DIR": folder}
 
 
 def peak_memory_gb() -> float:
-    """The largest memory that this process has taken so far, GB."""
+    """Return the largest memory that this process has taken so far, GB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 

@@ -1,5 +1,6 @@
-"""Measure how deep the niches of small blocks are, and how many stand out from the noise, by placement and on coarser, smoother
-walls.
+"""Measure how deep the niches of small blocks are, and how many stand out from the noise.
+
+This depends on how blocks are placed, and on how coarse and smooth the wall is.
 
     python benchmarks/niche_depth.py [--width 24 --height 14] [--maps 2] [--write]
 
@@ -43,7 +44,7 @@ CASES = (
 
 
 def smoothed(config: ProceduralWall, sigma_m: float) -> Wall:
-    """The wall, its relief filtered before it is sampled every `config.resolution_m`."""
+    """Return the wall, its relief filtered before it is sampled every `config.resolution_m`."""
     fine = config.model_copy(update={"resolution_m": FINE_M}).mesh(KeyedRandom(0))
     coarse = config.mesh(KeyedRandom(0))
     step = round(config.resolution_m / FINE_M)
@@ -74,7 +75,7 @@ def niches(config: DatasetConfig, case: tuple[str, float, float], extent: dict[s
 
 
 def rows(extent: dict[str, float], maps: int) -> Iterator[str]:
-    """The table's, in Markdown."""
+    """Yield the rows of the table, in Markdown."""
     config = load_dataset_config(bundled_config("datasets", "detector_test"))
     heads = ("placement", "vertices every", "filter's deviation", *config.noise, "depth", "centre above surface")
     yield f"| {' | '.join(heads)} |"

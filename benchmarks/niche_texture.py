@@ -45,7 +45,7 @@ def deviations(shown: LabelledMap) -> Iterator[tuple[float, float]]:
 
 
 def cells(folder: CocoFolder) -> dict[str, list[int]]:
-    """Indices of a folder's images by sensor, size and noise."""
+    """Return indices of a folder's images by sensor, size and noise."""
     found: dict[str, list[int]] = {}
     for index, image in enumerate(folder.images):
         found.setdefault(f"{SENSORS[image['sensor']]} | {image['size_class']} | {image['noise']}", []).append(index)
@@ -53,7 +53,7 @@ def cells(folder: CocoFolder) -> dict[str, list[int]]:
 
 
 def rows(sets: Sequence[Path]) -> Iterator[str]:
-    """The table's, in Markdown."""
+    """Yield the rows of the table, in Markdown."""
     yield f"| set | sensor | size | noise | niches | inside | around | median ratio | below {SMOOTHER:g} |"
     yield "|---" * 9 + "|"
     for path in sets:

@@ -1,5 +1,6 @@
-"""Compare the noise of simulated difference maps of the Glendale site, after ICP and without blocks, with the thesis (tables 5-1
-to 5-3).
+"""Compare the noise of simulated difference maps of the Glendale site with the thesis (tables 5-1 to 5-3).
+
+The maps are made after ICP and without blocks.
 
     python benchmarks/noise_table.py [--maps 45] [--levels high medium low] [--parameters | --readings]
         [--write]
@@ -59,7 +60,7 @@ class Reading:
     each_camera: bool = True
 
     def models(self, model: StereoModel) -> tuple[StereoModel, StereoModel]:
-        """The models of the two observations of one map."""
+        """Return the models of the two observations of one map."""
         drawn = "each_camera" if self.each_camera else "both_alike"
         after = model.model_copy(update={"noise": model.noise.model_copy(update={"orientation_drawn": drawn})})
         return after if self.noisy_reference else SILENT, after
@@ -97,7 +98,7 @@ class Maps:
 
 
 def bundled_model(name: str) -> StereoModel:
-    """A noise model of Glendale by its name after `glendale_`."""
+    """Return a noise model of Glendale by its name after `glendale_`."""
     path = bundled_config("noise", f"glendale_{name}")
     return parse(StereoModel, load_yaml(path), str(path))
 
@@ -154,7 +155,7 @@ def _root_mean_square(found: list[Figures]) -> str:
 
 
 def single_parameters(model: StereoModel) -> dict[str, StereoModel]:
-    """A model for each parameter of the noise that is not null, then all orientation, all matching and all of it."""
+    """Return a model for each parameter of the noise that is not null, then all orientation, all matching and all of it."""
     noise = model.noise.model_dump()
     matching = {key: noise[key] for key in ("parallax_sigma_px", "regularization_sigma_px")}
     orientation = {key: spread for key, spread in noise["orientation"].items() if spread["sigma"] > 0}

@@ -33,7 +33,7 @@ SHOWN = 10
 
 
 def resident_mb() -> float:
-    """The memory that this process has now, MB."""
+    """Return the memory that this process occupies now, MB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 

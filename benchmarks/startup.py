@@ -1,4 +1,7 @@
-"""Measure how long `scarpsim --help` takes, compared with starting a bare interpreter. Run: python benchmarks/startup.py"""
+"""Measure how long `scarpsim --help` takes, compared with starting a bare interpreter.
+
+Run `python benchmarks/startup.py`.
+"""
 
 from __future__ import annotations
 

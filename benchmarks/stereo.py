@@ -1,5 +1,6 @@
-"""Measure one stereo observation at medium quality on 1.3 M triangles against the bare ray casts it needs; target: at most 3
-times.
+"""Measure one stereo observation against the bare ray casts it needs; target: at most 3 times.
+
+It has medium quality and 1.3 M triangles.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ PULSES = 5_000_000
 
 
 def prepared() -> tuple[LaserScanner, RayCaster, KeyedRandom]:
-    """The scanner before its wall."""
+    """Return a scanner in front of a wall, the wall's ray caster, and the source of random numbers."""
     random = KeyedRandom(1)
     world = ProceduralWall(style="glendale", resolution_m=0.0697).mesh(random)
     station = StationConfig().place(Target(world))
@@ -44,7 +44,7 @@ def prepared() -> tuple[LaserScanner, RayCaster, KeyedRandom]:
 
 
 def cold() -> None:
-    """The first observation of a process that finds no compiled kernel, and the second."""
+    """Time the first observation of a process that finds no compiled kernel, and the second."""
     narrow_vectors()
     scanner, caster, random = prepared()
     first, second = (seconds(lambda: scanner.observe(caster, random)) for _ in range(2))

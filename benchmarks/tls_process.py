@@ -1,5 +1,6 @@
-"""Measure a whole process from mesh file to LAS file, on the scene on which HELIOS++ 2.0.1 was measured, and a soak of 100
-epochs.
+"""Measure a whole process from mesh file to LAS file, and a soak of 100 epochs.
+
+The scene is that on which HELIOS++ 2.0.1 was measured.
 
     python benchmarks/tls_process.py            (3 M pulses at 105 m, 1.3 M triangles; with one ray and with 19 sub-rays)
     python benchmarks/tls_process.py --soak     (100 epochs in one process: the memory after each ten)

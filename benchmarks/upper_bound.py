@@ -1,5 +1,6 @@
-"""Measure what any detector could find: share of blocks with a matched-filter signal-to-noise ratio above 4, by surface and
-placement.
+"""Measure what any detector could find, by surface and placement.
+
+This is the share of blocks with a matched-filter signal-to-noise ratio above 4.
 
     python benchmarks/upper_bound.py [--width 24 --height 14] [--write]
 
@@ -62,8 +63,14 @@ def rows(width_m: float, height_m: float) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class Niches:
-    """Niches of the blocks of one epoch: signal-to-noise ratios; depths of the visible niches, m, and shares of their boxes that
-    they fill; rise: height of the blocks' centres above the median surface within their contours, m.
+    """Niches of the blocks of one epoch.
+
+    Attributes
+    ----------
+    ratios : Signal-to-noise ratio of each block.
+    depths : Depths of the visible niches, m.
+    filled : Shares of their boxes that the visible niches fill.
+    rise : Heights of the blocks' centres above the median surface within their contours, m.
     """
 
     ratios: list[float]
@@ -73,7 +80,10 @@ class Niches:
 
 
 def observed(config: SimulationConfig, blocks_per_m2: float, given: Wall | None = None) -> Niches:
-    """What one epoch shows of its blocks. given: a wall that takes the place of the config's."""
+    """Simulate one epoch and return the niches of its blocks.
+
+    given: a wall that replaces the config's.
+    """
     random, progress = KeyedRandom(config.seed), Progress()
     site = prepare_site(config, "stereo", random, given)
     reference = observe_reference(config, site, random, progress)

@@ -70,8 +70,9 @@ class Varied:
 
 
 def _applied(function: Callable[..., Any], inputs: tuple[Any, ...]) -> Any:
-    """Apply the function to the value and to its alternatives; if it decides (true or false), record those that
-    decide otherwise.
+    """Apply the function to the value and to its alternatives.
+
+    If the function decides (true or false), those settings are recorded that decide otherwise.
     """
     varied = [each for each in inputs if isinstance(each, Varied)]
     matters = varied[0].matters

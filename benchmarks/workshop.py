@@ -1,5 +1,6 @@
-"""Simulate a laser scan of a workshop in closed form, with NumPy only: floor, walls, a box, a ball and pipes, curved and with
-edges.
+"""Simulate a laser scan of a workshop in closed form, with NumPy only.
+
+It has floor, walls, a box, a ball and pipes, curved and with edges.
 """
 
 from __future__ import annotations

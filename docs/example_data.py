@@ -35,7 +35,7 @@ TRUTH = (RangeIncidenceBias(coefficient_m=0.006),)
 
 
 def site(folder: Path, resolution_m: float = 0.06) -> None:
-    """A wall of 24 x 15 m that looks to the south-east, and a pair of photographs from 50 m with a base of 13 m."""
+    """Make a wall of 24 x 15 m that looks to the south-east, and a pair of photographs from 50 m with a base of 13 m."""
     wall = ProceduralWall(style="bulga", width_m=24.0, height_m=15.0, resolution_m=resolution_m).mesh(KeyedRandom(7))
     wall = wall.with_vertices(wall.vertices @ axis_rotation(2, np.radians(35.0)).T + ORIGIN)
     pair = RigConfig(distance_m=50.0, base_m=13.0).place(Target(wall))
@@ -45,7 +45,7 @@ def site(folder: Path, resolution_m: float = 0.06) -> None:
 
 
 def measurement(folder: Path, step_rad: float = 0.004, effects: tuple[Effect, ...] = TRUTH) -> None:
-    """A scan from 40 m, its pose known to 2 mm and 30 microradians, with `effects` that model.yaml does not name."""
+    """Make a scan from 40 m, its pose known to 2 mm and 30 microradians, with `effects` that model.yaml does not name."""
     wall = ProceduralWall(style="glendale", width_m=40.0, height_m=26.0, resolution_m=0.2).mesh(KeyedRandom(3))
     frame = WallFrame.fit(wall.vertices, Target(wall).stand(40.0, 1.6))
     known = TlsModel()

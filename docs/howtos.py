@@ -60,7 +60,7 @@ class Step:
 
 
 def steps(page: str) -> list[Step]:
-    """The steps of a how-to guide or tutorial; blocks that are neither titled nor bash only show something."""
+    """Return the steps of a how-to guide or tutorial: its blocks that are titled or bash."""
     folder = "tutorials" if page in TUTORIALS else "howto"
     blocks = _BLOCK.findall((FOLDER / folder / f"{page}.md").read_text(encoding="utf-8"))
     return [Step(title, text) for language, title, text in blocks if title or language == "bash"]

@@ -50,8 +50,15 @@ names the file, what is wrong, what is allowed and how to mend it, and that it w
 
 @dataclass(frozen=True)
 class Kind:
-    """Files of one kind. suffix: of their names; doors: words of a command, or a function, by their name, FILE for the file;
-    faults: how a file with a fault is made."""
+    """Files of one kind, and how commands and functions are tried with faults in them.
+
+    Attributes
+    ----------
+    title : Heading of the kind.
+    suffix : Suffix of the files' names.
+    doors : What reads such files, by name: the words of a command (FILE for the file), or a function.
+    faults : How a file with each fault is made.
+    """
 
     title: str
     suffix: str
@@ -286,7 +293,7 @@ def prepare(folder: Path) -> None:
 
 
 def outcome(kind: Kind, door: str, fault: str) -> str:
-    """What a door does with a file that has a fault, in a prepared working folder: "refused", or what it does instead."""
+    """Return what a door does with a file that has a fault, in a prepared working folder: "refused", or what it does instead."""
     file = Path(f"bad{kind.suffix}")
     make = kind.good if fault == NO_FAULT else kind.faults[fault]
     if make is not None:
@@ -310,14 +317,14 @@ def outcome(kind: Kind, door: str, fault: str) -> str:
 
 
 def table(kind: Kind, found: dict[tuple[str, str], str]) -> str:
-    """The table of one kind of files: a row for each fault, a column for each door."""
+    """Return the table of one kind of files: a row for each fault, a column for each door."""
     lines = [f"| fault | {' | '.join(kind.doors)} |", "|---" * (len(kind.doors) + 1) + "|"]
     lines += [f"| {fault} | {' | '.join(found[door, fault] for door in kind.doors)} |" for fault in kind.faults]
     return "\n".join(lines)
 
 
 def tried(kind: Kind) -> dict[tuple[str, str], str]:
-    """What each door does with each fault, every time in a folder of its own."""
+    """Return what each door does with each fault, every time in a folder of its own."""
     found, here = {}, Path.cwd()
     for door in kind.doors:
         for fault in kind.faults:

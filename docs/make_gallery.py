@@ -62,18 +62,21 @@ class Stage:
 
     @cached_property
     def frame(self) -> WallFrame:
+        """The wall frame, for a sensor at 105 m."""
         return WallFrame.fit(self.wall.vertices, Target(self.wall).stand(105.0, None))
 
     @cached_property
     def caster(self) -> RayCaster:
+        """The ray caster of the wall, wall frame."""
         return RayCaster(self.wall.with_vertices(self.frame.to_wall(self.wall.vertices)))
 
     @cached_property
     def without(self) -> dict[str, Observation]:
+        """What each sensor records without effects."""
         return {sensor: self.observe(sensor, ()) for sensor in SCENES}
 
     def observe(self, sensor: str, effects: tuple[Effect, ...]) -> Observation:
-        """What `sensor` (stereo, tls) records with `effects` and no noise."""
+        """Return what `sensor` (stereo, tls) records with `effects` and no noise."""
         target, random = Target(self.wall), KeyedRandom(SEED)
         if sensor == "stereo":
             model = StereoModel(noise=STEREO_QUIET, effects=effects)
@@ -97,15 +100,17 @@ class Comparison:
 
     @property
     def lost(self) -> NDArray[np.bool_]:
+        """(h, w) mask of the cells that only the observation without the effect has."""
         return self.without.valid & ~self.acting.valid
 
     @property
     def gained(self) -> NDArray[np.bool_]:
+        """(h, w) mask of the cells that only the observation with the effect has."""
         return self.acting.valid & ~self.without.valid
 
 
 def example(effect: type[Effect]) -> Effect:
-    """The effect at its parameters' typical values, of the left camera where it has one.
+    """Return the effect at its parameters' typical values, of the left camera where it has one.
 
     Raises InputError where no typical value differs from null.
     """
@@ -122,7 +127,7 @@ def example(effect: type[Effect]) -> Effect:
 
 
 def page(effect: type[Effect], comparison: Comparison) -> str:
-    """The Markdown page."""
+    """Return the Markdown page of an effect."""
     shown, name = example(effect), f"{effect.sensor}.{effect.model_fields['name'].default}"
     described = inspect.cleandoc(effect.__doc__ or "")
     parts = [
@@ -140,7 +145,7 @@ def page(effect: type[Effect], comparison: Comparison) -> str:
 
 
 def yaml(shown: Effect) -> str:
-    """A config section that switches the effect on, checked by reading it again."""
+    """Return a config section that switches the effect on; check it by reading it again."""
     values = {key: getattr(shown, key) for key in type(shown).model_fields if key != "name"}
     lines = [f"      {key}: {value}" for key, value in values.items() if value != type(shown).model_fields[key].default]
     text = "\n".join(["sensor:", f"  sensor: {shown.sensor}", "  effects:", f"    - name: {shown.name}", *lines])
@@ -189,7 +194,7 @@ def _figures(comparison: Comparison) -> str:
 
 
 def difference_map(comparison: Comparison, bounds: FloatArray, title: str) -> bytes:
-    """The picture, PNG of at most 64 colours."""
+    """Draw the map of the difference that an effect makes, as a PNG of at most 64 colours."""
     grid = Grid.over(bounds, GSD_M)
     points = np.where(comparison.without.valid[..., None], comparison.without.points, comparison.acting.points)
     both = np.isfinite(comparison.difference)
@@ -230,7 +235,7 @@ def _painted(mask: NDArray[np.bool_], colour: str) -> FloatArray:
 
 
 def _limit(mean: FloatArray) -> float:
-    """The next of 1, 2, 5 x 10^k mm above 98 % of the absolute values; 1 mm where nothing differs."""
+    """Return the next of 1, 2, 5 x 10^k mm above 98 % of the absolute values; 1 mm where nothing differs."""
     high = float(np.nanpercentile(np.abs(mean), 98))
     if high < 1e-3:
         return 1.0
@@ -248,7 +253,7 @@ def _palette_png(figure: Figure) -> bytes:
 
 
 def index() -> str:
-    """The list of all pages."""
+    """Return the page that lists all effects' pages."""
     lines = ["# The effects", "", "Written by `docs/make_gallery.py`; do not edit."]
     for title, effects in (("Laser scanner", TLS_EFFECTS), ("Stereo", (*STEREO_EFFECTS, *FURTHER_EFFECTS))):
         lines += ["", f"## {title}", ""]

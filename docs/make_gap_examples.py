@@ -67,7 +67,7 @@ class Pair:
 
 
 def write_measurement(folder: Path, pair: Pair) -> None:
-    """The folder that `scarpsim gap` takes, with a nearly perfect matcher as the model."""
+    """Make the folder that `scarpsim gap` takes, with a nearly perfect matcher as the model."""
     folder.mkdir(parents=True, exist_ok=True)
     some = slice(None, None, max(len(pair.points) // _MOST_POINTS, 1))
     write_ply(folder / "reference.ply", pair.reference)

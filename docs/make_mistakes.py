@@ -124,7 +124,7 @@ MISTAKES = (
 
 @contextlib.contextmanager
 def playground() -> Iterator[None]:
-    """A temporary folder with the files that the mistakes name, as the working folder."""
+    """Yield a temporary folder with the files that the mistakes name, as the working folder."""
     before, place = Path.cwd(), Path(tempfile.mkdtemp(prefix="scarpsim_mistakes_"))
     os.chdir(place)
     try:
@@ -183,7 +183,7 @@ def _make_files() -> None:
 
 
 def _make_begun(vertices: Any, faces: Any) -> None:
-    """A run on a mesh that was then replaced by another of the same name."""
+    """Make a run on a mesh that was then replaced by another of the same name."""
     trimesh.Trimesh(vertices, faces, process=False).export("survey.ply")
     lines = ["wall: {mesh: survey.ply}" if line.startswith("wall:") else line for line in SITE.splitlines()]
     Path("mesh.yaml").write_text("\n".join(lines))
@@ -194,7 +194,7 @@ def _make_begun(vertices: Any, faces: Any) -> None:
 
 
 def _wall() -> tuple[Any, Any]:
-    """A wavy wall of 5.7 x 4.2 m: vertices and faces."""
+    """Return a wavy wall of 5.7 x 4.2 m: vertices and faces."""
     columns, rows = 20, 15
     x, z = (axis.ravel() for axis in np.meshgrid(0.3 * np.arange(columns), 0.3 * np.arange(rows), indexing="ij"))
     at = np.arange(columns * rows).reshape(columns, rows)

@@ -28,7 +28,7 @@ def page() -> str:
 
 
 def _words(name: str) -> str:
-    """A test's name as words, with its parameter."""
+    """Return a test's name as words, with its parameter."""
     plain, _, parameter = name.removeprefix("test_").partition("[")
     return plain.replace("_", " ") + (f" ({parameter.rstrip(']')})" if parameter else "")
 

@@ -20,7 +20,7 @@ _PNG, _COLOURS = "image/png", 64
 
 
 def executed(path: Path, folder: Path) -> nbformat.NotebookNode:
-    """The notebook with its outputs, run in `folder`. Raises nbclient's CellExecutionError where a cell fails."""
+    """Return the notebook with its outputs, run in `folder`. Raises nbclient's CellExecutionError where a cell fails."""
     notebook = nbformat.read(path, as_version=4)
     client = NotebookClient(notebook, timeout=600, record_timing=False, resources={"metadata": {"path": str(folder)}})
     return client.execute()

@@ -18,7 +18,7 @@ WIDE, HIGH = 0.57, 0.57
 
 @dataclass(frozen=True)
 class Box:
-    """A block: middle x, z and half widths on the wall, and how much deeper the wall is there, m."""
+    """A block: its centre x, z and half widths on the wall, and by how much the wall is deeper there, m."""
 
     x: float
     z: float
@@ -31,14 +31,14 @@ class Box:
 
     @property
     def bounds(self) -> Array:
-        """(2, 3) lowest and highest corner."""
+        """Lowest and highest corner (2, 3), m."""
         ys = sorted((DISTANCE, DISTANCE + self.depth))
         return np.array(
             [[self.x - self.half[0], ys[0], self.z - self.half[1]], [self.x + self.half[0], ys[1], self.z + self.half[1]]]
         )
 
     def meets(self, ray: Array, plane: Array) -> Array:
-        """(n,) range at which rays end, given that of the plane."""
+        """Return the range (n,) at which rays end, given the range `plane` to the wall."""
         low, high = (corner / ray for corner in self.bounds)
         enter, leave = np.minimum(low, high).max(axis=1), np.maximum(low, high).min(axis=1)
         if self.depth < 0:
@@ -60,7 +60,7 @@ class Scan:
 
 
 def scan(step_rad: float, boxes: list[Box], lost: float, rng: np.random.Generator, stretch: float = 1.0) -> Scan:
-    """A raster of `step_rad`, `stretch` times as wide in azimuth, of which a share is lost."""
+    """Return a scan with angular step `step_rad`, `stretch` times as wide in azimuth, of which the share `lost` is lost."""
     azimuth = np.arange(np.pi / 2 - WIDE / 2, np.pi / 2 + WIDE / 2, step_rad * stretch)
     zenith = np.arange(np.pi / 2 - HIGH / 2, np.pi / 2 + HIGH / 2, step_rad)
     az, ze = (grid.ravel() for grid in np.meshgrid(azimuth, zenith, indexing="ij"))
@@ -75,7 +75,7 @@ def scan(step_rad: float, boxes: list[Box], lost: float, rng: np.random.Generato
 
 
 def waves(x: Array, z: Array, length_m: float, rng: np.random.Generator) -> Array:
-    """Correlated over metres, standard deviation 1."""
+    """Return an error that is correlated over metres, with standard deviation 1."""
     total = np.zeros_like(x)
     for _ in range(40):
         angle, phase, k = rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi), 2 * np.pi / (length_m * rng.uniform(0.7, 2.5))
@@ -84,7 +84,9 @@ def waves(x: Array, z: Array, length_m: float, rng: np.random.Generator) -> Arra
 
 
 def noise(of: Scan, outliers: float, reference_m: float, rng: np.random.Generator) -> Array:
-    """(n,) m: white, of the reference correlated over 3 m, and a share of outliers of either sign up to metres."""
+    """Return errors (n,), m: white noise, an error of the reference correlated over 3 m, and a share of outliers of up
+    to metres.
+    """
     at = of.plane[:, None] * of.ray
     white = SIGMA * rng.standard_normal(len(at)) + reference_m * waves(at[:, 0], at[:, 2], 3.0, rng)
     wild = rng.uniform(size=len(at)) < outliers
@@ -92,7 +94,7 @@ def noise(of: Scan, outliers: float, reference_m: float, rng: np.random.Generato
 
 
 def draw_boxes(count: int, half_m: tuple[float, float], depth_m: tuple[float, float], rng: np.random.Generator) -> list[Box]:
-    """Blocks clearly apart, of either sign."""
+    """Draw blocks clearly apart, some of missing and some of added rock."""
     found: list[Box] = []
     while len(found) < count:
         x, z = rng.uniform(-0.42, 0.42, 2) * DISTANCE * (WIDE, HIGH)

@@ -1,6 +1,6 @@
-"""Cores of parallel workers, and the tests that `make validate` carries out.
+"""Divide the cores among parallel test workers, and mark the long tests, which `make validate` runs.
 
-Workers of a parallel run share the cores out: threads that wait for each other on cores that all use cost half of the time.
+If all workers used all cores, threads would wait for each other and take half as long again.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ LONG = tomllib.loads((Path(__file__).parent / "validation.toml").read_text(encod
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the long tests, and complain about names in validation.toml that no test has any more."""
+    """Mark the long tests, and report names in validation.toml that no test has any more."""
     long = {f"{file}::{name}" for group in LONG for file, names in group.items() if file != "reason" for name in names}
     files, found = set(), set()
     for item in items:

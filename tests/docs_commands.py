@@ -1,4 +1,6 @@
-"""The commands that README.md and docs/ show: found, taken apart, and resolved as the program would, without being run."""
+"""Find the commands that README.md and docs/ show, parse them, and resolve their configs like the program, without
+running them.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ _END = re.compile(r"\s(?:\||>|#).*$")
 
 
 def commands(page: Path) -> list[str]:
-    """The commands of a page in fenced and indented blocks and within its sentences, each once, without comments and pipes."""
+    """Return the commands of a page, in fenced and indented blocks and in sentences, each once, without comments and pipes."""
     text = page.read_text(encoding="utf-8")
     prose = _FENCED.sub("", text)
     found = [line for block in _FENCED.findall(text) for line in _LINE.findall(block)]
@@ -43,25 +45,25 @@ def _plain(command: str) -> str:
 
 
 def parsed(command: str) -> tuple[str, argparse.Namespace]:
-    """The command's name and its arguments, by the program's own parser; raises InputError where the program would."""
+    """Parse a command with the program's own parser; return its name and arguments, or raise InputError as the program would."""
     program, *words = shlex.split(command)
     name = "simulate" if program == "simulate" else words.pop(0)
     return name, command_parser(f"scarpsim {name}", COMMANDS[name]).parse(words)
 
 
 def flags_of(command: str) -> set[str]:
-    """The flags in a command or a synopsis."""
+    """Return the flags in a command or a synopsis."""
     return set(re.findall(r"(?<![\w-])--[a-z][\w-]*", command))
 
 
 def known_flags(name: str) -> set[str]:
-    """The flags of a command's parser."""
+    """Return the flags that a command's parser accepts."""
     parser = command_parser(f"scarpsim {name}", COMMANDS[name])
     return {flag for action in parser._actions for flag in action.option_strings}
 
 
 def resolved(command: str) -> Iterator[dict[str, Any]]:
-    """The configs that a command would work with, as plain values; files that it names must be there."""
+    """Return the configs that a command would use, as plain values; the files that it names must exist."""
     name, given = parsed(command)
     overrides = getattr(given, "overrides", [])
     if name == "simulate":
@@ -85,7 +87,9 @@ def resolved(command: str) -> Iterator[dict[str, Any]]:
 
 
 def check_overrides(command: str) -> None:
-    """Each `--set` of a command must be seen in what it resolves to: a preset by the scanner's name, a model by its values."""
+    """Assert that each `--set` of a command changes the resolved config: a preset by the scanner's name, a model by
+    its values.
+    """
     _, given = parsed(command)
     for config in resolved(command):
         for override in map(read_override, getattr(given, "overrides", [])):
@@ -93,7 +97,7 @@ def check_overrides(command: str) -> None:
 
 
 def check_override(config: Mapping[str, Any], override: Override) -> None:
-    """The override is in the config."""
+    """Assert that the override is in the config."""
     if override.path in (("scanner",), ("scanner", "preset")) and isinstance(override.value, str):
         preset = read_preset(override.value)
         expected = {key: _as_json(value) for key, value in preset.scanner_values().items()}
@@ -115,7 +119,9 @@ def check_override(config: Mapping[str, Any], override: Override) -> None:
 
 
 def holds(found: Any, given: Any) -> bool:
-    """Whether values hold what was given for them: sections may have further keys, numbers become floats, names paths."""
+    """Return whether resolved values contain the given ones: sections may have more keys, numbers become floats, names become
+    paths.
+    """
     if isinstance(given, Mapping):
         return isinstance(found, Mapping) and all(key in found and holds(found[key], given[key]) for key in given)
     if isinstance(given, list):

@@ -1,4 +1,4 @@
-"""A cloud, a mesh and a raster with all that files can hold of them, for the tests of the formats."""
+"""A cloud, a mesh and a raster with every kind of content that files can hold, for the tests of the formats."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ GRID = Grid(x_min=1.25, y_max=9.5, gsd=0.02, width=70, height=40)
 
 
 def a_cloud() -> PointCloud:
-    """More points than two chunks of LAZ hold, with every kind of channel."""
+    """Return more points than two chunks of LAZ hold, with every kind of channel."""
     rng = np.random.default_rng(1)
     count = 120_000
     return PointCloud(
@@ -29,7 +29,7 @@ def a_cloud() -> PointCloud:
 
 
 def a_mesh() -> TriangleMesh:
-    """A bumpy sheet of 50 x 30 vertices in UTM-sized coordinates, with all that a mesh can carry."""
+    """Return a bumpy sheet of 50 x 30 vertices in UTM-sized coordinates, with every attribute of a mesh."""
     rng = np.random.default_rng(2)
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(50.0), np.arange(30.0)))
     first = (np.arange(29)[:, None] * 50 + np.arange(49)).ravel()
@@ -44,7 +44,7 @@ def a_mesh() -> TriangleMesh:
 
 
 def a_raster() -> np.ndarray:
-    """Over GRID, with a hole."""
+    """Return a raster over GRID with a hole."""
     raster = np.random.default_rng(3).normal(0, 0.01, GRID.shape).astype(np.float32)
     raster[:5, 10:20] = np.nan
     return raster

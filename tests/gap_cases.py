@@ -1,7 +1,8 @@
 """Measurements for the tests of `gap`, made in closed form with NumPy alone: nothing here comes from `sensors` or `pipeline`.
 
-The wall is a height field, linear on the triangles of a regular grid, in the world's xz plane; rays meet it by Newton's method on
-that function. The reference is the wall plus an error that is correlated over metres; poses are off; returns are lost at random.
+The wall is a height field, linear on the triangles of a regular grid, in the world's xz plane; rays are intersected with it by
+Newton's method. The reference mesh is the wall plus an error that is correlated over metres; the poses have errors; some returns
+are lost at random.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ SIGMA, ANGLE_SIGMA = 0.003, 4e-5
 
 @dataclass(frozen=True)
 class Field:
-    """Depth y of the wall at the nodes of a grid over x and z, linear on triangles cut along x - z = constant."""
+    """A wall: depth y at the nodes of a grid over x and z, linear on triangles that are cut along x - z = constant."""
 
     nodes: Array
 
     def at(self, x: Array, z: Array) -> tuple[Array, Array, Array, Array]:
-        """Depth, its slopes by x and z, and whether the point is inside."""
+        """Return depth, its derivatives by x and by z, and whether the point is inside."""
         rows, columns = self.nodes.shape
         i, j = np.clip(np.floor(x / STEP).astype(int), 0, rows - 2), np.clip(np.floor(z / STEP).astype(int), 0, columns - 2)
         a, b = x / STEP - i, z / STEP - j
@@ -38,7 +39,9 @@ class Field:
         return n00 + a * by_x + b * by_z, by_x / STEP, by_z / STEP, inside
 
     def cast(self, origin: Array, ray: Array) -> tuple[Array, Array]:
-        """Distance along unit rays, NaN where Newton's method does not settle, and the cosine of the incidence."""
+        """Return the distance along unit rays (NaN where Newton's method does not converge) and the cosine of the incidence
+        angle.
+        """
         t = (self.nodes.mean() - origin[1]) / ray[:, 1]
         for _ in range(25):
             point = origin + t[:, None] * ray
@@ -49,7 +52,7 @@ class Field:
         return np.where(inside & (left < 1e-7) & (t > 0), t, np.nan), cosine
 
     def write(self, path: Path) -> None:
-        """As a binary PLY mesh whose faces look to -y."""
+        """Write a binary PLY mesh whose faces point towards -y."""
         rows, columns = self.nodes.shape
         x, z = np.meshgrid(STEP * np.arange(rows), STEP * np.arange(columns), indexing="ij")
         vertices = np.stack([x, self.nodes, z], axis=-1).reshape(-1, 3)
@@ -66,7 +69,7 @@ class Field:
 
 
 def smooth_noise(shape: tuple[int, int], length_m: float, rng: np.random.Generator) -> Array:
-    """Random waves of about one wavelength, standard deviation 1."""
+    """Return a sum of random waves of about `length_m`, with standard deviation 1."""
     x, z = np.meshgrid(*(STEP * np.arange(size) for size in shape), indexing="ij")
     total = np.zeros(shape)
     for _ in range(40):
@@ -77,7 +80,11 @@ def smooth_noise(shape: tuple[int, int], length_m: float, rng: np.random.Generat
 
 @dataclass
 class Scan:
-    """What an effect may change before the points are written. R: ranges to be recorded; daz, dz: recorded minus true angle."""
+    """A scan before its points are written; an effect may change it.
+
+    R: ranges to be recorded, m; az, z: azimuth and zenith angle, rad; cos_i: cosine of the incidence angle; power: relative
+    received power; line: scan line; share: share of the scan's duration that has passed.
+    """
 
     R: Array
     az: Array
@@ -91,10 +98,13 @@ class Scan:
 
 @dataclass(frozen=True)
 class ScanCase:
-    """What a scan is like. angles: (azimuth, zenith, line) to recorded minus true angles; ranges: recorded ranges; lost: returns
-    lost; fall: x, z and depth of a niche of 1.2 m that the reference does not have; blocks: column, row and depth of nodes that
-    lie deeper than in the reference: pyramids of volume depth x STEP^2; scans: place and face of each of several scans, which are
-    of one pose where the place is the same."""
+    """What a scan is like.
+
+    angles: function of (azimuth, zenith, line) that returns recorded minus true angles; ranges: function that returns the
+    recorded ranges; lost: function that returns which returns are lost; fall: x, z and depth of a niche of 1.2 m that the
+    reference lacks; blocks: column, row and depth of nodes that lie deeper than in the reference (pyramids of volume depth x
+    STEP^2); scans: position and face of each of several scans; scans from one position share one pose.
+    """
 
     angles: Callable[[Array, Array, Array], tuple[Array, Array]] | None = None
     ranges: Callable[[Scan], Array] | None = None
@@ -109,7 +119,7 @@ class ScanCase:
 
 
 def write_scan(folder: Path, seed: int, **how: Any) -> None:
-    """A laser scan, or epochs of it whose poses are off each for itself. how: fields of a `ScanCase`."""
+    """Write a laser scan, or several epochs with a pose error each, as a measurement. how: fields of a `ScanCase`."""
     case = ScanCase(**how)
     rng = np.random.default_rng(seed)
     shape = int(WIDTH / STEP) + 1, int(HEIGHT / STEP) + 1
@@ -191,7 +201,7 @@ def _of_several(scans: Sequence[Any], rotation: Array) -> dict[str, Any]:
 
 
 def unit(azimuth: Array, zenith: Array) -> Array:
-    """Unit vectors of azimuth = atan2(y, x) and zenith from +z."""
+    """Return unit vectors of azimuth = atan2(y, x) and of the zenith angle from +z."""
     return np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=1)
 
 

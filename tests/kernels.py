@@ -1,4 +1,4 @@
-"""The kernels that a piece of work runs, however many of them the machine's cache holds already."""
+"""Count the Dr.Jit kernels that a call compiles or runs, independent of what the machine's kernel cache already holds."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from scene.common.backend import dr
 
 
 def kernels(work: Callable[[], object]) -> dict[str, int]:
-    """Operations of each kernel that `work` runs, by what the cache knows it as: what an empty cache would have to compile."""
+    """Run `work` and return the number of operations of each kernel, keyed by its hash: what an empty cache would have to
+    compile.
+    """
     dr.kernel_history_clear()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         work()

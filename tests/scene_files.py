@@ -11,7 +11,7 @@ UTM = np.array([500_000.0, 5_000_000.0, 800.0])
 
 
 def sheet(rows=6, columns=8, step=1.0):
-    """An open, slightly wavy sheet of 2 (rows - 1)(columns - 1) triangles."""
+    """Return an open, slightly wavy sheet of 2 (rows - 1)(columns - 1) triangles."""
     v, u = np.meshgrid(np.arange(rows) * step, np.arange(columns) * step, indexing="ij")
     vertices = np.stack([u, 0.1 * np.sin(u + 2 * v) + 1 / 3, v], axis=-1).reshape(-1, 3)
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
@@ -47,7 +47,7 @@ def written(path, mesh, colours=None):
 
 
 def rock(spacing=0.35, seed=3):
-    """A rough upright wall of 14 x 10 m that runs obliquely to the axes; its coordinates have all digits."""
+    """Return a rough upright wall of 14 x 10 m, oblique to the axes, whose coordinates use all digits."""
     mesh = heightfield(14.0, 10.0, spacing, seed=seed)
     x, y, z = mesh.vertices.T
     return mesh.with_vertices(np.stack([0.8 * x + 0.6 * z, 0.6 * x - 0.8 * z, y + 0.03 * z], axis=1))

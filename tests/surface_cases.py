@@ -1,7 +1,7 @@
-"""Clouds as photogrammetry gives them, made in closed form with NumPy alone: nothing here comes from `sensors` or `pipeline`.
+"""Point clouds as photogrammetry makes them, in closed form with NumPy alone: nothing here comes from `sensors` or `pipeline`.
 
-The wall is z = f(x, y), a sum of sines, in the world's frame turned upright: x along the wall, z up it, y into the rock. Points
-lie on it, moved along its normal by noise and by whatever a case adds; the reference is a mesh of the same function.
+The wall is y = f(x, z), a sum of sines, in upright world axes: x along the wall, z up, y into the rock. Points lie on it, moved
+along its normal by noise and by the effects of a case; the reference is a mesh of the same function.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _WAVES = [(*_RNG.uniform(0.15, 0.8, 1), *_RNG.uniform(0, 2 * np.pi, 2)) for _ in
 
 
 def depth(x: Array, z: Array) -> Array:
-    """How far the wall lies behind y = 0, m."""
+    """Return how far the wall lies behind y = 0, m."""
     total = np.zeros(np.broadcast(x, z).shape)
     for k, angle, phase in _WAVES:
         total += 0.15 / (0.2 + k) * np.sin(k * (np.cos(angle) * x + np.sin(angle) * z) + phase)
@@ -29,7 +29,7 @@ def depth(x: Array, z: Array) -> Array:
 
 
 def normals(x: Array, z: Array) -> Array:
-    """(n, 3) unit normals to the air, towards -y."""
+    """Return unit normals (n, 3) towards the air (-y)."""
     h = 1e-4
     by_x, by_z = (depth(x + h, z) - depth(x - h, z)) / (2 * h), (depth(x, z + h) - depth(x, z - h)) / (2 * h)
     found = np.stack([by_x, -np.ones_like(x), by_z], axis=1)
@@ -38,8 +38,12 @@ def normals(x: Array, z: Array) -> Array:
 
 @dataclass(frozen=True)
 class CloudCase:
-    """What a cloud is like. above: (x, z) to m above the wall, along the normal; scale: of the cloud about the wall's middle;
-    niche: x, z and depth of a square niche of 1 m along and up; sigma: m; points: how many; moved, turn_rad: of the cloud, m."""
+    """What a cloud is like.
+
+    above: function of (x, z) that returns the height above the wall along the normal, m; scale: scale of the cloud about the
+    wall's centre; niche: x, z and depth of a square niche of 1 m; sigma: noise, m; points: number of points; moved, turn_rad:
+    shift (m) and rotation of the cloud.
+    """
 
     above: Callable[[Array, Array], Array] | None = None
     scale: float = 1.0
@@ -51,7 +55,7 @@ class CloudCase:
 
 
 def cloud(seed: int, **how: Any) -> Array:
-    """(n, 3) points."""
+    """Return points (n, 3) of a `CloudCase` with these fields."""
     case = CloudCase(**how)
     rng = np.random.default_rng(seed)
     x, z = rng.uniform(0, WIDTH, case.points), rng.uniform(0, HEIGHT, case.points)
@@ -69,7 +73,7 @@ def cloud(seed: int, **how: Any) -> Array:
 
 
 def write_wall(path: Path, step: float = 0.05, beyond: float = 0.5, shift: tuple[float, float, float] = (0, 0, 0)) -> None:
-    """The reference: a PLY mesh of the wall, wider than the cloud by `beyond`."""
+    """Write the reference: a PLY mesh of the wall, larger than the cloud by `beyond` on each side."""
     xs, zs = np.arange(-beyond, WIDTH + beyond, step), np.arange(-beyond, HEIGHT + beyond, step)
     x, z = np.meshgrid(xs, zs, indexing="ij")
     vertices = np.stack([x, depth(x, z), z], axis=-1).reshape(-1, 3) + np.array(shift)
@@ -86,7 +90,7 @@ def write_wall(path: Path, step: float = 0.05, beyond: float = 0.5, shift: tuple
 
 
 def write_cloud(path: Path, points: Array) -> None:
-    """A PLY cloud without triangles."""
+    """Write a PLY cloud without triangles."""
     head = (
         f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\nproperty double x\nproperty double y\n"
         "property double z\nend_header\n"

@@ -1,4 +1,6 @@
-"""Bad inputs that crashed, hung or filled the memory when they were first tried: what is asked of a single reader or equation."""
+"""Bad inputs that crashed, hung or filled the memory when they were first tried, given directly to a single reader
+or equation.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +62,7 @@ def test_a_map_of_no_numbers_is_named(
 
 
 def test_a_tile_that_becomes_gigabytes_is_refused(tmp_path: Path) -> None:
-    """Before it is unpacked: a compressed tile of a few kilobytes can hold any number of zeros."""
+    """It is refused before decompression: a compressed tile of a few kilobytes can contain any number of zeros."""
     path = tmp_path / "bomb.tif"
     zlib_bomb(path, 0.05)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -86,7 +88,7 @@ def test_a_mesh_of_sixty_gigabytes_is_refused_at_once(name: str, tmp_path: Path)
 
 
 def test_a_pipe_that_a_mesh_names_is_not_read(tmp_path: Path) -> None:
-    """The reader would wait for ever."""
+    """Reading it would never end."""
     os.mkfifo(tmp_path / "buffer")
     (tmp_path / "a.gltf").write_text('{"asset": {"version": "2.0"}, "buffers": [{"uri": "buffer"}]}')
     with pytest.raises(InputError, match="is a pipe"):
@@ -162,7 +164,7 @@ def test_a_bad_word_is_answered_at_once(
 
 
 def test_an_argument_out_of_an_empty_variable_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    """Else it would be the current folder."""
+    """Otherwise an empty argument would mean the current folder."""
     assert main(["detect", "baseline", "a.tif", "--out", ""]) == 2
     assert "an argument is empty" in capsys.readouterr().err
 
@@ -216,7 +218,7 @@ def test_a_colmap_model_has_the_bounds_of_our_own(name: str, line: str, tmp_path
 
 
 def test_what_is_no_character_is_written_as_an_escape(tmp_path: Path) -> None:
-    """A file's name in another encoding, as Python holds it, in a report."""
+    """A file name in another encoding, with Python's surrogate characters, appears in a report."""
     write_text(tmp_path / "report.html", "h\udcf6he")
     assert (tmp_path / "report.html").read_text() == r"h\udcf6he"
 
@@ -237,7 +239,7 @@ def test_maps_measured_twice_are_named(tmp_path: Path) -> None:
 
 
 def test_what_is_no_number_in_a_key_of_others_is_left_out(tmp_path: Path) -> None:
-    """`detect` writes the images with all their keys, and JSON knows no NaN."""
+    """`detect` copies the images with all their keys, and JSON has no NaN."""
     image = {"id": 1, "file_name": "a.tif", "width": 2, "height": 2, "gsd_m": float("nan"), "more": {"a": [float("inf")]}}
     (tmp_path / "a.json").write_text(json.dumps({"images": [image], "annotations": [], "categories": []}))
     assert read_coco(tmp_path / "a.json").images[0] | {"id": 1} == {**image, "gsd_m": None, "more": {"a": [None]}}
@@ -296,4 +298,4 @@ def test_an_empty_config_is_not_taken_for_one(content: str, tmp_path: Path, caps
     (tmp_path / "site.yaml").write_text(content, encoding="utf-8")
     words = ["simulate", "--sensor", "tls", "--config", str(tmp_path / "site.yaml"), "--out", str(tmp_path / "out")]
     assert main(words) == 2
-    assert "holds no key" in capsys.readouterr().err
+    assert "contains no key" in capsys.readouterr().err

@@ -1,6 +1,6 @@
-"""Bad inputs, each to its command as benchmarks/bad_inputs has them: here those that are refused at the door, in this process.
+"""The bad inputs of benchmarks/bad_inputs, each given to its command: here, in this process, those that are refused on reading.
 
-Those that TensorFlow has to be loaded for, or that are computed with, are tried by the benchmark, which also looks at the memory.
+Those that need TensorFlow, or that are computed with, are tried by the benchmark, which also measures memory.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""Every benchmark runs at a tiny size, so that a changed signature cannot leave one behind. Its figures mean nothing at such
-a size.
+"""Every benchmark runs at a tiny size, so that none is forgotten when a signature changes. Its results mean nothing at that size.
 
-A script's constants and the configs that it makes are replaced by smaller ones before its `main` is called, in this process,
-so that imports and kernels are shared.
+A script's constants and the configs that it makes are replaced by smaller ones before its `main` is called in this process, so
+that imports and kernels are shared.
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ ELSEWHERE = {
     "fuzz": "tests/test_fuzz.py, test_fuzz_commands.py and test_fuzz_records.py run what it runs",
     "bad_inputs/run": "tests/test_bad_inputs.py",
     "bad_inputs/preloaded": "benchmarks/bad_inputs/run.py runs it as a process of its own",
-    "gap_challenge/run": "tests/test_gap_challenge.py",
+    "gap_closed_form/run": "tests/test_gap_closed_form.py",
     "gap_injections/run": "tests/test_gap_injections.py",
-    "gap_judge/run": "tests/test_gap_judge.py",
+    "gap_second_generator/run": "tests/test_gap_second_generator.py",
     "gap_thresholds": "tests/test_varied.py",
     "readers/draw": "tests/test_generated_pages.py",
     "field_reports/run": "tests/test_field_reports.py",
@@ -47,9 +46,11 @@ ELSEWHERE = {
 
 @dataclass(frozen=True)
 class Tiny:
-    """How a script is made small. words: on its command line; arguments: of its `main`; values: new values of its globals;
-    keys: what is set beside the keywords of a config that the script makes, by the config's name; overrides: of the configs
-    that it loads."""
+    """How a script is made small.
+
+    words: arguments of its command line; arguments: arguments of its `main`; values: new values of its globals; keys: by the name
+    of a config that the script makes, further keywords for it; overrides: overrides of the configs that it loads.
+    """
 
     words: tuple[str, ...] = ()
     arguments: tuple[Any, ...] = ()
@@ -128,7 +129,7 @@ SCRIPTS: dict[str, Tiny] = {
 
 
 def scripts() -> list[str]:
-    """All that can be run, by their path below benchmarks/ without the ending."""
+    """Return all scripts that can be run, by their path below benchmarks/ without the suffix."""
     found = (path.relative_to(FOLDER).with_suffix("") for path in FOLDER.rglob("*.py"))
     runnable = (path for path in found if "__main__" in (FOLDER / path).with_suffix(".py").read_text())
     return sorted(str(path) for path in runnable if str(path) not in LIBRARIES)
@@ -193,7 +194,7 @@ def _make_small(script: ModuleType, tiny: Tiny, monkeypatch: pytest.MonkeyPatch)
 
 
 def _with_keys(config: Callable[..., Any], keys: dict[str, Any]) -> Callable[..., Any]:
-    """The config's class, which sets these keys whatever it is called with."""
+    """Return a wrapper of the config's class that sets these keys in addition."""
 
     @functools.wraps(config, updated=())
     def small(*given: Any, **named: Any) -> Any:

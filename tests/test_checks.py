@@ -1,4 +1,6 @@
-"""The page of checks against what the commands do: each kind of fault at each door, and that a good file gets through each."""
+"""The page of checks, compared with what the commands do: each kind of fault is found by each command, and a good file is
+accepted.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,7 @@ def test_every_door_refuses_every_fault(kind: Kind, door: str, fault: str) -> No
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind.good is not None], ids=lambda kind: kind.title)
 def test_a_file_without_a_fault_gets_through(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else a door that refuses everything would look as if it checked everything."""
+    """Otherwise a command that refuses everything would seem to check everything."""
     for number, door in enumerate(door for door in kind.doors if door not in kind.long):
         folder = tmp_path / str(number)
         folder.mkdir()

@@ -1,4 +1,4 @@
-"""The documentation: the site builds without a warning, and its guides, tutorials and notebooks work as they are written."""
+"""The documentation: the site builds without a warning, and its guides, tutorials and notebooks work as written."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ FURTHER = {
 
 
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
-    """Links, anchors, pages missing from the navigation: `strict` makes each of them an error. Nothing is fetched."""
+    """In `strict` mode a bad link, anchor or a page missing from the navigation is an error. Nothing is fetched."""
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1", "SIGNATURE_WIDTH": "100000"}  # no formatter for each signature
     command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--site-dir", str(tmp_path / "site")]
     built = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
@@ -132,7 +132,7 @@ def read(path: str) -> Any:
 
 
 def a_site_is_simulated() -> None:
-    """Both sensors on the mesh, the scanner that was named, and results in the survey's coordinates."""
+    """Assert that both sensors use the mesh and the named scanner, and that results have survey coordinates."""
     for sensor in ("stereo", "tls"):
         assert Path(read(f"runs/{sensor}/run.json")["config"]["wall"]["mesh"]).name == "wall.ply"
         points = read_laz(Path(f"runs/{sensor}/epoch_001/points_world.laz")).points
@@ -167,7 +167,7 @@ def what_the_gap_names_is_simulated() -> None:
 
 
 def the_scanner_is_found() -> None:
-    """To a millimetre of the place that the example's own measurement states."""
+    """Assert that the position agrees to a millimetre with the one in the example's own measurement."""
     places = [
         yaml.safe_load(Path(folder, "measurement.yaml").read_text())["scanner"]["position_m"]
         for folder in ("my_measurement", "from_raw")
@@ -211,7 +211,7 @@ CLAIMS = {
 
 
 def test_the_effect_of_the_page_on_adding_one_is_an_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its code is the same as the notebook's, which uses it."""
+    """The page has the same code as the notebook, which uses it."""
     code = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "howto" / "add_effect.md").read_text(), re.DOTALL)[0]
     (tmp_path / "warm_up.py").write_text(code)
     monkeypatch.syspath_prepend(tmp_path)

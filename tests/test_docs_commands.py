@@ -1,7 +1,7 @@
-"""Every command of README.md and docs/ does what its page says: it is run on a small scene, or resolved as if it were.
+"""Every command of README.md and docs/ does what its page says: it is run on a small scene, or resolved without being run.
 
-A command that stands in none of the lists here fails `test_every_command_is_in_a_list`. test_docs.py carries out the commands of
-how-to guides and tutorials, and test_mistakes.py those of docs/reference/mistakes.md.
+A command that is in none of the lists here fails `test_every_command_is_in_a_list`. test_docs.py runs the commands of how-to
+guides and tutorials, and test_mistakes.py those of docs/reference/mistakes.md.
 """
 
 from __future__ import annotations
@@ -278,7 +278,7 @@ OF_A_PACKAGE_TO_COME = (
 
 
 def carry_out(command: str, *further: str) -> str:
-    """Run a command with further words; returns what it prints."""
+    """Run a command with further arguments; return what it prints."""
     program, *words = shlex.split(command)
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
@@ -289,7 +289,7 @@ def carry_out(command: str, *further: str) -> str:
 
 @pytest.fixture(scope="module", autouse=True)
 def playground(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The working folder: README's first commands were typed in it, and it holds the other files that the pages name."""
+    """The working folder: README's first commands have been run in it, and it contains the other files that the pages name."""
     before, folder = Path.cwd(), tmp_path_factory.mktemp("docs")
     os.chdir(folder)
     try:
@@ -319,7 +319,7 @@ MODELS: dict[str, Any] = {
 
 
 def test_every_command_is_in_a_list() -> None:
-    """And none is in a list that no page shows any more; the lists hold each once."""
+    """Also, no list has a command twice or one that no page shows any more."""
     listed = [*RUN, *RESOLVED, *PARSED, *NAMED, *OF_A_STYLE_TO_COME, *OF_A_PACKAGE_TO_COME]
     assert len(set(listed)) == len(listed)
     carried_out = {
@@ -392,7 +392,7 @@ def test_init_with_a_data_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_the_plan_has_the_maps_that_the_readme_promises() -> None:
-    """Maps of precision, spacing, blind spots and the smallest block. Of the scanner here; a how-to inspects both sensors."""
+    """Maps of precision, spacing, blind spots and the smallest block, here for the scanner; a how-to inspects both sensors."""
     carry_out(PLAN, *TINY_WALL, "--sensor", "tls", "--set", "planning.gsd_m=0.5", "--quiet")
     maps = {path.stem for path in Path("plan").glob("*.tif")}
     assert {"tls_normal_sigma_m", "tls_spacing_line_m", "tls_views", "tls_smallest_block_m"} <= maps

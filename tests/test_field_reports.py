@@ -1,4 +1,4 @@
-"""Files of kinds that broke other programs: each is read as it is meant, or refused with the reason."""
+"""Kinds of files that broke other programs: each is read as it is meant, or refused with the reason."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ REPORTS = [report for reports in KINDS.values() for report in reports]
 
 @pytest.mark.parametrize("report", REPORTS, ids=lambda report: report.thread)
 def test_the_page_says_what_happens(report: Report) -> None:
-    """`outcome` fails by itself where a file is read wrongly or taken although it should not be."""
+    """`outcome` itself fails if a file is read wrongly, or accepted although it should not be."""
     (row,) = (line for line in PAGE.read_text(encoding="utf-8").splitlines() if f"[{report.thread}](" in line)
     assert outcome(report).replace("|", "/") in row
 

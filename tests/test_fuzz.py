@@ -1,6 +1,6 @@
-"""Configs and input files with random damage: they load, or one InputError says what is wrong; nothing else comes out.
+"""Configs and input files with random damage: they load, or raise one InputError that says what is wrong, and nothing else.
 
-Hypothesis draws the damage, the same at each run (derandomised); docs/validation lists the faults that have own tests.
+Hypothesis draws the damage, the same in each run (derandomised); docs/validation lists the faults that have tests of their own.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ ODD = st.one_of(
 
 
 def answered(load: Callable[[], Any]) -> None:
-    """`load` ends, with a result or with an InputError of one line."""
+    """Assert that `load` ends with a result or with an InputError of one line."""
     try:
         load()
     except InputError as error:
@@ -72,7 +72,7 @@ def answered(load: Callable[[], Any]) -> None:
 
 
 def places(values: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """The path to every value in nested mappings and lists."""
+    """Yield the path to every value in nested mappings and lists."""
     for key, value in values.items() if isinstance(values, dict) else enumerate(values):
         yield (*path, key)
         if isinstance(value, dict | list):
@@ -118,7 +118,7 @@ def test_an_odd_override(override: str | tuple[str, Any]) -> None:
 
 @pytest.mark.parametrize("kind", LOADERS)
 def test_a_bomb_of_aliases(kind: str, tmp_path: Path) -> None:
-    """Eleven lines that stand for 31 thousand million values."""
+    """Eleven lines stand for 31 thousand million values."""
     lines = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]"]
     lines += [f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 9)}]" for level in range(1, 11)]
     first = next(iter(load_yaml(CONFIGS / f"{kind}.yaml")))
@@ -138,7 +138,7 @@ def test_an_archive_is_no_wall(tmp_path: Path) -> None:
 
 
 def damaged(whole: bytes, data: st.DataObject) -> bytes:
-    """`whole` cut, with bytes changed, or with some put in."""
+    """Return `whole` cut off, with bytes changed, or with bytes inserted."""
     at = data.draw(st.integers(0, len(whole) - 1) | st.integers(0, min(len(whole), 400) - 1), label="at")
     match data.draw(st.sampled_from(["cut", "change", "insert", "zero"])):
         case "cut":

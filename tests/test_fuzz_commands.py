@@ -1,7 +1,7 @@
-"""Each command with words and files spoilt at random: exit status 0 or 2, one line of error, nothing left behind.
+"""Each command with random damage in arguments and files: exit status 0 or 2, one line of error, nothing left behind.
 
-In this process and up to where a command's work begins (DOORS). FUZZ_EXAMPLES sets the cases of each command: 25 here, 500 in
-benchmarks/fuzz.py, which with --through also goes beyond the doors, and measures time and memory.
+The commands run in this process up to where their work begins (DOORS). FUZZ_EXAMPLES sets the number of cases of each command: 25
+here, 500 in benchmarks/fuzz.py, which with --through also goes further and measures time and memory.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from test_fuzz import QUICK
 
 from benchmarks.bad_inputs.case import tried
-from benchmarks.bad_inputs.drawn_cases import SET_UPS, drawn
 from benchmarks.bad_inputs.materials import make_small
+from benchmarks.bad_inputs.random_cases import SET_UPS, drawn
 from benchmarks.bad_inputs.run import said
 from pipeline.cli.main import COMMANDS
 from scene.common.errors import InputError

@@ -1,6 +1,6 @@
-"""Records and measurements with odd values at any place: read, or refused with one line, by the reader of their kind.
+"""Records and measurements with odd values at any place: their reader accepts them or refuses them with one line.
 
-FUZZ_EXAMPLES sets the cases of each kind: 25 here, 500 in benchmarks/fuzz.py.
+FUZZ_EXAMPLES sets the number of cases of each kind: 25 here, 500 in benchmarks/fuzz.py.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ DETECTOR = {"backbone": "fine", "image_px": 512, "proposal": {"anchor_sizes_px":
 
 
 def signed(values: Any) -> Any:
-    """dataset.json with the checksum that it should have."""
+    """Return dataset.json with a right checksum of its contents."""
     try:
         return {**values, "sha256": _digest(_text(values))} if isinstance(values, dict) else values
     except ValueError:  # NaN and infinity
@@ -78,7 +78,7 @@ RECORDS: dict[str, tuple[Any, str, Callable[[Path], Any], Callable[[Any], Any]]]
 
 
 def odd(values: Any, data: st.DataObject) -> Any:
-    """A copy with a value of another kind, a key less, or something else altogether."""
+    """Return a copy with a value of another kind, without one key, or replaced by something else altogether."""
     result = copy.deepcopy(values)
     path = data.draw(st.sampled_from([(), *places(result)]))
     if not path:
@@ -116,7 +116,7 @@ def measurement(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @QUICK
 @given(name=st.sampled_from(["measurement.yaml", "model.yaml"]), data=st.data())
 def test_a_measurement_with_an_odd_value(name: str, measurement: Path, data: st.DataObject) -> None:
-    """A value that is another, and not only odd, may fit: then it is read."""
+    """A changed value may be valid: then the measurement is read."""
     file = measurement / name
     before = file.read_text()
     try:

@@ -1,4 +1,4 @@
-"""Known effects put into real scans: the formulas against closed forms, the judge, and one injection through the diagnosis."""
+"""Known effects put into real scans: the formulas against closed forms, the scores, and one injection through the diagnosis."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 from benchmarks.gap_injections import bases, cases, formulas, run
 from benchmarks.gap_injections.formulas import Matched, Optics, Scan, in_raster, matched, scanned
-from benchmarks.gap_injections.judge import SIZES, judged
+from benchmarks.gap_injections.score import SIZES, scored
 
 RNG = np.random.default_rng(0)
 REAL = pytest.mark.skipif(not bases.DATA.exists(), reason="the shared data are not here")
@@ -27,7 +27,7 @@ def test_the_formulas_share_no_code_with_the_project() -> None:
 
 @pytest.fixture
 def scan() -> Scan:
-    """Of a horizontal plane 1.5 m below the scanner, on which 1 / cos i = R / 1.5."""
+    """A scan of a horizontal plane 1.5 m below the scanner, on which 1 / cos i = R / 1.5."""
     x, y = (each.ravel() for each in np.meshgrid(np.linspace(1, 4, 30), np.linspace(-1, 1, 30)))
     points = np.stack([x, y, np.full(x.shape, -1.5)], axis=1)
     return Scan.of(points, points, np.arange(len(x)) // 30, 2.0 + x)
@@ -106,29 +106,29 @@ OFFSET = {"offset_m": 0.01}
         ([], "missed"),
     ],
 )
-def test_answers_are_judged_by_name_and_size(effects: Any, expected: str) -> None:
-    assert judged(answer("range_offset", OFFSET, *effects))["judgement"] == expected
+def test_answers_are_scored_by_name_and_size(effects: Any, expected: str) -> None:
+    assert scored(answer("range_offset", OFFSET, *effects))["judgement"] == expected
 
 
 def test_what_was_there_before_is_not_blamed_on_the_injection() -> None:
     both = answer("range_offset", OFFSET, said("range_offset", "offset_m", 0.01, 1e-4), said("wobble", "amplitude_rad", 1.0, 0.1))
-    assert judged(both, frozenset(["wobble"]))["judgement"] == "right"
-    assert judged(both, frozenset(["collimation"]))["judgement"] == "wrong"
+    assert scored(both, frozenset(["wobble"]))["judgement"] == "right"
+    assert scored(both, frozenset(["collimation"]))["judgement"] == "wrong"
 
 
 def test_what_is_in_no_catalogue_is_right_where_nothing_is_blamed() -> None:
-    assert judged(answer("off_jump", {"size_m": 0.01}, verdict="unknown"))["judgement"] == "right"
-    assert judged(answer("off_jump", {"size_m": 0.01}, verdict="no_gap"))["judgement"] == "missed"
-    assert judged(answer("off_jump", {"size_m": 0.01}, said("wobble", "amplitude_rad", 1.0, 0.1)))["judgement"] == "wrong"
+    assert scored(answer("off_jump", {"size_m": 0.01}, verdict="unknown"))["judgement"] == "right"
+    assert scored(answer("off_jump", {"size_m": 0.01}, verdict="no_gap"))["judgement"] == "missed"
+    assert scored(answer("off_jump", {"size_m": 0.01}, said("wobble", "amplitude_rad", 1.0, 0.1)))["judgement"] == "wrong"
 
 
 @REAL
 @pytest.mark.slow
 def test_a_wobble_put_into_a_real_scan_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """20 degrees of the forest's ground; 0.4 mrad over 6.5 lines."""
+    """The scan is 20 degrees of forest ground; the wobble has 0.4 mrad over 6.5 lines."""
     small = bases.Base("small", "", bases.forest((-170, -150), (108, 131)), bases.put_scanned)
     monkeypatch.setitem(bases.BASES, "small", small)
     values = {"amplitude_rad": 4e-4, "lines_per_cycle": 6.5, "phase_rad": 0.5}
-    found = judged(run.answered(cases.Case(1, "small", "wobble", values), tmp_path))
+    found = scored(run.answered(cases.Case(1, "small", "wobble", values), tmp_path))
     assert found["judgement"] == "right"
     assert found["strength"] > 30

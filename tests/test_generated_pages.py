@@ -1,4 +1,4 @@
-"""Pages that are made from other files, and the draw of items for readers."""
+"""Pages that are generated from other files, and the random choice of texts that readers review."""
 
 from __future__ import annotations
 

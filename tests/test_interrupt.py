@@ -1,4 +1,4 @@
-"""Interrupts are heard when native code holds the main thread, as where a thread waits for memory that nobody gives."""
+"""Ctrl-C works while native code occupies the main thread, for example while a thread waits for memory that nobody frees."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rules between the folders, read from the source: who imports whom, how long a file may be, what `--help` may load."""
+"""The rules between folders, checked in the source: who imports whom, how long a file may be, what `--help` may load."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Imports = set[tuple[str, ...]]
 
 
 def imports_of(source: str) -> Imports:
-    """Every absolute module path imported anywhere in `source`, `from a import b` counted as a.b."""
+    """Return every absolute module path imported anywhere in `source`; `from a import b` counts as a.b."""
     found: Imports = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -33,7 +33,7 @@ def imports_of(source: str) -> Imports:
 
 
 def violations(folder: str, imports: Imports) -> Imports:
-    """The imports that a file of `folder` may not have."""
+    """Return the imports that a file of `folder` may not have."""
     forbidden = {"scene": {"sensors", "pipeline"}, "sensors": {"pipeline"}}.get(folder, set())
     wrong = {path for path in imports if path[0] in forbidden}
     if folder == "sensors":
@@ -77,7 +77,7 @@ def test_mitsuba_comes_through_the_backend_only(folder: str) -> None:
 
 @pytest.mark.parametrize("folder", ["scene", "sensors", "pipeline"])
 def test_what_cannot_be_is_said_by_types_and_not_by_asserts(folder: str) -> None:
-    """An assert is left out by `python -O`; a type that cannot hold the case needs none."""
+    """`python -O` removes asserts; types that exclude the case need none."""
     trees = {str(file.relative_to(ROOT)): ast.walk(ast.parse(file.read_text())) for file in sources(folder)}
     assert [name for name, nodes in trees.items() if any(isinstance(node, ast.Assert) for node in nodes)] == []
 
@@ -100,7 +100,7 @@ def test_help_loads_nothing_heavy(words: list[str]) -> None:
 
 
 def test_reading_a_config_loads_none_of_the_slow_libraries() -> None:
-    """What a step alone needs is imported by that step; scipy and trimesh together would take longer than all the rest."""
+    """Each step imports what only it needs; scipy and trimesh together would take longer to load than everything else."""
     program = "import sys, pipeline.config.simulation, pipeline.run.site; print(*sys.modules)"
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT)
     slow = {"scipy", "trimesh", "open3d", "matplotlib", "laspy", "pycocotools", "tensorflow"}
@@ -108,12 +108,12 @@ def test_reading_a_config_loads_none_of_the_slow_libraries() -> None:
 
 
 def folder_of(module: tuple[str, ...]) -> str:
-    """The folder of a module: `pipeline.gap.mean` for pipeline.gap.mean.selection."""
+    """Return the folder of a module: `pipeline.gap.mean` for pipeline.gap.mean.selection."""
     return ".".join(module[:-1])
 
 
 def room_edges(imports: dict[tuple[str, ...], Imports]) -> dict[str, set[str]]:
-    """Which rooms each room imports from, by the imports of all its modules, late ones included."""
+    """Return which sub-folders each sub-folder imports from, in all its modules, late imports included."""
     edges: dict[str, set[str]] = {folder_of(module): set() for module in imports}
     for module, found in imports.items():
         for path in found:
@@ -133,7 +133,7 @@ def modules() -> dict[tuple[str, ...], Imports]:
 
 
 def test_no_rooms_need_each_other() -> None:
-    """Raises CycleError, which names the rooms, where one does."""
+    """A cycle raises CycleError, which names the sub-folders."""
     order = list(TopologicalSorter(room_edges(modules())).static_order())
     assert order.index("scene.common") < order.index("sensors.laser") < order.index("pipeline.run") < order.index("pipeline.cli")
 
@@ -156,7 +156,7 @@ def test_every_module_lies_in_a_folder() -> None:
 
 
 def test_every_folder_says_what_it_holds() -> None:
-    """The docstring of a folder: what lives here, what does not, where to start."""
+    """A folder's docstring says what is in it, what is not, and where to start."""
     described = {
         file.relative_to(ROOT).as_posix(): ast.get_docstring(ast.parse(file.read_text())) or ""
         for folder in ("scene", "sensors", "pipeline")
@@ -168,7 +168,7 @@ def test_every_folder_says_what_it_holds() -> None:
 
 @pytest.mark.parametrize("file", sources("pipeline"), ids=lambda file: str(file.relative_to(ROOT)))
 def test_nothing_in_the_pipeline_is_decided_by_the_name_of_an_effect(file: Path) -> None:
-    """What is known of an effect stands on its class; an algorithm that is made for one effect names the class."""
+    """Knowledge of an effect belongs to its class; an algorithm that is made for one effect refers to the class."""
     names = {path.stem for path in (ROOT / "sensors" / "effects").glob("*.py")}
     names |= {f"{sensor}.{name}" for sensor in ("tls", "stereo") for name in names}
     written = {node.value for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.Constant)}
@@ -180,7 +180,7 @@ OF_OTHERS = {"_exit", "_actions", "_repr_html_"}
 
 
 def private_of_others(source: str) -> set[str]:
-    """Names with a leading underscore that a module takes from another one: imported, or of an object whose class it has not."""
+    """Return names with a leading underscore that a module imports from another one, or uses of an object of another class."""
     tree = ast.parse(source)
     nodes = list(ast.walk(tree))
     own = {node.name for node in nodes if isinstance(node, ast.FunctionDef | ast.ClassDef)}

@@ -1,4 +1,4 @@
-"""Every mistake of docs/reference/mistakes.md gets one message, that of the page, exit status 2, and leaves nothing behind."""
+"""Every mistake of docs/reference/mistakes.md gives the page's message, in one line, exit status 2, and leaves nothing behind."""
 
 from __future__ import annotations
 

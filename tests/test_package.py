@@ -1,4 +1,4 @@
-"""The wheel: everything that the program needs outside the checkout is in it, and nothing else is."""
+"""The wheel contains everything that the program needs outside the checkout, and nothing else."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PACKAGES = ("scene", "sensors", "pipeline")
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Built by the backend that pyproject.toml names, from a copy of what is in the checkout, without a network."""
+    """The wheel, built by the backend that pyproject.toml names, from a copy of the checkout's files, without a network."""
     source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
     for name in (*PACKAGES, "configs"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -53,7 +53,7 @@ def test_its_metadata(wheel: Path) -> None:
 
 
 def test_it_runs_where_there_is_no_checkout(wheel: Path, tmp_path: Path) -> None:
-    """Its code alone, on the libraries of this environment: the bundled configs are found in it, and load."""
+    """It runs with its own code on the libraries of this environment: the bundled configs are in it, and load."""
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path / "site")
     program = (

@@ -1,4 +1,4 @@
-"""Scanners, wall styles and readers of another package: one entry point each, and every command knows them."""
+"""Scanners, wall styles and readers from another package: one entry point each makes them available in every command."""
 
 from __future__ import annotations
 

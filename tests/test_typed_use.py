@@ -1,4 +1,4 @@
-"""A user's script against the types of the public functions: mypy accepts right uses and finds wrong ones."""
+"""The types of the public functions: mypy accepts a user's correct script and finds errors in a wrong one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A setting that is carried along with other values: what it decides is noted, and so is what cannot be followed."""
+"""Varied settings (benchmarks/varied.py): a value that carries alternatives notes the decisions made with it, and what it cannot
+follow.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,7 @@ def test_a_comparison_notes_the_values_that_would_decide_otherwise(measured: obj
 
 
 def test_what_is_computed_with_it_carries_all_values() -> None:
-    """2 (limit + 1) - 3, by the array and by the scalar: 19, 13 and 27; a root, a largest and a power too."""
+    """2 (limit + 1) - 3, by the array and by the scalar: 19, 13 and 27; also a root, a maximum and a power."""
     matters: set[Setting] = set()
     shifted = np.float64(2.0) * (limit(matters) + 1) - 3
     assert isinstance(shifted, Varied)

@@ -1,4 +1,4 @@
-"""A data set that is made in seconds."""
+"""A config of a data set that is made in seconds."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def tiny(**changes: Any) -> DatasetConfig:
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """Checksums of all that a set consists of; hidden files are the job's own."""
+    """Return the checksums of all files that belong to a data set; hidden files belong to the job that makes it."""
     files = (path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith("."))
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 

@@ -1,5 +1,6 @@
-"""Bad inputs that are valid but unusual files of other programs: properties, links, compression bombs, camera files, sparse
-giants.
+"""Bad inputs that are valid but unusual files of other programs.
+
+They have odd properties, links, compression bombs, unusual camera files or giant sparse arrays.
 """
 
 from __future__ import annotations

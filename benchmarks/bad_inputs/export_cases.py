@@ -80,7 +80,7 @@ def _surface(move: Callable[[TriangleMesh], TriangleMesh], name: str = AFTER) ->
 
 
 def _tile(values: Any) -> Change:
-    """The first tile of train with other values."""
+    """Return a change that gives the first tile of train other values."""
 
     def change(folder: Path) -> None:
         first = json.loads((folder / TILES).read_text())["images"][0]["file_name"]

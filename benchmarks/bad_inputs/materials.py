@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from benchmarks.gap_challenge.cases import Case, make
+from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.change.annotate import run_length_encoding
 from pipeline.cli.main import main
 from pipeline.config.bundled import configs_folder
@@ -72,8 +72,9 @@ def make_materials(folder: Path, *, diagnosed: bool = True) -> None:
 
 
 def make_small(folder: Path) -> None:
-    """Make good inputs of a few hundred pixels and points, in seconds, with diagnosis/ and events/ as their commands would write
-    them.
+    """Make good inputs of a few hundred pixels and points, in seconds.
+
+    diagnosis/ and events/ are made as their commands would write them.
     """
     site = {**SITE, "epochs": 1, "wall": {**SITE["wall"], "width_m": 4.0, "height_m": 3.0, "resolution_m": 0.2}}
     site |= {"scanner": {"azimuth_step_rad": 0.01, "zenith_step_rad": 0.01}, "rockfall": {"count": 2, "size_m": 0.5}}

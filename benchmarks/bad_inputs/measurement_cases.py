@@ -81,7 +81,7 @@ def _on_the_wall(found: Array) -> Array:
 
 
 def _pieces(folder: Path) -> None:
-    """The wall as triangles of their own, none of which shares a vertex."""
+    """Write the wall as triangles of which no two share a vertex."""
     found = read_ply(folder / WALL)
     write_mesh(folder / WALL, found.vertices[found.faces].reshape(-1, 3), np.arange(3 * len(found.faces)).reshape(-1, 3))
 

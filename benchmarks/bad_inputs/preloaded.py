@@ -48,8 +48,14 @@ class Order:
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended: exit status, wall time and processor time of all its processes, s, and peak memory of the largest one,
-    GB.
+    """How a command ended.
+
+    Attributes
+    ----------
+    code : Exit status.
+    wall_s : Wall time, s.
+    own_s : Processor time of all its processes, s.
+    gigabytes : Peak memory of the largest process, GB.
     """
 
     code: int
@@ -77,12 +83,14 @@ class Preloaded:
         )
 
     def run(self, order: Order) -> Ended:
+        """Run a command in a process that is forked from the preloaded one, and wait for its end."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         print(json.dumps(asdict(order)), file=self._process.stdin, flush=True)
         return Ended(**json.loads(self._process.stdout.readline()))
 
     def close(self) -> None:
+        """End the process."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         self._process.wait()

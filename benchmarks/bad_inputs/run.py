@@ -31,15 +31,15 @@ from benchmarks.bad_inputs import (
     dataset_cases,
     exchange_cases,
     export_cases,
+    foreign_content_cases,
     further_cases,
     gap_cases,
     measurement_cases,
+    odd_argument_cases,
     odd_results_cases,
-    odd_words_cases,
-    people_cases,
-    placed_cases,
     raw_cases,
     site_cases,
+    user_mistake_cases,
 )
 from benchmarks.bad_inputs.case import Case, Outcome, tried
 from benchmarks.bad_inputs.materials import make_materials
@@ -60,10 +60,10 @@ def all_cases() -> list[Case]:
         *exchange_cases.cases(),
         *camera_cases.cases(),
         *odd_results_cases.cases(),
-        *odd_words_cases.cases(),
+        *odd_argument_cases.cases(),
         *export_cases.cases(),
-        *placed_cases.cases(),
-        *people_cases.cases(),
+        *foreign_content_cases.cases(),
+        *user_mistake_cases.cases(),
     ]
 
 

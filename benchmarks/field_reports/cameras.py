@@ -15,7 +15,7 @@ _RESOLUTION = '<resolution width="8192" height="5460"/>'
 
 
 def _metashape(folder: Path, calibrations: str, kind: str = "frame", pose: str = _POSE) -> Path:
-    """A camera XML of one camera."""
+    """Write a camera XML of one camera."""
     (folder / "cameras.xml").write_text(
         f'<document version="2.0.0"><chunk label="Chunk 1" enabled="true"><sensors next_id="1">'
         f'<sensor id="0" label="camera" type="{kind}">{_RESOLUTION}{calibrations}</sensor></sensors>'

@@ -71,7 +71,7 @@ def _negative_in_between(folder: Path) -> str:
 
 
 def _polygons(folder: Path) -> str:
-    """A flat wall of one L-shaped polygon of six corners, which a fan of triangles from its first corner would not fill."""
+    """Write a flat wall of one L-shaped polygon of six corners, which a fan of triangles from its first corner would not fill."""
     outline = np.array([[0.0, 0, 4], [0, 0, 0], [6, 0, 0], [6, 0, 1], [2, 0, 1], [2, 0, 4]])
     mesh = _obj(folder, _vertex_lines(outline) + "f 1 2 3 4 5 6\n")
     area = _area(mesh.vertices, mesh.faces)
@@ -80,7 +80,7 @@ def _polygons(folder: Path) -> str:
 
 
 def _concave_quads(folder: Path) -> str:
-    """An arrowhead of four corners, whose diagonal from the first corner lies outside it."""
+    """Write an arrowhead of four corners, whose diagonal from the first corner lies outside it."""
     outline = np.array([[0.0, 0, 0], [2, 0, 1], [4, 0, 0], [2, 0, 4]])
     path = _ply_text(folder, "4 0 1 2 3\n", "property list uchar int vertex_index\n", outline)
     mesh, _ = read_mesh(path)

@@ -51,7 +51,7 @@ def _cut_laz(folder: Path) -> str:
 
 
 def _undeclared_bytes(folder: Path) -> str:
-    """Records of 34 bytes where the point format has 30, and no word about the other four."""
+    """Write records of 34 bytes where the point format has 30, without declaring the other four."""
     points = points_of_wall()
     path = folder / "scan.las"
     _las(path, points, lambda las: las.add_extra_dim(laspy.ExtraBytesParams("reflectance", "f4")))
@@ -93,7 +93,7 @@ def _return_number_zero(folder: Path) -> str:
 
 
 def _version_1_0(folder: Path) -> str:
-    """A file of version 1.0, whose bytes behind the header are no count of points."""
+    """Write a file of version 1.0, whose bytes behind the header are no count of points."""
     points = points_of_wall()
     path = _las(folder / "scan.las", points, version="1.2", point_format=0)
     _patch(path, 24, "<BB", 1, 0)
@@ -129,7 +129,7 @@ def _las_named_xyz(folder: Path) -> str:
 
 
 def _e57(path: Path, fields: dict[str, FloatArray], pose: dict[str, tuple[float, ...]] | None = None) -> Path:
-    """A file of one scan with the given fields, 64-bit numbers, and parts of a pose."""
+    """Write a file of one scan with the given fields, 64-bit numbers, and parts of a pose."""
     image = libe57.ImageFile(str(path), "w")
     root = image.root()
     root.set("formatName", libe57.StringNode(image, "ASTM E57 3D Imaging Data File"))
@@ -235,7 +235,7 @@ def _ptx_without_a_matrix(folder: Path) -> str:
 
 
 def _ply(path: Path, points: FloatArray, number: str, more: str = "", faces: bool = False) -> Path:
-    """A binary PLY file of points; more: a list property of every vertex."""
+    """Write a binary PLY file of points; more: a list property of every vertex."""
     kind = {"float": "<f4", "double": "<f8"}[number]
     properties = "".join(f"property {number} {axis}\n" for axis in "xyz") + more
     end = "element face 0\nproperty list ushort int vertex_indices\n" if faces else ""

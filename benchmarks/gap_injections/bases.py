@@ -127,8 +127,9 @@ def _measured() -> Array:
 
 
 def _write_pair(folder: Path, true: Array, found: Array) -> None:
-    """Write a pair's folder: the surface of disparities `true`, and the points of `found` (rows, columns), which are
-    also kept.
+    """Write a pair's folder.
+
+    true: disparities of the surface; found: (rows, columns) disparities of the points, which are also kept.
     """
     folder.mkdir(parents=True)
     even = true.copy()

@@ -18,6 +18,7 @@ class Case:
 
     @property
     def name(self) -> str:
+        """Number of the case in three digits."""
         return f"{self.number:03d}"
 
 

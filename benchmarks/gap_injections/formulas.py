@@ -21,8 +21,15 @@ _LEAST_COSINE = 0.1
 
 @dataclass(frozen=True)
 class Scan:
-    """Points of a scanner. az, ze: recorded angles, rad; R: range, m; line: scan line; cos_i: cosine of incidence; power: or
-    None.
+    """Points of a scanner, (n,) each.
+
+    Attributes
+    ----------
+    az, ze : Recorded azimuth and zenith, rad.
+    R : Range, m.
+    line : Scan line.
+    cos_i : Cosine of the incidence angle.
+    power : Received power, or None.
     """
 
     az: Array
@@ -134,8 +141,9 @@ class Optics:
 
 
 def matched(name: str, p: Values, seen: Matched, optics: Optics, rng: np.random.Generator) -> Matched:
-    """Return disparities with an effect on single points; an effect on the left image moves both place and disparity of
-    a point.
+    """Return disparities with an effect on single points.
+
+    An effect on the left image moves both place and disparity of a point.
     """
     u, v, d = seen.u, seen.v, seen.d
     x, y = (u - 0.5 - optics.cx) / optics.f, (v - 0.5 - optics.cy) / optics.f

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from benchmarks.gap_injections.bases import BASES
-from benchmarks.gap_injections.judge import SIZES, Json
+from benchmarks.gap_injections.score import SIZES, Json
 
 _KINDS = ("right", "class", "described", "size", "missed", "wrong", "refused", "error")
 _CLEAR, _STRONG = 8.0, 30.0
@@ -16,7 +16,7 @@ _HEAD = """# Known effects put into real scans
 
 This page shows whether `scarpsim gap` names a known effect in a real measurement. Real measurements disagree with their model in
 ways that no generator makes: edges, twigs, relief between points, rounded coordinates. The page is for users who want to know
-what to expect from data of their own. The [closed-form generator](gap_challenge.md) tests the same on simulated measurements.
+what to expect from data of their own. The [closed-form generator](gap_closed_form.md) tests the same on simulated measurements.
 
 Each case is a measurement of ../shared/data into whose ranges, angles or disparities a known effect was put by a closed form
 (`benchmarks/gap_injections/formulas.py`, which uses NumPy and SciPy alone). It is then diagnosed as `scarpsim gap` does it. Made
@@ -24,7 +24,7 @@ by
 
     OMP_NUM_THREADS=1 python benchmarks/gap_injections/run.py --out /tmp/injections --page docs/validation/gap_injections.md"""
 
-_JUDGED = {
+_OUTCOMES = {
     "right": (
         "names the effect, within 3 standard errors or 15 % of its size (a period within 5 %), and blames no other; for "
         "an effect outside the catalogue (`off_...`): `unknown`, and no effect of the catalogue is blamed"
@@ -79,7 +79,7 @@ def page(rows: list[Json], bases: dict[str, Json]) -> str:
     parts = [
         _HEAD,
         "## Results\n\n" + _in_short(rows) + "\n\n" + _counts(rows),
-        "## How answers are judged\n\n" + _table(("judged", "the answer"), _JUDGED.items()),
+        "## How answers are scored\n\n" + _table(("outcome", "the answer"), _OUTCOMES.items()),
         _STRENGTH,
         "## The measurements without an injected effect\n\n" + _bases(bases),
         "## Why cases fail\n\n" + _table(("where", "why"), _CAUSES.items()),
@@ -132,7 +132,7 @@ def _counts(rows: list[Json]) -> str:
 
 
 def _in_short(rows: list[Json]) -> str:
-    """What the counts come to."""
+    """Summarise the counts in sentences."""
     good = [row for row in rows if row["judgement"] in ("right", "class")]
     known = [row for row in good if not row["effect"].startswith("off_")]
     spoiled = [row for row in known if row["verdict"] == "unknown"]
@@ -166,7 +166,7 @@ def _rows(rows: list[Json]) -> str:
         ]
         for row in rows
     ]
-    return _table(("", "measurement", "put in", "values", "S/N", "judged", "verdict", "named", "size found"), lines)
+    return _table(("", "measurement", "put in", "values", "S/N", "outcome", "verdict", "named", "size found"), lines)
 
 
 def _values(values: Json) -> str:

@@ -1,4 +1,4 @@
-"""Inject known effects into real measurements, diagnose each like `scarpsim gap`, and judge the answers.
+"""Inject known effects into real measurements, diagnose each like `scarpsim gap`, and score the answers.
 
     OMP_NUM_THREADS=1 python benchmarks/gap_injections/run.py --out /tmp/injections [--page docs/validation/gap_injections.md]
 
@@ -26,8 +26,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from benchmarks.gap_injections.bases import BASES
 from benchmarks.gap_injections.cases import CASES, Case
-from benchmarks.gap_injections.judge import Json, judged
 from benchmarks.gap_injections.page import page
+from benchmarks.gap_injections.score import Json, scored
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
@@ -45,8 +45,9 @@ _NOISES = {
 
 
 def base_folder(name: str, out: Path) -> Path:
-    """Return the folder of an unchanged measurement, with the white noise that its own diagnosis proposes, made and diagnosed
-    once.
+    """Return the folder of an unchanged measurement, with the white noise that its own diagnosis proposes.
+
+    It is made and diagnosed once.
     """
     folder = out / "bases" / name
     answer = out / "answers" / f"{name}.json"
@@ -158,10 +159,10 @@ def _write(path: Path, values: Any) -> None:
 
 
 def run(out: Path, cases: tuple[Case, ...] = CASES) -> list[Json]:
-    """Return the judged answers to all cases."""
+    """Return the scored answers to all cases."""
     found = []
     for case in cases:
-        row = judged(answered(case, out), named_before(case.base, out))
+        row = scored(answered(case, out), named_before(case.base, out))
         print(f"{case.name} {case.base} {case.effect} {row['judgement']}: {row['verdict']} {row['named']}", flush=True)
         found.append(row)
     return found
@@ -172,7 +173,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--only", nargs="*", default=[], metavar="BASE", help="measurements to use (default: all)")
     parser.add_argument("--page", type=Path, help="write the table there")
-    parser.add_argument("--answered", action="store_true", help="make no further answers, judge those that are there")
+    parser.add_argument("--answered", action="store_true", help="make no further answers, score those that are there")
     arguments = parser.parse_args()
     wanted = [case for case in CASES if not arguments.only or case.base in arguments.only]
     if arguments.answered:

@@ -76,7 +76,7 @@ def messages() -> Iterator[dict[str, str]]:
 
 
 def drawn(seed: int) -> list[dict[str, Any]]:
-    """The items of one round."""
+    """Draw the items of one round."""
     source = random.Random(seed)
     items: list[dict[str, Any]] = []
     for kind, every in (("definition", definitions()), ("page", pages()), ("message", messages())):
@@ -85,7 +85,7 @@ def drawn(seed: int) -> list[dict[str, Any]]:
 
 
 def page() -> str:
-    """The page, from files of grades: a list of {number, kind, where, grade, understood}."""
+    """Return the page, from files of grades: a list of {number, kind, where, grade, understood}."""
     lines = ["| round | kind | items | median grade | below 2 |", "|---|---|---|---|---|"]
     failed = ["| round | item | grade | what was unclear |", "|---|---|---|---|"]
     for number, path in enumerate(sorted(FOLDER.glob("*.json")), start=1):

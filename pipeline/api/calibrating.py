@@ -117,8 +117,9 @@ class Calibration:
         return Picture(pick({name: png for name, _, png in pictures(self.figures, None)}, kind, "plot"))
 
     def write(self, out: Path | str) -> Path:
-        """Write the folder that `scarpsim calibrate` writes; return its report.html. Raises InputError if the folder is in
-        use.
+        """Write the folder that `scarpsim calibrate` writes; return its report.html.
+
+        Raises InputError if the folder is in use.
         """
         return write(Path(out), self.figures.config, self.figures, self.inputs)
 

@@ -141,8 +141,9 @@ class Comparison:
 
 
 def _given(sensors: Sequence[Any], seed: int | None, overrides: Mapping[str, Any]) -> list[Given]:
-    """Turn the arguments of `compare` into what `sensor_setups` takes: names of files and presets, or pairs of a name and a
-    config.
+    """Turn the arguments of `compare` into what `sensor_setups` takes.
+
+    They become names of files and presets, or pairs of a name and a config.
     """
     if not sensors:
         raise InputError("got no sensor", where="compare", remedy='write for example compare("glendale", "riegl_vz400i")')

@@ -107,8 +107,9 @@ class Detections:
 
     @property
     def events(self) -> geopandas.GeoDataFrame:
-        """One row per event: image, number, position, area, depth, volume, score; SI units. The geometry is its rectangle, wall
-        frame.
+        """One row per event: image, number, position, area, depth, volume, score; SI units.
+
+        The geometry is its rectangle, wall frame.
         """
         bounds = [
             [each.x_m - each.width_m / 2, each.y_m - each.height_m / 2, each.x_m + each.width_m / 2, each.y_m + each.height_m / 2]

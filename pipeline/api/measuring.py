@@ -124,7 +124,7 @@ class Measurement:
 
     @property
     def sensor(self) -> str:
-        """ "stereo" or "tls"."""
+        """The kind of sensor: "stereo" or "tls"."""
         return self.held.sensor
 
     @property
@@ -227,8 +227,9 @@ class Diagnosis:
 
     @property
     def changes(self) -> geopandas.GeoDataFrame:
-        """Regions where the scene itself changed: volume_m3, volume_std_m3, offset_m, position. The geometry is the bounding
-        rectangle, wall frame.
+        """Regions where the scene itself changed: volume_m3, volume_std_m3, offset_m, position.
+
+        The geometry is the bounding rectangle, wall frame.
         """
         rows, bounds = [], []
         for each in self.found.changes:
@@ -240,8 +241,9 @@ class Diagnosis:
 
     @property
     def residuals(self) -> Points:
-        """The compared points, wall frame, with the channels before_m and after_m (measured minus predicted depth) and
-        held_out.
+        """The compared points, wall frame, with their residuals.
+
+        The channels are before_m and after_m (measured minus predicted depth without and with the named effects) and held_out.
         """
         found, cloud = self.found, self.measurement.held.cloud
         depth, index = found.residuals.depth_m, found.residuals.index
@@ -267,8 +269,9 @@ class Diagnosis:
         return report.summarise(self.found)
 
     def plot(self, kind: str = "maps") -> Picture:
-        """Return a figure of the report (maps, profiles, gap, identifiability), or the residuals over the wall (before,
-        after).
+        """Return a figure of the report, or the residuals over the wall.
+
+        kind: maps, profiles, gap or identifiability for a figure of the report; before or after for the residuals.
         """
         if kind in ("before", "after"):
             points = self.residuals

@@ -37,8 +37,9 @@ class Mesh(TriangleMesh):
 
     @classmethod
     def from_arrays(cls, vertices: ArrayLike, faces: ArrayLike) -> Self:
-        """Return a mesh of vertices (n, 3), m, and faces (m, 3) of vertex indices; raise InputError for other shapes or
-        indices.
+        """Return a mesh of vertices (n, 3), m, and faces (m, 3) of vertex indices.
+
+        Raises InputError for other shapes or indices.
         """
         corners, triangles = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
         for name, array in (("vertices", corners), ("faces", triangles)):
@@ -81,8 +82,9 @@ class Mesh(TriangleMesh):
         return made
 
     def plot(self, gsd_m: float | None = None) -> Picture:
-        """Return a hillshade, viewed along the normal of the mean plane. gsd_m: side of a pixel, m; default: about 100,000
-        pixels.
+        """Return a hillshade, viewed along the normal of the mean plane.
+
+        gsd_m: side of a pixel, m; by default the picture has about 100,000 pixels.
         """
         from pipeline.precision.surface import wall_raster
         from pipeline.report.figures import hillshade_figure

@@ -110,8 +110,9 @@ class Monitoring:
 
     @property
     def differences(self) -> xarray.DataArray:
-        """Difference maps, (epoch, y, x), m: reference minus epoch along the wall's normal, missing rock positive, NaN without
-        data.
+        """Difference maps, (epoch, y, x), m: reference minus epoch along the wall's normal.
+
+        Missing rock is positive; pixels without data are NaN.
         """
         xarray = library("xarray")
         maps = [self._map("difference", epoch.number) for epoch in self.result.epochs]

@@ -73,8 +73,9 @@ class SensorPlan:
 
     @property
     def maps(self) -> xarray.Dataset:
-        """All maps by name (smallest_block_m, normal_sigma_m, incidence_rad, ...), SI units; NaN where the sensor sees
-        nothing.
+        """All maps by name (smallest_block_m, normal_sigma_m, incidence_rad, ...), in SI units.
+
+        They are NaN where the sensor sees nothing.
         """
         raster = self.promise.raster
         return dataset({

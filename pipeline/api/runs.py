@@ -91,8 +91,9 @@ def open_run(folder: Path | str) -> Run:
 
 @dataclass(frozen=True, repr=False)
 class Run:
-    """A run on disk, whose files are read when they are needed. `run[0]` is the reference epoch, `run[1]` the first after
-    rockfall.
+    """A run on disk, whose files are read when they are needed.
+
+    `run[0]` is the reference epoch, `run[1]` the first after rockfall.
 
     Attributes
     ----------
@@ -120,7 +121,7 @@ class Run:
 
     @property
     def sensor(self) -> SensorName:
-        """ "stereo" or "tls"."""
+        """The kind of sensor: "stereo" or "tls"."""
         return "stereo" if self.record["sensor"] == "stereo" else "tls"
 
     @property
@@ -166,8 +167,9 @@ class Run:
 
     @property
     def statistics(self) -> pandas.DataFrame:
-        """One row per epoch: statistics of the differences outside the blocks (count, median_m, nmad_m, ...), RMS of the
-        registration.
+        """One row per epoch: statistics of its differences and the RMS of its registration.
+
+        The statistics (count, median_m, nmad_m, ...) are those outside the blocks.
         """
         return frame(each.statistics for each in self.epochs)
 
@@ -269,8 +271,9 @@ class Epoch:
         )
 
     def plot(self, kind: str = "difference") -> Picture:
-        """Return a figure of the report: difference, blocks, hillshade, histogram, icp or m3c2. The reference has only its
-        hillshade.
+        """Return a figure of the report: difference, blocks, hillshade, histogram, icp or m3c2.
+
+        The reference has only its hillshade.
         """
         if self.number == 0:
             return Picture((self.run.folder / "reference.png").read_bytes())

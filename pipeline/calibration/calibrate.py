@@ -141,8 +141,9 @@ class CalibrationResult:
         return self.parameters.model(np.exp(self.found.x))
 
     def inseparable(self) -> list[tuple[str, str, float]]:
-        """Return pairs of parameters that the maps cannot separate: both names, and the correlation (over 0.9 in magnitude) of
-        their errors.
+        """Return pairs of parameters that the maps cannot separate: both names, and their correlation.
+
+        It is the correlation of their errors; pairs over 0.9 in magnitude are listed.
         """
         names, matrix = self.parameters.names, self.found.correlation
         rows, columns = np.nonzero(np.triu(np.abs(matrix) > _ALIKE, 1))

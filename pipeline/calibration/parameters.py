@@ -115,8 +115,9 @@ def noise_parameters(base: Model, names: Sequence[str]) -> NoiseParameters:
 
 
 def _default_names(base: Model) -> tuple[str, ...]:
-    """Return the default parameters of the model's sensor, without the orientation factor where the model has no orientation
-    noise.
+    """Return the default parameters of the model's sensor.
+
+    The orientation factor is left out if the model has no orientation noise.
     """
     names = _DEFAULT[base.sensor]
     return names if not isinstance(base, StereoModel) or _has_orientation_noise(base) else names[:-1]

@@ -188,8 +188,9 @@ def _values(result: CalibrationResult) -> list[tuple[str, str]]:
 
 
 def _with_interval(name: str, value: float, low: float, high: float) -> str:
-    """Format a value and its interval in the unit that people read it in; the orientation's is a factor of the
-    config's sigmas.
+    """Format a value and its interval in the unit that people read it in.
+
+    The orientation's value is a factor of the config's sigmas.
     """
     unit, factor = _READ_IN.get(name.rpartition("_")[2], (" times the config's" if name == ORIENTATION else "", 1.0))
     return f"{factor * value:.4g}{unit}  ({factor * low:.4g} to {factor * high:.4g})"

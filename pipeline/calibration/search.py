@@ -89,8 +89,9 @@ class Simulations:
 
 @dataclass(frozen=True)
 class ResponseSurface:
-    """Response surface: the statistics' mean as a quadratic polynomial of z = (x - centre) / scale, and their covariance about
-    it.
+    """Response surface: how the mean of the statistics depends on the parameters, and their scatter.
+
+    The mean is a quadratic polynomial of z = (x - centre) / scale, with x the logarithmic parameters.
 
     Attributes
     ----------
@@ -376,8 +377,9 @@ def cost_of_new_simulations(
 
 
 def _distance(s: FloatArray, observed: FloatArray) -> FloatArray:
-    """Return the (n,) RMS differences of simulated from observed statistics, unweighted, for use before their covariance is
-    known.
+    """Return the RMS difference (n,) of simulated from observed statistics.
+
+    It is unweighted, for use before the covariance of the statistics is known.
     """
     return np.sqrt(np.mean((s - observed) ** 2, axis=1))
 

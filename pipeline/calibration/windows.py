@@ -90,8 +90,9 @@ def stable_ground(maps: Sequence[NDArray[np.floating]]) -> BoolArray:
 
 
 def _compact(values: NDArray[np.floating], background: FloatArray) -> BoolArray:
-    """Return the (h, w) mask of patches, 3 x 3 pixels or larger, of one sign that all exceed the limit, with a margin of two
-    pixels.
+    """Return the mask (h, w) of patches of one sign that all exceed the limit, with a margin of two pixels.
+
+    A patch has 3 x 3 pixels or more.
     """
     behind = np.repeat(np.repeat(background, _CHANGE_CELL_PX, axis=0), _CHANGE_CELL_PX, axis=1)
     departure = values - behind[: values.shape[0], : values.shape[1]]

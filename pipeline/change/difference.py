@@ -75,8 +75,9 @@ def raster_grid(bounds: FloatArray, config: DifferenceConfig) -> Grid:
 
 
 def surface_raster(mesh: TriangleMesh, grid: Grid) -> SurfaceRaster:
-    """Rasterise `mesh` (wall frame) by looking along -z at every pixel centre of `grid`. Labels are its `face_block`, else
-    `vertex_block`.
+    """Rasterise `mesh` (wall frame) by looking along -z at every pixel centre of `grid`.
+
+    Labels are its `face_block`, else `vertex_block`.
     """
     dr.flush_malloc_cache()  # frees the observation's memory: rasterising the surface is the peak of an epoch
     return cast_raster(RayCaster(mesh), grid)
@@ -97,8 +98,9 @@ def cast_raster(caster: RayCaster, grid: Grid) -> SurfaceRaster:
 
 
 def difference(reference: SurfaceRaster, epoch: SurfaceRaster) -> NDArray[np.float32]:
-    """Return reference minus epoch in z, (h, w), m: positive where rock is missing, negative where it was added, NaN without
-    data.
+    """Return reference minus epoch in z, (h, w), m.
+
+    It is positive where rock is missing, negative where it was added, and NaN without data.
     """
     if reference.grid != epoch.grid:
         raise InputError(f"{epoch.grid} is not the reference's {reference.grid}", where="difference")

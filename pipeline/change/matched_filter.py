@@ -38,8 +38,9 @@ _LEAST_FREE = 0.5
 def signal_to_noise(
     difference: NDArray[np.float32], block: IntArray, change: NDArray[np.float32], count: int
 ) -> NDArray[np.float64]:
-    """Compute rho (count,) of each block in a difference map; NaN if it cannot be determined, 0 for a block that is not in the
-    map.
+    """Compute the matched filter's signal-to-noise ratio rho (count,) of each block in a difference map.
+
+    It is NaN if it cannot be determined, and 0 for a block that is not in the map.
 
     Parameters
     ----------
@@ -151,8 +152,9 @@ def true_change(
 
 
 def _ratio(template: FloatArray, spectrum: FloatArray) -> float:
-    """Return rho of a template. A template larger than the spectrum's window is averaged to coarser pixels, whose noise counts as
-    white.
+    """Return rho of a template.
+
+    A template larger than the spectrum's window is averaged to coarser pixels, whose noise counts as white.
     """
     side = len(spectrum)
     step = -(-max(template.shape) // side)

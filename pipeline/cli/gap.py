@@ -1,5 +1,6 @@
-"""`scarpsim gap`: find where simulation and measurement disagree, name the effects that explain it, and write the improved
-model.
+"""`scarpsim gap`: find where simulation and measurement disagree, and name the effects that explain it.
+
+The command also writes the improved model.
 """
 
 from __future__ import annotations
@@ -77,11 +78,12 @@ def _measurement_folder(arguments: argparse.Namespace, out: Path) -> Path:
     if len(given) == 1 and (given[0].is_dir() or given[0].suffix in ("", ".yaml", ".yml")) and not arguments.reference:
         return given[0]
     if not arguments.reference:
-        remedy = (
-            "add --reference (a mesh, a cloud, or half) and --scanner, or --photographs for a cloud from photographs without "
-            "cameras; or give the folder of a measurement"
+        raise InputError(
+            "is a raw file, and no reference is given to compare it with",
+            where=str(given[0]),
+            remedy="add --reference (a mesh, a cloud, or half) and --scanner, or --photographs for a cloud from photographs "
+            "without cameras; or give the folder of a measurement",
         )
-        raise InputError("is a raw file, and no reference is given to compare it with", where=str(given[0]), remedy=remedy)
     return build_measurement_folder(arguments, given, out / "measurement").folder
 
 

@@ -63,7 +63,9 @@ class Command(Protocol):
     SUMMARY: str
     EXAMPLE: str
 
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None: ...
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Declare the command's arguments and options on its parser."""
+        ...
 
     def run(self, arguments: argparse.Namespace) -> CommandOutput:
         """Run the command and return what it prints. It may set `arguments.kept`, which says what an interrupt leaves usable."""
@@ -94,8 +96,9 @@ COMMANDS: dict[str, Command] = {
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run `scarpsim COMMAND ...` and return the exit status. `argv`: the words after `scarpsim`; default: those of the
-    process.
+    """Run `scarpsim COMMAND ...` and return the exit status.
+
+    argv: the words after `scarpsim`; by default those of the process.
     """
     words = sys.argv[1:] if argv is None else argv
     name = words[0] if words else ""

@@ -17,8 +17,9 @@ _NEGATIVE_NUMBERS = re.compile(r"^-\.?\d[\d.,eE+-]*$")
 
 
 class Parser(argparse.ArgumentParser):
-    """Argument parser that requires complete option names, shows an example in its help, and raises InputError instead of
-    exiting.
+    """Argument parser of all commands: it requires complete option names and has an example in its help.
+
+    It raises InputError instead of exiting.
     """
 
     def __init__(self, prog: str, description: str, example: str) -> None:

@@ -1,5 +1,6 @@
-"""Compute the results of a comparison for each sensor and for measured epochs: noise, level of detection, detected blocks and
-completeness.
+"""Compute the results of a comparison for each sensor and for measured epochs.
+
+They are the noise, the level of detection, the detected blocks and the completeness.
 """
 
 from __future__ import annotations
@@ -401,8 +402,9 @@ def _table(size: FloatArray, depth: FloatArray, hit: BoolArray) -> FloatArray:
 
 
 def shared_scale_m(noises: list[MapNoise]) -> float:
-    """Return the standard deviation that scales the colours of all maps, m: the largest NMAD, so that no sensor's noise
-    saturates.
+    """Return the standard deviation that scales the colours of all maps, m.
+
+    It is the largest NMAD, so that no sensor's noise saturates.
     """
     return max((each.stable.nmad for each in noises if each.stable.count), default=1e-3) or 1e-3
 

@@ -1,5 +1,6 @@
-"""Compute, for each pixel of the wall, what noise may depend on: range, incidence angle, distance from edges, albedo and
-visibility.
+"""Compute what noise may depend on, for each pixel of the wall.
+
+The covariates are range, incidence angle, distance from edges, albedo and visibility.
 """
 
 from __future__ import annotations

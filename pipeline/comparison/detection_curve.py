@@ -172,8 +172,9 @@ def _gap_around(at: float, sizes: FloatArray) -> tuple[float, float] | None:
 
 
 def _profile(log_size: FloatArray, seen: BoolArray) -> _ProfileLikelihood:
-    """Compute the profile likelihood on a grid of ln t, over coarse widths first and then over fine ones around the
-    likely ones.
+    """Compute the profile likelihood on a grid of ln t, where t is the size that is detected in 95 % of cases.
+
+    The maximum is searched over coarse widths first, and then over fine ones around the likely ones.
     """
     coarse = np.geomspace(*_WIDTHS, _COARSE)
     best = [_of_width(width, log_size, seen).maximum for width in coarse]

@@ -91,8 +91,9 @@ def side_by_side(panels: Sequence[MapPanel], limit_m: float, label: str, *, sign
 
 
 def noise_figure(noises: Mapping[str, MapNoise]) -> bytes:
-    """Draw histograms (dashed: normal with the same median and NMAD), linear and logarithmic, and variograms with
-    their models.
+    """Draw histograms of the noise, linear and logarithmic, and variograms with their models.
+
+    Dashed lines are normal distributions with the same median and NMAD.
     """
     figure = Figure(figsize=(_WIDTH_IN, 4.4), dpi=DPI, layout="constrained")
     linear, logarithmic, correlation = figure.subplots(1, 3)

@@ -84,8 +84,9 @@ def _write(out: Path, comparison: ComparisonResult) -> None:
 
 
 def answer(found: SensorAssessment) -> str:
-    """Return the main result of a sensor as a sentence: the smallest block that it sees in 95 % of cases, and from
-    which blocks.
+    """Return the main result of a sensor as a sentence.
+
+    It states the smallest block that the sensor sees in 95 % of cases, and from which blocks this was estimated.
     """
     curve = found.detection.by_size
     if curve is None:

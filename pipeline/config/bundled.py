@@ -31,10 +31,10 @@ def named_configs(kind: str) -> dict[str, Path]:
 
 
 def bundled_config(kind: str, name: str) -> Path:
-    """Return the file of the bundled config `name` of a `kind` (a subfolder such as "sites"; "" for the top level, such as
-    demo.yaml).
+    """Return the file of the bundled config `name` of a `kind`.
 
-    Raises InputError, with the most similar name, if there is none.
+    kind: a subfolder such as "sites", or "" for the top level with demo.yaml. Raises InputError, with the most similar name, if
+    there is none.
     """
     named = named_configs(kind)
     if name in named:
@@ -62,5 +62,6 @@ def config_path(kind: str, given: Path) -> Path:
     try:
         return bundled_config(kind, given.name)
     except InputError as error:
-        what = "is no file, and no bundled config has that name"
-        raise InputError(what, where=str(given), allowed=error.allowed, remedy=error.remedy) from None
+        raise InputError(
+            "is no file, and no bundled config has that name", where=str(given), allowed=error.allowed, remedy=error.remedy
+        ) from None

@@ -38,8 +38,9 @@ def model_file(name: str) -> Path:
 
 
 def expand_shorthand(overrides: Sequence[str | Override]) -> list[Override]:
-    """Return the overrides with `scanner=NAME` as `scanner.preset=NAME`, so that another instrument keeps the pattern that is
-    scanned.
+    """Return the overrides with `scanner=NAME` as `scanner.preset=NAME`.
+
+    Another instrument so keeps the pattern that is scanned.
     """
     found = [read_override(each) if isinstance(each, str) else each for each in overrides]
     return [
@@ -49,11 +50,17 @@ def expand_shorthand(overrides: Sequence[str | Override]) -> list[Override]:
 
 
 def without_keys_of_preset(values: dict[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
-    """Prepare a file's values for overrides (`expand_shorthand`): if these name a preset, remove from the file what the preset
-    sets.
+    """Remove from a file's values what a preset sets, if the overrides name one.
 
-    The preset so replaces the keys of `scanner` that it knows, and the model of a laser scanner, in its place. Everything else
-    in the file stays. Keys among the overrides are applied afterwards and win.
+    The preset so replaces the keys of `scanner` that it knows, and the model of a laser scanner, in its place. Everything else in
+    the file stays. Keys among the overrides are applied afterwards and win.
+
+    Parameters
+    ----------
+    values : dict
+        Values of the file.
+    overrides : sequence of Override
+        Overrides, as from `expand_shorthand`.
     """
     values = _with_section(values)
     later = apply_overrides({}, [each for each in overrides if each.path[0] == "scanner"]).get("scanner")
@@ -98,8 +105,9 @@ def _in_place(sensor: Any, preset: ScannerPreset) -> Any:
 
 
 def _with_model(sensor: Any, preset: ScannerPreset) -> Any:
-    """Return the `sensor` section with the preset's model added, unless it already has a laser scanner's (or is not a
-    section).
+    """Return the `sensor` section with the preset's model added.
+
+    It stays as it is if it already has a laser scanner's model or is not a section.
     """
     models = [sensor] if isinstance(sensor, dict) else sensor or ()
     if not isinstance(models, list | tuple) or any(_kind(model) == "tls" for model in models):

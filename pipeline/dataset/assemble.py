@@ -1,8 +1,7 @@
-"""Assemble a data set from its shards (records of single epochs): annotations.json of each split, the data set card and the
-checksums.
+"""Assemble a data set from its shards, the records of single epochs.
 
-The shards are read one at a time. The result depends on the shards and dataset.json only, so that an interrupted job ends with
-the same bytes as an undisturbed one.
+Written are annotations.json of each split, the data set card and the checksums. The shards are read one at a time. The result
+depends on the shards and dataset.json only, so that an interrupted job ends with the same bytes as an undisturbed one.
 """
 
 from __future__ import annotations
@@ -157,8 +156,24 @@ def _write_coco(
     statistics: SetStatistics,
     digests: dict[str, str],
 ) -> None:
-    """Stream the annotations.json of a split: annotations as they come, then the images; count statistics and checksums on the
-    way.
+    """Stream the annotations.json of a split: annotations as they come, then the images.
+
+    Statistics and checksums are collected on the way.
+
+    Parameters
+    ----------
+    file : text file
+        Where to write.
+    info : dict
+        Entry `info` of the file.
+    records : iterator of Record
+        Records of the tiles.
+    ids : _LastIds
+        Last ids of images and annotations; continued.
+    statistics : SetStatistics
+        Statistics of the whole set; added to.
+    digests : dict
+        Checksum of each file by name; added to.
     """
     head = {"info": info, "licenses": [], "categories": [BLOCK_CATEGORY]}
     file.write(_compact(head)[:-1] + ',"annotations":[')

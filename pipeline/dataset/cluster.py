@@ -103,8 +103,9 @@ def _require_distributed(where: str) -> None:
         import cryptography  # noqa: F401
         import distributed  # noqa: F401
     except ImportError as error:
-        problem = f"needs Dask's distributed and cryptography ({error})"
-        raise InputError(problem, where=where, remedy=how_to_install("dataset")) from None
+        raise InputError(
+            f"needs Dask's distributed and cryptography ({error})", where=where, remedy=how_to_install("dataset")
+        ) from None
 
 
 def _make(orders: list[EpochOrder], count: int, scheduler: str) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -128,8 +129,9 @@ def _make(orders: list[EpochOrder], count: int, scheduler: str) -> Iterator[tupl
 def _results(
     client: Client, futures: list[Future], cluster: LocalCluster | None
 ) -> Iterator[tuple[Future, list[dict[str, Any]]]]:
-    """Yield each future with its result as it finishes, and release it: Dask would otherwise repeat the epochs of
-    dead workers.
+    """Yield each future with its result as it finishes, and release it.
+
+    Dask would otherwise repeat the epochs of dead workers.
     """
     from distributed import KilledWorker, wait
 
@@ -178,8 +180,9 @@ def _threads_each(count: int) -> int:
 
 
 def _local(stack: ExitStack, count: int) -> LocalCluster:
-    """Start workers on this machine, with one Dask thread each. Dask's memory limit is off: it takes the ray tracer's memory for
-    a leak.
+    """Start workers on this machine, with one Dask thread each.
+
+    Dask's memory limit is off, because it takes the ray tracer's memory for a leak.
     """
     import dask
     from distributed import LocalCluster, Security
@@ -270,8 +273,9 @@ def _closed(each: LocalCluster | Client) -> None:
 
 
 def _remote(stack: ExitStack, address: str) -> Client:
-    """Connect to the user's scheduler. For tls://, Dask's own configuration gives the
-    certificates (docs/reference/data_sets.md).
+    """Connect to the user's scheduler.
+
+    For tls://, Dask's own configuration gives the certificates (docs/reference/data_sets.md).
     """
     from distributed import Client
 

@@ -108,8 +108,9 @@ class _Activity:
     checked: float = field(default_factory=time.monotonic)
 
     def stalled(self, used: float, seconds: float) -> bool:
-        """Whether the processor time `used`, s, has not grown for so many seconds; a time without checks (as after Ctrl-Z) does
-        not count.
+        """Whether the processor time `used`, s, has not grown for so many seconds.
+
+        A time without checks, as after Ctrl-Z, does not count.
         """
         now = time.monotonic()
         slept, self.checked = now - self.checked > seconds, now

@@ -1,5 +1,6 @@
-"""Export a data set for Hugging Face's `datasets`: Parquet files of tiles with their blocks, as `load_dataset` and the Hub read
-them.
+"""Export a data set for Hugging Face's `datasets`: Parquet files of tiles with their blocks.
+
+`load_dataset` and the Hub read them.
 """
 
 from __future__ import annotations

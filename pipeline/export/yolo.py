@@ -110,8 +110,9 @@ def grey_values(image: NDArray[np.float32], valid: NDArray[np.bool_], limit_m: f
 
 
 def outline(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the outline (k, 2) of a mask (h, w) as x, y, px from the top-left corner; separate parts are joined by lines there
-    and back.
+    """Return the outline (k, 2) of a mask (h, w) as x, y, px from the top-left corner.
+
+    Separate parts are joined by lines there and back.
     """
     fine = np.kron(mask.astype(np.uint8), np.ones((_FINER, _FINER), np.uint8))
     found, _ = cv2.findContours(fine, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)

@@ -22,8 +22,14 @@ _PROJECT = "project the points to a coordinate system in metres, such as UTM, an
 
 @dataclass(frozen=True)
 class AxisUnits:
-    """Unit of the coordinates, as a file states it. metres: length of one unit along x, y and z; source: where the file states
-    it.
+    """Unit of the coordinates, as a file states it.
+
+    Attributes
+    ----------
+    metres
+        Length of one unit along x, y and z, m.
+    source
+        Where the file states it.
     """
 
     metres: tuple[float, float, float]
@@ -83,8 +89,9 @@ def agreed_units(stated: AxisUnits | None, given: str | None, where: str, option
 
 
 def understood_crs(text: str) -> Any:
-    """Return the coordinate system (a pyproj.CRS) of WKT or a code such as EPSG:2260; None if PROJ does not understand
-    the text.
+    """Return the coordinate system (a pyproj.CRS) of WKT or a code such as EPSG:2260.
+
+    None if PROJ does not understand the text.
     """
     from pyproj import CRS
     from pyproj.exceptions import CRSError
@@ -102,8 +109,9 @@ def not_understood(text: str, where: str) -> str:
     """
     problem = f"states a coordinate system that is not understood: '{text:.60}'"
     if word := re.search(r"foot|feet|yard|\bft\b|us-ft", text, re.IGNORECASE):
-        remedy = "export the file with its EPSG code or valid WKT"
-        raise InputError(f"{problem}, and names the unit '{word[0]}'", where=where, remedy=remedy)
+        raise InputError(
+            f"{problem}, and names the unit '{word[0]}'", where=where, remedy="export the file with its EPSG code or valid WKT"
+        )
     return f"the file {problem}; its coordinates are read as metres"
 
 
@@ -142,8 +150,9 @@ def units_of_crs(crs: Any, where: str) -> AxisUnits | None:
 
 
 def metres_of_epsg_unit(code: int) -> float | None:
-    """Return the length, m, of a unit by its EPSG code, such as 9003 of the US survey foot; None if the code is not a unit of
-    length.
+    """Return the length, m, of a unit by its EPSG code, such as 9003 of the US survey foot.
+
+    None if the code is not a unit of length.
     """
     from pyproj.database import get_units_map
 
@@ -163,8 +172,12 @@ def _metres(axis: Any, name: str, where: str) -> float:
     if not factor:
         factor = metres_of_word(axis.unit_name)
     if not factor or "degree" in axis.unit_name:
-        problem = f"states the unit '{axis.unit_name}' in the coordinate system '{name}'"
-        raise InputError(problem, where=where, allowed="a unit of length", remedy=_PROJECT)
+        raise InputError(
+            f"states the unit '{axis.unit_name}' in the coordinate system '{name}'",
+            where=where,
+            allowed="a unit of length",
+            remedy=_PROJECT,
+        )
     return _exact(float(factor))
 
 

@@ -70,8 +70,9 @@ def summary(study: IcpStudy) -> str:
 
 
 def study_figure(study: IcpStudy, parameter: Parameter) -> bytes:
-    """Draw RMS of the fit, error of the pose and share of inliers against a parameter: lines are medians, dots single
-    registrations.
+    """Draw RMS of the fit, error of the pose and share of inliers against a parameter.
+
+    Lines are medians, dots single registrations.
     """
     rows = [row for row in study.rows if row.parameter == parameter]
     figure = Figure(figsize=(13.0, 4.2), dpi=DPI, layout="constrained")

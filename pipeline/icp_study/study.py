@@ -1,5 +1,6 @@
-"""Study which settings of ICP suit a run: the two sensitivity studies of the thesis (3.6), with the true transform beside the
-RMS.
+"""Study which settings of ICP suit a run.
+
+These are the two sensitivity studies of the thesis (3.6), with the error against the true transform beside the RMS.
 
 The true transform of an epoch is known in a simulation. T(s) is the rigid motion that brings what a sensor measured, s, onto
 the true wall of that epoch, by a point-to-plane fit over all points. To lie on the reference, the epoch has to be moved by
@@ -210,14 +211,13 @@ def surfaces_of_run(folder: Path, epochs: int) -> tuple[SimulationConfig, str, l
     """Read config, sensor, reference and the first `epochs` epochs of a run. Raises InputError if it has fewer epochs."""
     path = folder / RUN_FILE
     if not path.exists():
-        raise InputError(f"holds no {RUN_FILE}", where=str(folder), remedy="name a run's folder or a config file")
+        raise InputError(f"contains no {RUN_FILE}", where=str(folder), remedy="name a run's folder or a config file")
     run = read_run(path, "run it again with simulate")
     sensor, records = run["sensor"], [(record["epoch"], _applied(record)) for record in run.get("epochs", [])]
     if len(records) < 2:
         raise InputError("has no epoch after the reference", where=str(folder), remedy="finish it with simulate --resume")
     if epochs >= len(records):
-        has = f"1 to {len(records) - 1}, as many epochs as {folder} has"
-        raise InputError(f"got {epochs}", where="--epochs", allowed=has)
+        raise InputError(f"got {epochs}", where="--epochs", allowed=f"1 to {len(records) - 1}, as many epochs as {folder} has")
     config = load_config(path, [], None, None)
     found = []
     for number, applied in records[: epochs + 1]:
@@ -419,8 +419,9 @@ def _threshold_row(judge: _PoseEvaluator, threshold: float, epoch: StudyEpoch, g
 
 
 def _displaced(surface: EpochSurfaces, reference_to_truth: RigidTransform, offset_m: float, random: KeyedRandom) -> StudyEpoch:
-    """Displace the epoch by a random rigid motion: a shift of `offset_m`, and a rotation that moves the cloud's edge by as
-    much.
+    """Displace the epoch by a random rigid motion.
+
+    It is a shift of `offset_m`, and a rotation that moves the cloud's edge by as much.
     """
     points = surface.measured.vertices
     true = reference_to_truth.inverse().after(true_pose(surface, random))

@@ -1,5 +1,6 @@
-"""Build the measurement folder of laser scans, or of clouds from a stereo pair, with a record of how the files
-were interpreted.
+"""Build the measurement folder of laser scans, or of clouds from a stereo pair.
+
+A record of how the files were interpreted is part of it.
 """
 
 from __future__ import annotations
@@ -36,8 +37,9 @@ _PLANES = "incidence angles refer to planes through 24 of its points, as noise a
 
 
 def build(request: Request, out: Path) -> Interpretation:
-    """Write the measurement folder of laser scans: measurement.yaml, model.yaml, points, reference, and how the files were
-    interpreted.
+    """Write the measurement folder of laser scans, and a record of how the files were interpreted.
+
+    The folder has measurement.yaml, model.yaml, points and reference.
 
     Parameters
     ----------
@@ -104,8 +106,11 @@ def build_stereo(request: Request, cameras: Path, labels: tuple[str, str] | None
         As `build` does, and if the pair does not see the cloud.
     """
     if request.reference == HALF:
-        raise InputError("half needs scans: neighbours in a matched cloud share their errors", where="--reference half",
-                         remedy="name a mesh, a cloud or a DEM")  # fmt: skip
+        raise InputError(
+            "half works only with laser scans: neighbouring points of a photogrammetric cloud share their errors",
+            where="--reference half",
+            remedy="name a mesh, a cloud or a DEM",
+        )
     pair = read_pair(cameras, labels)
     model = StereoModel() if request.model is None else read_model(request.model)
     if not isinstance(model, StereoModel):
@@ -159,8 +164,9 @@ def _scans(request: Request) -> list[RawScan]:
 
 
 def _stations(scans: list[RawScan], request: Request) -> list[Station]:
-    """Find the station of each scan; raise InputError if half of the first scan would be the reference of a scan
-    from elsewhere.
+    """Find the station of each scan.
+
+    Raises InputError if half of the first scan would be the reference of a scan from elsewhere.
     """
     position = None if request.position is None else np.array(request.position)
     stations = [find_station(scan, position) for scan in scans]

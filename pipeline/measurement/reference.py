@@ -104,8 +104,9 @@ def reference_from_file(
 
 
 def reference_from_dem(path: Path, unit: str | None = None, option: str = "--unit") -> Reference:
-    """Make a surface of an elevation model: a vertex at the centre of each pixel, and two triangles between four pixels with
-    data.
+    """Make a surface of an elevation model.
+
+    It has a vertex at the centre of each pixel, and two triangles between four pixels with data.
 
     Parameters
     ----------

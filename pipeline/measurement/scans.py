@@ -98,8 +98,9 @@ def _checked(scan: RawScan, where: str) -> RawScan:
 
 
 def _power(intensity: FloatArray) -> tuple[FloatArray | None, list[str]]:
-    """Convert intensity to a received power, with notes: decibels as 10^(dB / 10), other negative numbers by subtracting their
-    minimum.
+    """Convert intensity (n,) to a received power, with notes on how.
+
+    Decibels become 10^(dB / 10); from other negative numbers their minimum is subtracted.
     """
     low, high = float(intensity.min()), float(intensity.max())
     if low == high:

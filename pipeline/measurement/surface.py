@@ -66,8 +66,11 @@ def build_surface(request: Request, out: Path) -> Interpretation:
 def _check(request: Request) -> None:
     """Raise InputError for options that only scans have, or a file that is given twice."""
     if request.reference == HALF:
-        raise InputError("half needs scans: neighbours in a matched cloud share their errors", where="--reference half",
-                         remedy="name a mesh, a cloud or a DEM")  # fmt: skip
+        raise InputError(
+            "half works only with laser scans: neighbouring points of a photogrammetric cloud share their errors",
+            where="--reference half",
+            remedy="name a mesh, a cloud or a DEM",
+        )
     if request.scanner is not None:
         raise InputError("the option needs laser scans", where="--scanner", remedy="leave out --scanner or --photographs")
     if len(set(request.scans)) < len(request.scans):
@@ -126,8 +129,9 @@ def _normal(points: FloatArray) -> FloatArray:
 
 
 def _view_towards(eye: FloatArray, centre: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the place and the rotation (3, 3) to the world of a frame that looks at `centre`: x towards it, z up in
-    the picture.
+    """Return the place and the rotation (3, 3) to the world of a frame that looks at `centre`.
+
+    Its x axis points towards the centre; z is up in the picture.
     """
     forward = (centre - eye) / np.linalg.norm(centre - eye)
     up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.9 else np.array([0.0, 1.0, 0.0])

@@ -106,8 +106,9 @@ def _by_shift(values: NDArray[np.floating], steps: tuple[int, ...]) -> tuple[Flo
 
 
 def _shifts(correlation: FloatArray, steps: tuple[int, ...]) -> FloatArray:
-    """Return one half of the shifts, (steps_0 + 1, 2 steps_1 + 1), rows from 0 and columns from -steps_1; the other half is
-    symmetric.
+    """Return the correlation at one half of the shifts, (steps_0 + 1, 2 steps_1 + 1).
+
+    Rows start at a shift of 0 and columns at -steps_1. The other half is symmetric.
     """
     rows = correlation[: steps[0] + 1]
     return np.concatenate([rows[:, rows.shape[1] - steps[1] :], rows[:, : steps[1] + 1]], axis=1)
@@ -248,8 +249,9 @@ def variance_of_mean(model: VariogramModel, mask: NDArray[np.bool_], gsd_m: floa
 
 
 def effective_sample_size(model: VariogramModel, mask: NDArray[np.bool_], gsd_m: float) -> float:
-    """Return how many independent pixels would give the mean over a mask (h, w) the same variance: 1 to the number of its
-    pixels.
+    """Return how many independent pixels would give the mean over a mask (h, w) the same variance.
+
+    It is from 1 to the number of the mask's pixels.
     """
     variance = variance_of_mean(model, mask, gsd_m)
     return (

@@ -27,8 +27,9 @@ _LARGEST_INCIDENCE_RAD = np.radians(85)
 
 @dataclass(frozen=True)
 class Curve:
-    """Detection probability against one quantity: the median over the places in the middle of the wall, all else being as it is
-    there.
+    """Detection probability against one quantity, in the middle of the wall.
+
+    It is the median over the places there; all else is as it is there.
 
     Attributes
     ----------
@@ -49,8 +50,9 @@ class Curve:
 
 
 def middle_places(raster: WallRaster, seen: BoolArray) -> BoolArray:
-    """Select the places (n,) that represent the middle of the wall: those that are seen there, some hundred at most, evenly
-    chosen.
+    """Select the places (n,) that represent the middle of the wall.
+
+    They are those that are seen there; at most some hundred, evenly chosen.
     """
     points = raster.places.points[:, :2]
     low, high = points.min(axis=0), points.max(axis=0)

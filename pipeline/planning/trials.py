@@ -1,5 +1,6 @@
-"""Estimate the detection probability by simulation, to check the closed form: niches in a flat wall, observed by the real
-sensors.
+"""Estimate the detection probability by simulation, to check the closed form.
+
+Niches in a flat wall are observed by the real sensors.
 """
 
 from __future__ import annotations
@@ -29,16 +30,23 @@ _ON_SURFACE_M = 1e-4
 
 @dataclass(frozen=True)
 class Trials:
-    """Results for k blocks: the predicted detection probability (k,) of each, and whether the simulated change exceeded its LoD
-    (k,).
+    """Results for k blocks: predicted detection probability and simulated detection.
+
+    Attributes
+    ----------
+    predicted : (k,) array
+        Detection probability by the closed form.
+    detected : (k,) array
+        Whether the simulated change exceeded its LoD.
     """
 
     predicted: FloatArray
     detected: BoolArray
 
     def score(self) -> float:
-        """Return observed minus expected detections, divided by the standard deviation of a sum of independent draws (Poisson
-        binomial).
+        """Return observed minus expected detections over their standard deviation.
+
+        It is that of a sum of independent draws (Poisson binomial).
         """
         variance = (self.predicted * (1 - self.predicted)).sum()
         return float((self.detected.sum() - self.predicted.sum()) / np.sqrt(max(variance, 1e-12)))
@@ -53,10 +61,10 @@ def detection_trials(
     count: int = 40,
     apart_m: float = 0.1,
 ) -> Trials:
-    """Carve cubes, half in the rock, out of a flat wall, observe before and after, and test each niche's floor as `detectability`
-    does.
+    """Carve cubes out of a flat wall, observe it before and after, and test each niche's floor for change.
 
-    A noiseless copy of the sensor tells which cells see the part of the floor that every viewpoint sees.
+    Half of each cube is in the rock. The test is that of `detectability`. A noiseless copy of the sensor tells which cells see
+    the part of the floor that every viewpoint sees.
 
     Parameters
     ----------

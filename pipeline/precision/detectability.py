@@ -161,8 +161,9 @@ def detection_probability(sampling: Sampling, side_m: FloatArray | float, config
 
 
 def smallest_block(sampling: Sampling, config: PlanningConfig) -> FloatArray:
-    """Return the side (n,) of the smallest block that is seen with `config.probability`, m; NaN if 30 m are not, or no floor is
-    visible.
+    """Return the side (n,) of the smallest block that is seen with `config.probability`, m.
+
+    NaN if a block of 30 m is not seen, or no floor is visible.
     """
     return _smallest(sampling, lambda side: detection_probability(sampling, side, config) >= config.probability)
 
@@ -177,8 +178,9 @@ def smallest_clear_block(sampling: Sampling, config: PlanningConfig) -> FloatArr
 
 
 def signal_to_noise(sampling: Sampling, side_m: FloatArray | float, config: PlanningConfig) -> FloatArray:
-    """Return f h / tau (n,), steps 2 and 3 of the module, at the mean number of points on the floor; 0 if that is less than
-    one.
+    """Return f h / tau (n,), steps 2 and 3 of the module, at the mean number of points on the floor.
+
+    It is 0 if that number is less than one.
     """
     depth = config.depth_ratio * np.asarray(side_m)
     width_a, width_b = (np.maximum(side_m - depth * shadow, 0.0) for shadow in (sampling.shadow_a, sampling.shadow_b))
@@ -225,8 +227,9 @@ def _hit(width: FloatArray, blur: FloatArray | float) -> FloatArray:
 def _exceeds(
     change: FloatArray, points: FloatArray, white: FloatArray, spread: FloatArray, kept: FloatArray, config: PlanningConfig
 ) -> FloatArray:
-    """Return P(detected | N_1, N_2), step 4 of the module; points, white, spread: (2, n) before and after; the latter two and
-    kept in m2.
+    """Return P(detected | N_1, N_2), step 4 of the module.
+
+    points, white, spread: (2, n) before and after. white, spread and kept are variances, m2.
     """
     from scipy.special import ndtr
 
@@ -241,8 +244,9 @@ def _exceeds(
 
 
 def _kept(width: FloatArray) -> FloatArray:
-    """Return the share of a grid-correlated error's variance that the mean over a width keeps; width in units of the nodes'
-    distance.
+    """Return the share of a grid-correlated error's variance that the mean over a width keeps.
+
+    width: in units of the nodes' distance.
     """
     steps, share = _averaging()
     return np.where(width > steps[-1], 1.5 / np.maximum(width, 1.0), np.interp(width, steps, share))

@@ -1,5 +1,6 @@
-"""Predict what a stereo pair achieves at places on the wall: GSD, base-to-distance ratio, convergence, precision of the
-intersection.
+"""Predict what a stereo pair achieves at places on the wall.
+
+Predicted are the GSD, the base-to-distance ratio, the convergence and the precision of the intersection.
 """
 
 from __future__ import annotations
@@ -66,8 +67,16 @@ class StereoGeometry:
 
 @dataclass(frozen=True)
 class DisparityNoise:
-    """Standard deviations of the disparity, px: white; grid-correlated, averaged over positions; and the distance between nodes,
-    px.
+    """Noise of the disparity, as standard deviations.
+
+    Attributes
+    ----------
+    white : float
+        White noise, px.
+    smooth : float
+        Grid-correlated noise, averaged over positions, px.
+    step : float
+        Distance between nodes, px.
     """
 
     white: float
@@ -126,8 +135,16 @@ def stereo_geometry(pair: StereoPair, places: Places, image_sigma_px: float = 0.
 
 @dataclass(frozen=True)
 class _Derivatives:
-    """Derivatives of a point by the rectified disparity d = u_l - u_r, by u_l at fixed disparity, and by the row v, (n, 3) each,
-    wall frame, m/px.
+    """Derivatives of a point by its rectified image coordinates, (n, 3) each, wall frame, m/px.
+
+    Attributes
+    ----------
+    by_disparity
+        By the disparity d = u_l - u_r.
+    by_u
+        By u_l at fixed disparity.
+    by_v
+        By the row v.
     """
 
     by_disparity: FloatArray
@@ -135,10 +152,10 @@ class _Derivatives:
     by_v: FloatArray
 
     def by_image_noise(self) -> FloatArray:
-        """Return the covariance (n, 3, 3) of the least-squares intersection, m2/px2, for noise of 1 px in each of u_l, v_l, u_r,
-        v_r.
+        """Return the covariance (n, 3, 3) of the least-squares intersection for image noise, m2/px2.
 
-        In the rectified pair both rows measure the same unknown, so their mean counts, with half the variance.
+        The noise is 1 px in each of u_l, v_l, u_r, v_r. In the rectified pair both rows measure the same unknown, so their mean
+        counts, with half the variance.
         """
         left = self.by_u + self.by_disparity
         terms = ((1.0, left), (1.0, self.by_disparity), (0.5, self.by_v))
@@ -160,11 +177,10 @@ def _intersection(nominal: CameraPair, points: FloatArray) -> _Derivatives:
 
 
 def orientation_covariance(pair: StereoPair, points: FloatArray) -> FloatArray:
-    """Compute the covariance (n, 3, 3) of recorded points from the noise of both cameras' orientation, wall frame, m2, to first
-    order.
+    """Compute the covariance (n, 3, 3) of points from the noise of both cameras' orientation, m2.
 
-    Each of the parameters is changed by its standard deviation alone, in each camera or in both alike. The real cameras see
-    the point with the change, the nominal ones intersect without it.
+    It is in the wall frame, to first order. Each of the parameters is changed by its standard deviation alone, in each camera or
+    in both alike. The real cameras see the point with the change, the nominal ones intersect without it.
     """
     covariance = np.zeros((len(points), 3, 3))
     noise, nominal = pair.model.noise.orientation, pair.cameras.in_wall_frame(pair.frame)

@@ -111,8 +111,9 @@ def tls_geometry(scanner: LaserScanner, places: Places) -> TlsGeometry:
 
 
 def _power(scanner: LaserScanner, albedo: FloatArray, cosine: FloatArray, range_m: FloatArray) -> FloatArray:
-    """Evaluate the lidar range equation, rho cos i / R^2 exp(-2 sigma R), relative to albedo 1 at 100 m, normal incidence and
-    clear air.
+    """Evaluate the lidar range equation, rho cos i / R^2 exp(-2 sigma R).
+
+    The power is relative to albedo 1 at 100 m, normal incidence and clear air.
     """
     power = albedo * np.maximum(cosine, 0.0) * np.square(REFERENCE_RANGE_M / range_m)
     return power * np.exp(-2 * scanner.config.extinction_per_m * range_m)

@@ -136,8 +136,9 @@ def blocks_of(points: FloatArray) -> list[FloatArray]:
 
 
 def scan_order(points: FloatArray) -> NDArray[np.intp] | slice:
-    """Return an index that makes neighbours in space neighbours in memory: the points' own order (a sensor's rows), or Morton's
-    curve.
+    """Return an index that makes neighbours in space neighbours in memory.
+
+    It is the points' own order (a sensor's rows), or Morton's curve.
     """
     stride = max(len(points) // _BLOCK, 1)
     steps = np.abs(points[1::stride] - points[:-1:stride]).max(axis=1)

@@ -92,8 +92,9 @@ class IcpConfig(Config):
     subsample_ratio: float = Field(0.9, ge=0, lt=1, description="share of the moving points that subsampling leaves out")
 
     def outlier_threshold_m(self, iteration: int) -> float:
-        """Return the outlier threshold, m, at an iteration counted from 1: T 2^max(k - i, 0); infinite without outlier
-        removal.
+        """Return the outlier threshold, m, at an iteration counted from 1: T 2^max(k - i, 0).
+
+        It is infinite without outlier removal.
         """
         if not self.remove_outlier:
             return float("inf")
@@ -220,8 +221,16 @@ class Registration:
 
 @dataclass(frozen=True)
 class Fit:
-    """How well points fit a reference: the number of points, of inliers within the outlier threshold, and the RMS of the inliers'
-    residuals (NaN if there are none).
+    """How well points fit a reference.
+
+    Attributes
+    ----------
+    points : int
+        Number of points.
+    inliers : int
+        Number of points within the outlier threshold.
+    rms_m : float
+        RMS of the inliers' residuals, m; NaN if there are none.
     """
 
     points: int
@@ -265,8 +274,9 @@ def register(
 def register_to(
     surface: ReferenceSurface, moving: FloatArray, config: IcpConfig, random: KeyedRandom, *, threads: int | None = None
 ) -> Registration:
-    """Register points to a reference that is already indexed, for many registrations to one reference. Arguments as in
-    `register`.
+    """Register points to a reference that is already indexed.
+
+    This saves time for many registrations to one reference. Arguments are as in `register`.
     """
     normals = _normals(surface, config)
     moving = checked_cloud(moving, "moving points")
@@ -362,7 +372,7 @@ class _Alignment:
         used = round(total * (1 - self.config.subsample_ratio)) if self.config.subsample_points else total
         if used < LEAST_POINTS:
             raise InputError(
-                f"leaves {used} of {total:,} points",
+                f"the subsample would leave only {used} of {total:,} points",
                 where="icp.subsample_ratio",
                 allowed=f"at most {1 - LEAST_POINTS / total:.6g}",
             )

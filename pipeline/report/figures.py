@@ -78,11 +78,19 @@ class Iteration(Protocol):
     """What a convergence picture shows of an iteration of the registration."""
 
     @property
-    def rms_m(self) -> float: ...
+    def rms_m(self) -> float:
+        """RMS of the inliers' residuals, m."""
+        ...
+
     @property
-    def inliers(self) -> int: ...
+    def inliers(self) -> int:
+        """Number of points within the outlier threshold."""
+        ...
+
     @property
-    def points(self) -> int: ...
+    def points(self) -> int:
+        """Number of points."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -147,8 +155,9 @@ def difference_figure(difference: NDArray[np.floating], grid: Grid, block: IntAr
 
 
 def block_boxes(block: IntArray) -> dict[int, tuple[int, int, int, int]]:
-    """Return left, right, bottom, top of the pixels of each label in (h, w), px from the top-left corner; right and bottom are
-    exclusive.
+    """Return left, right, bottom, top of the pixels of each label in (h, w), px from the top-left corner.
+
+    Right and bottom are exclusive.
     """
     rows, columns = np.nonzero(block != WALL)
     if not len(rows):
@@ -252,8 +261,9 @@ def _count_scale(known: NDArray[np.floating]) -> Normalize:
 
 
 def _scale(known: NDArray[np.floating]) -> Normalize:
-    """Return the colour scale of a map's values (n,): their 1 to 99 % quantiles, logarithmic if half of them are near its lower
-    end.
+    """Return the colour scale of a map's values (n,), from their 1 to their 99 % quantile.
+
+    It is logarithmic if half of the values are near its lower end.
     """
     low, middle, high = np.quantile(known, [0.01, 0.5, 0.99]).tolist() if known.size else (0.0, 0.5, 1.0)
     crowded = low > 0 and middle - low < _CROWDED * (high - low)
@@ -294,8 +304,9 @@ def curves_figure(panels: Sequence[CurvePanel], y_label: str, title: str = "") -
 
 
 def histogram_figure(outside: NDArray[np.floating], inside: NDArray[np.floating], title: str = "") -> bytes:
-    """Draw histograms of differences, m, outside and inside the blocks: the noise on a linear scale, everything on a logarithmic
-    one.
+    """Draw histograms of differences, m, outside and inside the blocks.
+
+    The noise has a linear scale, and everything a logarithmic one.
     """
     groups = [("outside the blocks", outside, _OUTSIDE), ("inside the blocks", inside, _INSIDE)]
     samples = [(name, values[~np.isnan(values)] * 1e3, colour) for name, values, colour in groups]
@@ -386,8 +397,9 @@ def _map_figure(grid: Grid, title: str, *, bar: bool = True, size: float = 1.0) 
 
 
 def label_map_axes(axes: Axes, left: float, bottom: float) -> None:
-    """Label the axes of a map over a wall. Coordinates far from zero, m, are given relative to round numbers, which the label
-    states.
+    """Label the axes of a map over a wall.
+
+    Coordinates far from zero, m, are given relative to round numbers, which the label states.
     """
     offsets = [_shortened(axis, low) for axis, low in ((axes.xaxis, left), (axes.yaxis, bottom))]
     far = f" (from x {offsets[0]:,.0f}, y {offsets[1]:,.0f})" if any(offsets) else ""

@@ -28,16 +28,19 @@ class NotebookProgress(Progress):
         self._show("")
 
     def plan(self, weights: Mapping[str, float]) -> None:
+        """Set the stages and their weights, and draw the bar."""
         super().plan(weights)
         self._draw()
 
     @contextmanager
     def stage(self, name: str) -> Iterator[Self]:
+        """Run one stage, with its name beside the bar."""
         with super().stage(name):
             self._draw()
             yield self
 
     def advance(self, fraction: float) -> None:
+        """Report which fraction of the stage is done, and draw the bar."""
         super().advance(fraction)
         self._draw()
 

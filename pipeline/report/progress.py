@@ -104,8 +104,9 @@ class Progress:
         return f"{duration(self.elapsed_s)} so far" + (", slower than expected" if overdue else "")
 
     def _done(self) -> float:
-        """Return the weight that is done. A stage that has not reported its progress is estimated from the pace of earlier
-        stages.
+        """Return the weight that is done.
+
+        A stage that has not reported its progress is estimated from the pace of earlier stages.
         """
         return self._weight_finished() + self._weight() * (self._fraction or min(self._guess(), _GUESS_LIMIT))
 
@@ -118,8 +119,9 @@ class Progress:
         return 0.0 if self.current in self._finished else self._weights.get(self.current, 0.0)
 
     def _guess(self) -> float:
-        """Return the share of the current stage that is done: as reported, else estimated from the pace of earlier stages (above
-        1 if it is slower).
+        """Return the share of the current stage that is done.
+
+        It is as reported, else estimated from the pace of earlier stages (above 1 if the stage is slower).
         """
         weight = self._weight()
         if not weight or self._fraction:
@@ -156,8 +158,9 @@ class LineProgress(Progress):
 
 
 def shown_progress(*, quiet: bool = False, stream: TextIO | None = None) -> Progress:
-    """Return the progress for a command: a bar on a terminal, plain lines elsewhere, nothing if `quiet`; on stderr if it is
-    open.
+    """Return the progress for a command: a bar on a terminal, plain lines elsewhere, nothing if `quiet`.
+
+    It goes to stderr if that is open.
     """
     stream = stream or sys.stderr
     if quiet or stream is None:

@@ -24,8 +24,9 @@ PACKAGES = (
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python, of this package and of those it computes with; packages that are not installed are left
-    out.
+    """Return the versions of Python, of this package and of those it computes with.
+
+    Packages that are not installed are left out.
     """
     found = {"python": platform.python_version(), "platform": platform.platform()}
     for package in PACKAGES:

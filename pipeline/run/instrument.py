@@ -22,8 +22,9 @@ _ONE_SIGMA = "(1 \N{GREEK SMALL LETTER SIGMA})"
 
 
 def instrument_figures(site: SensorSite) -> dict[str, str]:
-    """Return name and value, with unit, of what a reader asks first: which sensor observed the wall, from where, how
-    precisely.
+    """Return name and value, with unit, of what a reader asks first about a run.
+
+    They say which sensor observed the wall, from where, and how precisely.
     """
     own = _scanner_figures(site.sensor, site) if isinstance(site.sensor, LaserScanner) else _pair_figures(site.sensor, site)
     return {**own, **_places(site)}

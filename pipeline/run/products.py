@@ -64,8 +64,9 @@ M3C2_ANNOTATIONS = "annotations_m3c2"
 
 
 def is_whole(out: Path, checksums: Checksums, where: Path) -> bool:
-    """Return whether all files exist with the given checksums. Raises InputError if a name in the file `where` leads out of the
-    folder.
+    """Return whether all files exist with the given checksums.
+
+    Raises InputError if a name in the file `where` leads out of the folder.
     """
     files = {inside(out, name, where): digest for name, digest in checksums.items()}
     return bool(files) and all(path.is_file() and sha256(path) == digest for path, digest in files.items())
@@ -236,8 +237,9 @@ def _write_formats(stem: Path, formats: Sequence[str], cloud: PointCloud, scans:
 
 
 def write_cloud(path: Path, cloud: PointCloud, wkt: str = "") -> None:
-    """Write a point cloud as LAZ, or as COPC if `path` ends in .copc.laz. Channels with a field of their own in the format go
-    there.
+    """Write a point cloud as LAZ, or as COPC if `path` ends in .copc.laz.
+
+    Channels with a field of their own in the format go there.
 
     wkt: coordinate system of the points. Raises InputError as `write_laz` and `write_copc` do.
     """

@@ -37,10 +37,10 @@ def recorded_points(observations: Sequence[Observation]) -> PointCloud:
 
 
 def scans_of(observations: Sequence[Observation], frame: WallFrame | None = None) -> list[E57Scan]:
-    """Convert each observation to an E57 scan, with its grid as `row` and `column` and the sensor's position as pose (the wall
-    frame's axes).
+    """Convert each observation to an E57 scan, with its grid as `row` and `column`.
 
-    frame: if given, the pose leads to the world instead of the wall frame.
+    The pose has the sensor's position and the wall frame's axes. frame: if given, the pose leads to the world instead of the wall
+    frame.
     """
     frame = frame or WallFrame.identity()
     scans = []

@@ -109,8 +109,9 @@ def _interpolated(depth: FloatArray, column: FloatArray, row: FloatArray, step_m
 
 
 def _moments(valid: FloatArray, radius: int) -> tuple[FloatArray, FloatArray, tuple[FloatArray, ...], FloatArray]:
-    """Return mean column and row offset of the samples in each window, their (co)variances (columns, rows, mixed), and their
-    number.
+    """Compute the moments of the samples' offsets from the middle of each window.
+
+    Returns mean column and row offset, their (co)variances (columns, rows, mixed), and the number of samples.
     """
     count = _window(valid, radius)
     with np.errstate(invalid="ignore", divide="ignore"):

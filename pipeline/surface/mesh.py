@@ -151,8 +151,9 @@ def labelled_surface(
 
 
 def octree_depth(points: FloatArray) -> int:
-    """Return the octree depth whose cells are as large as the median spacing of points (n, 3). Raises InputError if they
-    coincide.
+    """Return the octree depth whose cells are as large as the median spacing of points (n, 3).
+
+    Raises InputError if they coincide.
     """
     longest = float(np.ptp(points, axis=0).max())
     return int(np.clip(np.ceil(np.log2(longest / median_spacing(points))), 4, _POISSON_DEPTH_LIMIT))
@@ -196,8 +197,9 @@ class _Cells:
         return used
 
     def faces(self, used: BoolArray) -> IntArray:
-        """Return the triangles (m, 3) over the numbered `used` samples, consistently wound; first all first triangles, then the
-        second ones.
+        """Return the triangles (m, 3) over the numbered `used` samples, consistently wound.
+
+        All first triangles of the cells come first, then the second ones.
         """
         number = _numbers(used)
         a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
@@ -296,8 +298,9 @@ def _small_holes(missing: BoolArray, maximum_px: int) -> BoolArray:
 
 
 def _ends(missing: BoolArray, axis: int) -> tuple[IntArray, IntArray]:
-    """Return the index (h, w) along `axis` of the last sample at or before each position, and of the next at or after it (-1, n:
-    none).
+    """Find the samples with data on both sides of each position, along `axis`.
+
+    Returns the index (h, w) of the last at or before the position, and of the next at or after it; -1 and n if there is none.
     """
     size = missing.shape[axis]
     place = np.arange(size, dtype=np.int32).reshape((-1, 1) if axis == 0 else (1, -1))

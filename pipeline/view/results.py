@@ -144,9 +144,14 @@ class Results(Protocol):
     step_name: str
 
     @property
-    def steps(self) -> Mapping[str, str]: ...
+    def steps(self) -> Mapping[str, str]:
+        """Labels of the steps by key; the first is shown first."""
+        ...
+
     @property
-    def surfaces(self) -> Mapping[str, str]: ...
+    def surfaces(self) -> Mapping[str, str]:
+        """Labels of the surfaces by key; the first is shown first."""
+        ...
 
     def layers(self, step: str) -> Sequence[Layer]:
         """Return the quantities that can give the colours."""
@@ -169,8 +174,9 @@ class Results(Protocol):
         ...
 
     def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
-        """Return at most about `budget` of the measured points in a window; None if the folder has none. Arguments as in
-        `patch`.
+        """Return at most about `budget` of the measured points in a window; None if the folder has none.
+
+        Arguments as in `patch`.
         """
         ...
 
@@ -180,8 +186,9 @@ class Results(Protocol):
 
 
 def cut(grid: Grid, window: ViewWindow | None, budget: int) -> tuple[slice, slice, int]:
-    """Return the rows and columns of `grid` inside `window` (at least one each), and how many pixels, along a row or column, to
-    average for `budget` cells.
+    """Return the rows and columns of `grid` inside `window`, and how many pixels to average.
+
+    There is at least one row and one column. The number of pixels is that along a row or a column for `budget` cells.
     """
     window = window or ViewWindow(-np.inf, np.inf, -np.inf, np.inf)
     columns = _inside(grid.columns(np.array([window.x0, window.x1])), grid.width)

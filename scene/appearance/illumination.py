@@ -84,8 +84,9 @@ def sun_position(time: datetime, latitude_rad: float, longitude_rad: float) -> S
 
 
 def _refraction(elevation_rad: float) -> float:
-    """Return the atmospheric refraction, rad, at a true elevation (Michalsky 1988, 288 K, 1013.25 hPa); zero if the sun is
-    down.
+    """Return the atmospheric refraction, rad, at a true elevation; zero if the sun is down.
+
+    The formula is that of Michalsky (1988), for 288 K and 1013.25 hPa.
     """
     degrees = np.degrees(elevation_rad)
     if degrees < -0.56:

@@ -221,8 +221,12 @@ def make_regular_blocks(
 
 
 class _PositionSearch:
-    """Finds positions of blocks by rejection sampling. boxes: (k, 2, 2) x and y range of the blocks placed so far, NaN for the
-    others.
+    """Find positions of blocks by rejection sampling.
+
+    Attributes
+    ----------
+    boxes : (k, 2, 2) array
+        Range in x and y, m, of the blocks that are placed so far; NaN for the others.
     """
 
     def __init__(self, config: RockfallConfig, zone: SafeZone, solids: Sequence[_Solid], random: KeyedRandom) -> None:
@@ -280,8 +284,9 @@ def _require_room(area: FloatArray, zone: SafeZone) -> None:
 
 
 def _draw_block(config: RockfallConfig, random: KeyedRandom) -> _Solid:
-    """Draw a block: a primitive of unit size, scaled along its axes, rotated, then roughened by radial offsets of its
-    vertices.
+    """Draw a block at random: scale a primitive along its axes, rotate it and roughen its surface.
+
+    The primitive has unit size. Roughness is a radial offset of each vertex.
     """
     from scipy.spatial.transform import Rotation
 

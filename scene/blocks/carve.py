@@ -73,8 +73,12 @@ class BlockMeshes:
 
 @dataclass(frozen=True)
 class _Surface:
-    """The carved patches before they are inserted into the wall. origin: (n,) the wall's vertex that each vertex is, -1 for new
-    ones.
+    """The carved patches before they are inserted into the wall.
+
+    Attributes
+    ----------
+    origin : (n,) array
+        Index of the wall's vertex that each vertex comes from; -1 for a new one.
     """
 
     vertices: FloatArray
@@ -113,8 +117,9 @@ def carve(mesh: TriangleMesh, blocks: Blocks, fresh_albedo: float = FRESH_ALBEDO
 
 
 def block_records(blocks: Blocks, removed_volume_m3: FloatArray) -> list[dict[str, Any]]:
-    """Make one record per block for blocks.json: label, shape, size, removed volume, bounding box and position, wall frame,
-    SI.
+    """Make the record of each block for blocks.json: label, shape, sizes, removed volume and place.
+
+    All values are in SI units; bounding box and position are in the wall frame.
     """
     return [
         {
@@ -189,8 +194,9 @@ def _containing(blocks: Blocks, removed: Piece, component: IntArray, wanted: NDA
 def _surface(
     mesh: TriangleMesh, rows: IntArray, corners: FloatArray, left: Piece, blocks: Blocks, fresh_albedo: float
 ) -> _Surface:
-    """Collect the remaining patches and the niches, without the closure at the back; find the wall's vertices by their source
-    faces.
+    """Collect the remaining patches and the niches, and find the wall's vertices by their source faces.
+
+    The closure at the back of the patch is left out.
     """
     is_wall = left.first & (left.source < len(rows))
     chosen = is_wall | ~left.first
@@ -222,8 +228,9 @@ def _barycentric(corners: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def _without_slivers(surface: _Surface) -> tuple[_Surface, FloatArray]:
-    """Remove slivers along the rims; return the surface and the volume that this adds, by label. Vertices on the patches'
-    boundary stay.
+    """Remove slivers along the rims; return the surface and the volume that this adds, by label.
+
+    Vertices on the patches' boundary stay.
     """
     of_wall, of_niche = (_used(surface, is_wall) for is_wall in (True, False))
     rank = np.ones(len(surface.vertices), dtype=np.int8)

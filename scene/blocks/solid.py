@@ -123,8 +123,16 @@ def boundary(faces: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def _closed(vertices: FloatArray, faces: IntArray, start: IntArray, end: IntArray, bottom: float) -> tuple[FloatArray, IntArray]:
-    """Return vertices and faces of the patch with vertical sides below the boundary edges start -> end, and fans below the
-    sides.
+    """Close a patch from below: add vertical sides and fans; return vertices and faces.
+
+    Parameters
+    ----------
+    vertices, faces : (n, 3) arrays
+        The patch.
+    start, end : (k,) arrays
+        Vertices of the boundary edges, from start to end.
+    bottom : float
+        z to which the sides reach, m.
     """
     rim, place = np.unique(np.concatenate([start, end]), return_inverse=True)
     start_low, end_low = (place + len(vertices)).astype(np.int32).reshape(2, -1)

@@ -46,8 +46,9 @@ _LONGEST = 600
 
 
 def one_line(part: str) -> str:
-    """Return `part` on one line without control characters, which a terminal would obey. The middle of a long text is left
-    out.
+    """Return `part` on one line without control characters, which a terminal would obey.
+
+    The middle of a long text is left out.
     """
     line = "".join(each if each.isprintable() else "\ufffd" for each in " ".join(part.splitlines()))
     return line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 3 :]}"

@@ -53,17 +53,20 @@ class FrameConfig(Config):
         if not 0 < np.linalg.norm(normal) < np.inf:
             raise InputError(f"got {self.normal}", where="frame.normal", allowed="a direction x, y, z that is not zero")
         if np.dot(towards - middle, normal) < 0:
-            remedy = "change its sign: the wall frame's z axis points towards the sensors"
-            raise InputError(f"{self.normal} points away from the sensors", where="frame.normal", remedy=remedy)
+            raise InputError(
+                f"{self.normal} points away from the sensors",
+                where="frame.normal",
+                remedy="change its sign: the wall frame's z axis points towards the sensors",
+            )
         return WallFrame.along(normal / np.linalg.norm(normal), vertices)
 
 
 @dataclass(frozen=True)
 class WallFrame:
-    """The rigid transform between the world frame (the survey's coordinates, m) and the wall frame: x_wall = R (x_world -
-    origin).
+    """The rigid transform from the world frame to the wall frame: x_wall = R (x_world - origin).
 
-    The origin is subtracted first, so that micrometres survive with UTM-sized coordinates.
+    The world frame has the survey's coordinates, m. The origin is subtracted first, so that micrometres survive with UTM-sized
+    coordinates.
 
     Attributes
     ----------

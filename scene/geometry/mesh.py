@@ -88,8 +88,9 @@ class TriangleMesh:
 
     @cached_property
     def edges(self) -> NDArray[np.int64]:
-        """(3 m,) number of each triangle side, equal for both directions. Sides 0-1 of all triangles come first, then 1-2, then
-        2-0.
+        """Number (3 m,) of each triangle side, equal for both directions.
+
+        Sides 0-1 of all triangles come first, then 1-2, then 2-0.
         """
         start, stop = self.faces.T.ravel(), self.faces[:, [1, 2, 0]].T.ravel()
         return np.minimum(start, stop).astype(np.int64) * len(self.vertices) + np.maximum(start, stop)
@@ -129,8 +130,9 @@ class TriangleMesh:
         return self.face_normals()
 
     def vertex_normals(self) -> FloatArray:
-        """Compute outward unit normals (n, 3) as the area-weighted mean of the adjacent faces' normals; NaN for an unused
-        vertex.
+        """Compute outward unit normals (n, 3): the area-weighted mean of the adjacent faces' normals.
+
+        An unused vertex has NaN.
         """
         total = np.zeros((3, len(self.vertices)))
         for start in range(0, len(self.faces), _CHUNK):

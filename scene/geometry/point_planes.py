@@ -112,8 +112,16 @@ def estimate_point_noise(points: FloatArray, viewpoint: FloatArray) -> float | N
 
 
 def _off_plane(points: FloatArray, near: FloatArray, rays: FloatArray) -> float:
-    """Return the robust standard deviation, m, of points (n, 3) along rays (n, 3) from planes fitted to their neighbours (n, k,
-    3).
+    """Return the robust standard deviation, m, of points from planes that are fitted to their neighbours.
+
+    Parameters
+    ----------
+    points : (n, 3) array
+        Points, m.
+    near : (n, k, 3) array
+        Neighbours of each point.
+    rays : (n, 3) array
+        Direction in which the distance from the plane is measured.
     """
     middle = near.mean(axis=1)
     within = near - middle[:, None]

@@ -1,5 +1,6 @@
-"""Find the faces of a wall that lie under boxes. A raster of the boxes and its integral image make this fast for millions of
-faces.
+"""Find the faces of a wall that lie under boxes.
+
+A raster of the boxes and its integral image make this fast for millions of faces.
 """
 
 from __future__ import annotations
@@ -69,8 +70,9 @@ def integral_image(raster: NDArray[np.generic]) -> IntArray:
 
 
 def _cells(positions: FloatArray, corner: FloatArray, cell: float, shape: NDArray[np.int64]) -> IntArray:
-    """Return cell numbers along one or both axes. Numbers 0 and shape - 1 stand for everything outside the boxes' common
-    rectangle.
+    """Return cell numbers along one or both axes.
+
+    Numbers 0 and shape - 1 stand for everything outside the boxes' common rectangle.
     """
     return np.clip(np.floor((positions - corner) / cell) + 1, 0, shape - 1).astype(np.int32)
 

@@ -74,8 +74,9 @@ def clean(mesh: TriangleMesh, where: str, origin: FloatArray | None = None) -> t
 
 
 def weld(mesh: TriangleMesh) -> Repaired:
-    """Merge vertices that lie within WELD_M of each other, directly or through a chain of such vertices. The first one is
-    kept.
+    """Merge vertices that lie within WELD_M of each other, directly or through a chain of such vertices.
+
+    The first one is kept.
     """
     first, inverse = unique_rows(mesh.vertices + 0.0)  # + 0.0: minus zero is zero
     near = _near_pairs(mesh.vertices[first])
@@ -285,8 +286,9 @@ def _shared_edges(mesh: TriangleMesh) -> tuple[Index, Index]:
 
 
 def _neighbours(mesh: TriangleMesh) -> tuple[Index, NDArray[np.bool_]]:
-    """Return pairs (k, 2) of triangles that share an edge, and whether both run along it in the same direction (inconsistent
-    winding).
+    """Return pairs (k, 2) of triangles that share an edge, and whether their winding is inconsistent.
+
+    The winding is inconsistent if both triangles run along the edge in the same direction.
     """
     start = mesh.faces.T.ravel()
     one, other = _shared_edges(mesh)
@@ -294,8 +296,9 @@ def _neighbours(mesh: TriangleMesh) -> tuple[Index, NDArray[np.bool_]]:
 
 
 def _pinched(mesh: TriangleMesh) -> NDArray[np.bool_]:
-    """Find the vertices (n,) whose triangles do not form one fan: walking around the vertex, edge by edge, misses some of
-    them.
+    """Find the vertices (n,) whose triangles do not form one fan.
+
+    Walking around such a vertex, edge by edge, misses some of its triangles.
     """
     count, corners = len(mesh.faces), mesh.faces.T.ravel()  # half-edge k m + f leaves corner k of triangle f
     one, other = _shared_edges(mesh)

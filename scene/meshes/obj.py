@@ -60,8 +60,9 @@ def with_plain_faces(text: bytes) -> bytes:
 
 
 def _divided(vertices: FloatArray, faces: Mapping[int, Sequence[bytes]]) -> dict[int, list[list[bytes]]]:
-    """Divide the polygons that a fan would not fill. Returns their triangles by line number, with corners as in the file
-    (v/vt/vn).
+    """Divide the polygons that a fan would not fill.
+
+    Returns their triangles by line number, with corners as in the file (v/vt/vn).
     """
     divided = {}
     for count in {len(corners) for corners in faces.values()}:
@@ -75,8 +76,9 @@ def _divided(vertices: FloatArray, faces: Mapping[int, Sequence[bytes]]) -> dict
 
 
 def _absolute(corner: bytes, counts: tuple[int, ...]) -> bytes:
-    """Convert one corner of a face (v/vt/vn) to positive indices. counts: how many vertices, texture coordinates and normals
-    precede it.
+    """Convert one corner of a face (v/vt/vn) to positive indices.
+
+    counts: how many vertices, texture coordinates and normals precede it.
     """
     indices = zip(corner.split(b"/"), counts, strict=False)
     return b"/".join(b"%d" % (count + 1 + int(index)) if index.startswith(b"-") else index for index, count in indices)

@@ -127,8 +127,9 @@ def _header_lines(file: BinaryIO) -> Iterator[list[str]]:
 
 
 def _columns(file: BinaryIO, element: _Element, order: str) -> Columns:
-    """Read one element as views of one array of records, and leave the file after it. Raises ValueError for lists of different
-    lengths.
+    """Read one element as views of one array of records, and leave the file after it.
+
+    Raises ValueError for lists of different lengths.
     """
     if not element.count or not element.properties:
         return {name: np.empty((0, 3) if counter else 0, kind) for name, (kind, counter) in element.properties.items()}

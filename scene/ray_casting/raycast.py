@@ -190,8 +190,9 @@ class RayCaster:
     def _meets(
         self, face: mi.UInt32, origin: mi.Array3f64, direction: mi.Array3f64, active: mi.Bool
     ) -> tuple[mi.Float64, mi.Bool]:
-        """Return the distance to the plane of `face` and whether the ray passes through the face, in float64 (Moeller and
-        Trumbore 1997).
+        """Return the distance to the plane of `face`, and whether the ray passes through the face.
+
+        The test is that of Moeller and Trumbore (1997), in float64.
         """
         numbers = (dr.gather(mi.UInt32, self._face_vertices, 3 * face + corner, active) for corner in range(3))
         a, b, c = (dr.gather(mi.Array3f64, self._vertices, number, active) for number in numbers)
@@ -260,8 +261,9 @@ class RayCaster:
         return face[met], np.einsum("ij,ij->i", self.mesh.face_normals(face[met]), sight[met]) > 0
 
     def labels_down(self, grid: Grid, shift_m: NDArray[np.float32]) -> IntArray:
-        """Return the block label (h, w) of the face seen along -z from each pixel centre minus `shift_m` (h, w, 2), m in x and
-        y.
+        """Return the block label (h, w) of the face below each pixel centre, looking along -z.
+
+        shift_m: (h, w, 2), m in x and y, is subtracted from each pixel centre.
         """
         hits, _ = self.look_down(grid, shift_m)
         return np.array(hits.block).reshape(grid.shape)

@@ -122,15 +122,20 @@ def join_meshes(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
 
 
 def read_reference(path: Path) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """Read a reference surface, m, and notes on it. Vertices stay as in the file, because repairs could move what is measured
-    against.
+    """Read a reference surface, m, and notes on it.
+
+    Vertices stay as in the file, because repairs could move what is measured against.
 
     Raises InputError if the file cannot be used.
     """
     mesh, notes = read_mesh(path)
     if (extent := _extent(mesh)) > _LARGEST_M:
-        size = f"the surface is {extent:.4g} m in size"
-        raise InputError(size, where=str(path), allowed=f"up to {_LARGEST_M:.0f} m", remedy="give it in metres, cut to the scene")
+        raise InputError(
+            f"the surface is {extent:.4g} m in size",
+            where=str(path),
+            allowed=f"up to {_LARGEST_M:.0f} m",
+            remedy="give it in metres, cut to the scene",
+        )
     mesh, words = drop_unused(mesh)
     return mesh, (*notes, *([words] if words else []))
 
@@ -184,7 +189,7 @@ def _read(path: Path, unit: str) -> TriangleMesh:
     faces = np.asarray(getattr(mesh, "faces", np.empty((0, 3))))
     if not len(faces):
         raise InputError(
-            "holds no triangles",
+            "contains no triangles",
             where=where,
             remedy="mesh the points first: scarpsim surface CLOUD --seen-from X Y Z --out wall.ply",
         )

@@ -326,8 +326,9 @@ class Rock:
         )
 
     def surface(self, u: FloatArray, v: FloatArray) -> tuple[Field, Field]:
-        """Evaluate relief, m, and albedo, (len(v), len(u)) each, on the regular grid of the axes u and v. The relief's mean plane
-        is removed.
+        """Evaluate relief, m, and albedo, (len(v), len(u)) each, on the regular grid of the axes u and v.
+
+        The relief's mean plane is removed.
         """
         relief = np.empty((len(v), len(u)), np.float32)
         albedo = np.empty_like(relief)
@@ -339,8 +340,9 @@ class Rock:
         return relief, albedo
 
     def _plane(self) -> FloatArray:
-        """Return offset and slopes of the least-squares plane through the relief, on a lattice whose spacing does not depend on
-        the resolution.
+        """Return offset and slopes of the least-squares plane through the relief.
+
+        The plane is fitted on a lattice whose spacing does not depend on the resolution.
         """
         u, v = (np.arange(_DETREND_STEP_M / 4, extent, _DETREND_STEP_M) for extent in self.size)
         relief = self._evaluate(u, v)[0].astype(np.float64)
@@ -383,8 +385,9 @@ class Rock:
 
 
 def _sum_layers(layers: tuple[JointedBlocks, ...], u: Field, v: Field, broken: Field) -> tuple[Field, Field]:
-    """Sum the heights, m, and the tones of several generations of blocks. The finer ones are weighted by how fractured the rock
-    is.
+    """Sum the heights, m, and the tones of several generations of blocks.
+
+    The finer ones are weighted by how fractured the rock is.
     """
     height, tone = layers[0].at(u, v)
     for layer in layers[1:]:
@@ -423,8 +426,9 @@ def _faults(random: KeyedRandom, size: Size, site: Site) -> Table:
 
 
 def _grid_faces(rows: int, columns: int) -> IntArray:
-    """Return the triangles (2 (rows - 1)(columns - 1), 3) of a grid, counter-clockwise with columns to the right and rows
-    upwards.
+    """Return the triangles (2 (rows - 1)(columns - 1), 3) of a grid, counter-clockwise.
+
+    Columns run to the right and rows upwards.
     """
     faces = np.empty((rows - 1, columns - 1, 2, 3), np.int32)
     corner = np.arange(columns - 1, dtype=np.int32) + columns * np.arange(rows - 1, dtype=np.int32)[:, None]

@@ -218,8 +218,9 @@ class JointedBlocks:
 
 @dataclass(frozen=True)
 class Notches:
-    """Concave erosional notches, as depths (m, positive inwards) on a lattice of 5 cm: a steep roof above, a longer floor
-    below.
+    """Concave erosional notches: a steep roof above and a longer floor below.
+
+    They are depths (m, positive inwards) on a lattice of 5 cm.
     """
 
     depth: Field
@@ -277,8 +278,9 @@ def ramp_knots(edges: FloatArray, ramp: float | FloatArray) -> FloatArray:
 
 
 def _bed_profile(draw: np.random.Generator, t: FloatArray, thickness: float, rule: BlockRule) -> Field:
-    """Draw height, slope and tone (3, n) of one bed's blocks along t. The tilt lifts no block's edge by more than the scale of
-    offsets.
+    """Draw the blocks of one bed along t: height, slope and tone (3, n).
+
+    The tilt lifts no block's edge by more than the scale of offsets.
     """
     joints = draw_partings(draw, t[0], t[-1], rule.joint_m, rule.spread)
     offset, tilt, slope, tone = draw.standard_normal((4, len(joints) - 1))

@@ -1,5 +1,6 @@
-"""Rectify a calibrated pair of cameras epipolarly, with OpenCV (Fusiello-style row alignment, Bouguet's split of the
-rotation).
+"""Rectify a calibrated pair of cameras epipolarly, with OpenCV.
+
+Rows are aligned as by Fusiello, and the rotation is split between the cameras as by Bouguet.
 """
 
 from __future__ import annotations

@@ -23,4 +23,5 @@ class AffinitySkew(CameraEffect):
     b2_px: float = parameter("real minus calibrated skew", unit="px", source="Metashape user manual, appendix D", ge=-1e4, le=1e4)
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
+        """Add the errors of affinity and skew, b1 and b2, px, to the real camera's."""
         return state.changed(self.camera, b1=self.b1_px, b2=self.b2_px)

@@ -43,9 +43,11 @@ class AngleEmpirical(Effect):
 
     @property
     def is_null(self) -> bool:
+        """Whether all values of the curve are zero."""
         return not any(map(any, self.values_rad))
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
+        """Add the curve's value at each pulse's covariate, rad, to the recorded azimuth or zenith."""
         x = state.azimuth if self.covariate == "azimuth" else state.zenith
         error = interpolate(x, x, self.along, Axis(), self.values_rad)
         return state.with_angle_error(**{self.angle: error})

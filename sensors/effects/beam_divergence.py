@@ -50,6 +50,7 @@ class BeamDivergence(Effect):
     )
 
     def evaluate(self, state: Beam, random: KeyedRandom) -> Beam:
+        """Replace the beam of no width by one of this divergence, with its sub-rays and its way of ranging."""
         return Beam(
             divergence_rad=self.divergence_rad,
             sub_rays=self.sub_rays,

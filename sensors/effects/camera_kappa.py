@@ -22,4 +22,5 @@ class CameraKappa(CameraEffect):
     angle_rad: float = parameter("real minus nominal rotation", unit="rad", source="photogrammetry", typical=1e-4, ge=-1, le=1)
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
+        """Rotate the real camera by the angle, rad, about its own z (viewing) axis."""
         return state.rotated(self.camera, axis=2, angle_rad=self.angle_rad)

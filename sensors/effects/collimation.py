@@ -25,4 +25,5 @@ class Collimation(AimEffect):
     )
 
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
+        """Return recorded minus true azimuth and zenith, rad: the collimation error over sin(zenith), and zero."""
         return p.angle_rad / m.sin(at.zenith), 0.0

@@ -37,7 +37,9 @@ class DetectionLimit(Effect):
     )
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
+        """Drop the returns whose received power is below the minimum."""
         return replace(state, returned=state.returned & (state.power >= dr.opaque(mi.Float32, self.minimum_power)))
 
     def kept(self, at: PulseGeometry) -> FloatArray:
+        """Return 1 for a received power of at least the minimum and 0 below it, (n,)."""
         return np.asarray(at.power >= self.minimum_power, dtype=np.float64)

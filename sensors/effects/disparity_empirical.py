@@ -38,9 +38,11 @@ class DisparityEmpirical(Effect):
 
     @property
     def is_null(self) -> bool:
+        """Whether all values of the curve or surface are zero."""
         return not any(map(any, self.values_px))
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
+        """Add the value at each match's covariates, px, to its disparity."""
         x, y = (self._of(state, each) for each in (self.covariate, self.second or self.covariate))
         return replace(state, disparity=state.disparity + interpolate(x, y, self.along, self.across, self.values_px))
 

@@ -40,6 +40,7 @@ class EdgeFattening(RasterEffect):
     )
 
     def filtered(self, disparity: FloatArray, cell_px: float, jump_px: float) -> FloatArray:
+        """Return the disparities, px, with the near side of each depth step grown by the radius, in whole cells."""
         return fattened(disparity, int(self.radius_px / cell_px + 1e-9), max(self.step_px, jump_px))
 
 

@@ -29,4 +29,5 @@ class FocalLength(CameraEffect):
     )
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
+        """Add the error, px, to the real camera's principal distance."""
         return state.changed(self.camera, f_px=self.delta_px)

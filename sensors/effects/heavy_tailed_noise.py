@@ -46,16 +46,17 @@ class HeavyTailedNoise(NodeNoise):
     )
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
+        """Add smooth noise, px, to the disparities, with a local size that itself varies smoothly."""
         error, size = (smooth_field(state, self.step_px, random.child(part), even=True) for part in ("error", "size"))
         sigma, tail = (dr.opaque(mi.Float32, value) for value in (self.sigma_px, self.tail))
         noise = sigma * error * dr.exp(tail * size - dr.square(tail))
         return replace(state, disparity=state.disparity + mi.Float64(noise))
 
     def semivariogram(self, lag: FloatArray) -> FloatArray:
-        """Return sigma^2 (1 - <r exp(t^2 (r - 1))>), where r is the correlation of the fields at two positions; < > averages over
-        positions.
+        """Return half the mean squared difference (k,), px2, of two pixels `lag` (k, 2), px, apart.
 
-        This follows from E exp(t (b + b')) = exp(t^2 (1 + r)) for normal b, b' of variance 1.
+        It is sigma^2 (1 - <r exp(t^2 (r - 1))>), where t is the tail parameter, r the correlation of the fields at two positions,
+        and < > the average over positions. This follows from E exp(t (b + b')) = exp(t^2 (1 + r)) for normal b, b' of variance 1.
         """
         correlation = uniform_field_correlation(lag / self.step_px)
         kept = correlation * np.exp(self.tail**2 * (correlation - 1))

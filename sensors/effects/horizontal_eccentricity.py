@@ -27,4 +27,5 @@ class HorizontalEccentricity(AimEffect):
     )
 
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
+        """Return recorded minus true azimuth, a sine of the azimuth, and zenith, which is zero; rad."""
         return p.amplitude_rad * m.sin(at.azimuth + p.phase_rad), 0.0

@@ -35,10 +35,12 @@ class AimEffect(Effect):
         """Return recorded minus true azimuth and zenith, rad."""
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
+        """Add the angle errors to the pulses: recorded minus true azimuth and zenith, rad."""
         azimuth, zenith = self.angles(state.geometry(), DEVICE, DeviceParameters(self))
         return state.with_angle_error(azimuth, zenith)
 
     def mean(self, at: PulseGeometry) -> FloatArray:
+        """Return the range error (n,), m, that the angle errors cause on an inclined surface, to first order."""
         azimuth, zenith = self.angles(at, HOST, self)
         return np.asarray(-azimuth * at.by_azimuth - zenith * at.by_zenith)
 
@@ -55,9 +57,11 @@ class RangeEffect(Effect):
         """Return recorded minus true range, m."""
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
+        """Add the systematic error, m, to each recorded range."""
         return state.with_range_error(self.error(state.geometry(), DEVICE, DeviceParameters(self)))
 
     def mean(self, at: PulseGeometry) -> FloatArray:
+        """Return the systematic range error (n,), recorded minus true, m."""
         return np.broadcast_to(self.error(at, HOST, self), len(at)).astype(np.float64)
 
 
@@ -74,8 +78,10 @@ class RangeSpread(Effect):
         """Return the standard deviation of the range, m."""
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
+        """Add normal noise, m, to each recorded range, independently for each pulse."""
         sigma = self.sigma(state.geometry(), DEVICE, DeviceParameters(self))
         return state.with_range_error(sigma * mi.Float64(state.normals(random).x))
 
     def variance(self, at: PulseGeometry) -> FloatArray:
+        """Return the variance (n,) of the range noise, m2."""
         return np.broadcast_to(np.square(self.sigma(at, HOST, self)), len(at)).astype(np.float64)

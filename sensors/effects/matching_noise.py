@@ -34,6 +34,7 @@ class MatchingNoise(Effect):
         return self.total_variance - self.semivariogram(lag)
 
     def variance(self, at: Any) -> FloatArray:
+        """Return the variance of a disparity, px2, the same for all pixels (n,)."""
         return np.full(len(at), self.total_variance)
 
 

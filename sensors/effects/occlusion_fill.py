@@ -24,4 +24,5 @@ class OcclusionFill(RasterEffect):
     reach_px: float = parameter("widest strip that is filled", unit="px", source="Hirschmueller 2008", typical=80.0, ge=0, le=1e5)
 
     def filtered(self, disparity: FloatArray, cell_px: float, jump_px: float) -> FloatArray:
+        """Return the disparities, px, with narrow strips without a match filled from the background."""
         return fill_gaps(disparity, self.reach_px / cell_px)

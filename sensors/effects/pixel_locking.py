@@ -45,6 +45,7 @@ class PixelLocking(Effect):
     )
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
+        """Add the sine of the matched disparity, px, to the noisy disparity."""
         amplitude, period, phase = opaque(self.amplitude_px, self.period_px or state.reduction, self.phase_rad)
         matched = state.disparity
         if self.tilt_rad:
@@ -52,6 +53,7 @@ class PixelLocking(Effect):
         return replace(state, disparity=state.disparity + amplitude * _wave(matched / period, phase, DEVICE))
 
     def mean(self, at: Any) -> FloatArray:
+        """Return the change (n,) of the disparity, px, at the disparities that were found."""
         matched = at.found
         if self.tilt_rad:
             matched = _turned(matched, at.tangent, at.infinity, math.tan(self.tilt_rad))
@@ -59,8 +61,20 @@ class PixelLocking(Effect):
 
 
 def _turned(disparity: Any, tangent: Any, infinity: Any, turn: Any) -> Any:
-    """Return disparities in a rectification that is rotated about the base: f B / Z' with Z' = Z (1 + y tan w). Its scale is part
-    of n.
+    """Convert disparities (n,), px, to a rectification that is rotated about the base.
+
+    The rotated rectification has f B / Z' with Z' = Z (1 + y tan w). Its change of scale is part of n.
+
+    Parameters
+    ----------
+    disparity : (n,) array
+        Disparities, px.
+    tangent : (n,) array
+        y, the tangent of the angle between the match's row and the rectified axis.
+    infinity : float
+        Disparity of a point at infinity, px.
+    turn : float
+        tan w, with w the rotation about the base.
     """
     return infinity + (disparity - infinity) / (1 + turn * tangent)
 

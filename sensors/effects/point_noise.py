@@ -47,6 +47,7 @@ class PointNoise(Effect):
         return MEAN_VARIANCE * self.shared_sigma_m**2
 
     def variance(self, at: Any) -> FloatArray:
+        """Return the variance (n,) of a point's height over the surface, m2: white and grid-correlated parts."""
         return self._own_variance(at) + self.shared_variance
 
     def _own_variance(self, at: Any) -> FloatArray:
@@ -55,6 +56,7 @@ class PointNoise(Effect):
         return own + (self.steep_sigma_m * np.nan_to_num(at.covariates["slope"])) ** 2 if self.steep_sigma_m else own
 
     def evaluate(self, state: RecordedPoints, random: KeyedRandom) -> RecordedPoints:
+        """Move each point along the surface's normal by white and grid-correlated noise, m."""
         white = np.sqrt(self._own_variance(state.places)) * random.child("point").generator().standard_normal(len(state.above))
         return state.with_height_error(
             white + self.shared_sigma_m * self._field(state.places.point[:, :2], random.child("nodes"))

@@ -36,6 +36,7 @@ class Precipitation(Effect):
     )
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
+        """Lose returns at random by their range, and give back a share of them at the range of a drop, m."""
         double_rate, early_share = opaque(2 * self.rate_per_m, self.early_share)
         nearest: mi.Float64 = state.minimum_range
         true_range: mi.Float64 = state.true_range
@@ -52,4 +53,5 @@ class Precipitation(Effect):
         )
 
     def kept(self, at: PulseGeometry) -> FloatArray:
+        """Return the probability (n,) that the rock's own echo is recorded, exp(-2 beta R)."""
         return np.exp(-2 * self.rate_per_m * np.asarray(at.range_m, dtype=np.float64))

@@ -28,4 +28,5 @@ class PrincipalPointX(CameraEffect):
     )
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
+        """Shift the real camera's principal point along x by the error, px."""
         return state.changed(self.camera, cx_px=self.delta_px)

@@ -28,4 +28,5 @@ class PrincipalPointY(CameraEffect):
     )
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
+        """Shift the real camera's principal point along y by the error, px."""
         return state.changed(self.camera, cy_px=self.delta_px)

@@ -32,4 +32,5 @@ class RadialDistortion(CameraEffect):
     k4: float = parameter("real minus calibrated k4", unit="1", source="Metashape user manual, appendix D", ge=-100, le=100)
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
+        """Add the errors of k1 to k4 to the real camera's radial distortion."""
         return state.changed(self.camera, k1=self.k1, k2=self.k2, k3=self.k3, k4=self.k4)

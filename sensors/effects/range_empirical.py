@@ -37,9 +37,11 @@ class RangeEmpirical(Effect):
 
     @property
     def is_null(self) -> bool:
+        """Whether all values of the curve or surface are zero."""
         return not any(map(any, self.values_m))
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
+        """Add the value at each pulse's covariates, m, to its recorded range."""
         x, y = (self._of(state, each) for each in (self.covariate, self.second or self.covariate))
         return state.with_range_error(interpolate(x, y, self.along, self.across, self.values_m))
 

@@ -24,4 +24,5 @@ class RangeIncidenceBias(RangeEffect):
     )
 
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
+        """Return the range error (n,), m, in proportion to 1 / cos i - 1."""
         return p.coefficient_m * slant(at.cos_incidence, m)

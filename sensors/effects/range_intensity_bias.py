@@ -40,15 +40,18 @@ class RangeIntensityBias(RangeEffect):
     )
 
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
+        """Return the range error (n,), m, in proportion to the logarithm of the received power over I_0."""
         return p.coefficient_m * m.log(at.power / p.reference_power)
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
+        """Add the range error, m; if no I_0 is given, it is the median power of all pulses that return."""
         if self.reference_power:
             return super().evaluate(state, random)
         state = state.evaluated()
         return self._about(np.array(state.power)[np.array(state.returned)]).evaluate(state, random)
 
     def mean(self, at: PulseGeometry) -> FloatArray:
+        """Return the range error (n,), m; if no I_0 is given, it is the median power of the given pulses."""
         return super().mean(at) if self.reference_power else self._about(at.power).mean(at)
 
     def _about(self, power: FloatArray) -> RangeIntensityBias:

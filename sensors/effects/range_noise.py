@@ -19,4 +19,5 @@ class RangeNoise(RangeSpread):
     sigma_m: float = parameter("standard deviation of the range", unit="m", source="datasheets", typical=0.003, ge=0, le=10)
 
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
+        """Return the standard deviation of the range, m, the same for all pulses."""
         return p.sigma_m

@@ -11,8 +11,9 @@ from sensors.signal_chain.pulses import PulseGeometry, slant
 
 
 class RangeNoiseIncidence(RangeSpread):
-    """Range noise grows with the incidence angle: dR ~ N(0, s (1 / cos i - 1)), independent for each pulse (Soudarissanane et al.
-    2011).
+    """Range noise grows with the incidence angle.
+
+    dR ~ N(0, s (1 / cos i - 1)), independent for each pulse (Soudarissanane et al. 2011).
     """
 
     name: Literal["range_noise_incidence"] = "range_noise_incidence"
@@ -24,4 +25,5 @@ class RangeNoiseIncidence(RangeSpread):
     )
 
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
+        """Return the standard deviation of the range (n,), m, in proportion to 1 / cos i - 1."""
         return p.sigma_m * slant(at.cos_incidence, m)

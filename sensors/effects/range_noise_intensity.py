@@ -39,4 +39,5 @@ class RangeNoiseIntensity(RangeSpread):
     )
 
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
+        """Return the standard deviation of the range (n,), m, a power of the received power."""
         return p.a_m * at.power**p.exponent

@@ -11,8 +11,9 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 
 class RangeNoiseProportional(RangeSpread):
-    """Range noise grows with the range: dR ~ N(0, ppm R 1e-6), independent for each pulse; the second figure of "1 mm + 10
-    ppm".
+    """Range noise grows with the range.
+
+    dR ~ N(0, ppm R 1e-6), independent for each pulse. It is the second figure of data sheets that state "1 mm + 10 ppm".
     """
 
     name: Literal["range_noise_proportional"] = "range_noise_proportional"
@@ -22,4 +23,5 @@ class RangeNoiseProportional(RangeSpread):
     ppm: float = parameter("standard deviation per range", unit="ppm", source="datasheets", typical=20.0, ge=0, le=1e5)
 
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
+        """Return the standard deviation of the range (n,), m, in proportion to the range."""
         return p.ppm * 1e-6 * at.range_m

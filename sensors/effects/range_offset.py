@@ -24,4 +24,5 @@ class RangeOffset(RangeEffect):
     offset_m: float = parameter("recorded minus true range", unit="m", source="Lichti 2007, A0", typical=0.003, ge=-100, le=100)
 
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
+        """Return the range error, m, the same for all pulses."""
         return p.offset_m

@@ -29,4 +29,5 @@ class RangeScale(RangeEffect):
     )
 
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
+        """Return the range error (n,), m, in proportion to the range."""
         return p.scale_ppm * 1e-6 * at.range_m

@@ -33,5 +33,6 @@ class RasterEffect(Effect):
         """
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
+        """Filter the raster of disparities, px; a step of more than one matched pixel counts as a depth step."""
         step = float(state.reduction)
         return state.with_raster(self.filtered(state.raster(), step, step))

@@ -34,8 +34,10 @@ class RegularizationNoise(NodeNoise):
     sigma_px: float = parameter("standard deviation at the nodes", unit="px", source="empirical", typical=0.2, ge=0, le=1000)
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
+        """Add grid-correlated noise, px, to the disparities."""
         field = smooth_field(state, self.step_px, random)
         return replace(state, disparity=state.disparity + mi.Float64(dr.opaque(mi.Float32, self.sigma_px) * field))
 
     def semivariogram(self, lag: FloatArray) -> FloatArray:
+        """Return half the mean squared difference (k,), px2, of two pixels `lag` (k, 2), px, apart."""
         return np.asarray(self.sigma_px**2 * node_semivariogram(lag / self.step_px))

@@ -42,14 +42,17 @@ class RowJitter(Effect):
         return p.amplitude_px * m.sin(2 * math.pi * row / p.rows_per_cycle + p.phase_rad)
 
     def evaluate(self, state: ImageRows, random: KeyedRandom) -> ImageRows:
+        """Displace the columns of the camera's image by the wave at their row, px."""
         if self.camera not in (state.camera, "both"):
             return state
         return replace(state, du=state.du + self.shift(state.v, DEVICE, DeviceParameters(self)))
 
     def mean(self, at: Any) -> FloatArray:
+        """Return the change of the disparity (n,), px: the left image's displacement minus the right one's."""
         left = self.shift(at.v, HOST, self) if self.camera != "right" else 0.0
         right = self.shift(at.v_right, HOST, self) if self.camera != "left" else 0.0
         return np.asarray(left - right)
 
     def argument(self, at: Any) -> FloatArray:
+        """Return the image row (n,), px, over which the wave repeats: the right image's if only that camera shakes."""
         return np.asarray(at.v_right if self.camera == "right" else at.v)

@@ -34,6 +34,7 @@ class Smoothing(RasterEffect):
         return True
 
     def filtered(self, disparity: FloatArray, cell_px: float, jump_px: float) -> FloatArray:
+        """Return the disparities, px, after the Gaussian low-pass."""
         return smoothed(disparity, self.sigma_px / cell_px)
 
 

@@ -34,13 +34,16 @@ class SurfaceEmpirical(Effect):
 
     @property
     def is_null(self) -> bool:
+        """Whether all values of the curve or surface are zero."""
         return not any(map(any, self.values_m))
 
     def mean(self, at: SurfacePlaces) -> FloatArray:
+        """Return the height error (n,) of the points along the surface's normal, m, by their covariates."""
         found = at.covariates
         return interpolate_on_host(
             found[self.covariate], found[self.second or self.covariate], self.along, self.across, self.values_m
         )
 
     def evaluate(self, state: RecordedPoints, random: KeyedRandom) -> RecordedPoints:
+        """Move each point along the surface's normal by the value at its covariates, m."""
         return state.with_height_error(self.mean(state.places))

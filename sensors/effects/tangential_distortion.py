@@ -33,4 +33,5 @@ class TangentialDistortion(CameraEffect):
     )
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
+        """Add the errors of p1 and p2 to the real camera's tangential distortion."""
         return state.changed(self.camera, p1=self.p1, p2=self.p2)

@@ -40,6 +40,7 @@ class TiltDrift(AimEffect):
     )
 
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
+        """Return recorded minus true azimuth and zenith, rad, which grow with the elapsed share of the scan."""
         turn_x, turn_y = p.rate_x_rad * at.share, p.rate_y_rad * at.share
         sin_azimuth, cos_azimuth = m.sin(at.azimuth), m.cos(at.azimuth)
         azimuth = -m.cos(at.zenith) / m.sin(at.zenith) * (turn_x * cos_azimuth + turn_y * sin_azimuth)

@@ -30,4 +30,5 @@ class TrunnionTilt(AimEffect):
     )
 
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
+        """Return recorded minus true azimuth and zenith, rad: the tilt times cot(zenith), and zero."""
         return p.angle_rad * m.cos(at.zenith) / m.sin(at.zenith), 0.0

@@ -27,4 +27,5 @@ class VerticalEccentricity(AimEffect):
     )
 
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
+        """Return recorded minus true azimuth, which is zero, and zenith, a sine of the zenith; rad."""
         return 0.0, p.amplitude_rad * m.sin(at.zenith + p.phase_rad)

@@ -21,4 +21,5 @@ class VerticalIndex(AimEffect):
     )
 
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
+        """Return recorded minus true azimuth, which is zero, and zenith, a constant; rad."""
         return 0.0, p.offset_rad

@@ -37,7 +37,9 @@ class Wobble(AimEffect):
     )
 
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
+        """Return recorded minus true azimuth, which is zero, and zenith, a sine of the scan line; rad."""
         return 0.0, p.amplitude_rad * m.sin(2 * math.pi * at.line / p.lines_per_cycle + p.phase_rad)
 
     def argument(self, at: PulseGeometry) -> FloatArray:
+        """Return the scan line (n,) over which the wave repeats."""
         return np.asarray(at.line, dtype=np.float64)

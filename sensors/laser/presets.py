@@ -132,8 +132,9 @@ class ScannerPreset(Config):
         return (BeamDivergence(divergence_rad=self.divergence_mrad.full_angle * 1e-3, ranging=self.ranging, **width),)
 
     def _range_noise(self) -> dict[str, float]:
-        """Fit sigma^2 = sigma_0^2 + (p R)^2 to the figures. A single figure is sigma_0; so is the first of two if the second is
-        smaller.
+        """Fit sigma^2 = sigma_0^2 + (p R)^2 to the figures of the data sheet.
+
+        A single figure is sigma_0; so is the first of two if the second is smaller.
         """
         if not self.range_precision_mm:
             return {}

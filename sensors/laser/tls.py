@@ -219,7 +219,11 @@ class LaserScanner:
         """Scan in one face. real: the scanner in its real pose."""
         pulses, beam = self.emitted(self.emit(), random)
         if beam.records_several and self.config.faces == 2:
-            raise InputError("two faces are averaged pulse by pulse", where="scanner.faces", allowed="1, for the mode multiple")
+            raise InputError(
+                "two faces cannot be measured in the mode multiple, because faces are averaged pulse by pulse",
+                where="scanner.faces",
+                allowed="1",
+            )
         echo = real.echo(scene, pulses, beam, beam.combine_echoes)
         seen = self._record(self.measured(pulses, echo, random), real)
         if echo.returns is None or not np.any(echo.returns.numpy() > 1):
@@ -319,8 +323,9 @@ class LaserScanner:
         return SubRays(echoes, beam.sub_rays)
 
     def _axes(self, pulses: Pulses, start: int, count: int) -> tuple[mi.Array3f64, ...]:
-        """Return unit vectors along the beams of `count` pulses from number `start` on, and two perpendicular to each, wall
-        frame.
+        """Return unit vectors along the beams, and two perpendicular to each; wall frame.
+
+        The beams are those of `count` pulses from number `start` on.
         """
         pulse = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
         azimuth, zenith = (dr.gather(mi.Float64, angle, pulse) for angle in (pulses.aim_azimuth, pulses.aim_zenith))

@@ -49,8 +49,9 @@ class Target:
         return horizontal / np.linalg.norm(horizontal)
 
     def stand(self, distance_m: float, height_m: float | None) -> FloatArray:
-        """Return the point (3,) at `distance_m` horizontally in front of the centre, and `height_m` above the toe (None: level
-        with the centre).
+        """Return the point (3,) at `distance_m` horizontally in front of the wall's centre.
+
+        It lies `height_m` above the toe, or level with the centre if that is None.
         """
         position = self.centre + distance_m * self.outward
         return position if height_m is None else np.append(position[:2], self.mesh.bounds[0, 2] + height_m)

@@ -24,8 +24,9 @@ def rotated(matrix: FloatArray, vectors: mi.Array3f64) -> mi.Array3f64:
 
 
 def cell_index(place: Any, count: int) -> mi.UInt32:
-    """Return the number of the cell that contains each position. The result is a valid index for `dr.gather` whatever the
-    position.
+    """Return the number of the cell that contains each position.
+
+    The result is a valid index for `dr.gather` whatever the position.
 
     A gather outside its array ends the process, so every index that is computed from sensor values should come from here.
 

@@ -1,13 +1,13 @@
-"""Model the cross section of a laser beam by sub-rays that share a pulse's energy, and combine their echoes into the pulse's
-return.
+"""Model the cross section of a laser beam by sub-rays that share a pulse's energy.
 
-The energy density falls with the angle r from the axis as exp(-8 r^2 / D^2), where D is the full divergence (1/e^2). A
-fraction u of the energy lies within 8 r^2 / D^2 = -ln(1 - u). Rings of 6, 12, 18, ... sub-rays surround a central one, and all
-sub-rays carry the same energy. Ring j thus represents the annulus between two such fractions, at its root-mean-square radius.
-All radii are scaled so that the second moments equal the Gaussian's, D^2/16 about each axis. The share of the energy that a
-straight edge cuts off is then wrong by at most 0.11 with 19 sub-rays (root mean square 0.03), 0.22 with 7 and 0.07 with 37. A
-hexagonal grid with Gaussian weights is worse (0.15 with 19), because an edge along the grid crosses many of its sub-rays at
-once.
+The echoes of the sub-rays are combined into the pulse's return.
+
+The energy density falls with the angle r from the axis as exp(-8 r^2 / D^2), where D is the full divergence (1/e^2). A fraction u
+of the energy lies within 8 r^2 / D^2 = -ln(1 - u). Rings of 6, 12, 18, ... sub-rays surround a central one, and all sub-rays
+carry the same energy. Ring j thus represents the annulus between two such fractions, at its root-mean-square radius. All radii
+are scaled so that the second moments equal the Gaussian's, D^2/16 about each axis. The share of the energy that a straight edge
+cuts off is then wrong by at most 0.11 with 19 sub-rays (root mean square 0.03), 0.22 with 7 and 0.07 with 37. A hexagonal grid
+with Gaussian weights is worse (0.15 with 19), because an edge along the grid crosses many of its sub-rays at once.
 """
 
 from __future__ import annotations
@@ -79,8 +79,9 @@ class SubRays:
     many: int
 
     def over(self, step: Callable[..., tuple[Any, ...]], *state: Any) -> tuple[Any, ...]:
-        """Run `step(echo, *state)` for one sub-ray of every pulse after another, in a loop of the compiled kernel; return the
-        final state.
+        """Run `step(echo, *state)` once for each sub-ray, for all pulses together; return the final state.
+
+        The sub-rays follow one another in a loop of the compiled kernel.
         """
         many = dr.opaque(mi.UInt32, self.many)
         first = many * dr.arange(mi.UInt32, dr.width(self.echoes.range_m) // self.many)
@@ -198,8 +199,9 @@ class Beam:
 
 @dataclass
 class _Span:
-    """Range interval from the nearest to the farthest echo of a return, m. Not frozen, because Dr.Jit's loops replace its
-    variables.
+    """The range interval from the nearest to the farthest echo of a return, m.
+
+    It is not frozen, because Dr.Jit's loops replace its variables.
     """
 
     low: mi.Float64
@@ -215,8 +217,9 @@ class _Span:
 
 
 def unit_offsets(sub_rays: int) -> FloatArray:
-    """Return the offsets (k, 2) of the sub-rays from the axis for D = 1, as the module describes. Ring j is rotated by j golden
-    angles.
+    """Return the offsets (k, 2) of the sub-rays from the axis, for a divergence D of 1.
+
+    They are those that the module describes. Ring j is rotated by j golden angles.
     """
     rings = round((np.sqrt(12 * sub_rays - 3) - 3) / 6)
     bounds = np.cumsum([0, 1, *(6 * ring for ring in range(1, rings + 1))]) / sub_rays

@@ -16,8 +16,9 @@ from scene.ray_casting.raycast import RayCaster
 
 @dataclass(frozen=True)
 class FurtherReturns:
-    """The returns of a scan beyond those in its grid, for pulses with several returns. There are n of them, by cell, then by
-    range.
+    """The returns of a scan beyond those in its grid, for pulses with several returns.
+
+    There are n of them, sorted by cell and then by range.
 
     Attributes
     ----------

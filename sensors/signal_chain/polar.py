@@ -17,8 +17,9 @@ def polar(local: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def polar_axes(azimuth: FloatArray, zenith: FloatArray) -> list[FloatArray]:
-    """Return unit vectors (n, 3) in the scanner's frame: along the beam, towards increasing azimuth, towards increasing
-    zenith.
+    """Return the unit vectors of polar coordinates in the scanner's frame, three arrays (n, 3).
+
+    They point along the beam, towards increasing azimuth and towards increasing zenith angle.
     """
     sin_az, cos_az, sin_ze, cos_ze = np.sin(azimuth), np.cos(azimuth), np.sin(zenith), np.cos(zenith)
     beam = [sin_ze * cos_az, sin_ze * sin_az, cos_ze]

@@ -20,8 +20,9 @@ metres.
 
 
 def slant(cos_incidence: Any, m: Functions) -> Any:
-    """Return 1 / cos i - 1 (n,), the relative stretch of the echo from an inclined surface. m: functions of host or device
-    arrays.
+    """Return 1 / cos i - 1 (n,), the relative stretch of the echo from an inclined surface.
+
+    m: functions of host or device arrays.
     """
     return 1 / m.select(cos_incidence < 1 / _STEEPEST, 1 / _STEEPEST, cos_incidence) - 1
 

@@ -120,8 +120,9 @@ class Studio:
 
 
 def full_scale(*pictures: Radiance) -> float:
-    """Return the radiance at which automatic exposure saturates, one value for all pictures: both cameras have the same
-    settings.
+    """Return the radiance at which automatic exposure saturates.
+
+    It is one value for all pictures, because both cameras have the same settings.
     """
     bright = np.percentile(np.concatenate([picture.ravel() for picture in pictures]), WHITE_PERCENTILE)
     return max(float(bright) / WHITE_LEVEL, 1e-6)

@@ -125,11 +125,10 @@ def without_speckles(disparity: Disparity, speckle_px: int) -> Disparity:
 
 
 def _aligned(left: Picture, right: Picture, search: SearchRange) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Copy both pictures in 8 bits to canvases of the same size, so that disparity `search.least` becomes 0 and no left cell
-    lacks room.
+    """Copy both pictures in 8 bits to canvases of the same size, so that disparity `search.least` becomes 0.
 
-    Left cell j is at column j + count of its canvas; the right cell that matches it at the least disparity is at the same
-    column.
+    No left cell lacks room. Left cell j is at column j + count of its canvas; the right cell that matches it at the least
+    disparity is at the same column.
     """
     rows, columns = left.shape
     canvases = np.zeros((2, rows, columns + search.count), dtype=np.uint8)

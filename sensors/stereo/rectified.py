@@ -76,8 +76,9 @@ class RectifiedGrid:
         return self.left_first - self.right_first
 
     def left(self, image: NDArray[np.uint8]) -> Picture:
-        """Resample the left picture: grey values (height, left_width), NaN outside. image: one pixel per `step` px of the
-        frame.
+        """Resample the left picture to grey values (height, left_width), NaN outside.
+
+        image: one pixel per `step` px of the frame.
         """
         geometry = self.geometry
         return self._resampled(image, self.pair.left, geometry.left, geometry.u_left, self.left_first, self.left_width)
@@ -112,8 +113,9 @@ class RectifiedGrid:
 
 
 def _outline(camera: Camera, rotation: FloatArray, geometry: Rectification, u_0: float) -> tuple[FloatArray, FloatArray]:
-    """Return rectified pixels (u, v) of the frame's border. Raises InputError if a border ray is parallel to the rectified
-    plane.
+    """Return rectified pixels (u, v) of the frame's border.
+
+    Raises InputError if a border ray is parallel to the rectified plane.
     """
     along = np.linspace(0, 1, 65)
     zero, one = np.zeros_like(along), np.ones_like(along)

@@ -178,8 +178,9 @@ class _Pictures:
         return _solution(sums, inside & (sums[0] >= LEAST_SHARE * side * side))
 
     def _cubic(self, first: mi.Int32, t: mi.Float32, active: mi.Bool) -> tuple[mi.Float32, mi.Float32]:
-        """Return value and slope of the right picture at fraction t after the second of four cells from `first` on (Keys, a =
-        -1/2).
+        """Interpolate the right picture between four cells by a cubic (Keys, a = -1/2); return value and slope.
+
+        The position is at the fraction t after the second of the cells, which start at `first`.
         """
         a, b, c, d = (dr.gather(mi.Float32, self.right, first + k, active) for k in range(4))
         linear, square, cube = (c - a) / 2, a - 2.5 * b + 2 * c - 0.5 * d, (d - a) / 2 + 1.5 * (b - c)

@@ -174,8 +174,9 @@ def _range(depth: mi.Float64, valid: mi.Bool) -> tuple[float, float]:
 
 
 def sampled_disparity(disparity: Disparity, column: mi.Float64, row: mi.Float64) -> mi.Float32:
-    """Interpolate disparities (n,) at fractional columns and rows: bilinearly on one surface, the nearest cell's at a depth
-    step.
+    """Interpolate disparities (n,) at fractional columns and rows.
+
+    On one surface the interpolation is bilinear; at a depth step it takes the nearest cell's.
     """
     height, width = disparity.shape
     values = on_device(mi.Float32, disparity)

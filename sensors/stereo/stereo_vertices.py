@@ -33,11 +33,11 @@ from sensors.stereo.stereo_pair import REDUCTION, StereoPair, rectified_disparit
 
 
 def observe_vertices(pair: StereoPair, scene: RayCaster, random: KeyedRandom) -> TriangleMesh:
-    """Return the wall as the pair reconstructs it: its vertices at their recorded positions (wall frame), its triangles and
-    labels.
+    """Return the wall as the pair reconstructs it: triangles and labels, with vertices as recorded.
 
-    Vertices outside one of the images or behind a camera are left out. The same `random` draws the same orientation and row
-    displacement as `pair.observe`; matching noise is keyed by the vertex. Raises InputError if nothing is left.
+    Positions are in the wall frame. Vertices outside one of the images or behind a camera are left out. The same `random` draws
+    the same orientation and row displacement as `pair.observe`; matching noise is keyed by the vertex. Raises InputError if
+    nothing is left.
     """
     mesh = scene.mesh
     effects = pair.model.chain(random)
@@ -177,8 +177,16 @@ class VertexMatches(Matches):
         return replace(self, disparity=self.disparity + dr.select(one_surface, mean, nearest), before=disparity)
 
     def _beside(self, place: mi.Float64, count: int, side: int) -> tuple[mi.UInt32, mi.Float64]:
-        """Return the cell whose centre is before (side 0) or after (1) `place`, in cells, and its weight in a linear
-        interpolation.
+        """Return the neighbouring cell for a linear interpolation at `place`, and its weight.
+
+        Parameters
+        ----------
+        place : mi.Float64, (n,)
+            Position, cells.
+        count : int
+            Number of cells.
+        side : int
+            0 for the cell whose centre is before `place`, 1 for the one after.
         """
         first = dr.floor(place - 0.5)
         share = place - 0.5 - first

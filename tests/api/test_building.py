@@ -1,4 +1,4 @@
-"""The building blocks on arrays, and a sensor of one's own out of the documentation."""
+"""The Python interface's building blocks applied to arrays, and the user-defined sensor from docs/howto/add_sensor.md."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ COARSE: dict[str, Any] = {"station__distance_m": 12.0, "scanner__azimuth_step_ra
 
 
 def own_sensor() -> dict[str, Any]:
-    """What the Python block of docs/howto/add_sensor.md defines."""
+    """The names that the Python block of docs/howto/add_sensor.md defines."""
     text = (ROOT / "docs" / "howto" / "add_sensor.md").read_text()
     code = next(block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "class FlashLidar" in block)
     body = code[code.index("@dataclass") :]
@@ -41,7 +41,7 @@ def own_sensor() -> dict[str, Any]:
 
 
 def test_given_blocks_take_their_volume_out_of_a_plane() -> None:
-    """Cubes half in the rock of a flat wall take half their volume along; a turned one the same."""
+    """Cubes that lie half in the rock of a flat wall remove half of their volume, and so does a rotated cube."""
     wall = heightfield(8.0, 6.0, 0.25, roughness=0.0)
     blocks = make_blocks([[2, 3, 0], [5, 3, 0]], [0.8, 0.5], rotations_rad=[[0, 0, 0], [0, 0, 0.7]])
     found = carve(wall, blocks)
@@ -72,7 +72,7 @@ def test_a_wall_of_arrays_is_scanned_meshed_registered_and_compared(tmp_path: Pa
 
 @pytest.mark.parametrize("as_arrays", [False, True])
 def test_register_finds_a_known_motion_of_meshes_and_of_arrays(as_arrays: bool) -> None:
-    """Vertices that no triangle uses are left out of a mesh; an array's normals are estimated."""
+    """Vertices that no triangle uses are ignored; the normals of an array are estimated."""
     wall = heightfield(8.0, 6.0, 0.1, roughness=0.3)
     turn, shift = (
         np.array([[np.cos(0.01), -np.sin(0.01), 0.0], [np.sin(0.01), np.cos(0.01), 0.0], [0.0, 0.0, 1.0]]),

@@ -1,6 +1,6 @@
-"""What is public stands on docs/reference/python.md, with its parameters; notebooks and examples use nothing else.
+"""Every public name is listed in docs/reference/python.md with its parameters; notebooks and examples use no others.
 
-python tests/api/test_public.py    writes the list anew
+python tests/api/test_public.py    writes the list again
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def test_every_public_name_is_explained() -> None:
 
 
 def sources() -> dict[str, str]:
-    """The code of notebooks and of the Python examples in the documentation, by where it stands."""
+    """Return the code of the notebooks and of the Python examples in the documentation, by file."""
     import nbformat
 
     found = {

@@ -180,7 +180,7 @@ def test_a_record_is_checked_where_it_is_read(
 
 
 def test_blocks_of_a_run_that_does_not_hold_their_place_in_the_world(run: Run, tmp_path: Path) -> None:
-    """As those before November 2026: told by the wall frame."""
+    """Runs from before November 2026 lack the world coordinates of blocks, which then come from the wall frame."""
     record = json.loads((run.folder / "run.json").read_text())
     for block in record["epochs"][1]["blocks"]:
         del block["world_position_m"]

@@ -1,4 +1,4 @@
-"""Dr.Jit before TensorFlow: the other way round Dr.Jit takes LLVM symbols of TensorFlow's and crashes."""
+"""Import Dr.Jit before TensorFlow: in the other order Dr.Jit takes TensorFlow's LLVM symbols and crashes."""
 
 import os
 
@@ -13,7 +13,7 @@ os.environ.setdefault("TF_ENABLE_ONEDNN_OPTS", "1")  # as `import_keras` has it
 
 @pytest.fixture
 def eager():
-    """Step by step: a graph takes 20 s to build, which a few steps are not worth."""
+    """Run TensorFlow eagerly: building a graph takes 20 s, too long for a few steps."""
     import tensorflow as tf
 
     tf.config.run_functions_eagerly(True)

@@ -1,4 +1,4 @@
-"""Anchors, the box codec, suppression, ROIAlign."""
+"""Anchors, the box codec, non-maximum suppression, ROIAlign."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _random_boxes(count: int, seed: int, side: float = 200.0) -> np.ndarray:
 
 
 def _greedy(boxes: np.ndarray, threshold: float) -> list[int]:
-    """The textbook loop."""
+    """The textbook loop of greedy non-maximum suppression."""
     overlap = np.asarray(intersection_over_union(boxes, boxes))
     kept: list[int] = []
     for index in range(len(boxes)):

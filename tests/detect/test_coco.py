@@ -73,7 +73,7 @@ def test_polygons_count_as_the_pixels_that_they_enclose(tmp_path):
 
 
 def test_polygons_are_learned_as_pycocotools_draws_them(tmp_path):
-    """A slanted outline, one of two parts, and one of less than a pixel, which shows nothing."""
+    """A slanted outline, one with two parts, and one smaller than a pixel, whose mask is empty."""
     content = truth(_polygon)
     content["annotations"][0]["segmentation"] = [[4.5, 6, 13, 9.5, 8, 17.25]]
     content["annotations"][1]["segmentation"] = [[30, 20, 40, 20, 35, 28.5], [40, 22, 45, 22, 45, 29, 40, 29]]
@@ -218,7 +218,7 @@ OF_DETECTIONS = {
 
 
 def _refused(words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> str:
-    """The message of a command that has to fail with exit code 2, one line, and nothing left behind."""
+    """Return the message of a command that must fail with exit code 2, print one line and leave no files."""
     assert main([*words, "--out", str(tmp_path / "out")]) == 2
     message = capsys.readouterr().err
     assert message.count("\n") == 1

@@ -1,4 +1,4 @@
-"""Maps that are damaged or claim to be huge, in `train` and `detect`: one message, and nothing half-written is left."""
+"""Maps that are damaged or claim to be huge, in `train` and `detect`: one message, and no incomplete files are left."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from scene.common.errors import InputError
 
 
 def _claiming(path: Path, height: int, width: int) -> Path:
-    """A file of some hundred bytes that says that it holds an image of that size."""
+    """Write a file of a few hundred bytes whose header claims an image of this size."""
     tifffile.imwrite(path, np.zeros((64, 64), np.float32), compression="zlib", tile=(64, 64))
     with tifffile.TiffFile(path, mode="r+b") as file:
         tags = file.pages.first.tags
@@ -84,7 +84,7 @@ def test_a_tile_that_is_cut_short_stops_a_training_before_it_begins(split, tmp_p
 
 @pytest.mark.slow
 def test_a_training_that_fails_in_its_first_epoch_leaves_nothing(tmp_path, eager):
-    """Called as a function, which does not read every tile beforehand."""
+    """The function is called directly, because the command would read every tile beforehand."""
     from pipeline.detection.training.training import train
 
     for name in ("train", "val"):
@@ -96,7 +96,7 @@ def test_a_training_that_fails_in_its_first_epoch_leaves_nothing(tmp_path, eager
 
 
 def test_polygons_reach_the_network_as_run_lengths_do(tmp_path):
-    """Rectangles, whose outlines and run lengths are of the same pixels: the same batches, which are all that a training sees."""
+    """Rectangles as polygons and as run lengths cover the same pixels, so training sees the same batches."""
     found = []
     for polygons in (False, True):
         folder = make_set(tmp_path, 2, 5)

@@ -1,4 +1,6 @@
-"""What comes in and what goes out without a network: normalisation, COCO folders, tiles, seams, masks, events, the baseline."""
+"""The detector's input and output without a network: normalisation, COCO folders, tiles, merging across tile borders, masks,
+events, the baseline.
+"""
 
 from __future__ import annotations
 
@@ -84,7 +86,7 @@ def test_a_mirrored_map_has_its_blocks_mirrored(tmp_path, axis):
 
 @pytest.mark.parametrize(("flips", "turned"), [(True, True), ("left_right", False), (False, False)])
 def test_maps_are_mirrored_along_the_axes_asked_for(tmp_path, flips, turned):
-    """The topmost rows have no data; left and right differ in where the blocks are."""
+    """The topmost rows have no data; left and right differ by the places of the blocks."""
     folder = CocoFolder(make_set(tmp_path, 8, 3, side=64, blocks=1))
     config, training = DetectorConfig(image_px=64, most_blocks=4), TrainingConfig(batch=1, flips=flips)
     examples = list(batches(folder, config, training, 0, learning=True))
@@ -95,7 +97,7 @@ def test_maps_are_mirrored_along_the_axes_asked_for(tmp_path, flips, turned):
 
 
 def test_blocks_to_ignore_are_marked_as_such_for_the_loss(tmp_path):
-    """COCO's `ignore` and `iscrowd`: -1 where a block counts 1 and an empty place 0."""
+    """COCO's `ignore` and `iscrowd` give the class -1, where a block has 1 and padding 0."""
     folder = make_set(tmp_path, 1, 4, blocks=3)
     path = folder / "annotations.json"
     content = json.loads(path.read_text())
@@ -119,7 +121,7 @@ def test_tiles_cover_the_map_with_half_their_side_shared(shape, count):
 
 
 def test_a_mask_is_pasted_at_its_place():
-    """A half-plane mask whose edge lies at a known place, with sub-pixel box corners."""
+    """A half-plane mask has its edge at a known place; the box has sub-pixel corners."""
     probability = np.zeros((56, 56), np.float32)
     probability[:, :28] = 1
     row, column, mask = paste(probability, np.array([10.25, 20.5, 30.25, 40.5], np.float32), 64)
@@ -225,7 +227,7 @@ def test_training_stops_where_the_mean_slope_is_flat():
 
 
 def test_the_detector_does_without_the_ray_tracer_and_that_refuses_to_come_second():
-    """Dr.Jit would take LLVM's symbols from TensorFlow and crash; the other way round both work."""
+    """If Dr.Jit is imported after TensorFlow, it takes TensorFlow's LLVM symbols and crashes; the other order works."""
     modules = "pipeline.detection.products.run, pipeline.detection.training.training, pipeline.detection.products.score_files"
     script = f"""
 import sys, {modules}
@@ -243,7 +245,7 @@ except InputError as error:
 
 
 class _EverythingIsABlock:
-    """Stands for a network whose one detection is the whole window, also where the map has ended."""
+    """A fake network whose only detection is the whole window, even beyond the end of the map."""
 
     size = 64
     config = DetectorConfig(image_px=64)
@@ -287,7 +289,7 @@ def test_convolutions_are_onednns_unless_the_environment_says_otherwise(
 
 
 def test_maps_of_one_name_are_told_apart(tmp_path: Path) -> None:
-    """Two runs: each map has its own name in the tables, and its own pictures."""
+    """Maps of two runs: each has its own name in the tables, and its own pictures."""
     values = np.where(np.arange(900).reshape(30, 30) % 31 == 0, 0.5, 0.0).astype(np.float32)
     for name in ("a/difference_001.tif", "b/difference_001.tif", "b/x y.tif", "b/x_y.tif"):
         write_geotiff(tmp_path / name, values, Grid(0.0, 3.0, 0.1, 30, 30))

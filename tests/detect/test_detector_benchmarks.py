@@ -1,4 +1,4 @@
-"""The detector's benchmarks run at a tiny size, with a network that has learned nothing: their figures mean nothing here."""
+"""The detector's benchmarks run at a tiny size with an untrained network; their results mean nothing here."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SENSORS, SIZES = ("stereo", "tls"), ("small", "medium", "large")
 
 
 def labelled(folder: Path, count: int) -> Path:
-    """Tiles that say of which wall, noise, sensor and size of blocks they are, and of each block how far it stands out."""
+    """Write tiles whose records hold wall, noise, sensor and block size, and for each block its signal-to-noise ratio."""
     make_set(folder, 1, seed=count, side=SIDE, blocks=1)
     whole = json.loads((folder / "annotations.json").read_text())
     image, annotation = whole["images"][0], {**whole["annotations"][0], "signal_to_noise": 9.0, "ignore": 0}
@@ -64,7 +64,7 @@ def detector(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def script(name: str, monkeypatch: pytest.MonkeyPatch, *words: object) -> ModuleType:
-    """A benchmark with the words of its command line set."""
+    """Load a benchmark with its command-line arguments set."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, words)])
     return importlib.import_module(name)
@@ -96,7 +96,7 @@ def test_ablation(data_set: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def _one_tile_of_each(part):
-    """`part` of a data set, of which the first tiles of each size are taken: training goes tile by tile."""
+    """Return `part` of a data set, reduced to the first tile of each size, because training goes tile by tile."""
 
     def few(folder: Path, out: Path, **options: object) -> Path:
         part(folder, out, **options)
@@ -140,7 +140,7 @@ def test_mirrored(data_set: Path, detector: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def _every_24th(folder_class):
-    """A folder of tiles of which one of each size of blocks is taken."""
+    """Return a folder class that holds one tile of each block size."""
 
     def few(path: Path):
         folder = folder_class(path)

@@ -78,7 +78,7 @@ def test_a_crowd_region_takes_what_no_block_takes_any_number_of_times():
 @pytest.mark.parametrize("kind", ["segm", "bbox"])
 @pytest.mark.parametrize("seed", range(12))
 def test_the_table_counts_as_pycocotools_on_drawn_sets(seed, kind):
-    """Several images and categories, crowd regions, equal scores, doubles, nothing in some images."""
+    """Random sets with several images and categories, crowd regions, equal scores, duplicates, and images without anything."""
     truth, found = _drawn(np.random.default_rng(seed))
     for confidence in (0.0, 0.5, 0.9):
         kept = [item for item in found if item["score"] >= confidence]
@@ -112,7 +112,7 @@ def _drawn(random):
 
 
 def _counts_of_pycocotools(truth, found, thresholds, kind):
-    """True and false positives and false negatives, from pycocotools' own matches of each image and category."""
+    """Return true positives, false positives and false negatives, from pycocotools' own matches of each image and category."""
     with contextlib.redirect_stdout(io.StringIO()):
         reference = COCO()
         reference.dataset = copy.deepcopy(truth)
@@ -135,7 +135,9 @@ def _counts_of_pycocotools(truth, found, thresholds, kind):
 
 
 def test_each_category_has_a_table_of_its_own_beside_the_total(truth, found, tmp_path):
-    """All detections are called vegetation where the truth has rockfall: none is right in any table, nor in COCO's line."""
+    """All detections have the category vegetation where the truth has rockfall: none is right in any table or in
+    COCO's summary.
+    """
     truth["categories"].append({"id": 2, "name": "vegetation"})
     truth["annotations"].append({**_item(9, 2, 40, 40, 8, 8), "category_id": 2})
     (tmp_path / "annotations.json").write_text(json.dumps(truth))

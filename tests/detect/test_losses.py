@@ -56,7 +56,7 @@ def test_anchors_near_a_block_and_the_nearest_are_positive():
 
 
 def test_in_a_block_to_ignore_nothing_is_sampled():
-    """COCO's crowd: what lies in it by half or more of itself is neither block nor background."""
+    """As with COCO's crowd regions, a box of which half or more lies in such a block is neither a block nor background."""
     config = ProposalConfig(sampled_anchors=512)
     places = anchors(64, 64, STRIDES, config.anchor_sizes_px, config.anchor_ratios)
     blocks = np.array([[[4, 4, 40, 40], [48, 48, 60, 60]]], np.float32)

@@ -1,4 +1,4 @@
-"""Detection that looks at a map's mirror images too: what it says of a mirrored map, and how it is asked for."""
+"""Detection that averages over a map's mirror images: its answer for a mirrored map, and how it is switched on."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TURNS = VIEWS["both"]
 
 @pytest.fixture(scope="module")
 def model() -> MirroredMaskRCNN:
-    """With weights large enough that what it says varies over the map, and depends on which way up the map is."""
+    """A network with weights large enough that its output varies over the map and depends on the map's orientation."""
     random, result = np.random.default_rng(4), MirroredMaskRCNN(SMALL)
     for head in (result.proposal_head, result.box_head, result.mask_head):
         for variable in head.weights:
@@ -39,13 +39,13 @@ def model() -> MirroredMaskRCNN:
 
 @pytest.fixture(scope="module")
 def images() -> np.ndarray:
-    """(4, h, w, 2) noise, with data everywhere: as it is, and turned by each of TURNS."""
+    """Noise (4, h, w, 2) without gaps: one map, mirrored in each way of TURNS."""
     noise = np.random.default_rng(5).normal(0, 1, (SIDE, SIDE)).astype(np.float32)
     return np.stack([np.stack([np.flip(noise, axes), np.ones_like(noise)], axis=-1) for axes in TURNS])
 
 
 def _turned(answer: dict[str, np.ndarray], axes: tuple[int, ...]) -> dict[str, np.ndarray]:
-    """What the answer for a mirrored map says of the map."""
+    """Return the answer for a mirrored map, mirrored back."""
     result = dict(answer)
     for name in ("boxes", "mask_boxes"):
         edges = answer[name].copy()
@@ -57,7 +57,10 @@ def _turned(answer: dict[str, np.ndarray], axes: tuple[int, ...]) -> dict[str, n
 
 @pytest.mark.parametrize("mirrored", VIEWS)
 def test_a_mirrored_map_has_mirrored_answers_where_its_mirror_images_are_looked_at(mirrored, model, images):
-    """A mean over a group of views turns as the map does. The network alone, and a turn that is in no view, do not."""
+    """The mean over a group of views is mirrored with the map.
+
+    The network alone does not have this property, nor have views that lack one mirror image.
+    """
     model.config = weights.with_head(SMALL, mirrored=mirrored)
     answers = {name: np.asarray(values) for name, values in model({"image": images}).items()}
     for number, axes in enumerate(TURNS):
@@ -101,7 +104,7 @@ def test_detectors_of_before_look_at_maps_as_they_are(tmp_path):
 
 
 def test_scores_are_set_for_each_way_of_looking(tmp_path, monkeypatch):
-    """By detections whose log odds are best moved by 1 where the map alone is looked at, and by 2 with its mirror images."""
+    """The detections' log odds are best shifted by 1 if only the map itself is used, and by 2 with its mirror images."""
     monkeypatch.setattr(operating_point, "_detect_all", lambda model, images, lowest: model.config.head.mirrored)
     monkeypatch.setattr(operating_point, "best_shifts", lambda _, found: {"none": (1.0, 0.5), "both": (2.0, -0.5)}[found])
     validation = type("Tiles", (), {"images": [], "annotations": []})()

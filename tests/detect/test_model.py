@@ -1,4 +1,4 @@
-"""The network as a whole: it learns two tiles by heart, steps are deterministic, it goes on after a kill as before."""
+"""The network as a whole: it memorises two tiles, steps are deterministic, and training resumes exactly after a kill."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ SMALL = DetectorConfig(
 
 
 def make_set(folder: Path, count: int, seed: int, side: int = SIDE, blocks: int = 3) -> Path:
-    """Difference maps with elliptic niches a few times the noise, as COCO."""
+    """Write difference maps with elliptic niches of a few times the noise, as a COCO folder."""
     random = np.random.default_rng(seed)
     images, annotations = [], []
     for number in range(1, count + 1):
@@ -101,10 +101,12 @@ def _compiled(seed: int = 1) -> MaskRCNN:
 
 @pytest.mark.slow
 def test_two_tiles_are_learned_by_heart(data_set, tmp_path):
-    """Every block of both tiles is found with a mask that overlaps it by more than 0.85 (the least is 0.91 here, and may be less
-    on another processor, whose kernels sum in another order), and nothing else; also from a score of 0.95 on, once the scores of
-    a network that is made too modest are shifted. Masks have no margin: learned by heart, they are known in the boxes of the
-    training alone."""
+    """Every block of both tiles, and nothing else, is found with a mask IoU above 0.85.
+
+    The least IoU is 0.91 here; another processor sums in another order. The same holds from a score of 0.95 on, after the scores
+    of a network that is made too unsure are shifted. Masks have no margin, because memorised masks are known in the training
+    boxes alone.
+    """
     folder, model = CocoFolder(data_set / "train"), _compiled()
     exact = SMALL.model_copy(update={"head": SMALL.head.model_copy(update={"mask_margin_px": 0.0})})
     model.config = exact
@@ -178,7 +180,7 @@ def test_a_killed_training_goes_on_to_the_same_curve(data_set, tmp_path, eager):
 
 @pytest.mark.slow
 def test_a_training_starts_from_the_weights_that_its_config_names(data_set, tmp_path, eager):
-    """At a learning rate of next to nothing it ends with them."""
+    """With a learning rate of almost zero it also ends with them."""
     begun = MaskRCNN(SMALL, seed=7)
     weights.save(begun, tmp_path / "begun")
     still = {"batch": 2, "warm_up_steps": 0, "epochs": 1, "learning_rate": 1e-9}
@@ -196,7 +198,7 @@ def test_a_training_does_not_start_from_another_network(data_set, tmp_path):
 
 
 class _KilledAfter:
-    """A progress that interrupts in the middle of an epoch, as Ctrl-C does."""
+    """A progress that interrupts training in the middle of an epoch, like Ctrl-C."""
 
     def __new__(cls, epochs: int):
         from pipeline.report.progress import Progress
@@ -218,7 +220,9 @@ def test_masks_have_the_size_of_the_config(size):
 
 
 class _SeesADisc(MaskRCNN):
-    """Its one box is smaller than the disc that it sees, as a small block's box is when it is off by a part of a pixel."""
+    """A fake network whose one box is smaller than the disc it sees, like a small block's box that is wrong by a fraction of a
+    pixel.
+    """
 
     centre, radius, box = (40.3, 60.8), 6.0, (35.0, 56.0, 45.0, 66.0)
 
@@ -239,15 +243,15 @@ class _SeesADisc(MaskRCNN):
         return self.inside(y0 + parts * (y1 - y0), x0 + parts * (x1 - x0))[None, None].astype(np.float32)
 
     def inside(self, y, x):
-        """(len(y), len(x)) how far inside the disc the points are, px."""
+        """Return how far inside the disc the points lie, px (len(y), len(x))."""
         return self.radius - np.hypot(y[:, None] - self.centre[0], x - self.centre[1])
 
 
 @pytest.mark.parametrize("margin", [0, 2])
 def test_a_mask_is_cut_at_the_margin_around_its_box(margin, eager):
-    """A disc in closed form that reaches beyond its box by up to 1.3 px: whole with a margin of 2 px, without what the box holds.
+    """A disc reaches up to 1.3 px beyond its box: with a margin of 2 px the mask is whole, without margin it ends at the box.
 
-    Pixels whose centres lie within a tenth of a pixel of the disc's edge may be either.
+    Pixels whose centres lie within a tenth of a pixel of the disc's edge may be in or out.
     """
     model = _SeesADisc(margin)
     (found,) = detect(model, np.random.default_rng(1).normal(0, 0.01, (SIDE, SIDE)).astype(np.float32))
@@ -263,7 +267,7 @@ def test_a_mask_is_cut_at_the_margin_around_its_box(margin, eager):
 
 
 def test_scores_are_shifted_by_the_size_of_the_box(eager):
-    """Log odds of 5, and 0.5 taken off for each doubling, of a box of 10 px."""
+    """The log odds are 5 for a box of 10 px, less 0.5 for each doubling of the size."""
     model = _SeesADisc(1.0)
     model.config = model.config.model_copy(update={"head": model.config.head.model_copy(update={"score_per_doubling": -0.5})})
     answer = model.predict_on_batch({"image": np.zeros((1, SIDE, SIDE, 2), np.float32)})
@@ -271,8 +275,10 @@ def test_scores_are_shifted_by_the_size_of_the_box(eager):
 
 
 def test_the_shifts_are_those_with_which_blocks_are_found_best():
-    """Small blocks are right from a score of 0.6 on, large ones from 0.9 on: one score for both misses or adds some, and with the
-    shifts a score of 0.95 parts all. Where no detection is wrong, size needs no shift."""
+    """Small blocks are right from a score of 0.6 on, large ones from 0.9 on, so no single score separates both.
+
+    After the shifts, 0.95 separates all. Where no detection is wrong, no shift by size is needed.
+    """
     right = [_square(number, 4, score) for number, score in enumerate((0.6, 0.7, 0.8))]
     right += [_square(number, 32, score) for number, score in enumerate((0.9, 0.97), start=3)]
     wrong = [_square(5, 4, 0.4), _square(6, 32, 0.8), _square(7, 32, 0.85)]
@@ -302,7 +308,9 @@ def test_boxes_stay_as_found_where_masks_have_a_margin(eager):
 
 @pytest.mark.parametrize(("name", "millions"), [("resnet50", 23.5), ("resnet101", 42.5)])
 def test_the_backbones_are_the_papers(name, millions):
-    """Parameters of the convolutions of He et al. without the classifier; the first takes one channel in place of three."""
+    """The number of convolution parameters is that of He et al. without the classifier; the first layer has one channel instead
+    of three.
+    """
     from pipeline.detection.network.backbone import feature_pyramid
 
     model = feature_pyramid(name, 64, 1, 256)
@@ -363,7 +371,7 @@ def test_a_window_keeps_what_it_shows_at_least_half_of(data_set):
 
 
 def test_the_detector_that_comes_along_finds_clear_blocks(tmp_path, eager):
-    """Twelve niches of ten times the noise, 10 to 30 px: it was trained on other shapes and other noise, so ten are enough."""
+    """Of twelve niches of ten times the noise, 10 to 30 px, it must find ten; it was trained on other shapes and other noise."""
     make_set(tmp_path / "set", 1, 9, side=512, blocks=12)
     events = run_detect("default", [tmp_path / "set"], tmp_path / "found", confidences=(CONFIDENCE,), pictures=False)
     truth = json.loads((tmp_path / "set" / "annotations.json").read_text())

@@ -1,4 +1,4 @@
-"""Events of a run's maps have the survey's coordinates, of the rock as it was before it fell."""
+"""Events found in a run's maps have survey coordinates, of the rock before it fell."""
 
 from __future__ import annotations
 

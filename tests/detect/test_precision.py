@@ -1,4 +1,4 @@
-"""Training in bfloat16: what is compiled computes in it, what lies outside of it does not, and it learns as in float32."""
+"""Training in bfloat16: compiled code computes in it, other code does not, and the losses are as in float32."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ bfloat16_processor = pytest.mark.skipif("avx512_bf16" not in _FLAGS, reason="thi
 
 
 def _error_of_a_product() -> float:
-    """Largest relative error of a compiled convolution of positive numbers."""
+    """Return the largest relative error of a compiled convolution of positive numbers."""
     random = np.random.default_rng(1)
     image, kernel = random.uniform(1, 2, (2, 32, 32, 16)), random.uniform(1, 2, (3, 3, 16, 16))
     convolved = tf.function(lambda x, k: tf.nn.relu(tf.nn.conv2d(x, k, 1, "VALID")))
@@ -50,7 +50,7 @@ def test_another_backend_is_refused(monkeypatch):
 @bfloat16_processor
 @pytest.mark.slow
 def test_a_training_in_bfloat16_has_the_losses_of_one_in_float32(tmp_path):
-    """To a hundredth of the losses that they begin with; what is saved is in float32."""
+    """They agree to a hundredth of the initial losses; weights are saved in float32."""
     make_set(tmp_path / "set" / "train", 4, 1)
     make_set(tmp_path / "set" / "val", 2, 2)
     short = {"batch": 2, "warm_up_steps": 2, "epochs": 2, "learning_rate": 1e-3}

@@ -1,4 +1,4 @@
-"""What scores mean: shares by hand, and that of scores which are probabilities by construction."""
+"""Reliability diagrams: shares computed by hand, and shares of scores that are probabilities by construction."""
 
 from __future__ import annotations
 
@@ -19,14 +19,16 @@ def _block(number: int, image: int, x: int, **more: float) -> dict:
 
 
 def _set(scores: np.ndarray, there: np.ndarray) -> tuple[dict, list[dict]]:
-    """An image with one detection each, which lies on the image's block or beside it."""
+    """Return images with one detection each, which lies on the image's block or beside it."""
     images = [{"id": number} for number in range(len(scores))]
     truth = {"images": images, "annotations": [_block(n, n, 0) for n in range(len(scores))]}
     return truth, [_block(n, n, 0 if there[n] else 8, score=float(scores[n])) for n in range(len(scores))]
 
 
 def test_shares_by_hand():
-    """Two of three between 0.9 and 0.95, none of one below 0.1, and scores of 0.99 and 1 in the last class."""
+    """Two of three detections between 0.9 and 0.95 are right, none of one below 0.1; scores of 0.99 and 1 are in the
+    last class.
+    """
     truth, found = _set(np.array([0.92, 0.9, 0.94, 0.05, 0.99, 1.0]), np.array([1, 1, 0, 0, 1, 1]))
     every, first = reliability(truth, found, {"all": range(6), "first": [0]})
     assert [(each.low, each.detections, each.right) for each in every.classes] == [(0.0, 1, 0), (0.9, 3, 2), (0.99, 2, 2)]
@@ -43,7 +45,7 @@ def test_a_double_of_a_block_is_wrong():
 
 
 def test_scores_that_are_probabilities_lie_on_the_diagonal():
-    """Each of eight classes within 3.5 of its standard errors (a false failure in 1 of 270); scores twice as sure do not."""
+    """Each of eight classes is within 3.5 standard errors (1 in 270 seeds fails); overconfident scores are not."""
     rng = np.random.default_rng(3)
     scores = rng.uniform(size=_COUNT)
     truth, found = _set(scores, rng.uniform(size=_COUNT) < scores)
@@ -64,7 +66,7 @@ def test_no_detection_has_no_class_and_a_picture_all_the_same(tmp_path):
 
 
 def test_names_of_groups_are_cut_in_the_picture(tmp_path):
-    """A word of a megabyte takes minutes to draw."""
+    """Drawing a name of a megabyte would take minutes."""
     truth, found = _set(np.array([0.8]), np.array([1]))
     groups = reliability(truth, found, {f"noise {number} {'x' * 1_000_000}": [0] for number in range(30)})
     write_reliability(groups, tmp_path / "reliability.png")

@@ -1,4 +1,4 @@
-"""Training with the data set in an accelerator's memory: its windows are the streamed training's, it learns, it resumes."""
+"""Training with the data set in the accelerator's memory: it sees the same windows as streamed training, learns, and resumes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FIXED = DetectorConfig(image_px=128, most_blocks=8, normalisation=NormalisationC
 
 
 class _At:
-    """A generator that draws a given corner."""
+    """A fake random generator that draws a given corner."""
 
     def __init__(self, *corner: int) -> None:
         self._left = list(corner)
@@ -35,7 +35,7 @@ class _At:
 @pytest.mark.parametrize("corner", [(0, 0), (17, 40), (64, 3)])
 @pytest.mark.parametrize("axes", [(), (0,), (0, 1)])
 def test_windows_are_those_of_the_streamed_training(tmp_path, corner, axes):
-    """Cut and mirrored in NumPy and on the device; the device keeps a block's number, NumPy counts anew."""
+    """Windows cut and mirrored by NumPy and on the device agree; the device keeps block numbers, NumPy numbers them again."""
     folder = CocoFolder(make_set(tmp_path, 2, 6, blocks=4))
     expected = cut_window(folder.labelled(1), 64, _At(*corner))
     found = cut_on_device(load_resident_set(folder, FIXED, 64), jnp.int32(1), jnp.array(corner), 64)
@@ -134,9 +134,11 @@ assert all(np.array_equal(variable, value) for variable, value in zip(model.trai
 
 
 def test_it_learns_and_goes_on_as_if_nothing_had_been(tmp_path):
-    """With JAX as the backend, in a process of its own, and a network of three numbers, which XLA compiles in no time: 32 steps
-    halve the loss of both sets, from the first epoch on; from the state after 16 steps the rest ends with the same numbers; with
-    learning rates of nought weights stay. (Mask R-CNN itself was trained so on a card: docs/validation/detector.md.)"""
+    """JAX trains a network of three numbers, which compiles fast, in a process of its own.
+
+    32 steps halve the losses of both sets; resumed from the state after 16 steps, training ends with the same numbers; with
+    learning rate zero the weights stay. (Mask R-CNN itself was trained this way on a GPU: docs/validation/detector.md.)
+    """
     for part, count in (("train", 16), ("val", 3)):
         make_set(tmp_path / part, count, 6, blocks=2)
     environment = {**os.environ, "KERAS_BACKEND": "jax"}

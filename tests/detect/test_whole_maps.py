@@ -1,4 +1,4 @@
-"""Maps larger than a tile: every block is found once, whole and at its place, in whichever way the map is given to `detect`."""
+"""Maps larger than a tile: every block is found once, whole and at its place, in whichever form `detect` gets the map."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ GSD = 0.02
 
 
 class MarkFinder:
-    """Stands for a network: finds what a tile shows of each mark, to the pixel.
+    """A fake network that finds, to the pixel, what a tile shows of each mark.
 
-    smaller_better: the scores of small parts are the better, else of large ones; blind: tiles, in their order, in which it finds
-    nothing; short_px: masks end that far before the borders of the tile, as a network's do.
+    smaller_better: small parts have the better scores, otherwise large ones; blind: numbers of the tiles in which it finds
+    nothing; short_px: masks end this far before the tile's borders, as a network's do.
     """
 
     size = TILE
@@ -68,7 +68,7 @@ class MarkFinder:
 
 
 def map_of(shape: tuple[int, int], marks: list[np.ndarray]) -> np.ndarray:
-    """A difference map, m: noise and the marks (masks of the whole map)."""
+    """Return a difference map, m: noise and the marks (masks of the whole map)."""
     difference = np.random.default_rng(5).normal(0, NOISE, shape).astype(np.float32)
     for mark in marks:
         difference[mark] += DEPTH
@@ -82,7 +82,7 @@ def rectangle(shape: tuple[int, int], row: int, column: int, height: int, width:
 
 
 def scattered(shape: tuple[int, int]) -> list[np.ndarray]:
-    """Marks of 9 x 7 px, one somewhere in each cell of 17 x 15 px, apart from one another: some lie across borders of tiles."""
+    """Return marks of 9 x 7 px, one at a random place in each cell of 17 x 15 px; some lie across borders of tiles."""
     random = np.random.default_rng(8)
     cells = [(row, column) for row in range(0, shape[0] - 16, 17) for column in range(0, shape[1] - 14, 15)]
     return [rectangle(shape, row + random.integers(1, 7), column + random.integers(1, 7), 9, 7) for row, column in cells]
@@ -102,7 +102,7 @@ def as_set(masks: list[np.ndarray]) -> set[bytes]:
 @pytest.mark.parametrize("shape", [(64, 64), (50, 300), (65, 64), (150, 233)])
 @pytest.mark.parametrize("smaller_better", [False, True])
 def test_every_mark_is_found_once_and_whole(shape, smaller_better):
-    """Also where a part of a mark has a better score than the whole; places and masks to the pixel."""
+    """This holds even if a part of a mark has a better score than the whole mark; places and masks agree to the pixel."""
     marks = scattered(shape)
     for axis in (0, 1):
         spans = [np.flatnonzero(mark.any(axis=1 - axis))[[0, -1]] for mark in marks]
@@ -116,7 +116,7 @@ def test_every_mark_is_found_once_and_whole(shape, smaller_better):
 
 
 def test_margins_without_data_are_not_searched():
-    """As around a wall that does not fill its raster: the same answers, moved, from as many tiles."""
+    """Margins occur around a wall that does not fill its raster: the answers are the same, shifted, from as many tiles."""
     shape, margin = (150, 100), ((70, 300), (40, 130))
     marks = scattered(shape)
     alone, framed = MarkFinder(), MarkFinder()
@@ -157,7 +157,7 @@ def test_a_block_that_no_tile_sees_whole_is_put_together(kind, smaller_better):
 
 
 def test_a_part_that_the_tile_beside_denies_is_left_out():
-    """Tiles begin at columns 0, 32 and 64: only the middle one sees the mark whole, and here it sees nothing."""
+    """Tiles begin at columns 0, 32 and 64. Only the middle one sees the whole mark, and here it finds nothing."""
     shape = (64, 128)
     marks = [rectangle(shape, 20, 58, 9, 12)]
     assert len(inference.detect(MarkFinder(), map_of(shape, marks))) == 1
@@ -166,7 +166,7 @@ def test_a_part_that_the_tile_beside_denies_is_left_out():
 
 @pytest.mark.parametrize("smaller_better", [False, True])
 def test_masks_that_end_short_of_the_border_make_no_halves(smaller_better):
-    """A network's mask of a cut block ends up to some pixels before the border."""
+    """A network's mask of a block that the tile cuts ends up to some pixels before the border."""
     shape = (100, 200)
     marks = [mark for mark in scattered(shape) if not (mark[:2].any() or mark[-2:].any() or mark[:, :2].any())]
     marks = [mark for mark in marks if not mark[:, -2:].any()]
@@ -175,7 +175,7 @@ def test_masks_that_end_short_of_the_border_make_no_halves(smaller_better):
 
 
 def given_as(kind: str, folder: Path, maps: list[np.ndarray]) -> list[Path]:
-    """The maps as files, a run folder or a COCO folder; what to give to `detect`."""
+    """Write the maps as files, a run folder or a COCO folder, and return what to pass to `detect`."""
     paths = [folder / f"difference_{number:03d}.tif" for number in range(1, len(maps) + 1)]
     for path, values in zip(paths, maps, strict=True):
         write_geotiff(path, values, Grid(100.0, 50.0, GSD, values.shape[1], values.shape[0]))
@@ -216,8 +216,9 @@ def test_every_kind_of_input_is_searched_to_its_last_corner(kind, tmp_path, monk
 
 @pytest.mark.slow
 def test_the_detector_that_comes_along_searches_the_whole_map(tmp_path, eager):
-    """40 niches of 30 px, twenty times as deep as the noise, on a grid over 600 x 1400 px, 2 x 5 tiles: clear enough for each
-    to be found, by a mask of its own that covers most of it."""
+    """40 niches of 30 px and twenty times the noise, on a grid over 600 x 1400 px (2 x 5 tiles), are so clear that each must be
+    found, with a mask of its own that covers most of it.
+    """
     shape = (600, 1400)
     y, x = np.mgrid[: shape[0], : shape[1]]
     centres = [(60 + 160 * row, 60 + 142 * column) for row in range(4) for column in range(10)]

@@ -16,7 +16,7 @@ GRID = Grid(1.0, 9.0, 0.1, 90, 60)
 
 
 def labels(seed):
-    """A raster of ragged blobs in several pieces, touching borders and one another, with gaps in the numbering."""
+    """Return a raster of ragged blobs in several pieces, touching borders and one another, with gaps in the numbering."""
     noise = ndimage.gaussian_filter(np.random.default_rng(seed).normal(size=GRID.shape), 2)
     blobs, _ = ndimage.label(noise > 0.05)
     return np.where(blobs % 3 == 1, 0, blobs // 2).astype(np.int32)

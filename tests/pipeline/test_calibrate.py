@@ -1,4 +1,6 @@
-"""Calibration of the noise: windows, the fast simulation against the whole one, the search against closed forms, recovery."""
+"""Calibration of the noise: windows, the fast simulation against the whole one, the search against closed forms, recovery of
+known noise.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +64,7 @@ def small(sensor: str, *more: str) -> tuple[SimulationConfig, SensorSite]:
 
 
 def seen_by(config: SimulationConfig, site: SensorSite, epochs: int, seed: int) -> CalibrationInputs:
-    """Difference maps of the whole simulation, each of two observations of its own."""
+    """Return difference maps of the whole simulation, each of two independent observations."""
     caster, random = RayCaster(site.mesh), KeyedRandom(seed)
     grid = raster_grid(reconstruct(config, acquire(config, site, caster, random)).bounds, config.difference)
     maps = [noise_map(config, site, site, caster, random.child("map", number), grid) for number in range(epochs)]
@@ -98,7 +100,7 @@ def noisy_map(path: Path, values: FloatArray | None = None, grid: Grid = GRID) -
 
 
 def test_maps_that_are_no_measurement_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Nothing but zeros, one map as two epochs, and pixels without a size."""
+    """Refused in one line: nothing but zeros, one map given as two epochs, and pixels without a size."""
     once, zero, flat = (tmp_path / f"{name}.tif" for name in ("once", "zero", "flat"))
     noisy_map(once)
     noisy_map(zero, np.zeros(GRID.shape))
@@ -109,7 +111,7 @@ def test_maps_that_are_no_measurement_are_one_line(tmp_path: Path, capsys: pytes
     out = tmp_path / "out"
     for words, message in (
         ([zero], "zero: the difference is 0 m everywhere"),
-        ([once, once], "the map equals once"),
+        ([once, once], "the map has the same values as once"),
         ([flat], "its pixels are 0 x 0 units"),
     ):
         assert main(["calibrate", *map(str, words), "--sensor", "tls", "--out", str(out), "--quiet"]) == 2
@@ -154,7 +156,7 @@ def test_a_factor_scales_every_sigma_of_the_orientation_but_those_fitted_singly(
     ],
 )
 def test_chosen_cells_are_those_of_the_whole_observation_to_the_bit(sensor: str, more: list[str]) -> None:
-    """Also of a preset whose beam has a footprint: its sub-rays leave with the pulse and look at no other one."""
+    """Also for a preset whose beam has a footprint: its sub-rays leave with the pulse and use no other pulse."""
     config, site = small(sensor, *more)
     whole: Any = site.sensor
     seen = whole.observe(RayCaster(site.mesh), KeyedRandom(5)).points.reshape(-1, 3)
@@ -166,7 +168,7 @@ def test_chosen_cells_are_those_of_the_whole_observation_to_the_bit(sensor: str,
 
 @pytest.mark.parametrize("sensor", ["stereo", "tls"])
 def test_maps_in_windows_have_the_statistics_of_the_whole_simulation(sensor: str) -> None:
-    """The same random numbers in both, so that only the registration differs: 4 % of any length at small scale."""
+    """Both use the same random numbers, so only the registration differs: by 4 % for lengths at small scale."""
     config, site = small(sensor)
     inputs = seen_by(config, site, 2, 3)
     windows = inputs.windows(config)
@@ -188,7 +190,10 @@ def test_maps_in_windows_have_the_statistics_of_the_whole_simulation(sensor: str
 
 @pytest.mark.parametrize("count", [1, 5])
 def test_few_windows_have_no_modes_of_deformation(count: int) -> None:
-    """Fewer than twice the plane's terms: what is left is the RMS of the windows' medians, here 1, 2 ... mm in turn."""
+    """With fewer windows than twice the plane's terms only the RMS of the windows' medians (here 1, 2, ...
+
+    mm in turn) is computed.
+    """
     corner = np.array([[0, 32 * number] for number in range(count)], dtype=np.int32)
     windows = Windows(Grid(0.0, 1.0, 0.02, 200, 50), corner, 24, np.ones((count, 24, 24), dtype=bool))
     bumps = KeyedRandom(1).generator().normal(0, 0.05, (count, 24, 24))
@@ -201,7 +206,7 @@ def test_few_windows_have_no_modes_of_deformation(count: int) -> None:
 
 
 class Known:
-    """A simulation in closed form: statistics of n values each are logs of sqrt(sum_j a_ij theta_j^2) plus their own scatter."""
+    """A fake simulation in closed form: statistics of n values are logs of sqrt(sum_j a_ij theta_j^2) plus their own scatter."""
 
     shares = np.array([[1.0, 0.0], [1.0, 0.3], [0.6, 1.0], [0.1, 1.0], [0.4, 0.4]])
 
@@ -220,7 +225,7 @@ class Known:
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
-    """40 intervals of 90 %: false failure below 0.4 %."""
+    """40 intervals of 90 %; less than 0.4 % of seeds fail by chance."""
     known, held = Known(), 0
     for seed in range(20):
         truth = np.exp(KeyedRandom(seed).child("truth").generator().uniform(np.log(0.3), np.log(2), 2))
@@ -237,8 +242,11 @@ def test_a_model_that_cannot_make_the_measurement_is_told() -> None:
 
 
 def test_a_search_that_went_astray_starts_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the second parameter is too small to matter nothing shows the way back. Five standard deviations; the first search,
-    without the second, ends more than ten away."""
+    """The second parameter is too small to matter at first, so nothing leads back.
+
+    The final estimate is within five standard deviations, although the first search, without the second parameter, ends more than
+    ten away.
+    """
     known = Known(np.array([[1.0, 0.1], [1.0, 0.3], [0.6, 1.0], [0.1, 1.0], [0.4, 0.4]]))
     search, truth = known.search(1), np.log([1.0, 0.6])
     approach = search._approach
@@ -258,7 +266,7 @@ def test_a_search_that_went_astray_starts_anew(monkeypatch: pytest.MonkeyPatch) 
 
 
 class Recorded(Progress):
-    """Notes the share that is done whenever a stage begins, advances or ends."""
+    """A progress that notes the share that is done whenever a stage begins, advances or ends."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -278,7 +286,7 @@ class Recorded(Progress):
 
 @pytest.mark.parametrize("size", [0.0, 0.5])
 def test_progress_of_the_search_goes_from_nothing_to_all(size: float) -> None:
-    """Also where the misfit (of size 0.5 in one statistic) makes it search a second time."""
+    """Also if a misfit (0.5 in one statistic) causes a second search."""
     known, progress = Known(), Recorded()
     search = known.search(3)
     search.progress = progress
@@ -310,9 +318,9 @@ def test_greedy_meets_the_standard_deviation_and_not_the_pattern() -> None:
 
 @pytest.mark.slow
 def test_known_noise_of_another_wall_and_seed_comes_back() -> None:
-    """Within twice the interval of 95 %, four standard deviations: false failure below 1 %, as 60 sets give the scatter.
+    """Within twice the 95 % interval, that is four standard deviations: less than 1 % of seeds fail, as 60 sets give the scatter.
 
-    How often the intervals themselves hold is for benchmarks/calibrate_recovery.py.
+    benchmarks/calibrate_recovery.py measures how often the intervals themselves contain the truth.
     """
     config, site = small("tls", "wall.seed=22", "calibration.simulations=60", "seed=2")
     truth = np.array([0.0015, 2e-4])

@@ -1,4 +1,4 @@
-"""Calibration on references made of points: their error is not the instrument's."""
+"""Calibration on references made of points: the reference's error must not be attributed to the instrument."""
 
 from __future__ import annotations
 
@@ -51,8 +51,10 @@ def wall(rng: np.random.Generator, count: int = 40) -> TriangleMesh:
 
 @pytest.mark.parametrize("shared", [True, False])
 def test_points_lie_as_far_from_the_wall_as_from_one_whose_vertices_are_wrong(shared: bool) -> None:
-    """Of noise by casting on that wall, to 1 % of the noise; of relief, which no neighbour shares, by its variance: the sum of
-    the squared weights, within 3 standard errors."""
+    """For noise, distances are compared with ray casting on that wall, to 1 % of the noise.
+
+    For relief, which neighbours do not share, the variance is the sum of the squared weights, within 3 standard errors.
+    """
     mesh, rng = wall(np.random.default_rng(1)), np.random.default_rng(2)
     caster, sigma = RayCaster(mesh), 1e-3
     ray = rays(*rng.uniform([[np.pi / 2 - 0.11], [np.pi / 2 - 0.11]], [[np.pi / 2 + 0.11], [np.pi / 2 + 0.11]], (2, 5000)))
@@ -83,7 +85,7 @@ def test_points_that_are_missing_or_miss_the_wall_stay() -> None:
 
 @pytest.fixture(scope="module")
 def half(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One half of a scan of a wall against the other, with noise of 3 mm where the model believes in 1 mm."""
+    """One half of a scan of a wall against the other, with 3 mm of noise where the model claims 1 mm."""
     folder, rng = tmp_path_factory.mktemp("half"), np.random.default_rng(4)
     line, pulse = (each.ravel() for each in np.indices((360, 360)))
     ray = rays(np.pi / 2 - 0.12 + line * 6.6e-4, np.pi / 2 - 0.12 + pulse * 6.6e-4)
@@ -104,8 +106,11 @@ def inputs(half: Path) -> tuple[SimulationConfig, CalibrationInputs]:
 
 
 def test_maps_of_a_half_are_as_noisy_as_measured_only_with_the_reference_error(half: Path) -> None:
-    """Without it the simulated maps have less than 0.85 of the measured deviation, with it as much to 8 %: a half's points stand
-    as on a chessboard, simulated ones on squares, and pixels hold some three."""
+    """Without it the simulated maps have less than 0.85 of the measured deviation; with it they agree to 8 %.
+
+    The remainder comes from the points' layout: those of a half lie like one colour of a chessboard, simulated ones on squares,
+    with about three per pixel.
+    """
     config, found = inputs(half)
     assert found.reference_error is not None
     assert found.reference_error.sigma_m == pytest.approx(NOISE_M, rel=0.1)
@@ -133,7 +138,7 @@ def test_points_that_lie_in_one_direction_are_an_input_error(half: Path) -> None
 
 @pytest.mark.slow
 def test_the_noise_of_the_instrument_comes_back_from_a_half(half: Path) -> None:
-    """Within twice the interval of 95 %, and 8 % at most; without the reference's error it is a quarter more."""
+    """Within twice the 95 % interval, at most 8 %; without the reference's error it would be a quarter larger."""
     config, _ = inputs(half)
     result = calibrate(config, "tls", [half], Progress(), with_greedy=False)
     (value,), (low,), (high,) = (np.exp(each) for each in (result.found.x, result.found.low, result.found.high))

@@ -1,4 +1,4 @@
-"""Camera files against the camera itself: round trips over the frame, OpenCV's own projection, one real lens in two forms."""
+"""Camera files against the camera itself: round trips over the frame, OpenCV's own projection, one real lens in two formats."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def grid(of: Camera) -> tuple[FloatArray, FloatArray]:
 
 
 def largest_difference_px(one: Camera, other: Camera, posed: bool = True) -> float:
-    """The largest distance over the frame between where the two cameras image the same points, 100 m away."""
+    """Return the largest distance over the frame between where the two cameras image the same points, 100 m away, px."""
     u, v = grid(one)
     x, y = one.tangents(u, v)
     if posed:

@@ -1,4 +1,4 @@
-"""What a run writes is chosen, and its world coordinates say of which system they are."""
+"""The config chooses what a run writes; products in world coordinates state their coordinate system."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command line: exit codes, one line per mistake, and what reaches the pipeline. The pipeline itself is a stand-in here."""
+"""The command line: exit codes, one line per mistake, and the arguments that reach the pipeline, which is a fake here."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from scene.common.keyed_random import KeyedRandom
 
 
 class Pipeline:
-    """Stands in for pipeline.config.simulation and pipeline.run.simulation: keeps its arguments, raises what it is told to."""
+    """A fake of pipeline.config.simulation and pipeline.run.simulation: keeps its arguments and raises a given error."""
 
     def __init__(self) -> None:
         self.loaded: tuple[Any, ...] = ()
@@ -197,7 +197,7 @@ def test_init_writes_a_config_that_loads_and_its_schema(words: list[str], kind: 
 
 
 def test_init_names_the_files_of_an_own_site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Relative to the config's folder, and what simulate then reads."""
+    """The names are relative to the config's folder, and simulate reads them from there."""
     example_data.site(tmp_path / "data", resolution_m=0.5)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "plans").mkdir()
@@ -261,7 +261,7 @@ def test_the_schema_marks_mistakes() -> None:
 
 
 def test_scripts_get_one_document(pipeline: Pipeline, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    """Also where a library prints, and of an error."""
+    """With --json the output is one JSON document, also if a library prints something, and for an error."""
     (tmp_path / "here").mkdir()
     (tmp_path / "here/run.json").write_text('{"schema": 1, "config": {"long": 1}, "epochs": [{"points": 5}]}')
     pipeline.words = "from a library"
@@ -308,7 +308,7 @@ def test_bash_completes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
 
 
 def test_help_imports_nothing_heavy() -> None:
-    """The start-up of --help: only the standard library and ours (`benchmarks/startup.py` times it)."""
+    """--help starts fast: it imports only the standard library and our modules (`benchmarks/startup.py` measures the time)."""
     program = (
         "import sys; from pipeline.cli.main import main; main(['--help']); main(['simulate', '--help']); print(*sys.modules)"
     )

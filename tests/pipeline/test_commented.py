@@ -1,4 +1,4 @@
-"""A commented config loads into the same config, says what each key is, and stays right when comments become keys."""
+"""A commented config loads as the same config, explains each key, and stays valid when comments are turned into keys."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Style(Enum):
 
 
 class Imported(Config):
-    """A wall from a file."""
+    """A config section: a wall from a file."""
 
     kind: Literal["imported"] = "imported"
     path: Path = Field(Path("wall.ply"), description="the mesh file")
@@ -45,7 +45,7 @@ class Effect(Config):
 
 
 class Whole(Config):
-    """A simulation."""
+    """A config: a simulation."""
 
     seed: int = Field(1, ge=0, description="seed of all random numbers.")
     wall: Annotated[Imported | Procedural, Field(discriminator="kind")] = Field(Procedural(), description="the wall")
@@ -102,7 +102,7 @@ def test_each_key_is_explained() -> None:
 
 
 def inits() -> dict[str, str]:
-    """What `scarpsim init` writes."""
+    """Return the configs that `scarpsim init` writes."""
     sites = sorted(path.stem for path in (configs_folder() / "sites").glob("*.yaml"))
     return {site or "demo": simulation_text(site, None) for site in (None, *sites)} | {
         f"{site}, {scanner}": simulation_text(site, scanner)
@@ -112,7 +112,7 @@ def inits() -> dict[str, str]:
 
 @pytest.mark.parametrize(("name", "text"), inits().items(), ids=inits().keys())
 def test_all_comments_of_init_can_become_keys(name: str, text: str) -> None:
-    """At once, without a change of the config; then every key of the model is there."""
+    """All at once, without changing the config; then every key of the model is present."""
     short, whole = parse_yaml(text), parse_yaml(COMMENTED.sub(r"\1", text))
     assert parse(SimulationConfig, whole, name) == parse(SimulationConfig, short, name)
     assert set(whole) == set(SimulationConfig.model_fields)
@@ -120,7 +120,9 @@ def test_all_comments_of_init_can_become_keys(name: str, text: str) -> None:
 
 
 def uncommented_alone(lines: list[str]) -> Iterator[str]:
-    """The text with each commented key whose section is live as a key, one at a time, with what belongs to it."""
+    """Yield the text with each commented key, of sections that are present, turned into a key, one at a time with
+    its sub-keys.
+    """
     for number, line in enumerate(lines):
         indent = len(line) - len(line.lstrip())
         above = [other for other in lines[:number] if other.strip() and len(other) - len(other.lstrip()) < indent]

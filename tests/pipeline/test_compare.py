@@ -1,4 +1,4 @@
-"""Comparisons end to end: who is compared, what all share, what the truth says, and the files that are left."""
+"""Comparisons end to end: which sensors are compared, what they share, what the truth says, and the files that are written."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def trial(site: Path) -> Trial:
-    """The scanner with its own noise, and with ten times as much."""
+    """The comparison of the scanner with its own noise and with ten times as much."""
     noisy = site.parent / "noisy.yaml"
     noisy.write_text("sensor: tls\nnoise: {range_sigma_m: 0.02, angle_sigma_rad: 0.0}\n")
     sensors = [each for each in sensor_setups([str(site), str(noisy)]) if each.sensor == "tls"]
@@ -90,7 +90,7 @@ def test_an_unknown_name_is_told_with_the_nearest() -> None:
 
 
 def test_presets_scan_with_the_configs_step_unless_asked(site: Path) -> None:
-    """The config's is 2 mrad in both; the preset names none, so that its own is the default of 0.5 mrad."""
+    """The config has 2 mrad for both; the preset names no step, so its own would be the default of 0.5 mrad."""
     shared, own = (sensor_setups([str(site), "riegl_vz400i"], own_step=own_step) for own_step in (False, True))
     assert [each.angular_step_rad for each in shared] == [None, (0.002, 0.002), (0.002, 0.002)]
     assert own[2].angular_step_rad == (0.0005, 0.0005)
@@ -120,7 +120,9 @@ def test_too_many_epochs_are_refused_before_anything_is_done(
 def test_one_epoch_of_small_blocks_and_a_name_with_dollars(
     site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Blocks of 5 cm, of which the scanner sees less than half: a figure without data. And no formula in $x^$."""
+    """The scanner sees less than half of the blocks of 5 cm, so a figure has no data; $x^$ in a name must not become
+    a formula.
+    """
     named, out = tmp_path / "a $x^$ \\frac.yaml", tmp_path / "out"
     named.write_text(yaml.safe_dump(SMALL | {"sensor": [SMALL["sensor"][1]]}))
     words = ["compare", str(named), "--epochs", "1", "--out", str(out), "--quiet"]
@@ -134,7 +136,7 @@ def test_one_epoch_of_small_blocks_and_a_name_with_dollars(
 
 
 class Recorded(Progress):
-    """Notes the share that is done whenever a stage begins or ends."""
+    """A progress that notes the share that is done whenever a stage begins or ends."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -181,9 +183,11 @@ def test_all_see_the_same_wall_and_blocks(trial: Trial) -> None:
 
 
 def test_planted_noise_is_measured(trial: Trial) -> None:
-    """Ranges with 2 and 20 mm, in two epochs, interpolated by triangles: the NMAD of z on stable ground lies between sqrt(2 / 3)
-    (middle of a triangle) and sqrt(2) (vertex) times sigma over the cosine between ray and wall's normal (0.9 and more); the
-    tenfold noise gives the tenfold NMAD, to a fifth, as steps along slopes and ICP add to both.
+    """Ranges have 2 and 20 mm of noise in two epochs, interpolated on triangles.
+
+    On stable ground the NMAD of z lies between sqrt(2 / 3) (middle of a triangle) and sqrt(2) (vertex) times sigma over the
+    cosine between ray and normal (0.9 and more). Ten times the noise gives ten times the NMAD to a fifth, because the range steps
+    on slopes and ICP add to both.
     """
     found = [assess(trial, seen, KeyedRandom(1)) for seen in trial.seen]
     quiet, noisy = found

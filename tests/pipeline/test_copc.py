@@ -1,4 +1,4 @@
-"""COPC: laspy's reader, which is not ours, finds every point, those within bounds, and evenly thinned ones by resolution."""
+"""COPC files, read by laspy: it finds every point, the points within bounds, and evenly thinned ones by resolution."""
 
 from __future__ import annotations
 
@@ -75,7 +75,9 @@ def node_of(entry: laspy.copc.Entry, key: laspy.copc.VoxelKey) -> laspy.copc.Oct
 
 
 def test_a_query_by_resolution_has_a_point_in_each_cell(path: Path) -> None:
-    """A flat wall of points 4 cm apart: level k shows one point for each cell of spacing / 2^k, all of them at the end."""
+    """On a flat wall of points 4 cm apart, the levels up to k have one point in each cell of spacing / 2^k; all levels have all
+    points.
+    """
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(0, 32, 0.04), np.arange(0, 16, 0.04)))
     wall = path.with_name("wall.copc.laz")
     write_copc(wall, PointCloud(np.stack([x, y, 0.01 * np.sin(x)], axis=1)))

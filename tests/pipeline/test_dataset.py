@@ -1,4 +1,7 @@
-"""Data sets: the folder, who loads it, splits that do not overlap, repair, merging, splitting. Whole sets, small."""
+"""Data sets: the folder and the libraries that load it, splits that do not overlap, repair, merging, splitting.
+
+Whole, small sets.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +65,7 @@ def test_every_split_loads_in_pycocotools_with_ids_of_its_own(made: Path) -> Non
 
 
 def test_the_folder_follows_the_conventions_of_torchvision_and_fiftyone(made: Path) -> None:
-    """CocoDetection joins its root and file_name; FiftyOne finds file_name below data_path and wants these keys."""
+    """CocoDetection joins its root and file_name; FiftyOne finds file_name below data_path and requires these keys."""
     content = json.loads((made / "train/annotations.json").read_text())
     assert {"info", "licenses", "categories", "images", "annotations"} <= content.keys()
     for image in content["images"]:
@@ -103,7 +106,7 @@ def test_annotations_know_their_blocks(made: Path) -> None:
 
 
 def test_the_truth_lies_beside_the_noise(made: Path) -> None:
-    """Noiseless heights: the sensor's difference departs from them by its noise; away from niches they are exactly 0."""
+    """Noiseless heights: the sensor's difference departs from them by its noise; outside niches they are exactly 0."""
     for image in entries(made, "test", "images"):
         noisy, place = read_geotiff(made / "test" / image["file_name"])
         truth, place_of_truth = read_geotiff(made / "test" / image["truth_file_name"])
@@ -152,7 +155,7 @@ def test_the_card_tells_what_is_there(made: Path) -> None:
 
 
 def test_an_epoch_does_not_depend_on_those_before_it(made: Path) -> None:
-    """The last epoch of each sensor alone, its stage set up for it only, against the set's tiles."""
+    """The last epoch of each sensor is made alone, with its own stage, and compared with the set's tiles."""
     config = tiny()
     epoch = planned_epochs(config)[-1]
     found = make_epoch(config, epoch, StageCache(config), Progress())
@@ -215,7 +218,7 @@ def test_sets_merge_and_split(made: Path, tmp_path: Path) -> None:
     tls = Tiles(tmp_path / "parts/tls/train")
     assert {record["sensor"] for record in tls.records} == {"tls"}
     assert len(tls) == sum(image["sensor"] == "tls" for image in entries(merged, "train", "images"))
-    with pytest.raises(InputError, match="an earlier set has the same epochs"):
+    with pytest.raises(InputError, match="another of the given sets has the same epochs"):
         merge_datasets([made, made], tmp_path / "twice")
     assert not (tmp_path / "twice").exists()
     with pytest.raises(InputError, match="unknown key 'sensr'"):
@@ -253,8 +256,10 @@ def test_the_loaders_leave_the_simulation_alone() -> None:
 
 
 def test_tf_data(made: Path) -> None:
-    """In a process of its own: TensorFlow and the ray tracer bring LLVM each. Tiles are read in threads of TensorFlow's, several
-    of them, in which PROJ would crash."""
+    """In a process of its own, because TensorFlow and the ray tracer each bring LLVM.
+
+    TensorFlow reads tiles in several threads, in which PROJ would crash.
+    """
     pytest.importorskip("tensorflow")
     program = f"""
 import numpy as np

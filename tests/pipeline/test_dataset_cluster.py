@@ -1,4 +1,4 @@
-"""Workers on this machine: nobody else can hand them work, and their death is answered in bounded time."""
+"""Dask workers on this machine: no other user can give them work, and their death is handled within bounded time."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def deadly(orders: Sequence[EpochOrder]) -> list[dict[str, Any]]:
 
 
 def deadlocked(orders: Sequence[EpochOrder]) -> list[dict[str, Any]]:
-    """Waits in native code, without the interpreter's lock, for what nobody gives; the worker's own threads go on."""
+    """Wait forever in native code, without Python's interpreter lock; the worker's own threads go on."""
     lock = threading.Lock()
     lock.acquire()
     lock.acquire()
@@ -50,7 +50,7 @@ def deadlocked(orders: Sequence[EpochOrder]) -> list[dict[str, Any]]:
 
 
 def slowly(orders: Sequence[EpochOrder]) -> list[dict[str, Any]]:
-    """Takes processor time; a file says that it does."""
+    """Use processor time and write a file to say so."""
     Path(os.environ["AT_WORK"]).touch()
     end = time.monotonic() + 1.0
     while time.monotonic() < end:
@@ -59,7 +59,7 @@ def slowly(orders: Sequence[EpochOrder]) -> list[dict[str, Any]]:
 
 
 def spawned() -> list[psutil.Process]:
-    """The workers of this process."""
+    """Return the workers of this process."""
     found = []
     for child in psutil.Process().children(recursive=True):
         try:
@@ -72,7 +72,7 @@ def spawned() -> list[psutil.Process]:
 
 @contextmanager
 def killer(most: int) -> Iterator[list[int]]:
-    """Kills workers as soon as they are there, `most` of them; a list of those that it killed."""
+    """Start a thread that kills up to `most` workers as soon as they exist; return the list of those it killed."""
     killed: list[int] = []
     stop = threading.Event()
 
@@ -94,7 +94,7 @@ def killer(most: int) -> Iterator[list[int]]:
 
 
 def test_nobody_else_can_hand_the_workers_work() -> None:
-    """Without certificates, and with others than the job's; nor is there a dashboard."""
+    """Clients without certificates, or with others than the job's, are refused; there is no dashboard."""
     with ExitStack() as stack:
         own = cluster._local(stack, 1)
         client = cluster._client(stack, own)
@@ -143,7 +143,7 @@ def test_an_epoch_that_kills_its_workers_ends_the_job(monkeypatch: pytest.Monkey
 def test_a_stopped_worker_is_replaced(
     moment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """SIGSTOP, as of a process that stands still with its interpreter; the work is done by the next."""
+    """The worker gets SIGSTOP, which freezes it with its interpreter; the next one does the work."""
     monkeypatch.setenv("AT_WORK", str(tmp_path / "at_work"))
     monkeypatch.setattr(cluster, "make_and_store_run", slowly)
     monkeypatch.setattr(cluster, "_LOOK_S", 0.5)
@@ -174,7 +174,7 @@ def test_a_deadlocked_worker_ends_the_job(monkeypatch: pytest.MonkeyPatch, capfd
 
 @pytest.fixture
 def no_workers(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """The address of a scheduler without any, which is given up after a second."""
+    """Return the address of a scheduler without workers, which is given up after a second."""
     monkeypatch.setattr(cluster, "_LOOK_S", 0.2)
     monkeypatch.setattr(cluster, "_EMPTY_S", 1.0)
     with distributed.LocalCluster(n_workers=0, processes=False, protocol="tcp", dashboard_address=None) as empty:
@@ -190,7 +190,7 @@ def test_a_cluster_of_the_users_without_workers_ends_the_job(no_workers: str) ->
 def test_an_error_while_closing_does_not_hide_the_outcome(
     monkeypatch: pytest.MonkeyPatch, no_workers: str, error: Exception
 ) -> None:
-    """The last is what a client of a busy machine said that was about to give up its connection to a dead scheduler."""
+    """The last error is that of a client on a busy machine, which was about to give up its connection to a dead scheduler."""
     close = distributed.Client.close
 
     def failing(client: distributed.Client, timeout: float | None = None) -> None:
@@ -246,7 +246,7 @@ def test_an_interrupt_reaches_the_job_and_prints_no_traceback(tmp_path: Path) ->
 
 
 def test_workers_do_not_run_the_script_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a spawned process is told of the main module: neither its file nor its name while workers start."""
+    """While workers start, a spawned process is told neither the main module's file nor its name."""
     main = sys.modules["__main__"]
     for spec, file in ((None, "/tmp/my_script.py"), (ModuleSpec("my_package.__main__", None), "/tmp/my_package/__main__.py")):
         monkeypatch.setattr(main, "__spec__", spec, raising=False)

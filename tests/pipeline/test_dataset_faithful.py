@@ -1,4 +1,6 @@
-"""Data sets as the reference made them: what levels of noise scale, who measures vertices, what a card says of samples."""
+"""Data sets that repeat the reference's (thesis) choices: what noise levels scale, measurement at vertices, the
+card's samples.
+"""
 
 from __future__ import annotations
 

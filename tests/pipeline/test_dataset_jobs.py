@@ -1,4 +1,4 @@
-"""Jobs that make data sets, and what interrupts them; a job is a process of its own, as the command starts it."""
+"""Jobs that make data sets, in a process of their own as the command starts them, and their interruptions."""
 
 from __future__ import annotations
 
@@ -69,7 +69,9 @@ def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str], seco
 
 
 def test_a_killed_job_is_finished_by_the_next_with_the_same_checksums(made: Path, tmp_path: Path) -> None:
-    """kill -9 in the middle of writing an epoch's tiles, before its shard; then of a job whose workers outlive it for a while."""
+    """First kill -9 while an epoch's tiles are written, before its record; then for a job whose workers outlive it for
+    a while.
+    """
     out = tmp_path / "set"
     for moment, workers in (
         (lambda: any((out / ".staging").glob("*/*/*.tif")), 0),
@@ -88,7 +90,7 @@ def test_a_killed_job_is_finished_by_the_next_with_the_same_checksums(made: Path
 
 
 def test_a_killed_worker_costs_nothing(made: Path, tmp_path: Path) -> None:
-    """Dask starts another one and gives it the run of two epochs; which worker makes an epoch, and when, leaves no trace."""
+    """Dask starts another worker, which gets the order of two epochs; the result does not show which worker made which epoch."""
     pytest.importorskip("distributed")
     import psutil
 
@@ -108,7 +110,7 @@ def test_a_killed_worker_costs_nothing(made: Path, tmp_path: Path) -> None:
     ("name", "workers"), [("small", 1), ("small", 2), ("rockfall_9", 2), ("rockfall_9", 16), ("rockfall_9", 256)]
 )
 def test_epochs_that_share_a_stage_go_to_one_worker(name: str, workers: int) -> None:
-    """Every epoch once; no run has two stages; whole stages where they are short; enough runs for all workers."""
+    """Orders contain every epoch once and never two stages; short stages stay whole; there are enough orders for all workers."""
     from pipeline.dataset.cluster import runs
     from pipeline.dataset.worker import EpochOrder
 
@@ -142,7 +144,7 @@ def test_a_scheduler_that_is_not_there(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_a_worker_that_does_not_end_in_time_spoils_nothing(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As Dask's nanny on a busy machine: the set is finished, and so is the command."""
+    """As with Dask's nanny on a busy machine: the set is finished, and the command ends."""
     distributed = pytest.importorskip("distributed")
 
     class Slow(distributed.LocalCluster):  # type: ignore[misc, name-defined]

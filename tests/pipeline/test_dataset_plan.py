@@ -1,4 +1,6 @@
-"""Why a data set has no tile: the size of the wall in pixels, the validation region, or the pixels without data; with numbers."""
+"""A data set without a tile is explained with numbers: the wall's size in pixels, the validation region, or pixels
+without data.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,7 @@ def test_a_wall_of_few_pixels_is_named(split: Split) -> None:
 
 
 def test_a_validation_region_that_is_too_narrow_is_named() -> None:
-    """Two columns of tiles; the second, of the validation, has 600 - 512 = 88 columns of pixels: 17.2 % of a tile."""
+    """There are two columns of tiles; the second, for validation, has 600 - 512 = 88 columns of pixels, 17.2 % of a tile."""
     words = r"^validation_region: .* 600 x 700 px .*, and the validation region is 88 px wide: it fills a tile of 512 px to 17 %"
     with pytest.raises(InputError, match=words):
         check(600, 700, "val", 0.5)
@@ -43,7 +45,7 @@ def test_a_validation_region_that_is_too_narrow_is_named() -> None:
 
 
 def test_a_region_that_overlap_leaves_without_a_tile_is_named() -> None:
-    """Columns begin at 0 and 400; training ends at 400, where a tile of 512 pixels is not at an end yet."""
+    """Columns begin at 0 and 400; training ends at 400, before the end of a tile of 512 pixels."""
     with pytest.raises(InputError, match=r"what the validation region leaves to train is 400 px wide: .* to 0 % at most"):
         check(900, 700, "train", 0.5, overlap_px=112, minimum_valid_share=0.0)
 

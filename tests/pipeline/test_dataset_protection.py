@@ -1,4 +1,4 @@
-"""What a data set's files say is checked before it is believed: damage is found, and no name leads out of the folder."""
+"""A data set's files are checked before they are used: damage is found, and no file name leads out of the folder."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def copy(made: Path, tmp_path: Path) -> Path:
 
 
 def in_one_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """The error of a command that ends with exit status 2."""
+    """Return the error message of a command that must end with exit status 2."""
     assert main(words) == 2
     error = capsys.readouterr().err.strip()
     assert "\n" not in error
@@ -53,7 +53,7 @@ def in_one_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 
 
 def test_a_set_is_told_by_the_files_of_its_cameras(tmp_path: Path) -> None:
-    """A camera's folder may hold others, and folders; a lens that cameras.yaml names is the set's too."""
+    """A camera folder may hold other files and folders; a lens file that cameras.yaml names belongs to the set."""
     lens = dict.fromkeys(("cx_px", "cy_px", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2"), 0.0)
     camera = Camera(640, 480, 900.0, **lens, position=np.zeros(3), rotation=np.eye(3))
     write_colmap(tmp_path / "model", {"left": camera, "right": replace(camera, position=np.array([5.0, 0, 0]))})
@@ -89,7 +89,7 @@ def test_a_changed_digit_is_found_and_spoils_no_tile(made: Path, copy: Path, cap
 
 
 def test_a_config_that_is_not_the_epochs_own_makes_no_tile(copy: Path) -> None:
-    """Another config with a right checksum, as by someone who knows how."""
+    """The config is replaced together with its checksum, as somebody could do on purpose."""
     known = read_dataset_file(copy)
     for source in known["sources"].values():
         source["config"]["annotation"]["minimum_area_px"] = 77
@@ -168,7 +168,7 @@ def test_an_epoch_beyond_the_plan_is_named(copy: Path) -> None:
 
 
 def forged(folder: Path, file_name: str) -> None:
-    """The first shard with another name of its first tile, and a right checksum."""
+    """Rename the first tile in the first record, and give the record a right checksum."""
     name = sorted((folder / "shards").iterdir())[0].name
     record = read_shard(folder, name)
     assert record is not None
@@ -198,7 +198,7 @@ def test_a_link_out_of_the_set_is_not_followed(copy: Path, tmp_path: Path) -> No
         lambda: merge_datasets([copy, other], tmp_path / "merged"),
         lambda: verify_dataset(copy),
     ):
-        with pytest.raises(InputError, match=r"lies outside of its folder|an earlier set has"):
+        with pytest.raises(InputError, match=r"lies outside of its folder|another of the given sets has"):
             call()
 
 
@@ -287,7 +287,7 @@ def test_too_many_workers_are_refused_by_verify_too(copy: Path) -> None:
 
 @pytest.mark.parametrize("spoil", ["tile", "shard"])
 def test_a_set_that_is_not_whole_is_neither_merged_nor_split(spoil: str, copy: Path, tmp_path: Path) -> None:
-    """The last epoch: what was copied before it is taken back."""
+    """The last epoch is damaged: what was already copied is removed again."""
     tile = max((copy / "test").glob("*.tif"))
     path = tile if spoil == "tile" else max((copy / "shards").glob("*.json"))
     path.write_bytes(path.read_bytes()[:-7])

@@ -1,4 +1,4 @@
-"""The detection probability of blocks against exact distributions, and against niches that the real sensors observe."""
+"""The detection probability of blocks, against exact distributions and against niches that the simulated sensors observe."""
 
 from __future__ import annotations
 
@@ -69,14 +69,14 @@ def together(trials: list[Trials]) -> Trials:
 @pytest.mark.parametrize("position", [SQUARE, OBLIQUE], ids=["square", "oblique"])
 @pytest.mark.parametrize("side", [0.07, 0.10, 0.13])
 def test_the_scanner_detects_as_many_niches_as_predicted(side: float, position: np.ndarray) -> None:
-    """200 niches each; the probabilities lie between 0.01 and 0.9, the binomial interval is +-0.13 wide at 0.5."""
+    """200 niches each; the probabilities lie between 0.01 and 0.9, and the binomial interval is +-0.13 wide at 0.5."""
     sensor = scanner(position, range_sigma_m=0.06)
     trials = together([detection_trials(sensor, FLAT, side, PLAN, KeyedRandom(seed), count=100) for seed in (11, 12)])
     assert abs(trials.score()) < LIMIT
 
 
 def test_beams_that_leave_in_another_direction_than_recorded_miss_the_floor_near_its_edge() -> None:
-    """0.4 mrad are 2 cm at 50 m; without the share that misses the prediction would be 0.92 instead of 0.64."""
+    """0.4 mrad are 2 cm at 50 m; without beams that miss, the prediction would be 0.92 instead of 0.64."""
     sensor = scanner(SQUARE, range_sigma_m=0.05, angle_sigma_rad=4e-4)
     trials = together([detection_trials(sensor, FLAT, 0.12, PLAN, KeyedRandom(seed), count=100) for seed in (31, 32)])
     assert abs(trials.score()) < LIMIT
@@ -101,7 +101,9 @@ def test_the_stereo_pair_detects_as_many_niches_as_predicted(noise: dict[str, fl
 
 @pytest.mark.parametrize("lines", [2, 3, 4, 10])
 def test_on_a_whole_lattice_it_is_the_noncentral_t_distribution(lines: int) -> None:
-    """A block of exactly `lines` steps holds lines^2 points in both epochs: Welch's test is Student's, with 2 (N - 1)."""
+    """A block that is exactly `lines` steps wide has lines^2 = N points in both epochs: Welch's test is Student's with 2 (N
+    - 1).
+    """
     side, points = lines * 0.02, lines**2
     white = np.linspace(0.005, 0.2, 40)
     delta = PLAN.depth_ratio * side / (white * np.sqrt(2 / points))
@@ -121,9 +123,10 @@ def test_for_many_points_the_change_exceeds_a_known_level_of_detection() -> None
 
 
 def test_the_mean_of_smooth_noise_has_the_variance_of_interpolated_nodes() -> None:
-    """Without white noise the change of a patch's mean is normal with 2 c_m^2; c_m^2 by brute force over phases and nodes.
+    """Without white noise the change of a patch's mean is normal with variance 2 c_m^2, found here by brute force over phases and
+    nodes.
 
-    20,000 draws know a standard deviation to 0.5 %; 2.5 % holds with a false-failure rate below 1e-5.
+    20,000 draws give a standard deviation to 0.5 %; 2.5 % holds with a false-failure rate below 1e-5.
     """
     random = np.random.default_rng(4)
     for width in (0.1, 0.7, 1.5, 4.0):
@@ -137,9 +140,9 @@ def test_the_mean_of_smooth_noise_has_the_variance_of_interpolated_nodes() -> No
 
 
 def kept_variance(width: float) -> float:
-    """c_m^2 over c^2 for a patch of `width` nodes along a and none along b, out of the probability of a change of 1.
+    """Return c_m^2 over c^2 for a patch of `width` nodes along a and none along b, from the probability of a change of 1.
 
-    With neither white noise nor spread that counts (N is huge) P = Phi(h / sqrt(2 c_m^2)).
+    With negligible white noise and spread (N is huge), P = Phi(h / sqrt(2 c_m^2)).
     """
     side = 1.0
     grains = sampling(step_a=1e-5, step_b=1e-5, white=1e-9, smooth=1.0, grain_a=side / width, grain_b=1e9)
@@ -155,7 +158,9 @@ def test_a_block_of_the_smallest_size_is_seen_with_the_probability_asked_for() -
 
 
 def test_the_smallest_findable_block_is_that_of_the_closed_form() -> None:
-    """White noise w on a lattice a x b: S/N = r s^2 / (w sqrt(2 a b)), r depth over side; at least one point on it."""
+    """White noise w on a lattice a x b: S/N = r s^2 / (w sqrt(2 a b)), with r = depth over side, and at least one point on the
+    block.
+    """
     white, a, b = np.array([0.003, 0.01, 0.05]), np.array([0.02, 0.03, 0.1]), np.array([0.02, 0.05, 0.1])
     cases = sampling(white=white, step_a=a, step_b=b, shadow_a=0.0, shadow_b=0.0)
     expected = np.sqrt(CLEAR_SNR * white * np.sqrt(2 * a * b) / PLAN.depth_ratio)
@@ -182,7 +187,9 @@ def test_the_points_on_a_block_are_its_area_times_the_cosine_over_the_squared_sp
 
 
 def test_from_aside_and_below_the_rim_of_an_upright_niche_hides_what_both_tangents_say() -> None:
-    """A block 20 m above the scanner and 30 m beside it, 40 m away: the lines of equal zenith climb the wall askew there."""
+    """The block is 20 m above the scanner, 30 m to its side and 40 m away, where lines of equal zenith run obliquely over the
+    wall.
+    """
     sensor = scanner(OBLIQUE, range_sigma_m=0.01)
     places = Places(np.array([[6.0, 24.0, 0.0]]), np.array([[0.0, 0.0, 1.0]]), np.array([0.5]))
     found = tls_geometry(sensor, places).sampling

@@ -1,4 +1,4 @@
-"""Level of detection, blocks seen or not, false alarms and curves, against planted noise and blocks that are known."""
+"""Level of detection, detected blocks, false alarms and detection curves, against planted noise and known blocks."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ def record(label: int, side: float) -> dict[str, Any]:
 
 
 def test_the_level_is_the_95_percent_quantile_where_it_lies() -> None:
-    """5 epochs of cells of 40 x 40: the quantile of 8,000 has a relative standard error of 1.1 %; limit four of them."""
+    """5 epochs of cells of 40 x 40 pixels: the quantile of 8,000 values has a relative standard error of 1.1 %; the limit is
+    four.
+    """
     stable = noise(1, (5, 100, 120))
     stable[:, :, 80:] *= 3
     stable[:, :40, :40] = np.nan
@@ -45,7 +47,7 @@ def test_the_level_is_the_95_percent_quantile_where_it_lies() -> None:
 
 
 def test_the_limit_of_a_mean_follows_the_correlation() -> None:
-    """White noise: z sigma / sqrt(n). Noise that is the same over the block: z sigma, however many pixels."""
+    """For white noise it is z sigma / sqrt(n); for noise that is constant over the block z sigma, for any number of pixels."""
     level = np.full((50, 50), 1.96 * SIGMA, dtype=np.float32)
     block, window = np.ones((10, 10), dtype=bool), (slice(5, 15), slice(5, 15))
     assert BlockMeanTest(WHITE, level, 0.1).limit_m(block, window) == pytest.approx(1.96 * SIGMA / 10)
@@ -78,7 +80,7 @@ def test_blocks_that_must_and_must_not_be_seen() -> None:
 
 
 def test_stable_ground_is_taken_for_a_block_in_two_and_a_half_percent() -> None:
-    """40 footprints at 10 places on each of 20 maps of white noise: 8,000 trials, 2.5 +- 0.18 %; limit 4.5 sigma."""
+    """40 footprints at 10 places on each of 20 maps of white noise: 8,000 trials, 2.5 +- 0.18 %; the limit is 4.5 sigma."""
     level = np.full((200, 200), 1.96 * SIGMA, dtype=np.float32)
     test, random = BlockMeanTest(WHITE, level, 0.1), KeyedRandom(3)
     shapes = [np.ones((size, size), dtype=bool) for size in (4, 5, 6, 7)] * 10

@@ -1,4 +1,4 @@
-"""The curve of blocks seen and the smallest block, against curves that are known and blocks that leave it open."""
+"""The detection curve and the smallest detectable block, against known curves, and blocks that do not determine it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def fitted(size: FloatArray, seen: FloatArray) -> DetectionCurve:
 
 
 def drawn(seed: int, count: int, lapse: float, sizes: FloatArray | None = None) -> DetectionCurve:
-    """Blocks of all sizes, or of a few with a spread of 10 %, seen as the known curve says."""
+    """Return blocks of all sizes, or of a few sizes with a spread of 10 %, detected at random by the known curve."""
     generator = KeyedRandom(seed).generator()
     size = np.exp(generator.uniform(np.log(0.03), np.log(0.6), count))
     if sizes is not None:
@@ -40,7 +40,7 @@ def truth(lapse: float) -> float:
     [(200, 0.0, None), (200, 0.02, None), (60, 0.02, np.geomspace(0.05, 0.8, 6)), (60, 0.0, [0.05, 0.4])],
 )
 def test_the_interval_holds_the_truth_as_often_as_it_says(count: int, lapse: float, sizes: FloatArray | None) -> None:
-    """20 trials each: fewer than 16 intervals of 95 % hold the truth in 0.26 % of cases, in one of four cases in 1 %."""
+    """20 trials each: fewer than 16 of them contain the truth with probability 0.26 % per 95 % interval, 1 % for any of four."""
     inside = 0
     for seed in range(20):
         low, high = drawn(seed, count, lapse, sizes).interval_m
@@ -49,7 +49,7 @@ def test_the_interval_holds_the_truth_as_often_as_it_says(count: int, lapse: flo
 
 
 def test_many_blocks_tell_the_curve() -> None:
-    """3,000 blocks without lapses: the size is known to some 4 %, limit four standard errors (a wrong failure: 0.01 %)."""
+    """3,000 blocks without lapses give the size to about 4 %; the limit is four standard errors (false failure: 0.01 %)."""
     curve = drawn(7, 3000, 0.0)
     assert curve.smallest_95_m == pytest.approx(truth(0.0), rel=0.16)
     assert curve.middle_m == pytest.approx(MIDDLE, rel=0.06)
@@ -63,8 +63,11 @@ def test_many_blocks_tell_the_curve() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_gap_between_the_sizes_is_told_and_no_number_made_up(seed: int) -> None:
-    """Complete separation: all of 5 cm missed, all of 30 cm seen. The likelihood is 1 for any size between, to a tenth, as the
-    curve's least width of 0.02 keeps it from the blocks themselves."""
+    """Complete separation: all blocks of 5 cm are missed, all of 30 cm detected.
+
+    The likelihood is 1 for any size between them, to a tenth, because the curve's least width of 0.02 keeps it away from the
+    blocks themselves.
+    """
     spread = np.exp(KeyedRandom(seed).generator().normal(0, 0.1, 60))
     size = np.repeat([0.05, 0.3], 30) * spread
     curve = fitted(size, np.repeat([False, True], 30))
@@ -78,7 +81,9 @@ def test_a_gap_between_the_sizes_is_told_and_no_number_made_up(seed: int) -> Non
 
 
 def test_separation_without_a_gap_has_its_number_between() -> None:
-    """Sizes 2 % apart: the estimate lies between the largest missed and the smallest seen one, to a grid step of 2.5 %."""
+    """Sizes are 2 % apart: the estimate lies between the largest missed and the smallest detected block, to a grid step of
+    2.5 %.
+    """
     size = np.geomspace(0.05, 0.8, 141)
     curve = fitted(size, size > 0.2)
     assert curve.between_m is None

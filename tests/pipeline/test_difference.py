@@ -37,7 +37,7 @@ def surface(z, block=None, x_range=(0.0, WIDTH)):
 
 
 def centres(grid: Grid):
-    """x and y (h, w) of the pixels' centres, m."""
+    """Return x and y (h, w) of the pixels' centres, m."""
     column, row = np.meshgrid(np.arange(grid.width), np.arange(grid.height))
     return grid.x_min + (column + 0.5) * grid.gsd, grid.y_max - (row + 0.5) * grid.gsd
 

@@ -1,4 +1,4 @@
-"""The doctor: right about this machine, and alive where things are missing."""
+"""`scarpsim doctor`: it is right about this machine, and works where packages are missing."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_llvm_is_looked_for_where_drjit_looks(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_the_set_up_can_ask_for_missing_packages_with_a_bare_python() -> None:
-    """As tools/setup.sh does, before the environment is there: no package, and no module of ours in the way of the library's."""
+    """tools/setup.sh does so before the environment exists: no package is needed, and none of our modules hides a library's."""
     script = Path(__file__).parents[2] / "pipeline/cli/system_libraries.py"
     result = subprocess.run([sys.executable, "-P", "-S", str(script)], capture_output=True, text=True, check=False, env={})
     assert result.returncode == 0, result.stderr

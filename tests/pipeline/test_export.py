@@ -1,4 +1,4 @@
-"""`scarpsim export`: what is made of a run or a set shows what is in it."""
+"""`scarpsim export`: exported files show the contents of the run or the data set."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def export(*words: Any) -> int:
 
 
 def test_a_place_is_drawn_where_it_projects() -> None:
-    """A plane 10 x 6 m with a square of 60 mm missing rock about (7, 4): the square's colour stands at its projection."""
+    """A plane of 10 x 6 m with a square of 60 mm missing rock at about (7, 4): the square's colour appears at its projection."""
     corners = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [10.0, 6.0, 0.0], [0.0, 6.0, 0.0]])
     plane, grid = TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)), Grid(0.0, 6.0, 0.1, 100, 60)
     difference = np.zeros(grid.shape)
@@ -99,7 +99,7 @@ def test_a_run_as_picture_and_animations(run: Path, tmp_path: Path, monkeypatch:
 
 
 def test_a_run_as_gltf(run: Path, tmp_path: Path) -> None:
-    """The wall and each niche that the surface shows, together the surface."""
+    """The wall and each visible niche are separate meshes; together they are the surface."""
     assert export(run, "gltf", "--out", tmp_path / "wall.glb") == 0
     scene = trimesh.load(tmp_path / "wall.glb")
     surface = read_ply(run / "epoch_001/surface.ply")
@@ -109,7 +109,7 @@ def test_a_run_as_gltf(run: Path, tmp_path: Path) -> None:
 
 
 def test_a_run_as_copc(run: Path, tmp_path: Path) -> None:
-    """The points of points.laz, each once."""
+    """It holds each point of points.laz once."""
     assert export(run, "copc", "--epoch", 2, "--out", tmp_path / "wall.copc.laz") == 0
     with laspy.CopcReader.open(tmp_path / "wall.copc.laz") as reader:
         found = reader.query()
@@ -153,7 +153,7 @@ def test_a_package_refuses_links_out_of_its_folder(tmp_path: Path, capsys: pytes
         (["picture", "--epoch", "9"], "--epoch: there is no epoch 9; allowed: 0 to 2"),
         (["gltf", "--out", "wall.obj"], "--out: got 'wall.obj'; allowed: .glb"),
         (["movie"], "got 'movie'; allowed: picture"),
-        (["yolo"], "holds no split of a data set"),
+        (["yolo"], "contains no split of a data set"),
     ],
 )
 def test_what_cannot_be_made_is_told_in_one_line(
@@ -167,7 +167,7 @@ def test_what_cannot_be_made_is_told_in_one_line(
 
 
 def masks() -> list[np.ndarray[Any, Any]]:
-    """One part, two parts, one pixel, one with a bay."""
+    """Masks of one part, of two parts, of one pixel, and of one with a bay."""
     blank = np.zeros((30, 40), dtype=bool)
     whole, parted, single, bay = blank.copy(), blank.copy(), blank.copy(), blank.copy()
     whole[5:12, 8:20] = True
@@ -195,7 +195,7 @@ def test_an_outline_covers_its_mask(number: int) -> None:
 
 @pytest.fixture
 def tiles(tmp_path: Path) -> Path:
-    """A set of one tile in two splits: 6 mm of rock added, one block of 0.4 m, one pixel without data."""
+    """A set of one tile in two splits: 6 mm of added rock, one block of 0.4 m, one pixel without data."""
     values, mask = np.full((30, 40), -0.006, np.float32), masks()[0]
     values[0, 0], values[mask] = np.nan, 0.4
     for split in ("train", "val"):
@@ -225,7 +225,7 @@ def test_a_set_as_yolo_reads_it(tiles: Path, tmp_path: Path, capsys: pytest.Capt
 
 
 def test_a_set_as_hugging_face_reads_it(tiles: Path, tmp_path: Path) -> None:
-    """Its own library finds the splits, metres and missing data bit for bit, and the blocks' outlines."""
+    """Hugging Face's own library finds the splits, metres and missing data bit for bit, and the blocks' outlines."""
     datasets = pytest.importorskip("datasets", reason="the extra huggingface is not installed")
     assert export(tiles, "huggingface", "--out", tmp_path / "hub") == 0
     loaded = datasets.load_dataset(str(tmp_path / "hub"), cache_dir=str(tmp_path / "cache"))

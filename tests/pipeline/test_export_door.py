@@ -1,4 +1,4 @@
-"""`scarpsim export` of runs and sets that were spoilt after they were written: one line, and nothing is left."""
+"""`scarpsim export` of runs and data sets that were damaged after they were written: one line, and no file is left."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def surface(places: FloatArray = CORNERS, faces: Any = FACES) -> TriangleMesh:
 
 
 def write_run(folder: Path, change: Callable[[Record], object] = lambda record: None) -> Path:
-    """A run of one epoch, of two triangles."""
+    """Write a run of one epoch with two triangles, its record changed by `change`."""
     record: Record = {"sensor": "tls", "config": {}, "wall": {"name": "w"}, "wall_frame": dict(FRAME)}
     record["epochs"] = [{"epoch": 0, "blocks": []}, {"epoch": 1, "blocks": [], "statistics": {"sigma_m": 0.01}}]
     change(record)

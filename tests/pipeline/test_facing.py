@@ -1,4 +1,4 @@
-"""Walls and references wound the wrong way, and other meshes that cannot be used as they are: one answer for both."""
+"""Walls and references whose triangles face away from the sensor, and other unusable meshes: one treatment for both."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ SITE: dict[str, Any] = {
 
 
 def seen(path: Path, sensor: SensorName, **changes: Any) -> tuple[TriangleMesh, tuple[str, ...], Any]:
-    """The wall of a site, what was mended in it, and the points that the sensor observes."""
+    """Return the wall of a site, the notes of what was repaired in it, and the points that the sensor observes."""
     config = parse(SimulationConfig, {**SITE, "wall": {"mesh": str(path)}, **changes}, "test")
     site = prepare_site(config, sensor, KeyedRandom(1))
     return site.mesh, site.repairs, site.sensor.observe(RayCaster(site.mesh), KeyedRandom(2)).points
@@ -104,7 +104,7 @@ def test_a_closed_surface_is_turned_only_where_it_is_wound_inwards() -> None:
 
 
 def turned_reference(folder: Path, which: Any = slice(None)) -> Measurement:
-    """The measurement of `folder` with a reference that is wound otherwise."""
+    """Write the measurement of `folder` with a reference of which the triangles `which` are reversed."""
     mesh = read_ply(folder / "wall.ply")
     write_ply(folder / "other.ply", wound(mesh, which))
     settings = yaml.safe_load((folder / "measurement.yaml").read_text())
@@ -136,7 +136,7 @@ def moebius() -> TriangleMesh:
 
 
 def changed(**values: Any) -> TriangleMesh:
-    """A sheet with some vertices elsewhere."""
+    """Return a sheet with some vertices moved."""
     mesh = sheet()
     for number, value in values.items():
         mesh.vertices[int(number[1:])] = value
@@ -146,8 +146,8 @@ def changed(**values: Any) -> TriangleMesh:
 NOTHING = "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nelement face 0\n"
 NOTHING += "property list uchar int vertex_indices\nend_header\n"
 BAD = {
-    "nothing in it": (NOTHING, "holds no triangles|is not a valid ply file"),
-    "points alone": (replace(sheet(), faces=np.empty((0, 3), np.int32)), "holds no triangles"),
+    "nothing in it": (NOTHING, "contains no triangles|is not a valid ply file"),
+    "points alone": (replace(sheet(), faces=np.empty((0, 3), np.int32)), "contains no triangles"),
     "nan": (changed(v7=np.nan), r"1 of 48 vertices are not finite, the first is vertex 7 at \(nan, nan, nan\)"),
     "infinite": (changed(v7=np.inf), "1 of 48 vertices are not finite"),
     "1e300": (changed(v7=1e300), r"1 of 48 vertices are not on earth, the first is vertex 7 at \(1e\+300"),

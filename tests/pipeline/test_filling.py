@@ -1,4 +1,4 @@
-"""A folder of results appears when all of it is there."""
+"""A folder of results appears only when it is complete."""
 
 from __future__ import annotations
 

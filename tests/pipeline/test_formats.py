@@ -1,4 +1,4 @@
-"""Files of every format: whole or not at all, system errors in one line, equal bytes for equal arguments."""
+"""Files of every format: written completely or not at all, system errors in one line, equal bytes for equal arguments."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def raster() -> np.ndarray:
 
 @contextmanager
 def file_size_limit(size: int) -> Iterator[None]:
-    """No file may grow beyond `size` bytes: writing fails as it does on a full disk."""
+    """Let no file grow beyond `size` bytes, so that writing fails as on a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:

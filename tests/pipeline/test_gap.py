@@ -1,4 +1,4 @@
-"""`scarpsim gap` on measurements of an independent generator (tests/gap_cases.py): verdicts, values, files, its own output."""
+"""`scarpsim gap` on measurements of an independent generator (tests/gap_cases.py): verdicts, values, files, printed output."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_rockfall_is_a_change_of_the_scene(tmp_path: Path) -> None:
 
 
 def wobbling(azimuth: Any, _zenith: Any, line: Any) -> Any:
-    """Recorded minus true angles: 80 microradians in zenith, every 37 lines."""
+    """Return recorded minus true angles: 80 microradians in zenith, with a period of 37 lines."""
     return 0 * azimuth, 8e-5 * np.sin(2 * np.pi * line / 37 + 1)
 
 
@@ -89,8 +89,11 @@ def test_a_jump_in_azimuth_is_unknown(tmp_path: Path) -> None:
 
 
 def test_a_range_error_that_jumps_is_folded_with_its_high_overtones(tmp_path: Path) -> None:
-    """A square first found as the sine of a cyclic error: to the fifth overtone 6.7 % of its variance are left (a correlation of
-    0.966), which was taken for noise, to the eleventh 3.4 % (0.983)."""
+    """A square wave is first found as the sine of a cyclic error.
+
+    With overtones up to the fifth, 6.7 % of its variance remain (correlation 0.966), which used to be taken for noise; up to the
+    eleventh, 3.4 % remain (0.983).
+    """
     length = 2.6
 
     def square(range_m: Any) -> Any:
@@ -150,7 +153,7 @@ def test_the_outcome_does_not_depend_on_the_number_of_threads(tmp_path: Path, mo
 
 
 def test_a_model_that_is_too_noisy_is_told_so(tmp_path: Path) -> None:
-    """Ranges of 3 mm noise against a model of 6 mm and the angles' share."""
+    """The ranges have 3 mm of noise; the model expects 6 mm and the angles' share."""
     write_scan(tmp_path, 31, step_rad=0.007)
     model = tmp_path / "model.yaml"
     model.write_text(model.read_text().replace("range_sigma_m: 0.003", "range_sigma_m: 0.006"))
@@ -165,8 +168,10 @@ def test_a_model_that_is_too_noisy_is_told_so(tmp_path: Path) -> None:
 
 
 def test_noise_by_incidence_is_told_from_noise_of_the_angles(tmp_path: Path) -> None:
-    """Nine points a cell, quiet ones beside noisy ones: without their weights the noisy tilt the cell's plane, and the quiet seem
-    noisy too."""
+    """Each cell has nine points, quiet ones beside noisy ones.
+
+    Without weights the noisy points tilt the cell's plane, and the quiet ones seem noisy too.
+    """
     noisy = found_in(
         tmp_path,
         43,

@@ -1,4 +1,6 @@
-"""Errors of the recorded angles that the catalogue does not know: described as curves of an angle, exactly in the model."""
+"""Errors of the recorded angles that the catalogue lacks: they are described as empirical curves of an angle, exactly in the
+model.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ CYCLES, AMPLITUDE = 20, 4e-4
 
 @pytest.mark.slow
 def test_an_unevenly_divided_circle_is_described_by_its_own_curve(tmp_path: Path) -> None:
-    """Nothing else is named beside it: the ranges that it changes look like the wall's slopes, and so do several effects."""
+    """No other effect may be named, although the range changes look like the wall's slopes and like several effects."""
     write_scan(tmp_path, 11, step_rad=0.008, angles=lambda az, ze, line: (AMPLITUDE * np.sin(CYCLES * az + 0.5), 0.0 * az))
     found = diagnose(read_measurement(tmp_path))
     assert found.verdict == "unknown"

@@ -1,4 +1,6 @@
-"""What no config may hold is no candidate: the diagnosis ends in a verdict whatever the best value of an effect would be."""
+"""A best value outside an effect's bounds, which no config may hold, excludes the effect; the diagnosis still ends in
+a verdict.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ from sensors.models.sensor_model import StereoModel, TlsModel
 
 
 def _bounded() -> list[tuple[str, str, str, float]]:
-    """Sensor, effect, parameter and the largest value that it may have, of all effects with such parameters."""
+    """Return sensor, effect, parameter and largest allowed value of all parameters that have one."""
     found = []
     for effect in (*TLS_EFFECTS, *STEREO_EFFECTS):
         for key, info in effect.model_fields.items():
@@ -46,7 +48,9 @@ def _named(sensor: str, name: str, values: dict[str, Any]) -> NamedEffect:
 
 
 def test_noise_whose_coefficient_no_config_may_hold_ends_in_a_verdict(tmp_path: Path) -> None:
-    """Intensities as counts of some recorder, not as relative powers: the noise by them would need a coefficient of 40 m."""
+    """The intensities are a recorder's counts instead of relative powers, so noise by intensity would need a coefficient of
+    40 m.
+    """
 
     def ranges(scan: Scan) -> Any:
         noisy = scan.R + 0.004 * scan.power**-0.5 * scan.rng.standard_normal(len(scan.R))

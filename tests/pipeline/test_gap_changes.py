@@ -1,6 +1,7 @@
-"""Changes of the scene by `pipeline.gap.residuals.scene_changes`: each listed once with box and volume; none on quiet walls.
+"""Scene changes found by `pipeline.gap.residuals.scene_changes`: each is listed once with box and volume; none on quiet walls.
 
-Volumes: a block of n points is known to 20 % (what is seen of its sides, from aside) plus 1.6 / sqrt(n) (which points are on it).
+The volume of a block of n points is known to 20 % (because its sides are partly seen, obliquely) plus 1.6 / sqrt(n) (because of
+which points lie on it).
 """
 
 from __future__ import annotations
@@ -43,7 +44,9 @@ def touches(box: Box, change: SceneChange) -> bool:
 
 
 def check(seen: Scan, boxes: list[Box], found: list[SceneChange]) -> None:
-    """Each block of five points and five sigmas is one change, each change one block."""
+    """Assert that each block with at least five points and five sigmas is exactly one change, and that each change is on one
+    block.
+    """
     owners = np.array([[touches(box, change) for change in found] for box in boxes]).reshape(len(boxes), len(found))
     assert (owners.sum(axis=0) == 1).all()
     for box, hits, row in zip(boxes, seen.hits, owners, strict=True):
@@ -57,7 +60,7 @@ def check(seen: Scan, boxes: list[Box], found: list[SceneChange]) -> None:
 
 @pytest.mark.parametrize("step_rad", STEPS)
 def test_small_blocks_are_found_once_each(step_rad: float) -> None:
-    """Ten of 0.1 to 0.3 m, of some five to fifty points, among 1 % of outliers and with 2 % of returns lost."""
+    """Ten blocks of 0.1 to 0.3 m with about five to fifty points each, among 1 % of outliers and with 2 % of returns lost."""
     rng = np.random.default_rng(1)
     spacing = 30 * step_rad
     boxes = draw_boxes(10, (1.1 * spacing, 3.4 * spacing), (0.1, 0.3), rng)
@@ -76,7 +79,7 @@ def test_blocks_of_five_sigmas_are_found(step_rad: float) -> None:
 
 @pytest.mark.parametrize("step_rad", STEPS)
 def test_a_large_block_stays_whole(step_rad: float) -> None:
-    """Five of up to 1.8 m: 4,000 points in the densest scan."""
+    """Five blocks of up to 1.8 m, with 4,000 points in the densest scan."""
     rng = np.random.default_rng(3)
     boxes = draw_boxes(5, (0.3, 0.9), (0.1, 0.4), rng)
     seen = scan(step_rad, boxes, 0.02, rng)
@@ -85,7 +88,9 @@ def test_a_large_block_stays_whole(step_rad: float) -> None:
 
 @pytest.mark.parametrize("stretch", [1.0, 3.0])
 def test_blocks_some_points_apart_are_not_merged(stretch: float) -> None:
-    """Four points of wall between them, on a raster that may be three times as wide one way as the other."""
+    """Four points of wall lie between the blocks, on a raster that may be three times as wide in one direction as in
+    the other.
+    """
     step = 2e-3
     spacing = 30 * step
     boxes = [Box(side * (0.3 + 2.5 * spacing * stretch), 0.1, (0.3, 0.3), 0.2) for side in (-1, 1)]
@@ -105,7 +110,9 @@ def test_a_change_in_two_epochs_is_one() -> None:
 
 @pytest.mark.parametrize("outliers", [0.0, 0.02])
 def test_nothing_is_found_on_a_quiet_wall(outliers: float) -> None:
-    """By construction at most 0.01 a wall by points and 0.01 by medians: of other seeds a third might fail at the worst."""
+    """By construction, false changes number at most 0.01 per wall by points and 0.01 by medians: at most a third of other seeds
+    fail.
+    """
     for seed in range(20):
         rng = np.random.default_rng(seed)
         seen = scan(4e-3, [], 0.02, rng)
@@ -120,7 +127,9 @@ def test_nothing_is_found_on_a_wall_whose_reference_is_wrong_by_more_than_the_no
 
 
 def test_nine_small_rockfalls_of_a_whole_scan(tmp_path: Path) -> None:
-    """Pyramids over one node of the wall, five to eight points of 90 to 200 mm each, that the reference does not have."""
+    """The rockfalls are pyramids over one node of the wall, with five to eight points of 90 to 200 mm, which the
+    reference lacks.
+    """
     nodes = [(25, 20), (35, 60), (45, 35), (55, 15), (60, 50), (70, 70), (75, 30), (95, 20), (100, 60)]
     blocks = [(i, j, 0.24 + 0.02 * number) for number, (i, j) in enumerate(nodes)]
     write_scan(tmp_path, 9, blocks=blocks, step_rad=0.006)
@@ -153,7 +162,9 @@ def test_where_much_of_the_wall_moved_nothing_is_said_of_the_sensor(tmp_path: Pa
 
 @pytest.mark.parametrize(("half", "depth", "reference"), [((0.1, 0.4), (0.02, 0.05), 1e-3), ((0.3, 0.9), (0.1, 0.4), 4e-4)])
 def test_volumes_are_known_as_well_as_is_said(half: Any, depth: Any, reference: float) -> None:
-    """Of 48 blocks the errors over their standard deviations have a root mean square of 0.6 to 1.25 (chance leaves 0.1 of it)."""
+    """The errors of 48 volumes over their stated standard deviations have a root mean square of 0.6 to 1.25 (chance changes it by
+    0.1).
+    """
     off = []
     for seed in range(8):
         rng = np.random.default_rng(200 + seed)
@@ -167,7 +178,9 @@ def test_volumes_are_known_as_well_as_is_said(half: Any, depth: Any, reference: 
 
 
 def test_a_large_noise_is_no_wall_that_moved(tmp_path: Path) -> None:
-    """8 cm where the model has 3 mm: on half of the wall medians of nine lie off by more than three predicted sigmas and 2 cm."""
+    """The noise is 8 cm where the model has 3 mm, so on half of the wall medians of nine points are off by more than three
+    predicted sigmas and 2 cm.
+    """
     write_scan(tmp_path, 9, ranges=lambda scan: scan.R + 0.08 * scan.rng.standard_normal(len(scan.R)), step_rad=0.009)
     found = diagnose(read_measurement(tmp_path))
     assert "tls.range_noise" in {name for effect in found.effects for name in (effect.name, *effect.alike)}

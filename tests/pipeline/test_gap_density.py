@@ -1,4 +1,4 @@
-"""More points of one wall must not make the diagnosis worse: the same name, and a value within an error that does not grow."""
+"""More points of the same wall must not make the diagnosis worse: it gives the same name and an error that does not grow."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ BENT = 0.055
 
 
 def _search(folder: Path, step_rad: float, bent: float = BENT) -> tuple[list[str], float, float, float]:
-    """Names that are chosen for 8 mm of incidence bias on a rough wall, its value and standard deviation, and the points.
+    """Return the chosen effects for 8 mm of incidence bias on a rough wall, its value and standard deviation, and the points.
 
-    bent: share by which the error departs from the effect's form, as a wave along the incidence; the rest is white noise of 1 mm.
+    bent: relative departure of the error from the effect's form, as a wave along the incidence angle; white noise of 1 mm is
+    added.
     """
     folder.mkdir()
     write_scan(folder, 5, step_rad=step_rad, ranges=lambda scan: scan.R)
@@ -43,7 +44,7 @@ def _search(folder: Path, step_rad: float, bent: float = BENT) -> tuple[list[str
 
 
 def test_a_denser_scan_keeps_the_name_and_the_value(tmp_path: Path) -> None:
-    """4,500 and 21,000 points of an error that is not quite of the effect's form, by 5.5 % of its size: 1.1 % of the gain."""
+    """4,500 and 21,000 points of an error that departs from the effect's form by 5.5 % of its size (1.1 % of the gain)."""
     (few, coarse, wide, fewer), (many, fine, narrow, more) = (_search(tmp_path / f"at_{step}", step) for step in STEPS)
     assert few == many == ["range_incidence_bias"]
     assert all(abs(value - TRUE) < 3 * std + BENT * TRUE for value, std in ((coarse, wide), (fine, narrow)))
@@ -52,6 +53,6 @@ def test_a_denser_scan_keeps_the_name_and_the_value(tmp_path: Path) -> None:
 
 
 def test_a_free_form_of_its_own_is_still_asked_for_beside_an_effect(tmp_path: Path) -> None:
-    """What the effect leaves is 20 % of it: no more a matter of precision."""
+    """The effect leaves 20 % of the error unexplained, which is more than a lack of precision."""
     names = _search(tmp_path / "scan", 0.0065, 0.2)[0]
     assert "incidence" in names

@@ -1,4 +1,6 @@
-"""Measurements that `gap` cannot take: each is answered by one line that says what and where, and leaves nothing behind."""
+"""Measurements that `gap` cannot use: each is refused in one line that says what is wrong and where, and no files are left
+behind.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,7 @@ def case(tmp_path: Path) -> Path:
 
 
 def changed(**keys: Any) -> Callable[[Path], None]:
-    """measurement.yaml with other keys."""
+    """Return a function that changes keys of measurement.yaml."""
 
     def change(folder: Path) -> None:
         path = folder / "measurement.yaml"
@@ -47,12 +49,12 @@ def changed(**keys: Any) -> Callable[[Path], None]:
 
 
 def scanned(folder: Path) -> Any:
-    """(n, 3) points, scanner frame."""
+    """Return the scan's points (n, 3), scanner frame."""
     return read_points(folder / "scan_0.ply").points
 
 
 def put(move: Callable[[Any], Any], *, pattern: bool = True) -> Callable[[Path], None]:
-    """Other points, (n, 3) to (m, 3), in an XYZ file."""
+    """Return a function that replaces the points (n, 3) of a measurement by `move` of them (m, 3), as an XYZ file."""
 
     def change(folder: Path) -> None:
         np.savetxt(folder / "scan.xyz", move(scanned(folder)), fmt="%.17g")
@@ -77,7 +79,7 @@ def one_line(folder: Path) -> None:
 
 
 def header(place: int, value: float) -> Callable[[Path], None]:
-    """A LAZ file with another number in its header."""
+    """Return a function that writes another number into the header of the LAZ file."""
 
     def change(folder: Path) -> None:
         path = folder / "scan.laz"
@@ -175,7 +177,9 @@ def test_a_line_is_bounded_wherever_it_stands(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("sensor", "off_m", "good"), [("tls", 4.0, False), ("stereo", 4.0, True), ("stereo", 8.0, False)])
 def test_a_pair_may_be_off_by_what_a_turned_camera_does(sensor: Sensor, off_m: float, good: bool) -> None:
-    """A camera that is turned by 3.5 mrad (catalogue: up to 4) moves what lies at 100 m, ten bases away, by 3.5 m and more."""
+    """A camera that is turned by 3.5 mrad (up to 4 in the catalogue) moves points at 100 m, ten base lengths away, by 3.5 m and
+    more.
+    """
     x, y = np.meshgrid(np.linspace(-10, 10, 21), np.linspace(-10, 10, 21))
     points = np.stack([x.ravel(), y.ravel(), np.full(x.size, -100.0)], axis=1)
     wall = RayCaster(plane(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -100.0]), half_side=50.0))

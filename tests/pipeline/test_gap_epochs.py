@@ -1,4 +1,4 @@
-"""Several epochs, and ground that is known to be stable."""
+"""Measurements of several epochs, and stable areas given by the user."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def found_in(folder: Path, seed: int, **how: Any) -> GapDiagnosis:
 
 
 def test_three_epochs_from_places_of_their_own_leave_no_gap_and_the_last_is_held_out(tmp_path: Path) -> None:
-    """Each stands some millimetres and 30 microradians off, which is no noise of the angles."""
+    """Each pose is off by a few millimetres and 30 microradians, which must not be taken for noise of the angles."""
     found = found_in(tmp_path, 21, epochs=3)
     assert (found.verdict, found.effects) == ("no_gap", ())
     epochs = read_measurement(tmp_path).epochs[found.residuals.index]
@@ -35,12 +35,12 @@ def test_an_effect_on_two_epochs_is_named(tmp_path: Path) -> None:
 
 
 def half_that_moved(scan: Scan) -> Any:
-    """Ranges of a wall of which one half has crept up to 8 cm towards the scanner."""
+    """Return ranges of a wall of which one half has crept up to 8 cm towards the scanner."""
     return scan.R - 0.08 * np.clip((scan.az - np.median(scan.az)) / np.ptp(scan.az), 0, None) * (1 + scan.z)
 
 
 def still_half(folder: Path) -> list[float]:
-    """The other half as a box in the wall frame."""
+    """Return the other half as a box in the wall frame."""
     residuals = compute_residuals(read_measurement(folder))
     azimuth = residuals.geometry.azimuth
     x = residuals.wall_xy[azimuth < (azimuth.min() + azimuth.max()) / 2 - 0.03, 0]

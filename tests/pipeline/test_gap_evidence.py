@@ -1,5 +1,6 @@
-"""What is no evidence for an effect: debris in blocks that are held out, an error of the reference, what a free form misses,
-what another effect makes up for."""
+"""What must not count as evidence for or against an effect: debris on validation blocks, an error of the reference, what a free
+form leaves unexplained, and what another effect compensates.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +27,7 @@ from scene.common.keyed_random import KeyedRandom
 
 
 def test_debris_on_blocks_that_were_held_out_does_not_speak_against_an_effect(tmp_path: Path) -> None:
-    """One point in a hundred lies 20 cm before the wall: the effect gains as much as without them."""
+    """With one point in a hundred 20 cm before the wall, the effect must gain as much as without debris."""
 
     def gain(folder: Path, share: float) -> float:
         folder.mkdir()
@@ -54,7 +55,10 @@ def _bulging(scan: Scan) -> Array:
 def test_an_effect_beside_others_whose_one_value_may_be_none_is_only_mentioned(
     tmp_path: Path, std: float, weak: list[str]
 ) -> None:
-    """Whatever it gains: a kappa of -0.36 +- 0.63 mrad was named beside a skew of the other camera, which undoes it."""
+    """An effect with one parameter within two standard deviations of zero is not named, whatever it gains.
+
+    A real case: a kappa of -0.36 +- 0.63 mrad was named beside a skew of the other camera, which compensates it.
+    """
     write_scan(tmp_path, 8, step_rad=0.007, ranges=lambda scan: _bulging(scan) + 0.004 * np.sin(2 * np.pi * scan.R / 1.7))
     there, found, _ = align(read_measurement(tmp_path))
     bias = {"name": "range_incidence_bias", "coefficient_m": 0.004}
@@ -75,7 +79,9 @@ def test_an_effect_beside_others_whose_one_value_may_be_none_is_only_mentioned(
 def test_noise_differs_between_neighbours_and_an_error_of_the_reference_does_not(
     tmp_path: Path, length_m: float, count: int
 ) -> None:
-    """2 mm beside noise of 3 mm: white it is range noise; correlated over 1.2 m, less than a cell of the search, it is not."""
+    """An error of 2 mm beside noise of 3 mm is range noise if it is white; if it is correlated over 1.2 m, which is less than a
+    cell of the search, it is not.
+    """
     write_scan(tmp_path, 3, step_rad=0.005)
     _, residuals, _ = align(read_measurement(tmp_path))
     part = residuals.part(residuals.usable)
@@ -92,7 +98,7 @@ def test_noise_differs_between_neighbours_and_an_error_of_the_reference_does_not
 
 
 def test_what_a_free_form_misses_of_a_drift_gets_no_name(tmp_path: Path) -> None:
-    """Ranges settle by 20 mm in the first tenth of the scan, which no effect of the catalogue does."""
+    """The ranges drift by 20 mm in the first tenth of the scan, as no effect of the catalogue does."""
     write_scan(tmp_path, 6, ranges=lambda scan: scan.R + 0.02 * np.exp(-scan.share / 0.1), step_rad=0.006)
     found = diagnose(read_measurement(tmp_path))
     assert found.verdict == "unknown"
@@ -100,7 +106,7 @@ def test_what_a_free_form_misses_of_a_drift_gets_no_name(tmp_path: Path) -> None
 
 
 def test_two_effects_that_only_make_up_for_each_other_both_fail(tmp_path: Path) -> None:
-    """Without either the other would be 20 mm off; together they put 2 mm where there is nothing."""
+    """Without either one the other would be wrong by 20 mm; together they add 2 mm where there is no error."""
     write_scan(tmp_path, 8, step_rad=0.007)
     there, residuals, _ = align(read_measurement(tmp_path))
     held_out = in_validation_blocks(residuals.wall_xy, WallCells.over(residuals.wall_xy).side_m)
@@ -119,7 +125,10 @@ def test_two_effects_that_only_make_up_for_each_other_both_fail(tmp_path: Path) 
 
 
 class _Scripted:
-    """A search whose scores, by name and form ("" of an effect), are those of a script for each set of names that is known."""
+    """A fake search.
+
+    The script maps the set of known effects to the scores of the others, by name and form ("" for an effect).
+    """
 
     def __init__(self, scores: Callable[[set[str]], dict[tuple[str, str], float]]) -> None:
         self._scores = scores
@@ -150,8 +159,9 @@ class _Scripted:
 
 
 class _Cameras(_Scripted):
-    """A search in which tangential_distortion of the left camera does better alone and beside focal_length, that of the right one
-    beside camera_shift."""
+    """A fake search in which tangential_distortion of the left camera scores best alone and beside focal_length, and that of the
+    right camera beside camera_shift.
+    """
 
     _SCORES: ClassVar = {
         "": {"tangential_distortion left": 45.0, "focal_length": 6.0, "camera_shift": 4.0},
@@ -177,7 +187,7 @@ class _Cameras(_Scripted):
 
 
 def test_what_does_as_well_beside_the_other_camera_is_of_the_class() -> None:
-    """Both sets score 102 and 101; beside the right camera's distortion alone focal_length would score 18 less."""
+    """Both sets score 102 and 101; beside the right camera's distortion alone, focal_length would score 18 less."""
     chosen, _ = ForwardSelection(_Cameras()).select()
     assert {each.candidate.name: each.indistinguishable for each in chosen} == {
         "tangential_distortion": (),
@@ -187,7 +197,7 @@ def test_what_does_as_well_beside_the_other_camera_is_of_the_class() -> None:
 
 @pytest.mark.parametrize(("places", "named"), [(5.0, {"collimation", "range_scale"}), (35.0, {"collimation"}), (45.0, set())])
 def test_a_name_says_more_than_mere_places_do(places: float, named: set[str]) -> None:
-    """One effect says much, a second something beside it, and places along the wall always as much."""
+    """One effect explains much, a second one something beside it; a step at a place along the wall always explains as much."""
 
     def scores(known: set[str]) -> dict[tuple[str, str], float]:
         return {("collimation", ""): 40.0, ("range_scale", ""): 28.0 if known else 18.0, (f"{SPATIAL_NULL} 30", "wave"): places}
@@ -198,7 +208,10 @@ def test_a_name_says_more_than_mere_places_do(places: float, named: set[str]) ->
 
 @pytest.mark.parametrize(("surface", "named"), [(10.0, {"camera_shift", "radius"}), (35.0, {"radius"})])
 def test_an_effect_beside_a_free_form_says_more_than_a_form_of_two_covariates(surface: float, named: set[str]) -> None:
-    """A bump in the picture is no function of the radius alone: what that misses an effect takes up, and a surface does too."""
+    """A bump in the image is no function of the radius alone.
+
+    Both an effect and a surface explain what such a function leaves.
+    """
 
     def scores(known: set[str]) -> dict[tuple[str, str], float]:
         form = 70.0 if "camera_shift" in known else 60.0

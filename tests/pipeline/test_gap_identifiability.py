@@ -1,4 +1,4 @@
-"""`scarpsim gap --identifiability` before data: against a rigid fit of points in closed form, and its files."""
+"""`scarpsim gap --identifiability`, before there are data: compared with a rigid fit of points in closed form; its files."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def found(wall: Field, tmp_path_factory: pytest.TempPathFactory) -> Identifiabil
 
 
 def moved_by(azimuth: Array, zenith: Array, distance: Array, name: str) -> Array:
-    """Recorded minus true points for a unit of an effect, by central differences of the effect's equation."""
+    """Return recorded minus true points for a unit of an effect, by central differences of the effect's equation."""
     step = 1e-5
     errors = {
         "range_offset": (1.0, 0 * azimuth, 0 * azimuth),
@@ -64,7 +64,7 @@ def test_the_table_writes_shares_with_a_space(found: Identifiability) -> None:
 
 @pytest.mark.parametrize("name", ["range_offset", "vertical_index", "collimation", "trunnion_tilt"])
 def test_survival_and_noise_are_those_of_a_rigid_fit_of_points(found: Identifiability, wall: Field, name: str) -> None:
-    """Points moved by the effect are fitted to the wall's planes by a shift and a turn, weighted along the ray."""
+    """Points that the effect has moved are fitted to the wall's planes by a shift and a rotation, weighted along the ray."""
     azimuth, zenith = (g.ravel() for g in np.meshgrid(np.arange(0.9, 2.4, 0.004), np.arange(0.7, 1.7, 0.004), indexing="ij"))
     ray = unit(azimuth, zenith)
     distance, cosine = wall.cast(POSITION, ray)
@@ -85,7 +85,7 @@ def test_survival_and_noise_are_those_of_a_rigid_fit_of_points(found: Identifiab
 
 
 def test_axis_errors_change_sign_in_the_second_face_and_part_from_the_pose(found: Identifiability) -> None:
-    """[S, -S] is orthogonal to [J, J], so both faces see S whole: S/N 5 at 5 sigma / (sqrt 2 |S|)."""
+    """[S, -S] is orthogonal to [J, J], so with both faces all of S remains: S/N 5 is reached at 5 sigma / (sqrt 2 |S|)."""
     second = next(each for each in found.extensions if "second face" in each.name)
     for name in ("vertical_index", "collimation", "trunnion_tilt"):
         row = found.names.index(f"tls.{name}")

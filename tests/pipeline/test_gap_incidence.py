@@ -1,4 +1,4 @@
-"""Angles of incidence on a reference made of points, against closed forms: its triangles lean by noise, planes do not."""
+"""Incidence angles on a reference made from points, against closed forms: noise tilts its triangles, but not fitted planes."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ NOISE_M = 0.0025
 
 
 def scan(path: Path, bias_m: float = 0.0, swell_m: float = 0.0) -> Path:
-    """Ground 1.7 m under the scanner, noise of 2.5 mm in range, as text, line after line; swell_m: amplitude of waves of 0.9 m.
+    """Write a text file of ground 1.7 m below the scanner, line after line, with range noise of 2.5 mm.
 
-    bias_m: added to ranges as bias (1 / cos i - 1), i by the surface's own gradient.
+    bias_m: adds bias (1 / cos i - 1) to the ranges, with i from the surface's own gradient; swell_m: amplitude of waves of 0.9 m.
     """
     rng = np.random.default_rng(8)
     azimuth, zenith = (
@@ -49,7 +49,7 @@ def scan(path: Path, bias_m: float = 0.0, swell_m: float = 0.0) -> Path:
 
 @pytest.fixture(scope="module")
 def level(tmp_path_factory: pytest.TempPathFactory) -> TlsMeasurement:
-    """Level ground, one half against the other."""
+    """Level ground, one half of the points compared with the other."""
     folder = tmp_path_factory.mktemp("level")
     build(Request([scan(folder / "ground.xyz")], "half", "riegl_vz400i", position=(0.0, 0.0, 0.0)), folder / "out")
     measurement = read_measurement(folder / "out")
@@ -58,7 +58,7 @@ def level(tmp_path_factory: pytest.TempPathFactory) -> TlsMeasurement:
 
 
 def slant_error(geometry: RayGeometry) -> np.ndarray:
-    """(n,) of 1 / cos i; on level ground it is R / h."""
+    """Return the error (n,) of 1 / cos i; on level ground the true value is R / h."""
     return np.asarray(1 / geometry.cos_incidence - geometry.range_m / HEIGHT_M)
 
 
@@ -77,7 +77,9 @@ def test_the_simulation_takes_the_same_incidence(level: TlsMeasurement) -> None:
 
 
 def test_a_bias_of_the_incidence_is_named_on_half_of_a_scan(tmp_path: Path) -> None:
-    """Of 6 mm, put into the half that is compared; waves of 2 cm, whose chords are 13 cm long where rays graze."""
+    """The bias of 6 mm is in the half that is compared; the waves have 2 cm, and triangle edges are 13 cm long at grazing
+    incidence.
+    """
     quiet, biased = (scan(tmp_path / f"{name}.xyz", bias, swell_m=0.02) for name, bias in (("quiet", 0.0), ("biased", 0.006)))
     build(Request([quiet], "half", "riegl_vz400i", position=(0.0, 0.0, 0.0)), tmp_path / "out")
     build(Request([biased], "half", "riegl_vz400i", position=(0.0, 0.0, 0.0)), tmp_path / "other")
@@ -104,7 +106,7 @@ def test_planes_are_not_asked_for_where_nothing_looks_at_them() -> None:
 
 
 def test_normals_of_a_sphere_point_to_its_middle() -> None:
-    """24 neighbours of 20,000 points on a sphere span 0.06 rad; the plane through them leans by a part of that."""
+    """24 neighbours among 20,000 points on a sphere span 0.06 rad; a plane through them is tilted by a fraction of that."""
     vectors = np.random.default_rng(3).standard_normal((20_000, 3))
     radial = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     cosine = np.abs(np.einsum("ni,ni->n", PointPlanes.of(5 * radial, np.zeros(3)).normal, radial))

@@ -1,4 +1,4 @@
-"""What an empty kernel cache has to compile for a diagnosis: few small kernels, however many sets of effects are tried."""
+"""A diagnosis needs few small kernels, however many sets of effects are tried; an empty kernel cache has to compile them all."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from kernels import kernels
 
-from benchmarks.gap_challenge.cases import Case, make
+from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import diagnose
 
@@ -20,7 +20,9 @@ from pipeline.gap.naming.workflow import diagnose
 def test_a_diagnosis_compiles_few_small_kernels(
     sensor: str, kind: str, most: int, operations: int, largest: int, tmp_path: Path
 ) -> None:
-    """Before, of some 75,000 points: 76 kernels of 264,000 operations in all, the largest of 11,300; stereo 83 of 44,000."""
+    """An earlier version compiled, for about 75,000 points, 76 kernels of 264,000 operations in all, the largest of 11,300 (laser
+    scan), and 83 of 44,000 (stereo).
+    """
     make(Case(0, (1, 1), "one", sensor, (kind,), 5_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     found = kernels(lambda: diagnose(read_measurement(tmp_path / "case")))
     assert len(found) <= most

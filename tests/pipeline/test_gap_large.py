@@ -1,4 +1,4 @@
-"""Large effects, which slopes say only half of, and what is known of an effect's size before there are data."""
+"""Large effects, for which linearised effects are wrong by half, and prior knowledge of an effect's size."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from gap_cases import write_scan
 
-from benchmarks.gap_challenge import stereo_cases
-from benchmarks.gap_challenge.cases import Case, make
-from benchmarks.gap_challenge.strength import Target
+from benchmarks.gap_closed_form import stereo_cases
+from benchmarks.gap_closed_form.cases import Case, make
+from benchmarks.gap_closed_form.strength import Target
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.mean.candidates import Candidate, SineGrid
@@ -43,7 +43,7 @@ from scene.geometry.mesh import FloatArray
 
 
 class _Strong(Target):
-    """Effects as large as the generator makes them."""
+    """Draws effects as large as the generator allows."""
 
     @classmethod
     def draw(cls, random: np.random.Generator) -> Target:
@@ -52,8 +52,9 @@ class _Strong(Target):
 
 @pytest.mark.parametrize("kind", ["camera_phi", "camera_omega"])
 def test_a_large_turn_of_a_camera_is_one_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
-    """Some milliradians, which move the registered pair by metres: slopes give half the angle and make up for the rest with
-    other effects."""
+    """A turn of a few milliradians moves the registered pair by metres: linearised, half the angle and further effects would be
+    found.
+    """
     monkeypatch.setattr(stereo_cases, "Target", _Strong)
     make(Case(0, (3, 1), "one", "stereo", (kind,), 4_000, 4_000), tmp_path / "case", tmp_path / "truth.json")
     (truth,) = json.loads((tmp_path / "truth.json").read_text())["effects"]
@@ -68,8 +69,9 @@ def test_a_large_turn_of_a_camera_is_one_effect(tmp_path: Path, monkeypatch: pyt
 
 
 def test_whose_principal_point_is_off_shows_with_it_in_the_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """10 px, which turn the registered pair by some milliradians: by slopes it is the other camera's, beside which a focal length
-    makes up for the rest."""
+    """A principal point wrong by 10 px turns the registered pair by a few milliradians: linearised, it would be attributed to the
+    other camera, with a focal length beside it.
+    """
     monkeypatch.setattr(stereo_cases, "Target", _Strong)
     make(Case(0, (77, 1), "one", "stereo", ("principal_point_x",), 4_000, 4_000), tmp_path / "case", tmp_path / "truth.json")
     (truth,) = json.loads((tmp_path / "truth.json").read_text())["effects"]
@@ -81,7 +83,9 @@ def test_whose_principal_point_is_off_shows_with_it_in_the_model(tmp_path: Path,
 
 @pytest.fixture(scope="module")
 def turned_and_zoomed(tmp_path_factory: pytest.TempPathFactory) -> tuple[SearchInput, dict[str, dict[str, Any]]]:
-    """What is measured by a pair with a turned camera (4 mrad) and another focal length (8 px), and both effects' parameters."""
+    """The search input of a pair with a turned camera (4 mrad) and a wrong focal length (8 px), and the parameters of both
+    effects.
+    """
     folder = tmp_path_factory.mktemp("large")
     kinds = ("camera_kappa", "focal_length")
     with pytest.MonkeyPatch.context() as patched:
@@ -97,8 +101,9 @@ def turned_and_zoomed(tmp_path_factory: pytest.TempPathFactory) -> tuple[SearchI
 def test_slopes_are_the_true_ones_where_all_effects_together_fit_best(
     turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]],
 ) -> None:
-    """Least squares with the columns of both effects there find both values to 15 %, two to three standard errors;
-    by the slopes at the model they miss a third of one."""
+    """Linearised at the joint fit, least squares finds both values to 15 % (two to three standard errors); linearised at the
+    model, one is wrong by a third.
+    """
     points, truth = turned_and_zoomed
 
     def both(families: list[Candidate | SineGrid], part: Residuals, value: FloatArray) -> list[float]:
@@ -119,8 +124,10 @@ def test_slopes_are_the_true_ones_where_all_effects_together_fit_best(
 def test_noise_beside_effects_is_asked_for_with_these_in_the_model(
     turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]],
 ) -> None:
-    """Without them what they do, hundreds of times the noise, is found as noise of some pixels; with them none is, and the
-    residuals spread as predicted: an NMAD of 3,000 values errs by 2 %, and the effects' values by their own errors."""
+    """If the effects, hundreds of times the noise, are not in the model, they are found as noise of some pixels.
+
+    With them in the model no noise is found, and the residuals' NMAD is as predicted; it is known to 2 % from 3,000 values.
+    """
     points, _ = turned_and_zoomed
     asked: list[Residuals] = []
     search_at_joint_fit(replace(points, variance_at=lambda at: asked.append(at) or []))  # type: ignore[func-returns-value]
@@ -137,8 +144,9 @@ def test_noise_beside_effects_is_asked_for_with_these_in_the_model(
 def test_the_class_of_an_effect_taken_exactly_is_by_exact_likelihoods(
     turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is what the answer says: with any margin all that were taken exactly are in it, with none those alone that slopes put
-    there and that were not taken exactly."""
+    """With an unlimited margin all exactly fitted effects are in the class; with margin zero, only those that the linearised
+    search put there and that were not fitted exactly.
+    """
     points, _ = turned_and_zoomed
     first = MeanSearch(with_fitted_variance(points.part, [], 1.0), points.families, KeyedRandom(1))
     classes = {}
@@ -154,7 +162,9 @@ def test_the_class_of_an_effect_taken_exactly_is_by_exact_likelihoods(
 def test_slopes_do_not_serve_where_what_they_miss_is_as_much_as_something_gains(
     turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A weak second effect may be what the first one's slopes are wrong by: the first is taken exactly then, else not."""
+    """The first effect is fitted exactly only if the error of its linearisation is as large as the gain of a weak
+    second effect.
+    """
     points, _ = turned_and_zoomed
     first = MeanSearch(with_fitted_variance(points.part, [], 1.0), points.families, KeyedRandom(1))
     chosen = first.select()[0]
@@ -177,7 +187,7 @@ def test_slopes_do_not_serve_where_what_they_miss_is_as_much_as_something_gains(
 def test_two_large_effects_are_found_where_all_together_fit_best(
     turned_and_zoomed: tuple[SearchInput, dict[str, dict[str, Any]]],
 ) -> None:
-    """By slopes at the model two others, and a free form, say it."""
+    """Linearised at the model, two other effects and a free form would be found instead."""
     found = search_at_joint_fit(turned_and_zoomed[0])
     assert found is not None
     assert {each.candidate.name for each in found.chosen} <= {"focal_length", "camera_kappa", "affinity_skew"}  # a turn is a skew
@@ -186,7 +196,9 @@ def test_two_large_effects_are_found_where_all_together_fit_best(
 
 
 def test_what_is_known_before_shrinks_a_coefficient_as_bayes_says() -> None:
-    """One column, alike in all points of a cell, under white noise: (x'x + k)^-1 x'y, and that inverse as the variance."""
+    """With one column, equal for all points of a cell, and white noise, the estimate is (x'x + k)^-1 x'y, with that inverse as
+    variance.
+    """
     rng = np.random.default_rng(1)
     at = rng.uniform(0, 20, (4000, 2))
     cells = WallCells.over(at)
@@ -203,7 +215,9 @@ def test_what_is_known_before_shrinks_a_coefficient_as_bayes_says() -> None:
 
 
 def test_what_is_known_of_one_effect_holds_beside_another(tmp_path: Path) -> None:
-    """A column of which the data say next to nothing, 0.2 in size before there are data, beside one that overlaps with it."""
+    """A column about which the data say almost nothing (prior standard deviation 0.2) overlaps with one that the
+    data determine.
+    """
     write_scan(tmp_path, 8, ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1), step_rad=0.012)
     there, residuals, _ = align(read_measurement(tmp_path))
     part = residuals.part(residuals.usable)
@@ -222,7 +236,7 @@ def test_what_is_known_of_one_effect_holds_beside_another(tmp_path: Path) -> Non
 
 
 def test_an_effect_that_is_not_there_fails_on_blocks_that_were_held_out(tmp_path: Path) -> None:
-    """Ranges grow with the incidence angle; beside that a scale error is named that is not there, nine parts in 10,000."""
+    """The ranges grow with the incidence angle; a scale error of nine parts in 10,000 is also named, but is not there."""
     write_scan(tmp_path, 8, ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1), step_rad=0.007)
     there, residuals, _ = align(read_measurement(tmp_path))
     trained = ~in_validation_blocks(residuals.wall_xy, WallCells.over(residuals.wall_xy).side_m)
@@ -237,7 +251,7 @@ def test_an_effect_that_is_not_there_fails_on_blocks_that_were_held_out(tmp_path
 
 
 def test_an_effect_that_gains_no_more_than_its_standard_error_is_only_mentioned_beside_others(tmp_path: Path) -> None:
-    """Ranges grow with the incidence angle; beside that a scale error of 1 ppm, which nothing can tell from none."""
+    """The ranges grow with the incidence angle; a scale error of 1 ppm, which cannot be told from zero, is also named."""
     write_scan(tmp_path, 8, ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1), step_rad=0.007)
     there, residuals, _ = align(read_measurement(tmp_path))
     trained = ~in_validation_blocks(residuals.wall_xy, WallCells.over(residuals.wall_xy).side_m)

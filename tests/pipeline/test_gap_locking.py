@@ -1,4 +1,4 @@
-"""Pixel locking told by the measured disparities: against disparities drawn in closed form."""
+"""Pixel locking found from the measured disparities: against disparities drawn in closed form."""
 
 from __future__ import annotations
 
@@ -30,7 +30,9 @@ def test_amplitude_period_and_phase_are_found_through_noise(amplitude: float, pe
 
 
 def test_disparities_of_a_rough_wall_show_none() -> None:
-    """200 walls of ten facets each; the threshold is 1e-4 for each, so that one failure in fifty runs of this test is due."""
+    """200 walls of ten facets each; the significance level is 1e-4 for each, so one in fifty seeds of this test fails
+    by chance.
+    """
     rng = np.random.default_rng(4)
     for _ in range(200):
         facets = rng.uniform(200, 230, 10)[:, None] + rng.uniform(0, 6, (10, 1)) * rng.uniform(size=(10, 300))
@@ -39,8 +41,10 @@ def test_disparities_of_a_rough_wall_show_none() -> None:
 
 
 def test_a_small_amplitude_is_told_from_noise_by_how_much_of_it_there_may_be() -> None:
-    """0.115 px beside noise of 0.22: the first multiple alone shows. Twenty times: the mean within 8 %, 18 or more within 1.645
-    standard deviations."""
+    """Of 0.115 px beside noise of 0.22 px only the first harmonic shows.
+
+    In twenty draws the mean is within 8 %, and 18 or more intervals of 1.645 standard deviations contain the truth.
+    """
     found = []
     for seed in range(20):
         random = np.random.default_rng(seed)
@@ -55,8 +59,11 @@ def test_a_small_amplitude_is_told_from_noise_by_how_much_of_it_there_may_be() -
 
 
 def test_an_amplitude_that_folds_disparities_over_is_not_taken_for_a_small_one() -> None:
-    """A tenth of the disparities snapped to whole pixels beside 0.12 px of locking: the mean of the first multiple alone is as
-    that of 0.46 px, which no matcher makes. Snapping is no sine, so the amplitude is held to a sixth."""
+    """A tenth of the disparities is snapped to whole pixels beside 0.12 px of locking.
+
+    The first harmonic alone would also fit 0.46 px, which no matcher makes. Snapping is no sine, so the amplitude is only known
+    to a sixth.
+    """
     rng = np.random.default_rng(3)
     plain = rng.uniform(0, 80, 60_000)
     locked = plain + 0.12 * np.sin(2 * np.pi * plain)
@@ -68,7 +75,9 @@ def test_an_amplitude_that_folds_disparities_over_is_not_taken_for_a_small_one()
 
 @pytest.mark.parametrize(("tilt", "amplitude"), [(0.06, 0.3), (-0.04, 0.08)])
 def test_a_matcher_whose_rectification_is_turned_about_the_base_is_seen_through(tilt: float, amplitude: float) -> None:
-    """Disparities f B / Z' of another rectification, Z' = Z cos w + Y sin w, counted in pixels of its own principal distance."""
+    """The disparities f B / Z' belong to another rectification, Z' = Z cos w + Y sin w, in pixels of its own
+    principal distance.
+    """
     rng = np.random.default_rng(5)
     tangent, beyond, infinity = rng.uniform(-0.35, 0.3, 20_000), rng.uniform(400, 700, 20_000), -350.0
     theirs = 1.01 * beyond / (np.cos(tilt) + tangent * np.sin(tilt)) + 0.3 * rng.standard_normal(20_000)

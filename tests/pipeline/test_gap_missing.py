@@ -1,4 +1,4 @@
-"""Lost returns: chances drawn in closed form, and what must not be taken for an effect."""
+"""Lost returns: loss probabilities drawn in closed form, and losses that are no effect."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COUNT = 30_000
 
 
 def pulses() -> tuple[Array, Array, dict[str, Array]]:
-    """A wall 40 m wide and 30 m high, seen from 50 m: places x and y, and the covariates of pulses to them."""
+    """Places x and y on a wall 40 m wide and 30 m high, seen from 50 m, and the covariates of pulses to them."""
     rng = np.random.default_rng(5)
     x, y = rng.uniform(-20, 20, COUNT), rng.uniform(0, 30, COUNT)
     distance = np.sqrt(x**2 + y**2 + 50**2)
@@ -38,7 +38,7 @@ def pulses() -> tuple[Array, Array, dict[str, Array]]:
 
 
 def found(chance: Array, early: int = 0, seed: int = 6) -> LossExplanation | None:
-    """What is found where pulses are lost with a chance (n,)."""
+    """Return the effects that are found where pulses are lost with probabilities (n,)."""
     x, y, covariates = pulses()
     lost = np.random.default_rng(seed).uniform(size=COUNT) < chance
     every = np.arange(COUNT) % 5 != 0
@@ -72,7 +72,7 @@ def test_losses_in_a_sector_are_no_effect_of_the_catalogue() -> None:
 
 
 def test_losses_alike_everywhere_are_none() -> None:
-    """20 draws, none with the seed of the places; a score of 9 has a chance of some 1e-4 in each."""
+    """20 draws; by chance a score of 9 occurs in about 1e-4 of them."""
     assert all(found(np.full(COUNT, 0.03), seed=seed) is None for seed in range(100, 120))
 
 
@@ -82,8 +82,10 @@ def test_a_shrub_before_the_wall_is_none() -> None:
 
 
 def test_lines_that_the_scanner_dropped_are_none() -> None:
-    """Nine gaps of some lines and a fifth of their height, as often by chance in one sector; of 20 draws one may be taken for a
-    sector's losses, two with a chance of 2 % where that of each is 1 %."""
+    """There are nine gaps of a few lines and a fifth of their height.
+
+    One of 20 draws may be taken for a sector's losses; two would have a chance of 2 % if each has 1 %.
+    """
     _, _, covariates = pulses()
     azimuth, zenith = covariates["azimuth"], covariates["zenith"]
     wrong = 0
@@ -105,7 +107,9 @@ def test_drops_scatter_and_what_stands_before_the_wall_does_not() -> None:
 
 
 def test_the_score_of_losses_closes_the_gap_of_the_true_chance() -> None:
-    """The Brier score of a chance p is p (1 - p) on average: what is left is nothing, within 3.3 standard errors."""
+    """The Brier score of a probability p is p (1 - p) on average, so with the true probability the gap is zero within 3.3
+    standard errors.
+    """
     x, y, covariates = pulses()
     chance = np.where(covariates["zenith"] < 1.2, 0.62, 0.02)
     lost = np.random.default_rng(8).uniform(size=COUNT) < chance
@@ -122,7 +126,7 @@ def test_the_score_of_losses_closes_the_gap_of_the_true_chance() -> None:
 
 
 def test_a_wall_on_both_sides_of_the_azimuth_pi_is_one_wall(tmp_path: Path) -> None:
-    """The scanner's frame turned, so that half of the same points have azimuths below pi and half above minus pi."""
+    """The scanner's frame is turned so that half of the same points have azimuths just below pi and half just above -pi."""
     write_scan(tmp_path, 1)
     plain = read_measurement(tmp_path)
     assert isinstance(plain, TlsMeasurement)

@@ -1,4 +1,4 @@
-"""A real rock face of which much moved between two epochs: whichever is the reference, nothing is said of the sensor."""
+"""A real rock face of which much moved between two epochs: whichever epoch is the reference, the sensor is not blamed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ POSITION = (547449.975, 149565.052, 724.844)
 
 @pytest.fixture(scope="module")
 def epochs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """before.xyz: every second point; after.xyz: the others, twelve of the largest patches pushed back, in the middle most."""
+    """before.xyz: every second point; after.xyz: the others, with twelve of the largest patches pushed back, most in their
+    middle.
+    """
     points = np.loadtxt(ROCKS)
     pairs = cKDTree(points[:, :3]).query_pairs(0.6, output_type="ndarray")
     patch = connected_components(coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points))))[1]
@@ -43,7 +45,7 @@ def epochs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.skipif(not ROCKS.exists(), reason=f"the real rock face is not there: {ROCKS}")
 @pytest.mark.parametrize(("measured", "reference"), [("after", "before"), ("before", "after")])
 def test_much_moved_rock_is_no_agreement(epochs: Path, tmp_path: Path, measured: str, reference: str) -> None:
-    """The second was `no_gap`: few patches leave the gap unsure, and p = 0.012 does not reject."""
+    """The second order used to give `no_gap`: few patches remain, so the gap is uncertain, and p = 0.012 does not reject."""
     request = Request(
         [epochs / f"{measured}.xyz"], str(epochs / f"{reference}.xyz"), "riegl_vz400i",
         position=POSITION, columns=("x", "y", "z", "intensity"),

@@ -1,4 +1,4 @@
-"""What a search knows of any set of explanations, against fits of the same columns one set at a time."""
+"""The search's shared normal equations, against separate least-squares fits of the same columns."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from scene.common.keyed_random import KeyedRandom
 
 @pytest.fixture(scope="module")
 def families() -> list[Candidate | SineGrid]:
-    """Free forms along both axes, the lines of which are called effects of the catalogue."""
+    """Free forms along both axes, the linear ones of which stand for effects of the catalogue."""
     pixels = raster(48)
     found = [form for axis, name in enumerate(("image_x", "image_y")) for form in nonparametric_terms(name, pixels[:, axis])]
     return [replace(each, empirical=False) if isinstance(each, Candidate) and each.form == "line" else each for each in found]
@@ -37,8 +37,9 @@ def design(families: list[Candidate | SineGrid]) -> Design:
 
 
 def test_every_explanation_gains_beside_others_what_a_fit_of_both_gains(design: Design, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beside nothing, an effect, a free form, and a sine: the likelihoods of all sets, by elimination, are those of all columns
-    solved together. Of sines every fiftieth, whose products are asked for in another way once they are fixed."""
+    """Beside nothing, an effect, a free form and a sine, the likelihoods of all sets by elimination equal those of all columns
+    solved together. Only every fiftieth sine is compared, because fixed sines take another path through the code.
+    """
 
     def unmoved(_: Design, candidates: list[Candidate]) -> tuple[list[Candidate], MeanFit | None]:
         return candidates, None
@@ -78,7 +79,7 @@ def test_a_search_asks_for_a_set_of_effects_once(
 
 @pytest.mark.parametrize("told", [6, 4])
 def test_the_pose_is_that_of_least_squares_however_many_points(design: Design, told: int) -> None:
-    """Of 2,049 to 20,000 points, in blocks and not; also where two of its numbers change nothing, or what a third does."""
+    """2,049 to 20,000 points, in blocks and not; also where one pose parameter has no influence and another repeats the first."""
     random = np.random.default_rng(3)
     for count in (2_304, 2_049, 20_000):
         rows = random.integers(0, len(design.residuals), count)

@@ -1,7 +1,7 @@
-"""The p-value of each statistic that the diagnosis tests, where the model is right: even between 0 and 1, or nearly.
+"""The p-values of all statistics that the diagnosis tests are (nearly) uniform where the model is right.
 
-Each by Kolmogorov and Smirnov at 0.1 %, which the right distribution fails once in a thousand seeds; for each something that is
-there as well, which it has to find.
+Each is tested by Kolmogorov-Smirnov at 0.1 %, which the right distribution fails for one seed in a thousand. Each statistic must
+also reject an error that is present.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ SIGMA = 0.003
 
 
 def over_the_wall(side: int = SIDE, step: float = 0.1) -> FloatArray:
-    """(n, 2), m, a little irregular."""
+    """Return slightly irregular places (n, 2) on the wall, m."""
     at = step * np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
     return np.asarray(at + np.random.default_rng(1).uniform(-0.4 * step, 0.4 * step, at.shape))
 
 
 def ranges(value: FloatArray, at: FloatArray) -> TlsResiduals:
-    """Residuals of a scan; the pose is a plane over the wall."""
+    """Return residuals of a scan; the pose is a plane over the wall."""
     nothing, every = np.zeros(len(at)), np.ones(len(at), dtype=bool)
     pose = np.stack([np.ones(len(at)), at[:, 0], at[:, 1]], axis=1)
     covariates = {"azimuth": 0.02 * at[:, 0], "zenith": 0.02 * at[:, 1]}
@@ -49,7 +49,7 @@ def ranges(value: FloatArray, at: FloatArray) -> TlsResiduals:
 
 
 def of_the_mean(count: int, reference: float, length_m: float, added: float = 0.0) -> list[float]:
-    """p-values of what remains in measurements of white noise beside an error of the reference; added: a curve of the azimuth."""
+    """Return p-values of the remainder, for white noise beside an error of the reference; added: a curve of the azimuth."""
     at = over_the_wall()
     root = np.linalg.cholesky(np.exp(-0.5 * (cdist(at, at) / length_m) ** 2) + 1e-8 * np.eye(len(at)))
     found = []
@@ -66,8 +66,10 @@ def of_the_mean(count: int, reference: float, length_m: float, added: float = 0.
 
 @pytest.mark.parametrize(("reference", "length_m"), [(0.0, 1.0), (0.002, 1.0)])
 def test_of_a_mean_of_ranges(monkeypatch: pytest.MonkeyPatch, reference: float, length_m: float) -> None:
-    """Cells of 0.5 m, ranges of 3 mm; the reference's error (m) is correlated over two cells. The second is what is reached: it
-    passes, but 11 of its 40 lie below 0.05."""
+    """Cells of 0.5 m, ranges of 3 mm; the reference's error (m) is correlated over two cells.
+
+    The second is what is reached: it passes, but 11 of its 40 lie below 0.05.
+    """
     monkeypatch.setattr(wall_blocks, "_MOST_CELLS", 100)
     found = of_the_mean(40, reference, length_m)
     assert kstest(found, "uniform").pvalue > 0.001, sorted(found)
@@ -79,7 +81,7 @@ def test_of_a_mean_that_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def of_the_spread(count: int, excess: float) -> list[float]:
-    """p-values of one form that grows over the wall, one that is even and one of a few points."""
+    """Return p-values of a variance that grows over the wall, of one that is constant and of one of few points."""
     at = over_the_wall()
     block = wall_block_numbers(at, 0.15)
     forms = [np.ones(len(at)), at[:, 0], np.exp(-at[:, 1])]
@@ -100,7 +102,7 @@ def test_of_a_spread_that_is_there() -> None:
 
 
 def of_nodes(count: int, sigma_px: float) -> list[float]:
-    """p-values of noise on nodes in disparities of the model's own white noise."""
+    """Return p-values of grid noise in disparities that have only the model's white noise."""
     pixels = 4.0 * np.stack(np.meshgrid(np.arange(120.0), np.arange(120.0)), axis=-1).reshape(-1, 2)
     number, every = np.arange(len(pixels)), np.ones(len(pixels), dtype=bool)
     zero = np.zeros(len(pixels))

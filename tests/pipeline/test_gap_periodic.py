@@ -1,4 +1,4 @@
-"""What repeats but is no sine: folded over its period, or over a few scan lines, columns or rows."""
+"""Periodic errors that are no sine: averaged over their period ("folded"), or over a few scan lines, columns or rows."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from gap_cases import write_scan
 
-from benchmarks.gap_challenge.cases import Case, make
+from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.mean.candidates import (
     HARMONIC_SERIES,
@@ -41,7 +41,7 @@ PIXELS = STRIDE * np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), axis=-
 
 
 def residuals(error: FloatArray) -> StereoResiduals:
-    """An error with white noise on a raster; the pose is a parabola over the wall."""
+    """Return an error with white noise on a raster; the pose is a parabola over the wall."""
     at, count = PIXELS / 40.0, len(PIXELS)
     pose = np.stack([np.ones(count), *at.T, at[:, 0] ** 2, at[:, 0] * at[:, 1], at[:, 1] ** 2], axis=1)
     every, covariates = np.ones(count, dtype=bool), {"image_x": PIXELS[:, 0], "image_y": PIXELS[:, 1]}
@@ -52,7 +52,7 @@ def residuals(error: FloatArray) -> StereoResiduals:
 
 
 def best(found: Residuals, families: list[Candidate | SineGrid]) -> tuple[MeanSearch, Estimate]:
-    """The form that a search chooses, with its values."""
+    """Return the form that a search chooses, with its values."""
     search = MeanSearch(
         found,
         [*nonparametric_terms("image_x", PIXELS[:, 0]), *nonparametric_terms("image_y", PIXELS[:, 1]), *families],
@@ -66,7 +66,7 @@ def best(found: Residuals, families: list[Candidate | SineGrid]) -> tuple[MeanSe
 
 @pytest.mark.parametrize(("stride", "shortest"), [(4.0, 20.0), (27.0, 54.0)])
 def test_periods_are_searched_as_far_as_the_rows_tell_them_apart(stride: float, shortest: float) -> None:
-    """Sampled every 27 px, a jitter of 26.2 px is a wave of 884 px: a slanting wave was named so."""
+    """Sampled every 27 px, a jitter of 26.2 px looks like a wave of 884 px, which was once named for a slanting wave."""
     pixels = PIXELS * stride / STRIDE
     assert RowJitter.searched is not None
     nowhere = PixelGeometry(*pixels.T, pixels[:, 1], *[np.zeros(len(pixels))] * 9)
@@ -78,7 +78,7 @@ def test_periods_are_searched_as_far_as_the_rows_tell_them_apart(stride: float, 
 
 @pytest.mark.parametrize(("across", "down", "side"), [(4.0, 4.0, 4.0), (4.0, 8.0, 4.0), (8.0, 4.0, 4.0)])
 def test_cells_are_as_fine_as_the_finer_of_columns_and_rows(across: float, down: float, side: float) -> None:
-    """Coarser ones would hold pixels of two rows."""
+    """Larger cells would mix pixels of two rows."""
     u, v = (PIXELS / STRIDE * [across, down]).T
     assert raster_cell_px(u, v) == side
 
@@ -89,8 +89,9 @@ def square(x: FloatArray, period: float) -> FloatArray:
 
 @pytest.mark.parametrize(("period", "least"), [(PERIOD, 0.93), (96.0, 0.96)])
 def test_a_square_wave_is_folded_over_its_period_in_pixels(period: float, least: float) -> None:
-    """A square has the odd overtones: beyond the fifth 7 % of its variance are left, a correlation of 0.97 without noise, beyond
-    the eleventh 3 %, 0.983; 16 columns a period show none beyond the eighth."""
+    """A square wave has odd overtones: beyond the fifth 7 % of its variance remain (correlation 0.97 without noise), beyond the
+    eleventh 3 % (0.983); 16 columns per period show none beyond the eighth.
+    """
     found = residuals(square(PIXELS[:, 0], period))
     _, estimate = best(found, [])
     assert estimate.candidate.form == HARMONIC_SERIES
@@ -109,8 +110,11 @@ def test_a_sine_stays_a_sine() -> None:
 
 @pytest.mark.parametrize("lines", [3, 4, 5])
 def test_offsets_of_every_few_columns_are_found_with_their_number(lines: int) -> None:
-    """Facets of 0, 1, -0.6, 0.3 and -0.2 times 0.1 px: no sine of any period has them. Planes of cells as wide as five columns
-    take most of what tells these apart: 0.19 of their scatter is left then, 0.04 of that of three."""
+    """The columns are offset by 0, 1, -0.6, 0.3 and -0.2 times 0.1 px, in turn, as no sine of any period is.
+
+    Planes fitted to cells of five columns absorb most of the differences: 0.19 of their scatter remain, and 0.04 for cells of
+    three.
+    """
     column = PIXELS[:, 0] / STRIDE
     error = 0.1 * np.array([0.0, 1.0, -0.6, 0.3, -0.2])[(column % lines).astype(int)]
     found = residuals(error)
@@ -125,8 +129,9 @@ def test_offsets_of_every_few_columns_are_found_with_their_number(lines: int) ->
 
 @pytest.mark.parametrize("scale", [1.0, 0.985])
 def test_a_matcher_that_is_off_alike_at_each_half_of_a_pixel_is_found(scale: float) -> None:
-    """Two cycles a pixel, of a rectification whose principal distance may be another, on a wall of 40 px of disparity; the sine's
-    amplitude of 0.1 px is known to 0.2 sqrt(2 / 10,000) = 3 %."""
+    """The error has two cycles per pixel, of a rectification that may have another principal distance, on a wall of 40 px of
+    disparity; the amplitude of 0.1 px is known to 0.2 sqrt(2 / 10,000) = 3 %.
+    """
     x, y = PIXELS.T / (STRIDE * SIDE)
     disparity = 500 + 40 * (x + 0.3 * np.sin(5 * y) + 0.1 * np.sin(9 * x * y))
     error = 0.1 * np.sin(4 * np.pi * scale * disparity + 0.7)
@@ -142,8 +147,10 @@ def test_a_matcher_that_is_off_alike_at_each_half_of_a_pixel_is_found(scale: flo
 
 @pytest.mark.parametrize(("points", "least"), [(12_000, 34), (300, 0)])
 def test_waves_along_the_columns_are_tried_as_far_as_the_raster_shows_them(tmp_path: Path, points: int, least: int) -> None:
-    """A read-out in blocks may repeat tens of times over an image, twelve of which is what a wall's shape may do; a raster with
-    fewer than two columns a cycle shows another wave."""
+    """A block-wise read-out may repeat tens of times over an image, while a wall's shape may do so twelve times.
+
+    A raster with fewer than two columns per cycle shows another wave.
+    """
     make(Case(0, (3, 1), "none", "stereo", (), points, 6_000), tmp_path / "case", tmp_path / "truth.json")
     measurement = read_measurement(tmp_path / "case")
     found = compute_residuals(measurement)
@@ -157,7 +164,9 @@ def test_waves_along_the_columns_are_tried_as_far_as_the_raster_shows_them(tmp_p
 
 @pytest.mark.parametrize(("lines", "cycles"), [(300, 0.3), (2000, 0.3), (8000, 1.0)])
 def test_periods_are_tried_as_finely_as_the_lines_tell_them_apart(tmp_path: Path, lines: int, cycles: float) -> None:
-    """Neighbouring periods differ by less than so many cycles over all lines: whichever a wobble has, one is near it."""
+    """Neighbouring trial periods differ by less than the resolvable part of a cycle over all lines, so each wobble is
+    near one.
+    """
     write_scan(tmp_path, 3, step_rad=0.01)
     measurement = read_measurement(tmp_path)
     found = compute_residuals(measurement)

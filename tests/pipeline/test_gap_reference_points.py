@@ -1,4 +1,4 @@
-"""References made of points: noise of their own, chords, slopes and edges, against closed forms (benchmarks/workshop.py)."""
+"""References made from points: their noise, chord errors, slopes and edges, against closed forms (benchmarks/workshop.py)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SCANNER = np.zeros(3)
 
 
 def halves(folder: Path, points: np.ndarray) -> Path:
-    """A scan against its other half, with a model that believes in 1 mm."""
+    """Write a measurement of one half of a scan against the other, with a model that claims 1 mm of noise."""
     (folder / "model.yaml").write_text(yaml.safe_dump(MODEL))
     write_laz(folder / "scan.laz", PointCloud(points))
     build(Request([folder / "scan.laz"], "half", model=folder / "model.yaml", position=(0.0, 0.0, 0.0)), folder / "half")
@@ -36,7 +36,7 @@ def halves(folder: Path, points: np.ndarray) -> Path:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The workshop, one half against the other."""
+    """The workshop's scan, one half against the other."""
     return halves(tmp_path_factory.mktemp("workshop"), workshop.scan(0.4)[0])
 
 
@@ -48,7 +48,7 @@ def residuals(folder: Path) -> TlsResiduals:
 
 
 def changed(folder: Path, out: Path, model: Path, **keys: object) -> Path:
-    """The same measurement with another model, and with other keys; None takes one away."""
+    """Write the same measurement with another model and other keys; None removes a key."""
     out.mkdir()
     for name in ("scan_0.laz", "reference.ply"):
         (out / name).write_bytes((folder / name).read_bytes())
@@ -58,7 +58,9 @@ def changed(folder: Path, out: Path, model: Path, **keys: object) -> Path:
 
 
 def test_noise_of_points_is_told_from_relief() -> None:
-    """3 mm on a part of a ball of 5 m, 2 cm apart, to 5 % (10,000 points tell it to 1 %); none on waves of 1 m without noise."""
+    """3 mm of noise on part of a sphere of 5 m, with points 2 cm apart, is found to 5 % (10,000 points allow 1 %); on waves of 1
+    m without noise none is found.
+    """
     rng = np.random.default_rng(2)
     radial = workshop.rays(*rng.uniform([[0.0], [1.3]], [[0.6], [1.9]], (2, 20_000)))
     noise = estimate_point_noise((5 + 0.003 * rng.standard_normal((len(radial), 1))) * radial, SCANNER)
@@ -71,8 +73,11 @@ def test_noise_of_points_is_told_from_relief() -> None:
 
 
 def test_chords_across_a_ball_are_bent_back(tmp_path: Path) -> None:
-    """Seen from its middle every range is 5 m. The middle of a chord of c lies c^2 / 8 r inside, 31 micrometres for 3.5 cm, and a
-    triangle two thirds of that and more on average."""
+    """Seen from the centre every range is 5 m.
+
+    The middle of a chord of length c lies c^2 / 8 r inside (31 micrometres for 3.5 cm), and a triangle on average at least two
+    thirds of that.
+    """
     sweeps = 0.0035 * np.arange(180), 1.2 + 0.0035 * np.arange(180)
     azimuth, zenith = (each.ravel() for each in np.meshgrid(*sweeps, indexing="ij"))
     noise = 0.001 * np.random.default_rng(4).standard_normal((len(azimuth), 1))
@@ -99,8 +104,11 @@ def test_draws_of_the_vertices_errors_have_the_stated_variances(residuals: TlsRe
 
 
 def test_slopes_do_not_share_the_noise_of_the_ranges(tmp_path: Path) -> None:
-    """Level ground 1.7 m below: no slope by azimuth. That of a triangle is the noise of its corners, as is the range on it:
-    correlated by 4.6 standard deviations here, which passes for an error of the azimuth; that of planes is not."""
+    """Level ground 1.7 m below has no slope by azimuth.
+
+    The slope of a triangle comes from the noise of its corners, as does the range to it: their correlation of 4.6 standard
+    deviations would pass for an error of the azimuth. Fitted planes avoid it.
+    """
     rng = np.random.default_rng(8)
     azimuth, zenith = (
         each.ravel() for each in np.meshgrid(np.arange(-0.5, 0.5, 0.008), np.arange(1.9, 2.4, 0.004), indexing="ij")
@@ -118,7 +126,7 @@ def test_slopes_do_not_share_the_noise_of_the_ranges(tmp_path: Path) -> None:
 
 
 def test_edges_between_points_have_no_say(residuals: TlsResiduals) -> None:
-    """Most of the far points lie where the reference's own scatter about planes."""
+    """Most points with large residuals lie where the reference itself scatters about planes."""
     far = np.abs(residuals.value) > 5 * 1.4826 * np.median(np.abs(residuals.value))
     assert far.mean() > 0.01
     assert far[residuals.usable].mean() < 0.05 * far.mean()
@@ -126,7 +134,7 @@ def test_edges_between_points_have_no_say(residuals: TlsResiduals) -> None:
 
 
 def test_too_small_a_noise_is_named_and_then_nothing_is_missing(folder: Path, tmp_path: Path) -> None:
-    """As issue 20 has it of a real scan: 1 mm where it is 2.3, and the same on its own model_after."""
+    """A model with 1 mm of noise where a real scan has 2.3 mm (issue 20); on model_after, no gap remains."""
     found = diagnose(read_measurement(folder))
     assert (found.verdict, [each.name for each in found.effects]) == ("named", ["tls.range_noise"])
     whole = np.hypot(0.001, found.effects[0].entry["sigma_m"])
@@ -137,7 +145,7 @@ def test_too_small_a_noise_is_named_and_then_nothing_is_missing(folder: Path, tm
 
 
 def test_a_mesh_of_points_is_taken_for_what_it_is(folder: Path, tmp_path: Path) -> None:
-    """Where measurement.yaml does not say so, the scatter of its vertices does."""
+    """The scatter of the vertices shows that a reference was made from points, if measurement.yaml does not say so."""
     (tmp_path / "model.yaml").write_text(yaml.safe_dump(MODEL))
     unsaid = changed(folder, tmp_path / "mesh", tmp_path / "model.yaml", incidence=None, reference_error_m=None, notes=None)
     measurement = read_measurement(unsaid)
@@ -151,7 +159,7 @@ def test_a_mesh_of_points_is_taken_for_what_it_is(folder: Path, tmp_path: Path) 
 
 
 def test_a_lower_noise_is_the_instruments_alone(folder: Path, tmp_path: Path) -> None:
-    """A model of 6 mm, where it is 2.3 beside the reference's own: what is proposed is the former."""
+    """The model has 6 mm; the instrument has 2.3 mm beside the reference's noise. The proposed value is the instrument's."""
     noisy = MODEL | {"noise": {"range_sigma_m": 0.006, "angle_sigma_rad": 5e-5}}
     (tmp_path / "noisy.yaml").write_text(yaml.safe_dump(noisy))
     found = diagnose(read_measurement(changed(folder, tmp_path / "noisy", tmp_path / "noisy.yaml")))

@@ -1,4 +1,4 @@
-"""The report of `gap`: one for every verdict, one sign for both sensors, labels that can be read."""
+"""The report of `gap`: one for every verdict, one sign convention for both sensors, labels that can be read."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ MATRIX = {"names": ["tls.range_offset", "tls.range_scale"], "cosines": [[1.0, 0.
 
 @pytest.fixture(scope="module")
 def few(tmp_path_factory: pytest.TempPathFactory) -> tuple[GapDiagnosis, Measurement]:
-    """A diagnosis of some hundred points."""
+    """A diagnosis of a few hundred points."""
     folder = tmp_path_factory.mktemp("few")
     write_scan(folder, 1, step_rad=0.05)
     measurement = read_measurement(folder)
@@ -61,7 +61,9 @@ def few(tmp_path_factory: pytest.TempPathFactory) -> tuple[GapDiagnosis, Measure
     ],
 )
 def test_noises_are_split_by_what_they_depend_on(name: str, alike: str, expected: str) -> None:
-    """A second distance does not tell white disparities from smooth ones."""
+    """The proposed measurement varies what tells two noises apart; a second distance does not tell white from smoothed
+    disparities.
+    """
     item = NamedEffect(name, "physical", {"name": name.partition(".")[2]}, {}, (alike,), 0.002, 80.0)
     assert measurement_separating_noises(item, name.partition(".")[0]).startswith(expected)
 
@@ -97,7 +99,9 @@ def test_every_verdict_has_a_report(
 
 
 def test_what_is_closed_is_said_by_the_thresholds_of_the_diagnosis(few: tuple[GapDiagnosis, Measurement]) -> None:
-    """As it was diagnosed, wherever that is written: of a gap 500 of its errors wide none, where 1000 are asked for."""
+    """The thresholds of the diagnosis apply wherever it is written: with a minimum of 1000 standard errors a gap of 500
+    is none.
+    """
     found, measurement = few
     gap = Gap(before=0.006, after=0.001, floor=0.001, error=1e-5, floor_error=1e-5, points=100)
     strict = read_thresholds(["verdict.gap_sigmas=1000", "verdict.floor_sigmas=1000"])
@@ -106,7 +110,7 @@ def test_what_is_closed_is_said_by_the_thresholds_of_the_diagnosis(few: tuple[Ga
 
 
 def test_each_of_several_effects_says_what_it_takes_away(few: tuple[GapDiagnosis, Measurement]) -> None:
-    """Two of a kind take away the same, no more than the 4 mm that a range offset is."""
+    """Two equal effects each take away the same amount, at most the 4 mm of a range offset."""
     found, measurement = few
     first, second = contributions(replace(found, effects=(NAMED, NAMED)), measurement)
     np.testing.assert_array_equal(first, second)
@@ -144,7 +148,7 @@ def test_too_few_points_are_answered_with_what_to_measure(
 
 
 def _keep(path: Path, count: int) -> None:
-    """So many points of a binary PLY file of five doubles each."""
+    """Keep the first `count` points of a binary PLY file of five doubles each."""
     head, _, body = path.read_bytes().partition(b"end_header\n")
     rows = np.frombuffer(body, dtype="<f8").reshape(-1, 5)
     chosen = rows[np.linspace(0, len(rows) - 1, count).astype(int)]
@@ -154,7 +158,9 @@ def _keep(path: Path, count: int) -> None:
 
 @pytest.mark.parametrize("sensor", ["tls", "stereo"])
 def test_missing_rock_is_positive_of_both_sensors(few: tuple[GapDiagnosis, Measurement], sensor: str, tmp_path: Path) -> None:
-    """A surface 20 mm behind the reference: ranges 20 mm longer, disparities smaller by 20 mm over the depth of a pixel."""
+    """A surface 20 mm behind the reference: the ranges are 20 mm longer, the disparities smaller by 20 mm over the depth of a
+    pixel.
+    """
     found, measurement = few
     unit = 1.0 if sensor == "tls" else 0.25
     deeper = np.full(len(found.residuals), 0.02 / unit if sensor == "tls" else -0.02 / unit)
@@ -187,7 +193,7 @@ def test_missing_rock_is_red_and_one_bad_cell_does_not_set_the_colours(
 
 
 def test_labels_of_the_gap_do_not_overlap(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where all scores are equal, and where they differ; whiskers end within the axes."""
+    """The scores may be equal or different; the error bars end within the axes."""
     for gap in (GAP, replace(GAP, before=0.001, after=0.001), replace(GAP, before=0.0010001, after=0.0012, floor_error=0.1)):
         figure = _drawn(monkeypatch, lambda gap=gap: gap_figure(gap))
         (panel,) = figure.axes
@@ -199,7 +205,7 @@ def test_labels_of_the_gap_do_not_overlap(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def _drawn(monkeypatch: pytest.MonkeyPatch, draw: Any) -> Figure:
-    """The figure that becomes a PNG."""
+    """Return the figure that is saved as a PNG."""
     kept: list[Figure] = []
 
     def keep(figure: Figure, dpi: int = 110) -> bytes:
@@ -232,9 +238,10 @@ def test_a_value_ends_where_its_uncertainty_does(key: str, value: float, std: fl
 
 
 def test_losses_behind_shrubs_are_told_from_losses_by_a_covariate(few: tuple[GapDiagnosis, Measurement]) -> None:
-    """24,000 pulses on 40 m x 20 m, one in a hundred lost. Behind each of six shrubs of 0.8 m all of some 60 are, which is 8
+    """24,000 pulses on 40 m x 20 m, of which one in a hundred is lost, and all of about 60 behind each of six shrubs of 0.8 m: 8
     standard deviations of as many independent pulses as a bin has. Of 60 draws at most 3 may have a p-value below 0.01; with this
-    seed none has. A loss of 20 % more in half of the wall shows in each draw, with the shrubs before it."""
+    seed none has. A loss that is 20 % larger in half of the wall is found in each draw, shrubs included.
+    """
     random = np.random.default_rng(6)
     few_found, _ = few
     least = {False: [], True: []}

@@ -1,4 +1,4 @@
-"""Several scans of one instrument in one diagnosis: a pose for each set-up, one set of effects."""
+"""Several scans of one instrument in one diagnosis: one pose per set-up, and effects common to all."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ HERE, NEAR = (WIDTH * 0.42, -34.0, 2.5), (WIDTH * 0.55, -20.0, 1.0)
 
 
 def index(offset_rad: float) -> Any:
-    """An error of the vertical index."""
+    """Return a function that adds an error of the vertical index."""
     return lambda azimuth, zenith, line: (0 * azimuth, offset_rad + 0 * zenith)
 
 
@@ -50,7 +50,7 @@ def rows_of(found: TlsResiduals, measurement: TlsMeasurement, number: int) -> An
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> TlsMeasurement:
-    """From two places, without an effect."""
+    """Scans from two positions, without an effect."""
     return with_scan_order(of(tmp_path_factory.mktemp("scans") / "pair", (HERE, 1), (NEAR, 1), step_rad=0.02))
 
 
@@ -72,7 +72,7 @@ def test_each_scan_has_the_residuals_that_it_has_alone(pair: TlsMeasurement, res
 
 
 def test_every_set_up_is_registered_for_itself(pair: TlsMeasurement, residuals: TlsResiduals) -> None:
-    """Moved by its own pose, each scan's residuals are what slopes said, to second order."""
+    """After each scan is moved by its own pose, the residuals are as linearised, to second order."""
     pose = np.array([0.004, -0.003, 0.002, 1e-5, 2e-5, -3e-5, -0.002, 0.001, 0.003, -2e-5, 1e-5, 4e-5])
     moved = compute_residuals(pair.moved(pose))
     common = np.isin(residuals.index, moved.index) & residuals.usable
@@ -95,7 +95,9 @@ def test_scans_lie_apart_as_the_scanner_sees_them(pair: TlsMeasurement, residual
 
 
 def test_the_second_face_counts_angles_on(tmp_path: Path) -> None:
-    """Azimuth turned by pi, zenith angle 2 pi less: slopes by the zenith turn their sign, those by the pose stay."""
+    """Azimuths are turned by pi and zenith angles become 2 pi minus theirs: derivatives by the zenith change sign, those by the
+    pose do not.
+    """
     both = of(tmp_path / "faces", (HERE, 1), (HERE, 2), step_rad=0.02)
     found = compute_residuals(both)
     assert isinstance(found, TlsResiduals)
@@ -109,7 +111,7 @@ def test_the_second_face_counts_angles_on(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_an_ambiguous_effect_is_named_with_both_faces(tmp_path: Path) -> None:
-    """A vertical index, which a window of one face shows no better than a vertical eccentricity."""
+    """The effect is a vertical index, which one face alone cannot tell from a vertical eccentricity."""
     how = {"step_rad": 0.012, "angles": index(3e-4)}
     alone = diagnose(of(tmp_path / "one", (HERE, 1), **how))
     assert alone.verdict == "ambiguous"
@@ -140,7 +142,9 @@ def test_poses_that_are_not_one_for_each_file_are_refused(keys: dict[str, Any], 
 
 
 def test_raw_scans_from_two_places_are_one_measurement(tmp_path: Path) -> None:
-    """As E57 with their poses: `scanners` in the folder, and a word; a half of one is no reference for the other."""
+    """The E57 scans have poses: the folder gets `scanners`, and a message says so; half of one scan is no reference for the
+    other.
+    """
     write_scan(tmp_path, 5, scans=[(HERE, 1), (NEAR, 1)], step_rad=0.02)
     files = []
     for number, pose in enumerate(yaml.safe_load((tmp_path / "measurement.yaml").read_text())["scanners"]):
@@ -158,7 +162,7 @@ def test_raw_scans_from_two_places_are_one_measurement(tmp_path: Path) -> None:
 
 
 def test_a_place_from_which_too_little_is_seen_is_not_asked_for(pair: TlsMeasurement, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is no reason to give no answer."""
+    """A set-up with too few points does not prevent an answer."""
 
     def nothing(*_: Any) -> Any:
         raise InputError("240 of 358 points lie on smooth parts of the wall, 300 are needed", where="station")

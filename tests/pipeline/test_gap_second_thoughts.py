@@ -1,4 +1,6 @@
-"""What a diagnosis does where its first answer does not hold: rays that are turned off the wall, free forms that fail."""
+"""Where a first answer does not hold: effects that turn rays off the wall, free forms that fail validation, edge effects that are
+reconsidered.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ import numpy as np
 import pytest
 from gap_cases import write_scan
 
-from benchmarks.gap_challenge.cases import Case, make
+from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.formats.measurements.measurement import StereoMeasurement, read_measurement
 from pipeline.gap.mean.candidates import SPATIAL_NULL
 from pipeline.gap.naming import workflow
@@ -35,7 +37,7 @@ from sensors.stereo.stereo_pair import REDUCTION
 
 
 def test_an_effect_that_turns_all_rays_off_the_wall_leaves_no_residuals(tmp_path: Path) -> None:
-    """A principal point 10,000 px off, with an effect that looks at the raster of what is seen."""
+    """The principal point is wrong by 10,000 px, beside an effect that uses the raster of what is seen."""
     make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     measurement = read_measurement(tmp_path / "case")
     assert isinstance(measurement, StereoMeasurement)
@@ -94,8 +96,10 @@ def test_where_a_free_form_fails_all_is_named_again_without_any(
 
 
 def test_a_simulation_without_noise_departs_nowhere_from_the_surface(tmp_path: Path) -> None:
-    """Depth maps have cells of two pixels or more, the measurement's pixels are half a pixel off their middles: what the surface
-    does between is none of the sensor's."""
+    """Depth maps have cells of two pixels or more, whose centres differ by half a pixel from the measurement's pixels.
+
+    What the surface does between them must not count as an error of the sensor.
+    """
     make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     there, residuals, _ = align(read_measurement(tmp_path / "case"))
     assert isinstance(there, StereoMeasurement)
@@ -110,7 +114,7 @@ def test_a_simulation_without_noise_departs_nowhere_from_the_surface(tmp_path: P
 
 
 def test_outlines_grow_among_the_measurement_s_own_pixels_when_it_is_simulated(tmp_path: Path) -> None:
-    """On a depth map of finer cells the same radius reaches another width, from other steps."""
+    """On a depth map with finer cells the same radius would have another reach and start at other steps."""
     make(Case(0, (4, 1), "one", "stereo", ("edge_fattening",), 6_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     read = read_measurement(tmp_path / "case")
     plain = compute_residuals(read)
@@ -128,7 +132,9 @@ def test_outlines_grow_among_the_measurement_s_own_pixels_when_it_is_simulated(t
 
 
 def test_outlines_grow_where_a_turned_camera_sees_them_when_they_are_simulated(tmp_path: Path) -> None:
-    """Where they grow the simulation is to half a pixel what the residuals take off; on the nominal camera's view 18 % were."""
+    """Where outlines grow, the simulation agrees to half a pixel with what the residuals subtract; seen by the nominal camera
+    only 18 % did.
+    """
     make(
         Case(0, (6, 1), "two", "stereo", ("edge_fattening", "camera_omega"), 5000, 5000),
         tmp_path / "case",
@@ -150,7 +156,7 @@ def test_outlines_grow_where_a_turned_camera_sees_them_when_they_are_simulated(t
 
 
 def test_a_low_pass_that_others_feign_takes_no_outlines_along(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Seen only beside what was named, it does not count; what was seen with it does."""
+    """A smoothing that is seen only beside the named effects does not count, but grown outlines that were seen with it do."""
     nowhere = np.zeros(1, dtype=bool)
     seen = [EdgeEffect(effect, {}, 50.0, nowhere) for effect in (EdgeFattening(radius_px=3.0), Smoothing(sigma_px=2.0))]
 
@@ -176,7 +182,9 @@ def test_a_low_pass_that_others_feign_takes_no_outlines_along(monkeypatch: pytes
 def test_a_low_pass_is_tried_where_the_sensor_stays_unless_one_effect_explains_all(
     monkeypatch: pytest.MonkeyPatch, smooth: tuple[int, int], spreads: float, expected: set[str]
 ) -> None:
-    """One effect by itself that leaves no more spread; the answer is the least complex of what was tried."""
+    """The search at the initial pose is skipped if a single effect explains the residuals without more spread; the simplest
+    result wins.
+    """
     asked: dict[str, tuple[tuple[int, int], float]] = {
         "with_edge_effects": ((1, 3), 1.0),
         "without_edge_effects": (smooth, spreads),
@@ -205,7 +213,10 @@ def test_a_low_pass_is_tried_where_the_sensor_stays_unless_one_effect_explains_a
 
 
 def test_an_unknown_without_a_name_says_what_remains_is_most_like() -> None:
-    """The largest of what was tried, but mere places, with its size; nothing where chance leaves as much, or one was found."""
+    """The note names the largest form that was tried, except steps at a place, with its size.
+
+    There is no note if chance explains as much or if an effect was found.
+    """
 
     def item(name: str, score: float, form: str) -> Any:
         return SimpleNamespace(name=name, score=score, empirical=bool(form), candidate=SimpleNamespace(form=form))
@@ -223,7 +234,9 @@ def test_an_unknown_without_a_name_says_what_remains_is_most_like() -> None:
 
 
 def test_what_shapes_do_is_found_once_for_a_search(tmp_path: Path) -> None:
-    """A search has it of the whole raster, points that miss the reference included, and a trial in it takes that over."""
+    """The search takes the edge effects' change from the whole raster, including points that miss the reference, and passes it on
+    to its trials.
+    """
     make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     read = read_measurement(tmp_path / "case")
     there = read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 40.0}]))

@@ -1,4 +1,6 @@
-"""Effects where the surface is not smooth, and noise on a grid: measurements of the challenge's own generator."""
+"""Edge effects (smoothing, grown outlines, filled strips, beam footprints) and grid noise, on the closed-form
+generator's cases.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,9 @@ import numpy as np
 import pytest
 from scipy.interpolate import RectBivariateSpline
 
-from benchmarks.gap_challenge import stereo_effects
-from benchmarks.gap_challenge.cases import Case, make
-from benchmarks.gap_judge.cases import build, schedule
+from benchmarks.gap_closed_form import stereo_effects
+from benchmarks.gap_closed_form.cases import Case, make
+from benchmarks.gap_second_generator.cases import build, schedule
 from pipeline.formats.measurements.measurement import Measurement, TlsMeasurement, read_measurement
 from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.naming import effect_selection as steps
@@ -42,7 +44,7 @@ Made = tuple[Measurement, Residuals, dict[str, Any]]
 
 
 def made(tmp_path: Path, sensor: str, kinds: tuple[str, ...], seed: int) -> Made:
-    """A measurement with the effects `kinds`, its residuals, and the true parameters of the first of them."""
+    """Return a measurement with the effects `kinds`, its residuals, and the true parameters of the first effect."""
     stratum = "one" if kinds else "none"
     make(Case(0, (seed, 1), stratum, sensor, kinds, 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     effects = json.loads((tmp_path / "truth.json").read_text())["effects"]
@@ -51,7 +53,7 @@ def made(tmp_path: Path, sensor: str, kinds: tuple[str, ...], seed: int) -> Made
 
 
 def shapes_of(case: Made) -> dict[str, Any]:
-    """The effects on the shape of disparities, by name."""
+    """Return the edge effects that are found in disparities, by name."""
     there, residuals, _ = case
     return {
         each.name: each
@@ -77,7 +79,7 @@ def test_outlines_that_grow_are_found_with_their_reach(tmp_path: Path) -> None:
 
 
 def test_outlines_that_grow_at_high_steps_alone_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A matcher that follows slopes as others break at them: what it takes for a step is in no measurement."""
+    """The matcher follows low steps like slopes; the measurement does not say which height it takes for a step."""
     monkeypatch.setattr(stereo_effects, "_STEP_PX", 4.0)
     there, residuals, truth = case = made(tmp_path, "stereo", ("edge_fattening",), 4)
     raster = DisparityRaster.of(there, residuals.geometry)
@@ -90,8 +92,10 @@ def test_outlines_that_grow_at_high_steps_alone_are_found(tmp_path: Path, monkey
 
 
 def test_a_low_pass_takes_the_relief_off_what_a_move_changes(tmp_path: Path) -> None:
-    """Against moving the cameras and low-passing the reference anew, on a wall with ledges and relief; by mm and tens of
-    microradians, where the change is straight. Points beside what no pixel sees are left out: the low-pass does not know it."""
+    """The derivatives by the pose are compared with moving the cameras and smoothing the reference again, on a wall with ledges
+    and relief. Moves of millimetres and tens of microradians are small enough to be linear. Points beside what no pixel sees are
+    left out, because the smoothing does not know it.
+    """
     make(Case(0, (5, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     read = read_measurement(tmp_path / "case")
     there = read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 40.0}]))
@@ -109,7 +113,7 @@ def test_a_low_pass_takes_the_relief_off_what_a_move_changes(tmp_path: Path) -> 
 
 
 def test_a_cut_cloud_has_the_low_pass_of_the_whole_picture(tmp_path: Path) -> None:
-    """Clouds are cut, and matched before: beside the cut a low-pass sees what was cut off."""
+    """Clouds are matched first and cut then: at a cut, the smoothing has seen what was cut off."""
     make(Case(0, (5, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     read = read_measurement(tmp_path / "case")
     there = read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 30.0}]))
@@ -142,7 +146,7 @@ def test_nothing_is_matched_outside_of_the_right_picture(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("sigma_px", [4.0, 10.0])
 def test_a_low_pass_sees_over_a_straight_border_from_so_many_sigmas(sigma_px: float) -> None:
-    """More than a hundredth of a Gaussian lies beyond 2.326 standard deviations; cells' middles are half a cell inside."""
+    """More than a hundredth of a Gaussian lies beyond 2.326 standard deviations; cell centres are half a cell inside."""
     row, column = (np.ravel(each) for each in np.indices((120, 120)))
     raster = DisparityRaster(1.0, np.full((120, 120), 30.0), np.zeros((120, 120), dtype=bool), row, column)
     away, found = np.minimum(column, 119 - column) + 0.5, raster.near_border(sigma_px)
@@ -159,14 +163,14 @@ def test_a_raster_too_large_for_shapes_is_told(tmp_path: Path, monkeypatch: pyte
 
 
 def banded(monkeypatch: pytest.MonkeyPatch, cells: int, rows: int) -> None:
-    """Searches look among so many cells, in bands of at least so many rows."""
+    """Make searches use at most `cells` cells, in bands of at least `rows` rows."""
     monkeypatch.setattr(disparity_raster, "_SEARCHED", cells)
     monkeypatch.setattr(disparity_raster, "_LEAST_ROWS", rows)
 
 
 @pytest.mark.parametrize("shape", [(700, 300), (120, 400), (40, 3000)])
 def test_bands_of_a_large_raster_hold_what_the_whole_does(shape: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Bands far apart, that meet, and that are all of the picture; effects that reach 32 cells at the most."""
+    """The bands are far apart, touch, or cover the whole image; effects reach 32 cells at most."""
     banded(monkeypatch, 20_000, 20)
     random, (row, column) = np.random.default_rng(5), np.indices(shape)
     disparity = 40 + row / 50 + 6.0 * (np.sin(row / 17) * np.cos(column / 23) > 0.3)
@@ -186,7 +190,9 @@ def test_bands_of_a_large_raster_hold_what_the_whole_does(shape: tuple[int, int]
 
 
 def test_filled_gaps_show_as_copies_of_their_neighbours() -> None:
-    """Runs of equal disparities, to a thousandth of the noise; neighbours in a column, and across a gap, are none."""
+    """Copies are runs of equal disparities in a row, to a thousandth of the noise; neighbours in a column or across a gap are
+    none.
+    """
     random = np.random.default_rng(7)
     cells = random.normal(scale=0.3, size=(40, 60))
     cells[5, 10:14] = cells[5, 9]
@@ -206,7 +212,9 @@ def test_filled_gaps_show_as_copies_of_their_neighbours() -> None:
 
 
 def test_outlines_in_few_places_agree_by_signs() -> None:
-    """A block of 60 points and 14 of two, all for it: 15 of 15 signs are 3.9 deviations, the sums, of which one is most, 1.5."""
+    """One block of 60 points and 14 of two all agree: 15 of 15 signs are 3.9 standard deviations; the sums, of which one is
+    largest, are only 1.5.
+    """
     number = np.repeat(np.arange(15), [60, *[2] * 14])
     blocks, gains = WallBlocks(number), np.full(len(number), 2.0)
     assert blocks.total_if_agreed(gains) is None
@@ -219,7 +227,7 @@ def test_outlines_in_few_places_agree_by_signs() -> None:
 def test_shapes_are_found_in_bands_of_a_large_raster(
     tmp_path: Path, kind: str, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As in the whole, and with the points that they touch in all of it."""
+    """The values agree with those of the whole raster, and the touched points are found in all of it."""
     case = made(tmp_path, "stereo", (kind,), seed)
     whole = shapes_of(case)[kind]
     banded(monkeypatch, 8_000, 16)
@@ -281,8 +289,9 @@ def test_a_thin_beam_shows_no_footprint(tmp_path: Path, seed: int) -> None:
 
 
 def test_the_noise_of_angles_is_no_footprint(tmp_path: Path) -> None:
-    """A pencil whose directions scatter by 55 microradians, on ledges of strata: at edges it records on average what a beam of
-    four times that does (a quiet case of the second judge, who cast no footprint)."""
+    """A beam without a footprint, whose directions scatter by 55 microradians, hits ledges: at edges it records on average what a
+    beam of four times that divergence does (a case of the second generator, which has no footprints).
+    """
     build(schedule(78, 40)[26], 78, tmp_path / "case")
     there, residuals, _ = align(read_measurement(tmp_path / "case"))
     assert isinstance(there, TlsMeasurement)
@@ -297,7 +306,7 @@ def test_the_noise_of_angles_is_no_footprint(tmp_path: Path) -> None:
 @pytest.mark.parametrize("every", [1, 2])
 @pytest.mark.parametrize(("kind", "seed"), [("parallax_noise", 2), ("regularization_noise", 9)])
 def test_white_noise_and_noise_on_a_grid_are_told_apart(tmp_path: Path, kind: str, seed: int, every: int) -> None:
-    """Also where rows lie twice as far apart as columns, as of a map of which every second row is compared."""
+    """Also where rows lie twice as far apart as columns, because every second row of a map is compared."""
     there, residuals, truth = made(tmp_path, "stereo", (kind,), seed)
     row = residuals.geometry.sensor_coordinates[:, 1]
     step = raster_spacing_px(row)
@@ -314,7 +323,9 @@ def test_white_noise_and_noise_on_a_grid_are_told_apart(tmp_path: Path, kind: st
 
 @pytest.mark.parametrize(("kind", "seed", "empirical"), [("parallax_noise", 2, True), ("regularization_noise", 9, False)])
 def test_noise_on_a_grid_goes_before_an_empirical_term(tmp_path: Path, kind: str, seed: int, empirical: bool) -> None:
-    """Of few nodes some are noisier by chance, whatever covariate they are sorted by; white noise keeps its empirical term."""
+    """Some of few nodes are noisier by chance, whichever covariate sorts them, so grid noise replaces an empirical term; white
+    noise keeps it.
+    """
     there, residuals, _ = made(tmp_path, "stereo", (kind,), seed)
     part = residuals.part(residuals.usable)
     value = fit_pose_robustly(part)[0]
@@ -327,7 +338,7 @@ def test_noise_on_a_grid_goes_before_an_empirical_term(tmp_path: Path, kind: str
 
 
 def test_noise_on_a_coarse_grid_is_found_where_no_point_is_noisier_than_it_should_be(tmp_path: Path) -> None:
-    """Nodes 64 px apart, 0.23 px: within a cell of the search all points err alike."""
+    """Nodes are 64 px apart, with 0.23 px: within a cell of the search all points have the same error."""
     there, residuals, truth = made(tmp_path, "stereo", ("regularization_noise",), 8)
     part = residuals.part(residuals.usable)
     assert isinstance(there.model, StereoModel)
@@ -343,8 +354,11 @@ def _few_families(measurement: Measurement, part: Residuals) -> list[Candidate |
 
 
 def test_noise_on_a_coarse_grid_counts_as_no_error_of_the_reference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All is named again beside it: noise shared over cells had passed for a reference that is off by as much, so that with its
-    name the model predicted too wide a scatter of patches, and the right name went."""
+    """Effects are selected again beside the grid noise.
+
+    Otherwise the noise passes for an equal error of the reference; then, with the noise named, the model predicts too wide a
+    scatter of patches, and the right name is lost.
+    """
     there, residuals, _ = made(tmp_path, "stereo", (), 1)
     left = residuals.covariates["image_x"]
     part = residuals.part(residuals.usable & (left < np.median(left)))
@@ -367,7 +381,7 @@ def test_noise_on_a_coarse_grid_counts_as_no_error_of_the_reference(tmp_path: Pa
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
 def test_the_reference_error_is_not_taken_for_noise_on_a_grid(tmp_path: Path, seed: int) -> None:
-    """A few millimetres, correlated over metres."""
+    """The reference's error is a few millimetres, correlated over metres."""
     there, residuals, _ = made(tmp_path, "stereo", (), seed)
     part = residuals.part(residuals.usable)
     assert isinstance(there.model, StereoModel)
@@ -378,7 +392,9 @@ def test_the_reference_error_is_not_taken_for_noise_on_a_grid(tmp_path: Path, se
 def test_noise_that_neighbours_share_is_the_reference_s_error_only_where_that_may_be_so(
     tmp_path: Path, off_m: float, length_m: float, found: bool
 ) -> None:
-    """A reference is wrong by centimetres over metres, not over decimetres; an error of it that is let stand is spoken of."""
+    """A reference may be wrong by centimetres over metres, but not over decimetres; if an error is attributed to it, the note
+    says so.
+    """
     there, residuals, _ = made(tmp_path, "stereo", (), 1)
     part = residuals.part(residuals.usable)
     random = np.random.default_rng(3)

@@ -16,7 +16,7 @@ SHARED = Path(__file__).parents[3] / "shared" / "measurements"
 @pytest.mark.slow
 @pytest.mark.skipif(not SHARED.exists(), reason="the shared measurements are not part of the project")
 def test_a_second_gap_on_the_corrected_model_answers_no_gap(tmp_path: Path) -> None:
-    """Of an effect outside the catalogue; test_gap.py has one of the catalogue."""
+    """The effect is outside the catalogue; test_gap.py tests one of the catalogue."""
     measurement = read_measurement(SHARED / "tls_outside_catalogue")
     found = diagnose(measurement)
     assert found.verdict == "unknown"

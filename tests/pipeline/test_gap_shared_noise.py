@@ -1,4 +1,4 @@
-"""Noise that neighbours share, in the search for the mean and on held-out blocks, against dense covariance matrices."""
+"""Noise that neighbours share, in the search for the mean and on validation blocks, against dense covariance matrices."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ NOWHERE = PixelGeometry(*[np.zeros(1)] * 12)
 
 
 def raster(side: int = SIDE) -> FloatArray:
-    """(n, 2) pixels."""
+    """Return pixels (n, 2)."""
     return STRIDE * np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2).astype(float)
 
 
 def dense(field: NodeField) -> FloatArray:
-    """(n, n) covariance of what neighbours share."""
+    """Return the covariance (n, n) of what neighbours share."""
     weights = field.weights.toarray()
     return np.asarray(weights @ field.covariance @ weights.T)
 
 
 def model_of(pixels: FloatArray) -> tuple[MeanModel, FloatArray]:
-    """On cells of 16 points, and the covariance of the noise over sigma, in the model's rows."""
+    """Return a mean model on cells of 16 points, and the covariance of the noise over sigma, for the model's rows."""
     number = np.unique(pixels // (4 * STRIDE) @ np.array([1, 1000]), return_inverse=True)[1]
     centre = np.stack([np.bincount(number, pixels[:, axis]) / 16 for axis in (0, 1)], axis=1)
     model = MeanModel(
@@ -70,7 +70,9 @@ def _planes(model: MeanModel, count: int) -> FloatArray:
 
 @pytest.mark.parametrize("step_px", [16.0, 48.0])
 def test_noise_of_two_makers_is_that_of_both_on_one_grid_of_nodes(step_px: float) -> None:
-    """The finer grid carries the coarser noise too: root mean square of 4 % of the variance off, where one by itself is by 5."""
+    """The finer grid also represents the coarser noise, with a root mean square error of 4 % of the variance; one alone has
+    5 %.
+    """
     pixels = raster(32)
     makers = NOISE, RegularizationNoise(sigma_px=0.2, step_px=step_px)
     both = GridCorrelatedNoise(makers, pixels).node_field(len(pixels))
@@ -84,7 +86,7 @@ def test_noise_of_two_makers_is_that_of_both_on_one_grid_of_nodes(step_px: float
 
 
 def test_draws_have_the_variance_of_the_products_that_they_stand_for() -> None:
-    """4,000 draws: the variance scatters by 2.2 %; 10 %."""
+    """The variance of 4,000 draws scatters by 2.2 %; 10 % are allowed."""
     pixels = raster(24)
     model, _ = model_of(pixels)
     slow = np.sin(2 * np.pi * pixels[:, :1] / 80)
@@ -112,7 +114,7 @@ def test_the_score_on_held_out_blocks_is_the_density_of_all_points_together() ->
 
 
 def noisy(seed: int, pixels: FloatArray, cholesky: FloatArray) -> StereoResiduals:
-    """Nothing but noise; the pose is a parabola over the wall."""
+    """Return residuals of noise alone; the pose is a parabola over the wall."""
     random = np.random.default_rng(seed)
     value = cholesky @ random.standard_normal(cholesky.shape[1]) + WHITE * random.standard_normal(len(pixels))
     at = pixels / 40.0
@@ -125,7 +127,7 @@ def noisy(seed: int, pixels: FloatArray, cholesky: FloatArray) -> StereoResidual
 
 
 def p_values(seeds: int, monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Of what remains in measurements of nothing but noise, all free forms along either axis searched."""
+    """Return p-values of the remainder in measurements of noise alone, with all free forms along both axes searched."""
     monkeypatch.setattr(wall_blocks, "_MOST_CELLS", 100)
     pixels = raster(60)
     field = GridCorrelatedNoise((NOISE,), pixels).node_field(len(pixels))
@@ -142,8 +144,10 @@ def p_values(seeds: int, monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_noise_that_neighbours_share_is_not_said_to_be_too_large_since_cells_take_some_of_it(seed: int) -> None:
-    """Its mean square within cells is below white noise's (the control). A measurement less noisy than that is said to be so:
-    some 150 nodes, the share scatters by 6 %; 20 %."""
+    """Its mean square within cells is below that of white noise (the control).
+
+    A measurement that is less noisy is reported so: with about 150 nodes the share scatters by 6 %; 20 % are allowed.
+    """
     pixels = raster(100)
     field = GridCorrelatedNoise((NOISE,), pixels).node_field(len(pixels))
     residuals = noisy(seed, pixels, field.weights @ np.linalg.cholesky(field.covariance))
@@ -156,6 +160,6 @@ def test_noise_that_neighbours_share_is_not_said_to_be_too_large_since_cells_tak
 
 @pytest.mark.slow
 def test_what_remains_has_an_even_p_value_where_there_is_nothing_but_noise(monkeypatch: pytest.MonkeyPatch) -> None:
-    """40 measurements; Kolmogorov-Smirnov at 0.1 %, which the right distribution fails once in a thousand seeds."""
+    """40 measurements; Kolmogorov-Smirnov at 0.1 %, which the right distribution fails for one seed in a thousand."""
     found = p_values(40, monkeypatch)
     assert kstest(found, "uniform").pvalue > 0.001, sorted(found)

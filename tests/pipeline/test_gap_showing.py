@@ -1,4 +1,4 @@
-"""The last step of `gap`: what makes the model predict worse is taken out again, what makes it predict better stays."""
+"""The last step of `gap`: named effects that make the model predict worse are removed, those that improve it are kept."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from scene.common.keyed_random import KeyedRandom
 
 
 def _biased(coefficient_m: float) -> Callable[[Scan], Array]:
-    """Ranges that grow with the incidence angle."""
+    """Return a function that makes ranges grow with the incidence angle."""
     return lambda scan: scan.R + coefficient_m * (1 / scan.cos_i - 1)
 
 
 def _validation(folder: Path, ranges: Callable[[Scan], Array]) -> Validation:
-    """What a gap is measured with, of a scan with some ranges."""
+    """Return the input for measuring a gap, for a scan with the given ranges."""
     write_scan(folder, 8, ranges=ranges, step_rad=0.007)
     there, residuals, _ = align(read_measurement(folder))
     held_out = in_validation_blocks(residuals.wall_xy, WallCells.over(residuals.wall_xy).side_m)
@@ -47,7 +47,7 @@ def _named(name: str, key: str, value: float) -> NamedEffect:
 
 
 def test_a_harmful_effect_is_taken_out_and_a_true_one_stays(tmp_path: Path) -> None:
-    """Beside a true effect a noise is named that is not there, ten times the true one."""
+    """Beside a true effect a noise of ten times the true one is named that is not there."""
     true, wrong = _named("range_incidence_bias", "coefficient_m", 0.01), _named("range_noise", "sigma_m", 0.03)
     result, words = _validation(tmp_path, _biased(0.01)).validate([wrong, true])
     assert result.named == [true]
@@ -68,14 +68,17 @@ def test_a_harmful_effect_is_taken_out_and_a_true_one_stays(tmp_path: Path) -> N
 def test_an_effect_that_does_little_harm_is_taken_out_too(
     tmp_path: Path, name: str, key: str, value: float, kind: str, kept: int
 ) -> None:
-    """Half as much noise again, no more than chance would make of it, goes, named or not, and so does a description that clearly
-    does harm; what is there, and as small, stays."""
+    """Half as much noise again, no more than chance would make, is removed whether named or not, and so is a description that
+    clearly does harm; an equally small effect that is there is kept.
+    """
     result, _ = _validation(tmp_path, _biased(0.003)).validate([replace(_named(name, key, value), kind=kind)])
     assert len(result.named) == kept
 
 
 def test_drops_are_no_harm_to_ranges_on_the_wall(tmp_path: Path) -> None:
-    """A fifth of what rain takes comes back from drops, anywhere before the wall: a range on the wall says nothing of that."""
+    """A fifth of what rain removes comes back as returns from drops before the wall, which say nothing about ranges on
+    the wall.
+    """
     true = _named("range_incidence_bias", "coefficient_m", 0.01)
     rain = {"name": "precipitation", "rate_per_m": 2e-3, "early_share": 0.2}
     drops = replace(_named("precipitation", "rate_per_m", 2e-3), entry=rain)
@@ -88,8 +91,10 @@ def test_drops_are_no_harm_to_ranges_on_the_wall(tmp_path: Path) -> None:
 
 
 def test_harm_is_that_of_the_same_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An effect brings points near that were too far off to count: 7 mm without it on all of these, 3 with it. That the
-    others score 1 mm alone, and that a few held-out edges score worse, is nothing against it."""
+    """An effect brings points near that were too far off to count: without it all of these score 7 mm, with it 3.
+
+    That the others score 1 mm alone, and a few validation edges score worse, does not count against it.
+    """
     validation = _validation(tmp_path, _biased(0.003))
     with_it, alone = {True: (0.009, 0.011), False: (0.007, 0.003)}, {True: (0.001, 0.001), False: (0.001, 0.001)}
 
@@ -105,8 +110,10 @@ def test_harm_is_that_of_the_same_points(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_a_few_points_far_off_do_not_stand_for_the_wall(tmp_path: Path) -> None:
-    """In a strip, 4 % of the wall, a term moves all points by 30 cm, and half of them are there: it neither helps nor harms. The
-    bias of some millimetres beside it is what the gap tells of, which the strip's points as they are would make 23 mm."""
+    """A term moves a strip of 4 % of the wall by 30 cm, where half of the points are: it neither improves nor harms.
+
+    The gap shows a bias of some millimetres beside it; the strip's own points would make it 23 mm.
+    """
     middle, half = 1.5, 0.02
 
     def moved(scan: Scan) -> Array:

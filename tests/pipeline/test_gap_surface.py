@@ -41,7 +41,7 @@ def wall(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def coarse(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same wall by fewer triangles, where its chords do not matter."""
+    """The same wall with fewer triangles, for tests in which chord errors do not matter."""
     path = tmp_path_factory.mktemp("wall") / "wall.ply"
     write_wall(path, step=0.15)
     return path
@@ -62,13 +62,13 @@ def answered(wall: Path, folder: Path, seed: int, **how: Any) -> tuple[GapDiagno
 
 
 def bowl(x: Array, z: Array) -> Array:
-    """Zero in the wall's middle, BOWL in the middle of each margin, twice that in the corners."""
+    """Return a deformation: zero in the wall's middle, BOWL in the middle of each margin, twice that in the corners."""
     return BOWL * (((x - WIDTH / 2) / (WIDTH / 2)) ** 2 + ((z - HEIGHT / 2) / (HEIGHT / 2)) ** 2)
 
 
 @pytest.mark.slow
 def test_clouds_with_noise_alone_leave_no_gap(wall: Path, tmp_path: Path) -> None:
-    """Even p-values by Kolmogorov and Smirnov, which one of a hundred right diagnoses fails."""
+    """The p-values are uniform by Kolmogorov-Smirnov, which one of a hundred right diagnoses fails."""
     p_values = []
     for seed in range(NULLS):
         (tmp_path / str(seed)).mkdir()
@@ -84,7 +84,7 @@ def test_clouds_with_noise_alone_leave_no_gap(wall: Path, tmp_path: Path) -> Non
 
 @pytest.mark.slow
 def test_the_files_of_a_bowl(wall: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One command; it is described over the place with its size, and loadable by a simulation, which then shows it."""
+    """The bowl is described over the place on the wall with its size; a simulation can load the model and then shows the bowl."""
     write_cloud(tmp_path / "cloud.ply", cloud(1, above=bowl))
     words = ["gap", str(tmp_path / "cloud.ply"), "--reference", str(wall), "--photographs", "--out", str(tmp_path / "out")]
     assert main([*words, "--quiet"]) == 0
@@ -119,7 +119,7 @@ def test_a_wrong_scale_is_said(ppm: float, wall: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_fallen_block_is_a_change(wall: Path, tmp_path: Path) -> None:
-    """Of 1 m x 1 m x 0.15 m."""
+    """The block has 1 m x 1 m x 0.15 m."""
     _, answer = answered(wall, tmp_path, 2, niche=(8.0, 9.0, 0.15))
     (change,) = answer["scene_changes"]
     assert abs(change["volume_m3"] - 0.15) < 2.5 * change["volume_std_m3"]
@@ -130,7 +130,7 @@ def test_a_fallen_block_is_a_change(wall: Path, tmp_path: Path) -> None:
 
 
 def test_distances_places_and_slopes_are_those_of_the_wall(wall: Path, tmp_path: Path) -> None:
-    """A cloud without noise, 5 mm above the wall, in its place."""
+    """The cloud has no noise and lies 5 mm above the wall, at the right place."""
     points = cloud(1, sigma=0.0, above=lambda x, z: np.full_like(x, 0.005), moved=(0.0, 0.0, 0.0), turn_rad=0.0, points=4000)
     measurement = built(wall, tmp_path, points + 1e-4 * np.random.default_rng(2).standard_normal(points.shape))
     found = compute_residuals(measurement)
@@ -145,7 +145,7 @@ def test_distances_places_and_slopes_are_those_of_the_wall(wall: Path, tmp_path:
 
 @pytest.mark.parametrize("column", range(7))
 def test_the_datum_is_differentiated(column: int, coarse: Path, tmp_path: Path) -> None:
-    """Each of the seven values against a cloud that is really moved by it, about a cloud in its place."""
+    """The derivatives by each of the seven datum parameters are compared with a cloud that is actually moved."""
     measurement = built(coarse, tmp_path, cloud(1, sigma=1e-4, moved=(0.0, 0.0, 0.0), turn_rad=0.0, points=3000))
     before = compute_residuals(measurement)
     step = np.eye(7)[column] * (2e-3 if column < 3 else 2e-4)
@@ -158,7 +158,7 @@ def test_the_datum_is_differentiated(column: int, coarse: Path, tmp_path: Path) 
 
 
 def test_a_plane_tells_no_scale(tmp_path: Path) -> None:
-    """Nor roughness or slope, which differ by rounding alone."""
+    """On a plane the scale cannot be determined, nor effects of roughness or slope, which differ there only by rounding."""
     x, z = (each.ravel() for each in np.meshgrid(np.linspace(0, 8, 90), np.linspace(0, 5, 60)))
     rng = np.random.default_rng(1)
     flat = np.stack([x, 0 * x, z], axis=1)
@@ -179,7 +179,9 @@ def test_a_plane_tells_no_scale(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.8])
 def test_the_noise_of_a_cloud_is_found(share: float, wall: Path, tmp_path: Path) -> None:
-    """Its size, and what neighbours share of it: values on nodes 0.6 m apart, of the given share of the variance."""
+    """Both its size and the share that neighbours have in common: values on nodes 0.6 m apart, with the given share of the
+    variance.
+    """
     rng = np.random.default_rng(5)
     nodes = rng.standard_normal((60, 60)) * 1.5 * SIGMA * np.sqrt(share)
 
@@ -198,7 +200,7 @@ def test_the_noise_of_a_cloud_is_found(share: float, wall: Path, tmp_path: Path)
 
 
 def test_meshes_and_elevation_models_are_taken_as_they_are(coarse: Path, tmp_path: Path) -> None:
-    """The wall's own mesh is no cloud; of an elevation model the pixels are."""
+    """The vertices of a mesh and the pixels of an elevation model are used as points."""
     found = build_surface(Request([coarse], str(coarse)), tmp_path / "mesh")
     assert "the vertices of a mesh" in found.about["points"][0]
     grid = Grid(0.0, 8.0, 0.1, 120, 80)
@@ -218,7 +220,7 @@ BAD = {
     "one point": "has 1 points",
     "all NaN": "no point with finite values",
     "scanner": "needs laser scans",
-    "half": "half needs scans",
+    "half": "half works only with laser scans",
     "cameras too": "whose cameras are not at hand",
     "a model in pixels": "a model whose noise is in metres",
     "cameras in the model": "the model has focal_length",
@@ -267,7 +269,7 @@ def test_points_without_a_number_are_left_out_with_a_word(coarse: Path, tmp_path
 
 
 def test_what_a_cloud_alone_lacks_is_said(coarse: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """Without a word on what took it, and without a reference."""
+    """With or without a reference, a cloud does not say what measured it: the message names --photographs."""
     write_cloud(tmp_path / "cloud.ply", cloud(1, points=2000))
     for words in ([], ["--reference", str(coarse)]):
         assert main(["gap", str(tmp_path / "cloud.ply"), *words, "--out", str(tmp_path / "out")]) == 2

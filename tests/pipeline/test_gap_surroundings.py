@@ -1,11 +1,11 @@
-"""What lies about the places that pixels see, which is looked for once."""
+"""The surroundings of the places that pixels see, which are cast once and reused."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from benchmarks.gap_challenge.cases import Case, make
+from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.formats.measurements.measurement import StereoMeasurement, read_measurement
 from pipeline.formats.measurements.surroundings import Surroundings
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals, with_surroundings
@@ -22,7 +22,7 @@ def measurement(tmp_path_factory: pytest.TempPathFactory) -> StereoMeasurement:
 
 
 def _casts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The rays of each cast from here on."""
+    """Collect the rays of each cast from here on."""
     counts: list[int] = []
     cast = RayCaster.cast
 
@@ -51,7 +51,7 @@ def test_a_pair_that_stands_still_casts_one_ray_a_pixel(measurement: StereoMeasu
 def test_pixels_that_see_other_places_are_looked_at_again(
     measurement: StereoMeasurement, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Known of places a third of a pixel away it is taken over, whatever it says; of places five pixels away it is not."""
+    """Surroundings known for places a third of a pixel away are reused; for places five pixels away they are cast again."""
     expected = stereo_residuals(measurement)
     about = with_surroundings(measurement, expected).surroundings
     assert about is not None

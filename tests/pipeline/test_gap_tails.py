@@ -1,4 +1,4 @@
-"""Points far out: how many, where, and what they may and may not say of an instrument."""
+"""Outliers: how many there are, where they lie, and what may be concluded about an instrument from them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ POINTS, BLOCKS = 30_000, 100
 
 
 def _residuals(share: float, uneven: bool, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Normal residuals of which a share is ten times as wide: at random, or in one block of six."""
+    """Return normal residuals of which a share is ten times as wide: at random, or in one block of six."""
     rng = np.random.default_rng(seed)
     block = rng.integers(0, BLOCKS, POINTS)
     chance = np.where(block % 6 == 0, 6 * share, 0.0) if uneven else share
@@ -33,7 +33,7 @@ def test_normal_residuals_have_no_tails() -> None:
 
 @pytest.mark.parametrize("uneven", [False, True])
 def test_where_far_points_lie_says_whose_they_are(uneven: bool) -> None:
-    """Of 3 % of width 10 a share of 0.689 lies beyond 4: P(|z| > 0.4)."""
+    """Of 3 % with ten times the width a share of 0.689 lies beyond 4: P(|z| > 0.4)."""
     found = find_heavy_tails(*_residuals(0.03, uneven))
     assert found is not None
     assert found.uniform is not uneven
@@ -43,7 +43,7 @@ def test_where_far_points_lie_says_whose_they_are(uneven: bool) -> None:
 
 
 def test_what_far_points_gain_is_a_log_likelihood_and_not_their_number() -> None:
-    """Of a mixture over a normal distribution: an oracle by the same densities written out."""
+    """The gain of a mixture over a normal distribution, compared with the same densities written out."""
     z, block = _residuals(0.03, False)
     found = find_heavy_tails(z, block)
     assert found is not None
@@ -79,7 +79,7 @@ def test_an_effect_that_registration_undoes_is_not_believed_at_38_times_its_size
 def test_such_an_effect_stands_where_it_leaves_no_more_than_chance(
     p_value: float | None, empirical: bool, all_of_it: bool
 ) -> None:
-    """Whatever only looks like it leaves something: its signature is another one."""
+    """An effect that is implausibly large is kept if it leaves nothing; one that only looks similar has another signature."""
     estimate = SimpleNamespace(candidate=SimpleNamespace(empirical=empirical))
     found: Any = SimpleNamespace(
         search=SimpleNamespace(goodness_of_fit_p_value=lambda _: p_value), tried=(), estimates=[estimate]
@@ -88,7 +88,9 @@ def test_such_an_effect_stands_where_it_leaves_no_more_than_chance(
 
 
 def test_an_effect_that_is_not_believed_stays_in_the_class_of_what_looks_like_it() -> None:
-    """A camera turned by 23 times the usual looks as a tangential distortion does: whichever it is, it is not named alone."""
+    """A camera turned by 23 times the typical size looks like a tangential distortion: whichever it is, neither is
+    named alone.
+    """
     turn: Any = SimpleNamespace(name="camera_omega", empirical=False)
     chosen = SelectedEffect(turn, ("tangential_distortion",), 0.002, 70.0, 67.0, ())
     named = [
@@ -105,7 +107,9 @@ def test_an_effect_that_is_not_believed_stays_in_the_class_of_what_looks_like_it
 
 
 def test_what_is_named_in_the_place_of_an_effect_that_is_not_believed_shares_its_class() -> None:
-    """A drift of the tilt that was not there beside a vertical index is what that leaves; an offset that was there is not."""
+    """A tilt drift that is only what the implausible vertical index leaves joins its class; an offset that was there anyway does
+    not.
+    """
     index: Any = SimpleNamespace(name="vertical_index", empirical=False)
     chosen = SelectedEffect(index, (), 0.002, 70.0, 67.0, ())
     named = [

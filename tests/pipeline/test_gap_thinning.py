@@ -1,4 +1,4 @@
-"""Scans of more points than are looked at: what is drawn, that lost pulses are drawn as often, and that the answer stays."""
+"""Scans with more points than are used: which points are drawn, lost pulses are drawn as often, and the answer is the same."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _scan(folder: Path) -> TlsMeasurement:
 
 
 def test_points_are_drawn_alike_all_over_the_scan_and_lost_pulses_as_often(tmp_path: Path) -> None:
-    """Shares within 4 of their standard errors: the count, that of either half of the lines, that of the losses."""
+    """Within 4 standard errors: the number drawn, the share of either half of the lines, and the share of lost pulses."""
     scan = _scan(tmp_path)
     share = _MOST / len(scan.cloud.points)
     with use_thresholds(_few()):
@@ -61,7 +61,7 @@ def test_points_are_drawn_alike_all_over_the_scan_and_lost_pulses_as_often(tmp_p
 
 
 def test_a_part_of_the_points_names_the_same(tmp_path: Path) -> None:
-    """Of a sixth of the points the wobble is named, and the rows of the answer are those of the whole scan."""
+    """From a sixth of the points the wobble is named, and the answer's rows refer to the whole scan."""
     scan = _scan(tmp_path)
     found = diagnose(scan, thresholds=_few())
     assert [each.name for each in found.effects][:1] == ["tls.wobble"]

@@ -19,7 +19,9 @@ GAP = Path(__file__).parents[2] / "pipeline" / "gap"
 
 
 def _read() -> set[tuple[str, str]]:
-    """Thresholds that code reads: thresholds().group.key, or by.key where `by` was set to thresholds().group before."""
+    """Return the thresholds that code reads: thresholds().group.key, or by.key where `by` was set to
+    thresholds().group before.
+    """
     found: set[tuple[str, str]] = set()
     for path in GAP.rglob("*.py"):
         group_of_by = ""
@@ -50,7 +52,7 @@ def test_each_says_its_unit_what_it_decides_and_where_it_comes_from(group: str, 
 
 @pytest.mark.parametrize(("group", "key"), EVERY)
 def test_each_is_used_by_the_diagnosis(group: str, key: str) -> None:
-    """A threshold that nothing reads decides nothing."""
+    """A threshold that nothing reads would decide nothing."""
     assert (group, key) in READ
 
 

@@ -1,4 +1,4 @@
-"""The verdict of `gap` and its words over every combination of the numbers that they rest on: none contradicts another."""
+"""The verdict of `gap` and its sentences, over every combination of the numbers they depend on: none contradicts another."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class _Residuals(list[int]):
 
 @dataclass
 class _Found:
-    """What the words of a diagnosis are made of."""
+    """The numbers from which the sentences of a diagnosis are made."""
 
     effects: tuple[NamedEffect, ...]
     evidence: Evidence
@@ -87,7 +87,7 @@ class _Found:
 
 
 def _every() -> Iterator[tuple[Any, Evidence, str]]:
-    """Each combination, and all that is said of it, but those that cannot be: without an effect the gap stays."""
+    """Yield each possible combination and its sentences; without an effect the gap cannot change."""
     for named, gap, p_value, spread, far, wide in product(NAMED, GAPS, P_VALUES, SPREADS, FAR, WIDE):
         if gap is not None and not named and spread == 1.0 and gap.after != gap.before:
             continue
@@ -183,7 +183,7 @@ def test_too_much_noise_is_said_with_less_that_would_do() -> None:
 @pytest.mark.parametrize("gap", GAPS)
 @pytest.mark.parametrize("p_value", P_VALUES)
 def test_a_wall_much_of_which_moved_says_nothing_of_the_sensor(gap: Gap | None, p_value: float | None) -> None:
-    """Nothing is named then; 30 % of the wall are much."""
+    """If 30 % of the wall moved, no effect is named."""
     found: Any = _Found((), Evidence(gap, p_value, moved=0.41))
     said = f"{title(found)}. {paragraph(found, ROWS[:1])} {summarise(found)} {'; '.join(note_moved_wall(found.evidence, False))}"
     assert found.verdict == "insufficient_data"
@@ -215,7 +215,9 @@ def test_all_noise_is_lowered_alike(model: TlsModel | StereoModel, expected: dic
 
 @pytest.mark.parametrize(("error", "open_still"), [(0.0001, True), (0.004, False)])
 def test_a_gap_stays_open_only_beyond_its_uncertainty(error: float, open_still: bool) -> None:
-    """Rare edges may decide the score of a few held-out patches: 8.9 mm before, 10.9 after, off by some millimetres."""
+    """Rare edges may decide the score of few validation patches: 8.9 mm before and 10.9 mm after, uncertain by
+    some millimetres.
+    """
     gap = Gap(before=0.0089, after=0.0109, floor=0.0006, error=error, floor_error=0.003, points=100)
     assert Evidence(gap, 0.3).stays_open == open_still
 
@@ -224,7 +226,9 @@ def test_a_gap_stays_open_only_beyond_its_uncertainty(error: float, open_still: 
 def test_names_with_which_the_gap_grows_while_nothing_says_that_chance_is_left_are_not_the_answer(
     p_value: float | None, open_still: bool, unsaid: bool
 ) -> None:
-    """A principal point 3 px off on real photographs, which was named a focal length 58 px off, and later 47 px with a noise."""
+    """On real photographs a principal point wrong by 3 px was named as a focal length wrong by 58 px, later as 47 px
+    and noise.
+    """
     evidence = Evidence(Gap(before=0.0101, after=0.0122, floor=0.0102, error=0.002, floor_error=0.002, points=1000), p_value)
     assert evidence.stays_open is open_still
     assert (verdict_of([_effect("tls.wobble")], evidence) == "unknown") is unsaid

@@ -77,7 +77,10 @@ def test_on_the_central_meridian_the_northing_is_the_scaled_arc_and_north_is_nor
 
 
 def test_beside_it_attitudes_turn_by_the_convergence_of_the_meridians(tmp_path: Path) -> None:
-    """tan gamma = tan(difference of longitude) sin(latitude) on the sphere; the ellipsoid's is the same to 1e-5 at 1 degree."""
+    """Attitudes are rotated by the meridian convergence gamma.
+
+    On the sphere tan gamma = tan(difference of longitude) sin(latitude); the ellipsoid's is the same to 1e-5 at 1 degree.
+    """
     found = read_metashape(written(tmp_path / "cameras.xml", np.radians(10.0), UTM)).cameras["one"]
     gamma = np.arctan(np.tan(np.radians(1.0)) * np.sin(LATITUDE))
     turn = Rotation.from_euler("z", gamma).as_matrix()  # true north lies west of the grid's north, east of the meridian

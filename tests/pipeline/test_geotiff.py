@@ -1,4 +1,4 @@
-"""Rasters: what is read back is what was written, GDAL reads it too, and damaged files are told."""
+"""Rasters: what is read back is what was written, GDAL reads it too, and damaged files are reported."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def _gdal(
     mask: np.ndarray | None = None,
     **more: object,
 ) -> Path:
-    """A raster written by GDAL, one of the other programs that files come from."""
+    """Write a raster with GDAL, which many other programs use."""
     north_up = rasterio.transform.from_origin(*CORNER, SIDE, SIDE)
     profile = {"driver": "GTiff", "height": values.shape[0], "width": values.shape[1], "count": 1, "dtype": values.dtype.name}
     with (
@@ -178,7 +178,7 @@ def test_what_programs_write_for_no_data_is_no_height(tmp_path: Path, value: flo
 
 
 def test_minus_9999_among_heights_as_low_stays_a_height(tmp_path: Path) -> None:
-    """Ocean floor: other values come half as far from zero."""
+    """On an ocean floor other values come within half the distance from zero, so -9999 is a height."""
     deep = HEIGHTS - 6000
     deep[3, 3] = -9999
     raster = read_raster(_gdal(tmp_path / "a.tif", deep))
@@ -199,7 +199,7 @@ def test_a_mask_scale_and_offset_of_gdal_are_applied(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("crs", "metres"), [("EPSG:2225", 1200 / 3937), ("EPSG:2222", 0.3048)])
 def test_a_model_in_feet_becomes_metres(tmp_path: Path, crs: str, metres: float) -> None:
-    """State planes in US survey feet and in international feet: 5,400,030 ft differ by 3.3 m."""
+    """State planes in US survey feet and in international feet: at 5,400,030 ft they differ by 3.3 m."""
     reference = reference_from_dem(_gdal(tmp_path / "a.tif", crs=crs))
     centre = (CORNER[0] + SIDE / 2) * metres, (CORNER[1] - SIDE / 2) * metres, float(HEIGHTS[0, 0]) * metres
     np.testing.assert_allclose(reference.mesh.vertices[0], centre, rtol=1e-9)

@@ -1,4 +1,4 @@
-"""The true transform against one that is planted, the error against closed forms, and the recommendations."""
+"""The study of ICP: the true transform against a planted one, errors against closed forms, and the recommendations."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SIGMA = 0.003
 
 
 def measured(wall: TriangleMesh, seed: int, pose: RigidTransform | None = None) -> TriangleMesh:
-    """The wall's vertices with noise across the wall's plane, moved by `pose`."""
+    """Return the wall's vertices with noise across the wall's plane, moved by `pose`."""
     noise = KeyedRandom(seed).generator().normal(0, SIGMA, len(wall.vertices))
     points = wall.vertices + np.stack([np.zeros(len(noise)), np.zeros(len(noise)), noise], axis=1)
     return wall.with_vertices(points if pose is None else pose.apply(points))
@@ -36,7 +36,9 @@ def wall() -> TriangleMesh:
 
 
 def test_the_true_pose_is_the_planted_one(wall: TriangleMesh) -> None:
-    """8,000 points with 3 mm of noise tell a shift to some 0.02 mm across the wall, and along it to 0.1 mm by its roughness."""
+    """8,000 points with 3 mm of noise determine a shift across the wall to about 0.02 mm, and along it, by its roughness, to 0.1
+    mm.
+    """
     found = true_pose(EpochSurfaces(1, measured(wall, 1, PLANTED), wall), KeyedRandom(1)).after(PLANTED)
     assert found.translation == pytest.approx(np.zeros(3), abs=5e-4)
     moved = found.apply(wall.vertices) - wall.vertices
@@ -124,4 +126,4 @@ def test_odd_records_and_options_are_one_line(
 
 def test_a_folder_without_a_run_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["icp-study", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
-    assert "holds no run.json" in capsys.readouterr().err
+    assert "contains no run.json" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""What ICP registers to: the reconstructed reference, or the wall as it really is."""
+"""The target of ICP: the reconstructed reference surface, or the true wall."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SHIFT_M = 0.03
 
 @pytest.mark.parametrize(("target", "off"), [("reference", SHIFT_M), ("true_wall", 0.0)])
 def test_both_epochs_come_to_the_target(target: str, off: float) -> None:
-    """Real cameras that stand 3 cm aside of where they are thought to be put every surface 3 cm aside, rigidly."""
+    """Real cameras that stand 3 cm beside their nominal place shift every surface rigidly by 3 cm."""
     shifted = {"name": "camera_shift", "camera": "both", "x_m": SHIFT_M}
     quiet = {"parallax_sigma_px": 0, "regularization_sigma_px": 0}
     values = {

@@ -1,4 +1,4 @@
-"""`scarpsim inspect`: geometry and precision against closed forms on planes, against the sensors' own noise, and the command."""
+"""`scarpsim inspect`: geometry and precision against closed forms on planes, against the sensors' own noise; the command."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def scanner(noise: dict[str, float] | None = None, effects: tuple[dict[str, Any]
 
 
 def parallel_pair(z: float = 100.0, base: float = 20.0, **noise: Any) -> StereoPair:
-    """The normal case of photogrammetry: both axes along -z of the wall frame."""
+    """Return the normal case of photogrammetry: both axes along -z of the wall frame."""
     downwards = FRAME.rotation.T @ np.diag([1.0, -1.0, -1.0])
     interior = {"f_px": 2000.0, **dict.fromkeys(("cx_px", "cy_px", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2"), 0.0)}
     left, right = (
@@ -73,7 +73,7 @@ def convergent_pair(width: int = 1840, height: int = 1228, **noise: Any) -> Ster
 
 
 def spread_over(normal: np.ndarray, half_side: float = 12.0, count: int = 25) -> Places:
-    """A grid of places on the plane through the origin."""
+    """Return a grid of places on the plane through the origin."""
     x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-half_side, half_side, count)] * 2))
     points = np.stack([x, y, -(normal[0] * x + normal[1] * y) / normal[2]], axis=1)
     return Places(points, np.tile(normal, (len(points), 1)), np.full(len(points), 0.5))
@@ -94,7 +94,7 @@ def test_the_normal_case_has_the_textbook_formulas_all_over_a_parallel_wall() ->
 
 
 def test_measured_image_points_have_the_covariance_of_the_least_squares_intersection() -> None:
-    """Oracle: (J' J)^-1 with J the derivatives of all four image coordinates, in the normal case, by differences."""
+    """The expected value is (J' J)^-1, with J the numerical derivatives of all four image coordinates, in the normal case."""
     places = spread_over(TILTED, count=5)
     found = stereo_geometry(parallel_pair(parallax_sigma_px=0.0), places, image_sigma_px=0.4)
 
@@ -107,7 +107,7 @@ def test_measured_image_points_have_the_covariance_of_the_least_squares_intersec
 
 
 def test_glendale_has_the_references_precision() -> None:
-    """2.7 cm in z for 0.5 px in each image, that is 0.5 sqrt(2) px of parallax; the cameras converge, hence the 3 %."""
+    """2.7 cm in z for 0.5 px in each image, that is 0.5 sqrt(2) px of parallax; 3 % are allowed because the cameras converge."""
     middle = Places(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.array([0.5]))
     found = stereo_geometry(convergent_pair(7360, 4912, parallax_sigma_px=0.5 * np.sqrt(2)), middle)
     assert np.sqrt(found.covariance[0, 2, 2]) == pytest.approx(0.027, rel=0.03)
@@ -272,7 +272,7 @@ def test_the_command_says_which_block_is_seen(config: Path, tmp_path: Path, caps
 
 
 def test_several_stations_are_planned_together_and_one_by_one(config: Path, tmp_path: Path) -> None:
-    """Together they see what any sees, each place with the best station's figures; times and pulses add up."""
+    """Together they see what any of them sees, each place with the best station's values; times and pulses are summed."""
     second = "station=[{distance_m: 50.0}, {position_m: [-12.0, -15.0, 1.5]}]"
     loaded = load_config(config, [second, "scanner.faces=2"], "tls", None)
     together, *single = plans(loaded, prepare_site(loaded, "tls", KeyedRandom(loaded.seed)))
@@ -362,7 +362,7 @@ SET_UPS: dict[str, tuple[str, dict[str, Any]]] = {
 
 @pytest.mark.parametrize("name", SET_UPS)
 def test_headline_table_and_curves_say_the_same(name: str) -> None:
-    """The curves at the set-up's own value are the table's middle, and the headline's block is the smallest that is seen."""
+    """The curves at the set-up's own value equal the middle of the table; the headline's block is the smallest that is seen."""
     sensor, keys = SET_UPS[name]
     size = {"wall__width_m": 20.0, "wall__height_m": 12.0} | keys
     sides = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
@@ -384,7 +384,7 @@ def test_headline_table_and_curves_say_the_same(name: str) -> None:
 
 
 def _colours(png: bytes) -> list[tuple[int, ...]]:
-    """The colours of a picture without white, the most frequent first."""
+    """Return the colours of a picture except white, the most frequent first."""
     pixels = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).reshape(-1, 3)
     found, count = np.unique(pixels, axis=0, return_counts=True)
     ordered = [tuple(int(part) for part in found[row]) for row in np.argsort(-count)]

@@ -1,4 +1,4 @@
-"""Labels: outlines of the carved niches where the map shows them, for every way of making a surface, with and without noise."""
+"""Labels: the outlines of carved niches where the map shows them, for every way of making a surface, with and without noise."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def epoch(sensor: str, model: Any, size: float, **changes: Any) -> tuple[Referen
 
 
 def true_outlines(reference: ReferenceEpoch, seen: LaterEpoch) -> IntArray:
-    """(h, w) the block whose solid the wall's surface lies in, from the blocks' own meshes: no carving, no labels of faces."""
+    """Return per pixel (h, w) the block in whose solid the wall's surface lies, from the blocks' meshes, without carving."""
     grid = reference.raster.grid
     surface = heights(reference.caster, grid)
     result = np.full(grid.shape, WALL, dtype=np.int32)
@@ -75,7 +75,9 @@ def test_the_scanners_labels_are_the_true_outlines() -> None:
 
 @pytest.mark.parametrize("reconstruction", ["direct", "vertices"])
 def test_labels_go_where_the_sensors_errors_put_the_niches(reconstruction: str) -> None:
-    """Both principal points 12 px off put the map some 14 cm aside (105 m / 10,250 px each), which no ICP takes back here."""
+    """Both principal points are wrong by 12 px, which shifts the map by about 14 cm (105 m / 10,250 px each); no ICP corrects it
+    here.
+    """
     model = {**QUIET, "effects": [{"name": "principal_point_x", "camera": "both", "delta_px": 12.0}]}
     _, seen = epoch("stereo", model, 0.8, reconstruction=reconstruction, icp=None, depth_map="high", noisy_reference=True)
     _, still = epoch("stereo", QUIET, 0.8, reconstruction=reconstruction, icp=None, depth_map="high")
@@ -86,6 +88,6 @@ def test_labels_go_where_the_sensors_errors_put_the_niches(reconstruction: str) 
 
 
 def x_of(seen: LaterEpoch, label: int) -> float:
-    """The middle of a label in the wall frame, m."""
+    """Return the x of a label's middle in the wall frame, m."""
     grid = seen.raster.grid
     return grid.x_min + grid.gsd * (float(np.nonzero(seen.raster.block == label)[1].mean()) + 0.5)

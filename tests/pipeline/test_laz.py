@@ -1,4 +1,4 @@
-"""LAS and LAZ: what is read back is what was written, laspy reads it too, and damaged files are told."""
+"""LAS and LAZ: what is read back is what was written, laspy reads it too, and damaged files are reported."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_laz_header_as_laspy_reads_it(tmp_path: Path, cloud: PointCloud) -> None
 
 
 def test_laz_claims_no_extremes_of_its_channels(tmp_path: Path, cloud: PointCloud) -> None:
-    """laspy would write the first point's value as minimum and maximum."""
+    """The file states no minimum and maximum of its channels; laspy would write the first point's value as both."""
     write_laz(tmp_path / "a.laz", cloud)
     with laspy.open(tmp_path / "a.laz") as reader:
         (record,) = reader.header.vlrs.get("ExtraBytesVlr")
@@ -109,7 +109,7 @@ def test_laz_damaged_files_are_input_errors(tmp_path: Path, cloud: PointCloud) -
 
 
 def test_laz_absurd_chunk_table_is_an_input_error(tmp_path: Path, cloud: PointCloud) -> None:
-    """lazrs alone would ask for gigabytes and abort the process."""
+    """An absurd chunk table is refused; lazrs alone would ask for gigabytes and abort the process."""
     path = tmp_path / "a.laz"
     write_laz(path, PointCloud(cloud.points[:1000]))
     data = bytearray(path.read_bytes())
@@ -123,7 +123,7 @@ def test_laz_absurd_chunk_table_is_an_input_error(tmp_path: Path, cloud: PointCl
 
 
 def test_laz_absurd_chunk_size_and_records_are_input_errors(tmp_path: Path, cloud: PointCloud) -> None:
-    """lazrs alone would abort the process, laspy look for four billion records."""
+    """Absurd numbers are refused; lazrs alone would abort the process, and laspy would look for four billion records."""
     path = tmp_path / "a.laz"
     write_laz(path, PointCloud(cloud.points[:1000]))
     data = path.read_bytes()

@@ -25,7 +25,7 @@ SIGMA = 0.004
 
 
 def cloud(slope: float, shift: float, seed: int, spacing: float = 0.02) -> FloatArray:
-    """Points of the plane z = slope x - shift sqrt(1 + slope^2), with noise across it."""
+    """Return points of the plane z = slope x - shift sqrt(1 + slope^2), with noise across it."""
     generator = KeyedRandom(seed).generator()
     x, y = np.meshgrid(np.arange(-0.5, 6.5, spacing), np.arange(-0.5, 4.5, spacing))
     z = slope * x - (shift + generator.normal(0, SIGMA, x.shape)) * np.sqrt(1 + slope**2)
@@ -46,10 +46,10 @@ def labels() -> IntArray:
 
 @pytest.mark.parametrize(("slope", "direction", "factor"), [(0.0, "normal", 1.0), (0.5, "normal", 1.0), (0.5, "wall", 1.25**0.5)])
 def test_a_shifted_plane(slope: float, direction: str, factor: float) -> None:
-    """Missing rock of 3 cm across the plane is 3 cm along the normal, and 3 cm sqrt(1 + slope^2) along the wall's normal.
+    """3 cm of missing rock across the plane are 3 cm along its normal, and 3 cm sqrt(1 + slope^2) along the wall's normal.
 
-    A cylinder holds some pi (0.08 / 0.02)^2 = 50 points (fewer across a slope), so a distance has a standard error of
-    SIGMA sqrt(2 / 45) = 0.85 mm; the mean of 240 core points one of 0.06 mm, the limit is four of them.
+    A cylinder holds about pi (0.08 / 0.02)^2 = 50 points (fewer on a slope), so a distance has a standard error of SIGMA sqrt(2 /
+    45) = 0.85 mm; the mean of 240 core points has 0.06 mm, and the limit is four of them.
     """
     config = M3c2Config(core_step_px=5, direction=direction)  # type: ignore[arg-type]
     found = m3c2(cloud(slope, 0.0, 1), cloud(slope, 0.03, 2), raster(slope), labels(), config)
@@ -61,7 +61,7 @@ def test_a_shifted_plane(slope: float, direction: str, factor: float) -> None:
 
 
 def test_the_level_of_detection_holds_on_stable_ground() -> None:
-    """About 5 % of core points exceed it where nothing moved: 960 nearly independent ones, so 2.2 to 7.8 % is four sigma."""
+    """About 5 % of the core points exceed it where nothing moved; 960 are nearly independent, so 2.2 to 7.8 % is four sigma."""
     config = M3c2Config(core_step_px=2, direction="wall")
     found = m3c2(cloud(0.0, 0.0, 3), cloud(0.0, 0.0, 4), raster(0.0), labels(), config)
     assert 0.022 < found.significant.mean() < 0.078
@@ -95,11 +95,11 @@ def test_no_points_no_distance() -> None:
 
 
 def test_a_run_with_m3c2(tmp_path: Path) -> None:
-    """The same labels at the same places as the difference map, and distances along the wall's normal that agree with it.
+    """The labels agree with those of the difference map at the same places, and so do the distances along the wall's normal.
 
-    The raster has single pixels, M3C2 means over a cylinder: on stable ground the difference of both has about the raster's noise
-    (NMAD 4 mm), so that the medians agree to 0.3 mm; in the niches they differ by the rims that cylinders of 16 cm reach over (by
-    12 % from 10 cm of depth on, by 5 % from 15 cm).
+    The raster has single pixels, M3C2 the mean over a cylinder: on stable ground their difference has about the raster's noise
+    (NMAD 4 mm), so the medians agree to 0.3 mm; in niches they differ because cylinders of 16 cm reach over the rims (by 12 %
+    from 10 cm of depth on, by 5 % from 15 cm).
     """
     values = {
         "seed": 3,

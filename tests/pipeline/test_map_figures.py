@@ -1,4 +1,4 @@
-"""Maps over a wall: labels that fit in the picture however wide the wall is, and places of a national grid that can be read."""
+"""Maps over a wall: labels fit into the picture for any width of the wall, and national-grid coordinates are readable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""QGIS styles beside the maps: well-formed, with the reports' colours at the values of the raster."""
+"""QGIS styles beside the maps: well-formed, with the reports' colours at the raster's values."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pipeline.report.map_styles import difference_style, quantity_style
 
 
 def items(path: Path) -> list[tuple[float, str, str]]:
-    """Value, colour and label of a style's stops."""
+    """Return value, colour and label of a style's colour stops."""
     text = path.read_text(encoding="utf-8")
     assert text.startswith("<!DOCTYPE qgis")
     renderer = ElementTree.fromstring(text).find("pipe/rasterrenderer")

@@ -25,7 +25,7 @@ def labelled(*radii: float) -> np.ndarray:
 
 
 def test_in_white_noise_it_is_the_root_of_the_sum_of_squares() -> None:
-    """rho = sqrt(sum t^2) / sigma; the spectrum of some 300 windows is known to 3 % at each frequency, its mean to far less."""
+    """rho = sqrt(sum t^2) / sigma; about 300 windows give the spectrum to 3 % at each frequency, and its mean much better."""
     block, random = labelled(3, 12, 40), np.random.default_rng(1)
     change = np.where(block > 0, 0.02 + 0.03 * random.random(SHAPE), 0).astype(np.float32)
     difference = (change + random.normal(0, 0.025, SHAPE)).astype(np.float32)
@@ -35,7 +35,7 @@ def test_in_white_noise_it_is_the_root_of_the_sum_of_squares() -> None:
 
 
 def test_in_noise_with_grain_it_is_that_of_the_covariance_matrix() -> None:
-    """rho = t' t / sqrt(t' C t) on a square of 16 px, C of noise smoothed along both axes."""
+    """rho = t' t / sqrt(t' C t) on a square of 16 px, with C of noise that is smoothed along both axes."""
     kernel = np.array([1.0, 2.0, 3.0, 2.0, 1.0])
     kernel /= np.sqrt(np.sum(kernel**2))
     covariance = np.convolve(kernel, kernel[::-1])[4:]
@@ -51,7 +51,7 @@ def test_in_noise_with_grain_it_is_that_of_the_covariance_matrix() -> None:
 
 
 def _field(kernel: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Separable noise with the covariance of `kernel` plus 0.05 on the diagonal, along both axes."""
+    """Return separable noise whose covariance along both axes is that of `kernel` plus 0.05 on the diagonal."""
     parts = [random.normal(size=SHAPE) for _ in range(4)]
     across, down = (lambda a, axis=axis: ndimage.correlate1d(a, kernel, axis=axis, mode="wrap") for axis in (1, 0))
     small = np.sqrt(0.05)
@@ -71,9 +71,9 @@ def test_what_does_not_show_has_none_and_a_map_without_noise_tells_nothing() -> 
 
 @pytest.mark.parametrize(("shown", "scatter"), [(0.75, 1.0), (1.0, 0.5)])
 def test_the_ratio_is_of_what_the_map_shows_and_of_the_noise_inside_niches(shown: float, scatter: float) -> None:
-    """A map that shows 3/4 of each change has 3/4 of the ratio, noise of half the size inside niches doubles it.
+    """A map that shows 3/4 of each change has 3/4 of the ratio; half the noise inside niches doubles it.
 
-    60 blocks: a median scatters by 1.25 / sqrt(60) of a ratio's unit over rho = 10, the NMAD by 1.17 / sqrt(2 60) = 11 %.
+    60 blocks at rho = 10: a median scatters by 1.25 / sqrt(60), the NMAD by 1.17 / sqrt(2 60) = 11 %.
     """
     y, x = np.indices(SHAPE)
     block = np.where((y % 64 < 5) & (x % 64 < 5) & (y < 384), 1 + (y // 64) * 10 + x // 64, 0).astype(np.int32)

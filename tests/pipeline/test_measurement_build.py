@@ -1,7 +1,7 @@
-"""From raw files to the folder of a measurement: every format, the scanner's place by its lines, references, and bad input.
+"""From raw files to a measurement folder: every format, the scanner's position from its scan lines, references, and bad input.
 
-The scans are those of `gap_cases`: closed form, nothing of ours; the real ones lie beside the checkout (`shared/`), their tests
-are skipped where they are not there.
+The scans come from `gap_cases`: closed form, without our own code. Real scans lie beside the checkout (`shared/`); their tests
+are skipped where that folder is missing.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def as_e57(case: Case, folder: Path) -> Path:
 
 
 def as_ptx(case: Case, folder: Path) -> Path:
-    """A grid of one row with a missing return, and a rotation of four digits."""
+    """Write a PTX grid of one row with a missing return, and a rotation of four digits."""
     _, cloud, rotation = case
     matrix = np.vstack([np.hstack([np.round(rotation.T, 4), np.zeros((3, 1))]), [*POSITION, 1.0]])
     vectors = [POSITION, *np.round(rotation.T, 4), *matrix]
@@ -94,7 +94,7 @@ def as_ptx(case: Case, folder: Path) -> Path:
 
 
 def as_laz(case: Case, folder: Path) -> Path:
-    """In the order of a tile's index, not in that of the scan; its times tell it."""
+    """Write points in the order of a tile's index instead of that of the scan, with GPS times."""
     mixed = np.random.default_rng(1).permutation(len(case[1].points))
     cloud = case[1]
     write_laz(folder / "a.laz", PointCloud(in_world(case)[mixed], cloud.intensity[mixed], cloud.gps_time[mixed]))
@@ -113,7 +113,7 @@ FORMATS: dict[str, Callable[[Case, Path], Path]] = {
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_gives_the_same_measurement(name: str, case: Case, tmp_path: Path) -> None:
-    """Position and pattern come from the header or the scan lines; the points stay where they were."""
+    """Position and pattern come from the header or the scan lines; the points keep their places."""
     path = FORMATS[name](case, tmp_path)
     found = build(Request([path], str(case[0] / "wall.ply"), "riegl_vz400i"), tmp_path / "out")
     measurement = read_measurement(tmp_path / "out")
@@ -152,7 +152,7 @@ def test_columns_are_taken_as_named(case: Case, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("decimals", "atol"), [(6, 1e-4), (4, 0.005), (3, 0.05)])
 def test_the_lines_of_a_scan_meet_in_its_scanner(decimals: int, atol: float, case: Case) -> None:
-    """Rounding to 1 mm at 35 m is 8 urad in an angle; 3 sigma of the fit's own error bound what is off."""
+    """Rounding to 1 mm at 35 m is 8 urad in an angle; the error is within 3 sigma of the fit's own estimate."""
     found = origin_from_point_order(np.round(in_world(case), decimals))
     assert found is not None
     np.testing.assert_allclose(found.position, POSITION, atol=atol)
@@ -180,7 +180,7 @@ def test_large_coordinates_keep_their_millimetres(case: Case, tmp_path: Path) ->
 
 
 def test_half_of_a_scan_is_compared_with_the_other(case: Case, tmp_path: Path) -> None:
-    """Every second line goes into the surface; what that cannot show is said in the measurement itself."""
+    """Every second line becomes the surface; the measurement itself says what this comparison cannot show."""
     found = build(Request([as_e57(case, tmp_path)], "half", "riegl_vz400i"), tmp_path / "out")
     measurement = read_measurement(tmp_path / "out")
     assert len(measurement.cloud.points) == pytest.approx(len(case[1].points) / 2, rel=0.02)
@@ -205,7 +205,7 @@ def test_another_epoch_is_meshed_as_the_scanner_sees_it(case: Case, tmp_path: Pa
 
 
 def test_the_noise_of_a_surface_is_that_of_its_points() -> None:
-    """A plane at 30 m, noise 4 mm in range: roughness 4 mm, no triangle lost, all looking at the scanner."""
+    """A plane at 30 m with 4 mm of range noise: roughness 4 mm, no triangle lost, all facing the scanner."""
     rng = np.random.default_rng(4)
     azimuth, zenith = (grid.ravel() for grid in np.meshgrid(np.arange(-0.3, 0.3, 0.01), np.arange(1.3, 1.8, 0.01)))
     ray = np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=1)
@@ -238,7 +238,7 @@ def test_a_rotation_of_few_digits_is_made_orthonormal() -> None:
 
 
 def rewritten(case: Case, folder: Path, change: Callable[[dict[str, Any]], None]) -> Path:
-    """A copy of the measurement of gap_cases with other keys."""
+    """Copy the measurement of gap_cases with changed keys."""
     values = yaml.safe_load((case[0] / "measurement.yaml").read_text())
     values |= {key: str(case[0] / values[key]) for key in ("reference", "points", "model")}
     change(values)
@@ -280,7 +280,7 @@ def test_a_pose_of_few_digits_is_taken_with_a_word(case: Case, tmp_path: Path) -
 
 
 def nadir_pair() -> CameraPair:
-    """Two cameras 40 m above the ground, 6 m apart, looking down."""
+    """Return two cameras 40 m above the ground, 6 m apart, looking down."""
     lens = {
         "width": 1200,
         "height": 900,
@@ -296,7 +296,7 @@ def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def write_dem(path: Path) -> None:
-    """Heights every 0.25 m, a corner without data."""
+    """Write heights every 0.25 m, with a corner without data."""
     grid = Grid(float(UTM[0]) - 20, float(UTM[1]) + 20, 0.25, 180, 160)
     x, y = np.meshgrid(-20 + 0.25 * (np.arange(180) + 0.5), 20 - 0.25 * (np.arange(160) + 0.5))
     heights = UTM[2] + ground(x, y)
@@ -306,7 +306,7 @@ def write_dem(path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["cameras.yaml", "cameras.xml", "model"])
 def test_a_cloud_from_photographs_with_a_dem(kind: str, tmp_path: Path) -> None:
-    """Cameras in the three forms that people have them; every point lies on the surface to the chord of a pixel, s^2 / 8 c."""
+    """Cameras come in the three forms that users have; every point lies on the surface to a pixel's chord error, s^2 / 8 c."""
     cameras = nadir_pair()
     by_label = {"left.jpg": cameras.left, "right.jpg": cameras.right}
     if kind == "cameras.yaml":
@@ -364,7 +364,7 @@ def test_bad_photographs_are_answered_by_one_line(
 
 
 def said(words: list[str], capfd: pytest.CaptureFixture[str]) -> str:
-    """The one line with which a command refuses."""
+    """Return the one line of a command's error."""
     assert main(words) == 2
     told = capfd.readouterr()
     assert (told.out, told.err.count("\n")) == ("", 1)
@@ -429,7 +429,7 @@ def test_a_raw_scan_alone_is_no_measurement(case: Case, tmp_path: Path, capfd: p
 
 @pytest.mark.slow
 def test_gap_takes_raw_scans(case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The folder is built under the one of the results, which holds the verdict."""
+    """The measurement folder is made below the folder of results, which holds the verdict."""
     wall, out = str(case[0] / "wall.ply"), tmp_path / "out"
     words = ["gap", str(as_laz(case, tmp_path)), "--reference", wall, "--scanner", "riegl_vz400i", "--out", str(out), "--quiet"]
     assert main(words) == 0
@@ -439,7 +439,7 @@ def test_gap_takes_raw_scans(case: Case, tmp_path: Path, capsys: pytest.CaptureF
 
 @pytest.mark.skipif(not FOREST.exists(), reason=f"the real scan is not there: {FOREST}")
 def test_a_real_scan_in_its_own_frame(tmp_path: Path) -> None:
-    """A quarter of a RIEGL VZ-400i's scan in a forest: scanner at the origin and steps as documented, second echoes left out."""
+    """A quarter of a RIEGL VZ-400i scan in a forest: scanner at the origin, steps as documented, second echoes left out."""
     data: Any = np.load(FOREST)
     points = np.stack([data[axis] for axis in "XYZ"], axis=1)
     rows = points[:, 1] > np.abs(points[:, 0] + 0.5)
@@ -458,7 +458,9 @@ def test_a_real_scan_in_its_own_frame(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not ROCKS.exists(), reason=f"the real scan is not there: {ROCKS}")
 def test_a_real_scan_of_rounded_coordinates(tmp_path: Path) -> None:
-    """Coordinates in steps of 6 cm east and 1.6 cm north, the scanner's place unknown: asked for, then carried as an error."""
+    """The coordinates have steps of 6 cm east and 1.6 cm north, and the scanner's position is unknown: the command asks for it,
+    and then treats the rounding as an error.
+    """
     with pytest.raises(InputError, match="in front of them"):
         build(Request([ROCKS], "half", "riegl_vz400i"), tmp_path / "out")
     found = build(Request([ROCKS], "half", "riegl_vz400i", position=(547450.0, 149565.0, 725.0)), tmp_path / "out")

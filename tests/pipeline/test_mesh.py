@@ -14,7 +14,7 @@ SHAPE = (31, 41)
 
 
 def rays(shape=SHAPE, half_width=0.1):
-    """(h, w, 3) directions of a camera that looks along -z, rows down, columns to the right."""
+    """Return directions (h, w, 3) of a camera that looks along -z, rows down, columns to the right."""
     x, y = np.meshgrid(np.linspace(-half_width, half_width, shape[1]), np.linspace(half_width, -half_width, shape[0]))
     return np.stack([x, y, -np.ones(shape)], axis=-1)
 
@@ -26,7 +26,7 @@ def observation(points, block=None, viewpoint=VIEWPOINT):
 
 
 def plane_points(normal, shape=SHAPE, half_width=0.1, viewpoint=VIEWPOINT):
-    """Points of the plane through the origin with this normal."""
+    """Return points of the plane through the origin with this normal."""
     direction = rays(shape, half_width)
     scale = -np.dot(normal, viewpoint) / (direction @ np.asarray(normal))
     return viewpoint + scale[..., None] * direction
@@ -37,7 +37,7 @@ def corners(mesh: TriangleMesh):
 
 
 def normals(mesh: TriangleMesh):
-    """(m, 3) face normals, as long as twice the area."""
+    """Return face normals (m, 3), as long as twice the area."""
     points = corners(mesh)
     return np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
 
@@ -81,7 +81,7 @@ def test_sphere():
 
 
 def step_points(edge, depth):
-    """z = 0 left of column `edge`, z = -depth from it on."""
+    """Return points with z = 0 left of column `edge`, z = -depth from it on."""
     direction = rays()
     z = np.where(np.arange(SHAPE[1]) < edge, 0.0, -depth)
     return VIEWPOINT + (VIEWPOINT[2] - z)[None, :, None] * direction
@@ -114,7 +114,7 @@ def test_steep_slope_is_cut_by_its_grazing_angle_only():
 
 
 def cell(**z):
-    """One cell with corners a, b above c, d; NaN removes a corner."""
+    """Return one cell with corners a, b above c, d; NaN removes a corner."""
     corner = {"a": (0, 1), "b": (1, 1), "c": (0, 0), "d": (1, 0)}
     return np.array([(*corner[name], z.get(name, 0.0)) for name in "abcd"]).reshape(2, 2, 3)
 
@@ -157,7 +157,7 @@ def test_labels_travel_and_unused_samples_are_dropped():
 
 
 def holed():
-    """A plane with a hole of 3 x 4 samples, one of 6 x 6, and one at the border."""
+    """Return a plane with a hole of 3 x 4 samples, one of 6 x 6, and one at the border."""
     whole = plane_points([0.4, 0.5, 1.0])
     points = whole.copy()
     for window in (np.s_[5:8, 5:9], np.s_[15:21, 20:26], np.s_[0:2, 30:33]):
@@ -196,7 +196,7 @@ def test_noise_below_the_step_does_not_tear():
 
 
 def cloud():
-    """5,000 points of a dome z = 2 - (x2 + y2) / 10 over 8 x 6 m, labelled 3 where x > 0."""
+    """Return 5,000 points of a dome z = 2 - (x2 + y2) / 10 over 8 x 6 m, labelled 3 where x > 0."""
     random = np.random.default_rng(5)
     x, y = random.uniform(-4, 4, 5000), random.uniform(-3, 3, 5000)
     return np.stack([x, y, 2 - (x**2 + y**2) / 10], axis=1), np.where(x > 0, 3, 0).astype(np.int32)

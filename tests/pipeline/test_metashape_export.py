@@ -1,4 +1,4 @@
-"""What goes to Metashape: files that agree with each other, and a script that Python compiles and a stand-in API accepts."""
+"""Export to Metashape: consistent files, and a script that compiles and runs against a fake of Metashape's API."""
 
 from __future__ import annotations
 
@@ -53,14 +53,14 @@ def test_images_have_the_depth_maps_names_and_shape(folder: Path) -> None:
 
 
 class Shot:
-    """Metashape.Camera, which is a key of Metashape.DepthMaps."""
+    """A fake Metashape.Camera, which is a key of Metashape.DepthMaps."""
 
     def __init__(self, label: str) -> None:
         self.label, self.transform = label, None
 
 
 class Chunk:
-    """The calls of Metashape.Chunk that the script makes, with the signatures of the Python Reference 2.2."""
+    """A fake Metashape.Chunk: the calls that the script makes, with the signatures of the Python Reference 2.2."""
 
     def __init__(self) -> None:
         self.label = ""
@@ -103,5 +103,4 @@ def test_the_script_loads_both_maps(folder: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_the_script_is_python_3_8() -> None:
     """Metashape 2 brings Python 3.8 or newer."""
-
     ast.parse(SCRIPT, feature_version=(3, 8))

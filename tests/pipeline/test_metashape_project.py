@@ -1,4 +1,4 @@
-"""A Metashape project gives the cameras of its active chunk; what is missing or damaged is named."""
+"""Cameras read from the active chunk of a Metashape project; missing or damaged parts are named."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _archive(path: Path, text: str, name: str = "doc.xml") -> None:
 
 
 def _damage(path: Path, packing: int) -> None:
-    """An archive whose document is packed, with bytes of it changed."""
+    """Write an archive with a compressed document and change some of its bytes."""
     with zipfile.ZipFile(path, "w", packing) as file:
         file.writestr("doc.xml", "<chunk/>" * 200)
     content = bytearray(path.read_bytes())
@@ -44,7 +44,7 @@ def _damage(path: Path, packing: int) -> None:
 
 
 def _unknown_packing(path: Path) -> None:
-    """An archive that names a method of packing which there is not."""
+    """Write an archive that names a compression method that does not exist."""
     _archive(path, "<chunk/>")
     content = bytearray(path.read_bytes())
     content[8] = content[content.index(b"PK\x01\x02") + 10] = 97
@@ -52,7 +52,7 @@ def _unknown_packing(path: Path) -> None:
 
 
 def _chunk(folder: Path, cameras: dict[str, Camera]) -> str:
-    """The chunk of an exported camera XML, which stands in a project's archive by itself."""
+    """Write the chunk of an exported camera XML as a project's archive holds it."""
     write_metashape(folder / "export.xml", cameras)
     chunk = ElementTree.parse(folder / "export.xml").getroot().find("chunk")
     assert chunk is not None
@@ -61,7 +61,7 @@ def _chunk(folder: Path, cameras: dict[str, Camera]) -> str:
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
-    """rock wall.psx with two chunks, of which the second is active."""
+    """Write `rock wall.psx` with two chunks, the second of which is active."""
     files = tmp_path / "rock wall.files"
     (tmp_path / "rock wall.psx").write_text(DESCRIPTOR)
     _archive(files / "project.zip", CHUNKS)

@@ -1,4 +1,4 @@
-"""The bundled noise levels of the Glendale site: what they hold, and the difference maps that they make."""
+"""The bundled noise levels of the Glendale site: their values, and the difference maps that they give."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ def model(name: str) -> StereoModel:
 
 
 def sigmas(noise: StereoNoise) -> dict[str, float]:
-    """Every sigma of a model's noise, by name."""
+    """Return every sigma of a model's noise, by name."""
     matching = {key: getattr(noise, key) for key in ("parallax_sigma_px", "regularization_sigma_px")}
     return matching | {key: spread["sigma"] for key, spread in noise.orientation.model_dump().items()}
 
@@ -116,7 +116,9 @@ def test_maps_are_as_noisy_as_documented(level: str, stage: tuple[SimulationConf
 def test_by_vertices_and_against_a_silent_reference_the_printed_numbers_give_the_theses_noise(
     stage: tuple[SimulationConfig, SensorSite, RayCaster],
 ) -> None:
-    """Matching alone 17 mm (docs/validation/noise.md), to which each map's draw of the orientation adds; the seeds are fixed."""
+    """Measured at vertices against a noiseless reference, matching alone gives 17 mm (docs/validation/noise.md); each map's
+    random orientation adds to it. The seeds are fixed.
+    """
     config, site, caster = stage
     config = config.model_copy(update={"reconstruction": "vertices", "noisy_reference": False})
     silent, noisy = reference_sensor(config, with_model(site, model("high"))), with_model(site, model("high"))

@@ -1,4 +1,4 @@
-"""Tails, normality and binned statistics against distributions that are known in closed form."""
+"""Outlier shares, normality tests and binned statistics, against distributions known in closed form."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Configs of older minor versions still load: each folder of tests/configs_of_versions holds those of one version.
 
-A key that is renamed keeps its old name as an alias; when a minor version comes out, its own complete configs are added
-(`scarpsim init`, the `#` of its keys taken away). Nothing in these files is ever changed.
+A renamed key keeps its old name as an alias. When a minor version is released, its complete configs are added (those of `scarpsim
+init` with the `#` of all keys removed). These files are never changed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def test_a_config_of_an_older_version_loads(path: Path) -> None:
 
 
 def test_the_values_of_an_older_config_are_those_it_says() -> None:
-    """Not only accepted: a sample of its values arrives."""
+    """The configs are not only accepted: a sample of their values is checked."""
     path = next(path for path in FILES if path.parts[-2:] == ("0.1", "simulation.yaml"))
     config = load_config(path, [], None, None)
     assert config.rockfall.count == 1500

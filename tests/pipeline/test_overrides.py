@@ -1,4 +1,4 @@
-"""`--set` and the YAML it is read as."""
+"""The option `--set`, and the YAML values that it takes."""
 
 from __future__ import annotations
 

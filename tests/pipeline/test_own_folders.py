@@ -1,4 +1,4 @@
-"""What else stands where a command goes on with folders of its own is named at once: nothing waits, nothing is followed."""
+"""A command that resumes in its own folders names unexpected files there at once: it does not wait, and follows no link."""
 
 from __future__ import annotations
 

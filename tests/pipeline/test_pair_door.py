@@ -1,4 +1,4 @@
-"""A pair of cameras and the points that it is said to have seen."""
+"""Checks of a camera pair and of the points that it is said to have seen."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PAIR = CameraPair(LEFT, replace(LEFT, position=np.array([1.0, 0.0, 0.0])))
 
 
 def test_the_share_that_both_see() -> None:
-    """At a depth of 10 m the left frame reaches from -5 to 5 m in x, the right one from -4 to 6 m: both see -4 to 5 m."""
+    """At a depth of 10 m the left frame covers x from -5 to 5 m, the right one from -4 to 6 m: both see -4 to 5 m."""
     x = np.linspace(-10, 10, 20_001)
     points = np.stack([x, np.zeros_like(x), np.full_like(x, 10.0)], axis=1)
     assert check_seen(PAIR, points, "points") == pytest.approx(9 / 20, abs=1e-3)

@@ -1,4 +1,4 @@
-"""PCD files hold what they are given, as the Point Cloud Library lays it out."""
+"""PCD files contain what was written, in the Point Cloud Library's layout."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
 def read(path: Path) -> tuple[dict[str, str], np.ndarray[Any, Any]]:
-    """Header and rows by the format's own description."""
+    """Read header and rows by the format's own description."""
     head, body = path.read_bytes().split(b"DATA binary\n", 1)
     header = dict(line.split(" ", 1) for line in head.decode("ascii").splitlines() if not line.startswith("#"))
     columns = zip(*(header[name].split() for name in ("FIELDS", "TYPE", "SIZE")), strict=True)

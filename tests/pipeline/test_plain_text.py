@@ -1,4 +1,4 @@
-"""Text in pictures is drawn as it stands, in every module that draws."""
+"""Text in pictures is drawn literally, in every module that draws."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_what_looks_like_a_formula_is_none(title: str, tmp_path: Path) -> None:
 
 
 def test_dollars_are_drawn() -> None:
-    """As wide as two letters more: the columns with ink of "$ii$" and "ii"."""
+    """ "$ii$" must be wider than "ii" by two characters, measured by the columns with ink."""
 
     def inked(text: str) -> int:
         figure = Figure(figsize=(3, 1))

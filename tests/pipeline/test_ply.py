@@ -1,4 +1,4 @@
-"""PLY meshes and points: what is read back is what was written, other programs read it too, damaged files are told."""
+"""PLY meshes and points: what is read back is what was written, other programs read it too, damaged files are reported."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_ply_mesh_in_trimesh_and_open3d(tmp_path: Path, mesh: TriangleMesh) -> N
 
 
 def test_ply_of_trimesh_and_open3d(tmp_path: Path, mesh: TriangleMesh) -> None:
-    """Their float32 keeps 0.25 m of UTM: compare in local coordinates."""
+    """Their float32 resolves UTM coordinates only to 0.25 m, so local coordinates are compared."""
     local = mesh.vertices - UTM
     for encoding in ("ascii", "binary_little_endian"):
         data = trimesh.Trimesh(local, mesh.faces, process=False).export(file_type="ply", encoding=encoding.split("_")[0])

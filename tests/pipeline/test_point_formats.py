@@ -1,4 +1,4 @@
-"""Point clouds in every format a measurement may come in; `test_formats` has LAZ and PLY as the run writes them."""
+"""Point clouds in every format that a measurement may have; `test_formats` tests LAZ and PLY as the run writes them."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_a_damaged_e57_is_named(tmp_path: Path, cloud: PointCloud, keep: float) 
 
 
 def test_an_e57_takes_memory_for_the_points_that_are_there(tmp_path: Path, cloud: PointCloud) -> None:
-    """A billion points in its header; read in pieces of a thousand, the same points as at once."""
+    """The header claims a billion points; read in parts of a thousand, the points are the same as at once."""
     path, claim = tmp_path / "a.e57", 'recordCount="5000">\n        '
     write_e57(path, [scan(cloud)])
     (at_once,) = read_e57(path)
@@ -254,7 +254,7 @@ def test_xyz_that_is_none_is_named(tmp_path: Path, text: str, message: str) -> N
 
 
 def test_a_cloud_is_read_by_its_suffix(tmp_path: Path, cloud: PointCloud) -> None:
-    """In scanner coordinates everywhere but in E57, whose pose is applied."""
+    """In scanner coordinates, except E57, whose pose is applied."""
     write_laz(tmp_path / "a.laz", PointCloud(cloud.points))
     write_laz(tmp_path / "a.LAS", PointCloud(cloud.points))
     write_ply_points(tmp_path / "a.ply", cloud)

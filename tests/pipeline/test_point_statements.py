@@ -1,4 +1,4 @@
-"""What files of points state of themselves, held against what is in them: units, counts, boxes, flags, poses, missing returns."""
+"""What point files state about themselves, compared with their contents: units, counts, boxes, flags, poses, missing returns."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def points() -> np.ndarray[Any, Any]:
 
 
 def las(path: Path, points: Any, change: Callable[[laspy.LasData], None] = lambda _: None, **header: Any) -> Path:
-    """A file of laspy's."""
+    """Write a LAS file with laspy."""
     head = laspy.LasHeader(**({"point_format": 6, "version": "1.4"} | header))
     head.scales, head.offsets = np.full(3, 1e-4 if np.ptp(points, axis=0).max() < 1e5 else 1e-3), np.floor(points.min(axis=0))
     data = laspy.LasData(head)
@@ -50,13 +50,13 @@ def las(path: Path, points: Any, change: Callable[[laspy.LasData], None] = lambd
 
 
 def with_crs(*names: Any) -> Callable[[laspy.LasData], None]:
-    """A coordinate system as WKT; of two a compound one."""
+    """Return a function that adds a coordinate system as WKT; two names make a compound one."""
     crs = pyproj.CRS.from_user_input("+".join(names)) if isinstance(names[0], str) else names[0]
     return lambda data: data.header.add_crs(crs)
 
 
 def with_keys(**keys: int) -> Callable[[laspy.LasData], None]:
-    """GeoTIFF keys by their numbers, as k3072=2260."""
+    """Return a function that adds GeoTIFF keys by their numbers, such as k3072=2260."""
 
     def change(data: laspy.LasData) -> None:
         record = GeoKeyDirectoryVlr()
@@ -157,7 +157,7 @@ def patched(path: Path, at: int, form: str, value: float) -> Path:
 def test_a_las_header_that_the_points_contradict_is_an_error(
     tmp_path: Path, points: Any, at: int, form: str, value: float, problem: str
 ) -> None:
-    """Scale, offset, box and count."""
+    """The scale, the offset, the box or the count contradicts them."""
     path = patched(las(tmp_path / "a.las", points), at, form, value)
     with pytest.raises(InputError, match=problem) as caught:
         read_points(path)
@@ -201,7 +201,7 @@ def test_points_that_las_takes_out_of_use_are_left_out_with_a_word(tmp_path: Pat
 
 
 def test_a_flag_that_all_points_have_takes_none_out(tmp_path: Path, points: Any) -> None:
-    """As a program may flag the points of photographs, all of them, as synthetic."""
+    """For example, a program may flag all points of photographs as synthetic."""
 
     def change(data: laspy.LasData) -> None:
         data.synthetic = np.ones(COUNT, dtype=np.uint8)
@@ -212,7 +212,7 @@ def test_a_flag_that_all_points_have_takes_none_out(tmp_path: Path, points: Any)
 
 
 def test_a_box_in_single_precision_contradicts_nothing(tmp_path: Path, points: Any) -> None:
-    """A northing of 6,389,450 m is rounded to 0.5 m there."""
+    """A northing of 6,389,450 m is then rounded to 0.5 m."""
     far = points + np.array([0, 6_239_450, 0])
     path = las(tmp_path / "a.las", far)
     for at, value in ((195, far[:, 1].max()), (203, far[:, 1].min())):
@@ -230,7 +230,7 @@ def test_a_file_that_is_no_las_says_so(tmp_path: Path) -> None:
 
 
 def cloud_with(points: Any, filler: Any, count: int) -> Any:
-    """(n, 3) the points with `count` records at one place spread among them."""
+    """Return points (n, 3) among which `count` records at one place are spread."""
     rows = np.sort(np.random.default_rng(2).choice(len(points) + count, len(points), replace=False))
     found = np.tile(np.asarray(filler, dtype=float), (len(points) + count, 1))
     found[rows] = points
@@ -240,7 +240,7 @@ def cloud_with(points: Any, filler: Any, count: int) -> Any:
 @pytest.mark.parametrize("suffix", [".e57", ".ptx", ".pts", ".xyz", ".csv", ".ply", ".las"])
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (600_000.0, 150_000.0, 400.0)])
 def test_records_at_the_origin_are_no_points(tmp_path: Path, suffix: str, offset: tuple[float, ...]) -> None:
-    """About the scanner and in survey coordinates."""
+    """For clouds around the scanner and in survey coordinates."""
     points = np.random.default_rng(5).uniform(-20, 20, (300, 3)).round(3) + offset
     both, path = cloud_with(points, (0, 0, 0), 40), tmp_path / f"a{suffix}"
     match suffix:
@@ -261,14 +261,14 @@ def test_records_at_the_origin_are_no_points(tmp_path: Path, suffix: str, offset
 
 
 def test_records_at_another_shared_place_are_no_points(points: Any) -> None:
-    """Such as the scanner's place, where 0 0 0 was put into the world with the rest."""
+    """For example the scanner's position, if records 0 0 0 were transformed to world coordinates with the rest."""
     found = without_fillers(PointCloud(cloud_with(points, (600_010.5, 150_020.0, 410.0), 30)), "a")
     np.testing.assert_array_equal(found.points, points)
     assert found.notes == ("30 records at 600010.5 150020 410, which stand for no return, are left out",)
 
 
 def test_points_that_are_few_at_a_place_stay(points: Any) -> None:
-    """A point at the origin among others, and points that a file holds three times each."""
+    """One point at the origin among others, and points that a file contains three times each."""
     around = np.concatenate([points - points.mean(axis=0), np.zeros((1, 3))])
     assert without_fillers(PointCloud(around), "a").points is around
     thrice = np.repeat(points, 3, axis=0)
@@ -282,7 +282,7 @@ def test_points_that_are_few_at_a_place_stay(points: Any) -> None:
 
 
 def raw_e57(path: Path, metadata: str = "", **columns: Any) -> Path:
-    """A file with one scan of these fields, as other programs write them."""
+    """Write an E57 file with one scan of these fields, as other programs do."""
     lib = pye57.libe57
     image = lib.ImageFile(str(path), "w")
     image.extensionsAdd("", lib.E57_V1_0_URI)
@@ -332,7 +332,7 @@ def test_e57_fields_that_are_not_read_are_named(tmp_path: Path) -> None:
 
 
 def test_e57_in_another_unit_than_metres_is_refused(tmp_path: Path) -> None:
-    """The standard has metres; a coordinate system in feet beside them contradicts it."""
+    """E57 prescribes metres; a coordinate system in feet contradicts it."""
     xyz = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), np.random.default_rng(1).uniform(1, 9, (3, 50)), strict=True))
     with pytest.raises(InputError, match=r"us-ft \(US survey foot\), but E57 files are in metres"):
         read_e57(raw_e57(tmp_path / "a.e57", pyproj.CRS.from_epsg(2260).to_wkt(), **xyz))
@@ -422,7 +422,9 @@ def test_a_ply_file_with_more_points_than_it_states_is_an_error(tmp_path: Path, 
 
 
 def test_a_comment_on_the_place_of_ply_points_is_said(tmp_path: Path) -> None:
-    """PLY has no field for a coordinate system or a shift; what programs write into comments is not applied, and said."""
+    """PLY has no field for a coordinate system or a shift; what programs write into comments is not applied, and a note
+    says so.
+    """
     header = "ply\nformat ascii 1.0\ncomment made by hand\ncomment offset 345200 6389400 0\nelement vertex 2\n"
     axes = "".join(f"property double {axis}\n" for axis in "xyz")
     (tmp_path / "a.ply").write_text(f"{header}{axes}end_header\n1 2 3\n4 5 7\n")
@@ -433,7 +435,9 @@ def test_a_comment_on_the_place_of_ply_points_is_said(tmp_path: Path) -> None:
 
 
 def test_every_door_reads_the_unit_and_leaves_fillers_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`read_measurement` (gap, calibrate, compare --measured), Python's `measure`, and `surface`, from one file in US feet."""
+    """`read_measurement` (gap, calibrate, compare --measured), Python's `measure`, and `surface` read one file in US
+    feet alike.
+    """
     case = tmp_path / "case"
     case.mkdir()
     write_scan(case, 1, step_rad=0.012)

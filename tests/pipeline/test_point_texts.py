@@ -1,4 +1,4 @@
-"""Text files of points as people have them: encodings, names with units, separators, decimal commas, counts, and their errors."""
+"""Text files of points as users have them: encodings, names with units, separators, decimal commas, counts, and their errors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def written(folder: Path, text: str, encoding: str = "utf-8", name: str = "a.txt
 
 
 def rows(separator: str = " ", decimal: str = ".", order: str = "xyz", tail: str = "") -> str:
-    """POINTS as text, their axes in some order, further values behind them."""
+    """Return POINTS as text, with their axes in the given order and further values after them."""
     lines = (separator.join(f"{point['xyz'.index(axis)]:.4f}" for axis in order) + tail for point in POINTS)
     return "\n".join(lines).replace(".", decimal) + "\n"
 
@@ -29,7 +29,7 @@ def rows(separator: str = " ", decimal: str = ".", order: str = "xyz", tail: str
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "latin-1", "cp1252"])
 @pytest.mark.parametrize("header", ["", "Northing,Easting,Height\n", "# Höhe über Meer\nNorthing,Easting,Höhe\n"])
 def test_the_encoding_takes_no_point_and_no_name(tmp_path: Path, encoding: str, header: str) -> None:
-    """A byte-order mark is part of no name and no number; words before the points may be in any of the usual encodings."""
+    """A byte-order mark belongs to no name and no number; text before the points may be in any common encoding."""
     path = written(tmp_path, header + rows(",", order="yxz" if header else "xyz"), encoding, "a.csv")
     np.testing.assert_array_equal(read_points(path).points, POINTS)
 
@@ -59,7 +59,7 @@ def test_names_are_split_at_the_separator(tmp_path: Path, header: str) -> None:
 
 
 def test_names_with_spaces_keep_their_columns(tmp_path: Path) -> None:
-    """CloudCompare's header, and names with units between white space."""
+    """CloudCompare's header, and names with units separated by white space."""
     text = "//X;Y;Z;Roughness (0.01);Intensity\n3\n" + rows(";", tail=";0.002;7")
     found = read_points(written(tmp_path, text))
     np.testing.assert_array_equal(found.intensity, [7, 7, 7])
@@ -175,7 +175,7 @@ def test_whole_numbers_beside_commas_before_three_digits_are_grouped(tmp_path: P
     ],
 )
 def test_a_line_that_is_no_row_is_named(tmp_path: Path, text: str, line: int, problem: str) -> None:
-    """The line's number, what it holds, what is allowed; no words of NumPy's."""
+    """The message has the line's number, its text and what is allowed; nothing of NumPy's message."""
     with pytest.raises(InputError, match=rf"a\.txt, line {line}\b.*{problem}") as caught:
         read_points(written(tmp_path, text))
     assert "usecols" not in str(caught.value)
@@ -197,7 +197,7 @@ def test_a_pts_file_of_several_scans_has_a_count_before_each(tmp_path: Path) -> 
 
 
 def test_missing_values_are_left_out_with_a_word(tmp_path: Path) -> None:
-    """As 1.#QNAN, null or nothing between separators; a measurement then leaves the points out."""
+    """They are written as 1.#QNAN, null or nothing between separators; a measurement leaves such points out and says so."""
     text = rows(";", tail=";1;") + "1.#QNAN;null;;1;\n" + rows(";", tail=";1;")
     found = read_points(written(tmp_path, text))
     assert np.isnan(found.points[3]).all()
@@ -272,7 +272,7 @@ def test_files_of_other_formats_are_told_by_their_first_line(tmp_path: Path, sta
 
 @pytest.mark.parametrize("row", ['"{0}","{1}","{2}"', "{0} {1} {2} # good", "{0:.9e} {1:.9e} {2:.9e}", "{0:.4f}D+00 {1} {2}"])
 def test_numbers_as_other_programs_write_them(tmp_path: Path, row: str) -> None:
-    """In quotation marks, with a comment behind them, with exponents of C and of Fortran."""
+    """In quotation marks, with a comment after them, with exponents as in C and Fortran."""
     text = "\n".join(row.format(*point) for point in POINTS)
     np.testing.assert_allclose(read_points(written(tmp_path, text, name="a.csv")).points, POINTS, rtol=1e-9)
     quoted = "\n".join(",".join(f'"{value:.4f}"'.replace(".", ",") for value in point) for point in POINTS)

@@ -1,4 +1,4 @@
-"""Scanner presets: the beam's conversions, precision never mixed up with accuracy, presets in configs."""
+"""Scanner presets: conversions of the beam's divergence, precision never confused with accuracy, presets in configs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PRECISION = {"value": 0.4, "at_m": 10, "kind": "precision", "source": "test"}
 
 @pytest.fixture
 def bare(tmp_path: Path) -> Path:
-    """A config that says nothing of sensors."""
+    """Write a config without any statement about sensors."""
     path = tmp_path / "bare.yaml"
     path.write_text("epochs: 1\n")
     return path
@@ -49,7 +49,7 @@ def test_every_preset_makes_an_instrument_and_a_model(name: str) -> None:
 @pytest.mark.parametrize(("level", "share"), [("1/e2", np.exp(-2)), ("1/e", np.exp(-1)), ("fwhm", 0.5)])
 @pytest.mark.parametrize("angle", ["full", "half"])
 def test_divergence_is_converted_as_a_gaussian_beam_has_it(level: str, share: float, angle: str) -> None:
-    """Against the root of exp(-2 r^2 / w^2) = share, found numerically, of a beam of half angle w = 1 at 1/e^2."""
+    """Compared with the numerical root of exp(-2 r^2 / w^2) = share, for a beam with half angle w = 1 at 1/e^2."""
     radius = brentq(lambda r: np.exp(-2 * r**2) - share, 0, 3, xtol=1e-15)
     stated = Divergence(value=radius * (2 if angle == "full" else 1), level=level, angle=angle, source="test")
     assert stated.full_angle == pytest.approx(2.0, rel=1e-12)
@@ -69,7 +69,7 @@ def test_two_precisions_give_the_growth_of_the_noise_with_range() -> None:
 
 
 def test_the_beam_comes_as_an_effect_in_the_effects_own_convention() -> None:
-    """0.3 mrad of half angle at 1/e^2 are 0.6 mrad of full angle; a pulse of 5 ns; without a divergence there is no effect."""
+    """0.3 mrad of half angle at 1/e^2 are 0.6 mrad of full angle; the pulse has 5 ns; without a divergence there is no effect."""
     assert [effect.model_dump() for effect in read_preset("zf_5016").model().effects] == [
         BeamDivergence(divergence_rad=0.6e-3, ranging="phase").model_dump()
     ]
@@ -145,7 +145,7 @@ sensor:
     "override", ["scanner={}", "scanner.preset={}", "scanner={{preset: {}, azimuth_step_rad: 0.0003, faces: 2}}"]
 )
 def test_a_preset_named_later_wins_over_the_files_keys(bare: Path, override: str, name: str) -> None:
-    """And over its model of the noise; what the preset does not know stays: the pattern, the faces, the other sensor."""
+    """It also replaces the noise model; what the preset does not define stays: the pattern, the faces, the other sensor."""
     bare.write_text(WRITTEN_OUT)
     config, preset = load_config(bare, [override.format(name)], "tls", None), read_preset(name)
     assert preset.scanner_values().items() <= config.scanner.model_dump().items()
@@ -172,7 +172,7 @@ def test_a_later_preset_replaces_an_earlier_one(bare: Path) -> None:
 
 
 def test_a_model_named_on_the_command_line_stays_beside_the_preset(tmp_path: Path, bare: Path) -> None:
-    """Also as the config itself: a bare model, which stands on the demo."""
+    """Also if the config itself is a bare model, which is completed by the demo's values."""
     model = tmp_path / "model.yaml"
     model.write_text("sensor: tls\nnoise: {range_sigma_m: 0.007}\n")
     bare.write_text(WRITTEN_OUT)

@@ -1,4 +1,4 @@
-"""Progress: share done, time left and timings against a clock that is set by hand."""
+"""Progress: share done, remaining time and timings, with a clock that the test sets."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_a_stage_that_takes_far_longer_than_planned_promises_no_end() -> None:
 
 
 def test_a_plan_made_under_way_divides_what_is_left() -> None:
-    """A half is done when as much again turns out to be needed beside the other half: a third of the rest for each second."""
+    """Half is done when as much work as the other half turns up in addition: each second then counts a third of the remainder."""
     clock = Clock()
     progress = Progress(clock)
     progress.plan({"a": 1.0, "b": 1.0})
@@ -90,7 +90,7 @@ def test_a_plan_made_under_way_divides_what_is_left() -> None:
 
 
 def test_the_share_never_falls() -> None:
-    """A stage that comes again, and one that says it is less far than was guessed."""
+    """A stage that comes again, and one that reports less progress than was estimated."""
     clock = Clock()
     progress = Progress(clock)
     progress.plan({"a": 1.0, "b": 1.0})

@@ -1,6 +1,6 @@
 """A real cliff of many touching parts in three states: a rock of 14.9 m3 in place, leaning out, fallen (AImon, MIT licence).
 
-The truth comes from Open3D, which traces the same rays on the files' triangles as they are.
+The expected values come from Open3D, which traces the same rays on the files' triangles.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ROCK_M3, CHANGED_M = 14.9, 0.05
 
 @pytest.fixture(scope="module")
 def seen() -> dict[str, Observation]:
-    """What a scanner without noise sees of the rock and its deposits, from the place in the data's README."""
+    """What a scanner without noise sees of the rock and its deposits, from the position in the data's README."""
     keys = {
         "station": {"position_m": [26.5, -240.015, 135.411], "rotation": np.eye(3).tolist()},
         "scanner": {

@@ -1,4 +1,4 @@
-"""Depth maps as others take them, and COLMAP's surface of them, against planes."""
+"""Depth maps in other programs' conventions, and COLMAP's surface made from them, against planes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def camera(x: float, lens: dict[str, float] | None = None) -> Camera:
 
 
 def plane_map(x: float = 0.0, lens: dict[str, float] | None = None, noise_m: float = 0.0) -> DepthMap:
-    """The depth map of the plane NORMAL . P = 0."""
+    """Return the depth map of the plane NORMAL . P = 0."""
     of = camera(x, lens)
     u, v = np.meshgrid(np.arange(of.width) + 0.5, np.arange(of.height) + 0.5)
     rays = np.stack([*of.tangents(u, v), np.ones_like(u)], axis=-1) @ of.rotation.T
@@ -77,7 +77,7 @@ def test_normals_of_a_plane_are_exact_beside_a_hole_and_at_the_border(radius: in
 
 
 def test_normals_average_noise_as_least_squares_does() -> None:
-    """Slope of a window of n x n points at distance s: sigma / (s sqrt(n^2 (n^2 - 1) / 12)); 19,000 windows, tolerance 5 %."""
+    """The slope over n x n points at spacing s has sigma / (s sqrt(n^2 (n^2 - 1) / 12)); 19,000 windows, tolerance 5 %."""
     radius, sigma = 2, 0.01
     source = plane_map(noise_m=sigma)
     found = normals(source, radius) @ source.camera.rotation.T
@@ -123,7 +123,10 @@ def test_colmap_reads_the_workspace(pycolmap: Any, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("lens", [None, LENS])
 def test_colmap_gives_a_plane_back(pycolmap: Any, lens: dict[str, float] | None) -> None:
-    """A cell is 0.25 m wide, half a pixel of confusion would move the plane by 25 mm. The border, where Poisson ends, is out."""
+    """A cell is 0.25 m wide; an error of half a pixel would move the plane by 25 mm.
+
+    The border, where Poisson ends, is excluded.
+    """
     left, right = maps(lens)
     mesh = colmap_surface(left, right, *labels(left), SurfaceConfig(), FusionConfig())
     inside = (np.abs(mesh.vertices[:, 0]) < 12) & (np.abs(mesh.vertices[:, 1]) < 10)
@@ -186,5 +189,5 @@ def test_a_run_by_colmap_shows_the_blocks(pycolmap: Any, tmp_path: Path) -> None
 
 def test_a_scan_has_no_depth_maps_to_fuse(tmp_path: Path) -> None:
 
-    with pytest.raises(InputError, match="colmap fuses depth maps; allowed: direct"):
+    with pytest.raises(InputError, match="colmap needs the depth maps of a stereo pair; allowed: direct"):
         simulate(parse(SimulationConfig, RUN, "test"), "tls", tmp_path / "run")

@@ -1,4 +1,6 @@
-"""ICP against known transforms, a slow oracle of one step, closed-form uncertainty, and each parameter's effect."""
+"""ICP against known transforms, a slow reference implementation of one step, closed-form uncertainty, and each parameter's
+effect.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ WAVES = [(2.1, 0.3, 0.12), (3.7, 1.4, 0.25), (2.9, 2.3, 0.15), (6.3, 0.8, 0.40)]
 
 
 def surface(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(n, 3) points and unit normals of a rough wall."""
+    """Return points (n, 3) and unit normals of a rough wall."""
     z, slope = np.zeros_like(x), np.zeros((2, *x.shape))
     for length, direction, amplitude in WAVES:
         wave = 2 * np.pi / length * np.array([np.cos(direction), np.sin(direction)])
@@ -46,7 +48,9 @@ def grid(spacing: float) -> tuple[FloatArray, FloatArray]:
 
 
 def sample(count: int, random: KeyedRandom, sigma: float = SIGMA) -> tuple[FloatArray, FloatArray]:
-    """Points at random places a metre inside of the reference's edge, noise along the normals; and those normals."""
+    """Return points at random places at least a metre inside the reference's edge, with noise along the normals, and
+    the normals.
+    """
     generator = random.generator()
     x, y = generator.uniform(1, WIDTH - 1, count), generator.uniform(1, HEIGHT - 1, count)
     points, normals = surface(x, y)
@@ -54,13 +58,13 @@ def sample(count: int, random: KeyedRandom, sigma: float = SIGMA) -> tuple[Float
 
 
 def covariance(points: FloatArray, normals: FloatArray, sigma: float) -> FloatArray:
-    """(6, 6) of (w, t) about the centroid, rad and m: sigma^2 (J^T J)^-1."""
+    """Return the covariance (6, 6) of (w, t) about the centroid, rad and m: sigma^2 (J^T J)^-1."""
     jacobian = np.hstack([np.cross(points - points.mean(axis=0), normals), normals])
     return sigma**2 * np.linalg.inv(jacobian.T @ jacobian)
 
 
 def errors(result: Registration, points: FloatArray) -> FloatArray:
-    """(6,) rotation vector, rad, and shift of the centroid, m, that are left of OFFSET."""
+    """Return what is left of OFFSET (6,): rotation vector, rad, and shift of the centroid, m."""
     centroid = points.mean(axis=0)
     left = RigidTransform(result.rotation @ OFFSET.rotation, result.translation).rotation_vector
     return np.concatenate([left, result.apply(OFFSET.apply(centroid)) - centroid])
@@ -140,7 +144,7 @@ def test_shift_along_z_of_a_gentle_wall_scatters_by_sigma_over_root_n() -> None:
 
 
 def test_shuffled_points_give_the_same_pose(reference: ReferenceSurface, cloud: tuple[FloatArray, FloatArray]) -> None:
-    """Only rounding and the draw of the coarse subset differ, so poses agree to delta_threshold."""
+    """Only rounding and the random coarse subset differ, so poses agree to delta_threshold."""
     moving = OFFSET.apply(cloud[0])
     shuffled = moving[RANDOM.child("shuffle").generator().permutation(len(moving))]
     config = IcpConfig(delta_threshold=1e-6, threshold=0.0)
@@ -152,7 +156,7 @@ def test_shuffled_points_give_the_same_pose(reference: ReferenceSurface, cloud: 
 
 
 def pairs() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Moving points, a reference with normals, and the nearest of it to each moving point by brute force."""
+    """Moving points, a reference with normals, and the index of the nearest reference point to each, by brute force."""
     points, normals = grid(0.5)
     moving = OFFSET.apply(sample(300, RANDOM.child("oracle"))[0])
     return moving, points, normals, cdist(moving, points).argmin(axis=1)
@@ -185,7 +189,7 @@ def test_a_point_to_point_step_is_scipys_alignment() -> None:
 
 
 def test_no_reflection() -> None:
-    """Pairs that a mirror in x would match best still give a proper rotation."""
+    """Pairs that a mirror image in x would match best still give a proper rotation."""
     p = RANDOM.child("mirror").generator().normal(size=(50, 3))
     columns = np.vstack([p.T, (p * [-1, 1, 1] - p).T, np.ones((1, 50))])
     assert np.linalg.det(_point_step(columns @ columns.T).rotation) == pytest.approx(1.0)
@@ -204,7 +208,7 @@ def test_fit_counts_and_measures(reference: ReferenceSurface, cloud: tuple[Float
 
 
 def niche(cloud: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """The cloud with a niche 0.3 m deep (missing rock: -z) in the 5 % of its points nearest to a corner."""
+    """Return the cloud with a niche 0.3 m deep (missing rock: -z) in the 5 % of its points nearest to a corner."""
     points = cloud[0].copy()
     distance = np.hypot(points[:, 0] - 1, points[:, 1] - 1)
     points[distance <= np.quantile(distance, 0.05), 2] -= 0.3

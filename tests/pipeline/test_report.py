@@ -1,4 +1,4 @@
-"""Reports: the pictures show what they were given, the page holds every number and needs no network."""
+"""Reports: the pictures show the given data, the page contains every number and needs no network."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def synthetic() -> tuple[np.ndarray, np.ndarray]:
 
 
 def pixel(png: bytes, x: float, y: float) -> np.ndarray:
-    """(3,) RGB in [0, 1] of a map at wall coordinates: the axes' frame is found as the outermost dark lines."""
+    """Return the RGB (3,) in [0, 1] of a map at wall coordinates; the axes' frame is found as the outermost dark lines."""
     image = matplotlib.image.imread(io.BytesIO(png))[:, :, :3]
     dark = image.max(axis=2) < 0.2
     rows = np.flatnonzero(dark.mean(axis=1) > 0.6)
@@ -74,7 +74,7 @@ def test_difference_map_shows_missing_rock_red_at_its_place() -> None:
 
 
 def test_colours_end_at_six_sigma() -> None:
-    """Values beyond the scale have its last colour, half of the scale has another."""
+    """Values beyond the scale have its last colour, values at half of the scale another one."""
     block = np.zeros(GRID.shape, dtype=np.int32)
     colours = {
         factor: pixel(difference_figure(np.full(GRID.shape, factor * SIGMA_M), GRID, block, SIGMA_M), 15, 10)
@@ -86,7 +86,7 @@ def test_colours_end_at_six_sigma() -> None:
 
 
 def test_hillshade_is_lit_from_the_upper_left() -> None:
-    """A slope that faces up and left is the brightest, its opposite the darkest, the level wall between."""
+    """A slope that faces up and left is the brightest, its opposite the darkest, the level wall in between."""
     y, x = np.mgrid[GRID.y_max : 0 : -GRID.gsd, 0 : GRID.width * GRID.gsd : GRID.gsd][:, : GRID.height, : GRID.width]
     shades = [pixel(hillshade_figure(slope * (y - x), GRID), 15, 10).mean() for slope in (0.5, 0.0, -0.5)]
     assert shades[0] < shades[1] < shades[2]  # rising towards the upper left, it faces the lower right
@@ -140,7 +140,7 @@ def run_report() -> RunReport:
 
 
 class Page(HTMLParser):
-    """The text of a page, its elements in order and whether they nest."""
+    """Parses a page: its text, its elements in order, and whether they are nested properly."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -228,7 +228,7 @@ def test_many_blocks_come_folded(tmp_path: Path) -> None:
 
 
 def test_what_comes_from_a_file_stays_text(tmp_path: Path) -> None:
-    """A wall's name, a scanner's, a path in the config; and no template takes a value past the escaping."""
+    """A wall's name, a scanner's name and a path in the config are escaped; no template outputs an unescaped value."""
     evil = "</title></pre><script>alert(1)</script>"
     report = RunReport(evil, "tls", 1, b"", [], {"wall": {"mesh": evil}}, {"Sensor": evil, evil: "x"})
     write_report(tmp_path / "report.html", report)

@@ -1,4 +1,4 @@
-"""The report's key figures of the sensor, on a plane whose distances are known."""
+"""The report's key values of the sensor, on a plane whose distances are known."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def figures(plane: Path, kind: SensorName, **values: Any) -> dict[str, str]:
 
 
 def distances(eye: np.ndarray) -> tuple[float, float, float]:
-    """Least, median, largest distance of the plane's vertices from a point relative to its middle."""
+    """Return the least, median and largest distance of the plane's vertices from a point relative to its middle, m."""
     x, z = np.meshgrid(np.linspace(-2, 2, 21), np.linspace(-2, 2, 21))
     found = np.sqrt((x - eye[0]) ** 2 + eye[1] ** 2 + (z - eye[2]) ** 2)
     return found.min(), float(np.median(found)), found.max()

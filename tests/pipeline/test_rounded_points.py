@@ -1,4 +1,4 @@
-"""Points that a file has rounded: told from a tenth of the model's noise on, refused above it."""
+"""Points that a file has rounded: reported from a tenth of the model's noise on, refused above the noise."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from scene.common.errors import InputError
 
 
 def rounded(folder: Path, steps: list[float]) -> Measurement:
-    """A measurement whose points are rounded to steps along x, y and z of the scanner, m."""
+    """Write a measurement whose points are rounded to steps along the scanner's x, y and z, m."""
     write_scan(folder, 1, step_rad=0.02)
     cloud = read_ply_points(folder / "scan_0.ply")
     write_ply_points(folder / "scan_0.ply", replace(cloud, points=np.rint(cloud.points / steps) * steps))

@@ -1,4 +1,4 @@
-"""Whole runs, small: the folder, repeatability, resuming, survey coordinates, and what stops a run."""
+"""Whole, small runs: the folder, repeatability, resuming, survey coordinates, and errors that stop a run."""
 
 from __future__ import annotations
 
@@ -244,7 +244,7 @@ def test_a_folder_in_use_is_refused_with_the_way_on(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(InputError, match="choose another --out"):
         simulate(config(), "tls", tmp_path)
-    with pytest.raises(InputError, match="holds no run"):
+    with pytest.raises(InputError, match="contains no run"):
         simulate(config(), "tls", tmp_path / "nothing", resume=True)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
@@ -302,7 +302,7 @@ def test_a_wrong_config_is_answered_with_the_right_key(text: str, message: str, 
 
 
 def test_a_bare_sensor_model_is_a_config(tmp_path: Path) -> None:
-    """model_after.yaml of the gap workflow runs in `simulate`, as --config and as --set sensor=FILE."""
+    """`simulate` accepts model_after.yaml, which `gap` writes, as --config and as --set sensor=FILE."""
     model = tmp_path / "model_after.yaml"
     model.write_text("sensor: tls\nnoise: {range_sigma_m: 0.004}\neffects: [{name: range_offset, offset_m: 0.002}]\n")
     full = tmp_path / "config.yaml"

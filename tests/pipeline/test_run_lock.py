@@ -1,4 +1,4 @@
-"""A run folder has one writer; what a run finished is whole or made again; what others put beside it stays."""
+"""A run folder has one writer; a finished part is complete or made again; other files beside it stay."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def copied(folder: Path, to: Path) -> Path:
 
 
 def test_a_run_is_not_resumed_while_it_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nor begun a second time; and it ends as if nobody had tried."""
+    """Nor is it started a second time; and the running one ends as if nobody had tried."""
     out, answers = tmp_path / "run", []
     real = pipeline_run.observe_epoch
 
@@ -72,7 +72,7 @@ def test_what_stands_where_the_lock_should_is_refused_and_stays(make: Callable[[
 
 
 def test_the_lock_goes_with_its_process(tmp_path: Path) -> None:
-    """kill -9 leaves the lock's file, and nobody holds it."""
+    """kill -9 leaves the lock's file behind, but nobody holds the lock."""
     program = (
         "import sys, pathlib, os; from pipeline.formats.files.lock import locked\n"
         "with locked(pathlib.Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
@@ -97,7 +97,7 @@ def test_the_lock_goes_with_its_process(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_run_that_is_killed_goes_on_to_the_same_bytes(finished: Path, tmp_path: Path) -> None:
-    """kill -9 of the command itself in the middle of the reference epoch, then of its successor among the maps."""
+    """The command gets kill -9 in the middle of the reference epoch, and its successor among the maps."""
     out, coarse = tmp_path / "run", tmp_path / "coarse.yaml"
     coarse.write_text(json.dumps(config(**COARSE).model_dump(mode="json")))
     program = "from pipeline.cli.main import simulate; raise SystemExit(simulate())"
@@ -211,7 +211,7 @@ def test_an_error_takes_only_what_the_run_wrote(tmp_path: Path, monkeypatch: pyt
 def test_an_error_is_one_line_whatever_the_folder_is(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """`.`, a link and a folder that was there (as a mount point is) stay, empty."""
+    """`.`, a link and an existing folder (like a mount point) remain, empty."""
     folder = tmp_path / "folder"
     folder.mkdir()
     (tmp_path / "link").symlink_to(folder)

@@ -1,7 +1,7 @@
-"""The scanning pattern out of raw points: the project's own scanner, a tilted scan made here, and real scans where they lie.
+"""The scanning pattern found from raw points: the project's own scanner, a tilted scan made here, and real scans.
 
-The real data lie beside the checkout (`shared/`, made available to continuous integration); tests of them are skipped, with the
-path, where that folder is missing.
+The real data lie beside the checkout (`shared/`, also available to continuous integration); tests of them are skipped, with a
+message that names the path, where that folder is missing.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ POSITION = np.array([0.3, -0.2, 50.0])
 
 
 def scan(noise_m: float = 0.0, centre: float = 0.0) -> tuple[Observation, Pattern]:
-    """A window of 300 x 200 directions on a rough wall before empty sky; `centre`: azimuth of its middle, rad."""
+    """Return a scan of 300 x 200 directions of a rough wall before empty sky; `centre`: azimuth of its middle, rad."""
     wall = heightfield(30.0, 20.0, 0.5)
     mesh = wall.with_vertices(wall.vertices - [15.0, 10.0, 0.0])
     pattern = Pattern(centre - 0.36, 0.0024, 300, np.pi / 2 - 0.25, 0.0025, 200)
@@ -46,7 +46,7 @@ def scan(noise_m: float = 0.0, centre: float = 0.0) -> tuple[Observation, Patter
 
 
 def assert_pattern(found: ScanGeometry, seen: Observation, pattern: Pattern, points: np.ndarray, atol: float) -> None:
-    """Steps, starts and every point's place; rows and columns without a return at the window's edge are not to be known."""
+    """Assert steps, starts and every point's row and column; rows and columns without a return at the edge cannot be known."""
     line, pulse = np.nonzero(seen.valid)
     first_line, first_pulse = line.min(), pulse.min()
     np.testing.assert_array_equal(found.line, (line - first_line)[points])
@@ -62,7 +62,7 @@ def assert_pattern(found: ScanGeometry, seen: Observation, pattern: Pattern, poi
 @pytest.mark.parametrize("noise_m", [0.0, 0.01])
 @pytest.mark.parametrize("centre", [0.0, 3.1])
 def test_our_own_scan_gives_back_its_pattern(noise_m: float, centre: float) -> None:
-    """Recorded directions are nominal whatever the noise, so the pattern comes back to rounding; also across azimuth = pi."""
+    """Recorded directions are nominal whatever the noise, so the pattern is found to rounding; also across azimuth = pi."""
     seen, pattern = scan(noise_m, centre)
     rotation = LEVEL @ Rotation.from_rotvec([0, 0, -centre]).as_matrix()
     found = recover_pattern(seen.points[seen.valid], POSITION, rotation)
@@ -91,7 +91,7 @@ def test_the_pattern_is_found_in_shuffled_half_empty_points_with_second_echoes()
 
 
 def test_the_pattern_survives_a_laz_file(tmp_path: Path) -> None:
-    """Coordinates in whole micrometres at 50 m: 1e-8 rad each, 1e-9 in the start over 30,000 points."""
+    """Coordinates are in whole micrometres at 50 m: 1e-8 rad each, 1e-9 in the start over 30,000 points."""
     seen, pattern = scan(0.003)
     write_laz(tmp_path / "a.laz", PointCloud(seen.points[seen.valid]))
     found = recover_pattern(read_laz(tmp_path / "a.laz").points, POSITION, LEVEL)
@@ -100,7 +100,7 @@ def test_the_pattern_survives_a_laz_file(tmp_path: Path) -> None:
 
 
 def tilted_scan(rng: np.random.Generator) -> tuple[FloatArray, np.ndarray, np.ndarray, FloatArray]:
-    """A full circle as a turning head with a running mirror makes it: tilted, lines slanted, each with its own first zenith.
+    """Make a full circle like a turning head with a running mirror: tilted, with slanted lines, each with its own first zenith.
 
     Returns points in the level frame rounded to 1 mm, line, pulse, and the rotation of the axis's frame to the level one.
     """
@@ -116,7 +116,7 @@ def tilted_scan(rng: np.random.Generator) -> tuple[FloatArray, np.ndarray, np.nd
 
 
 def test_a_tilted_scan_gives_back_its_axis_lines_and_steps() -> None:
-    """1 mm of rounding at 6 to 18 m is 25 urad of noise in each angle; 100,000 points bring axis and steps far below that."""
+    """1 mm of rounding at 6 to 18 m is 25 urad of noise in each angle; 100,000 points give axis and steps far more precisely."""
     points, line, pulse, rotation = tilted_scan(np.random.default_rng(5))
     found = recover_pattern(points)
     assert np.degrees(found.lines.step) == pytest.approx(0.899, abs=1e-6)
@@ -150,7 +150,9 @@ def test_points_without_a_pattern_are_named(points: np.ndarray, message: str) ->
 
 
 def test_an_origin_that_is_off_shows_in_the_residuals() -> None:
-    """0.5 m at 50 m bend the pattern of a nearly flat wall by a tenth of a milliradian; the right origin leaves rounding."""
+    """An error of 0.5 m at 50 m bends the pattern of a nearly flat wall by a tenth of a milliradian; with the right origin only
+    rounding remains.
+    """
     seen, _ = scan()
     points = seen.points[seen.valid]
     off = recover_pattern(points, POSITION + np.array([0.5, 0.0, 0.0]), LEVEL)
@@ -159,10 +161,11 @@ def test_an_origin_that_is_off_shows_in_the_residuals() -> None:
 
 @pytest.mark.skipif(not FOREST.exists(), reason=f"the real scan is not there: {FOREST}")
 def test_a_real_scan_has_the_documented_pattern() -> None:
-    """RIEGL VZ-400i in a forest, 1 mm coordinates at 1 to 15 m (its README): 580 lines, steps 0.622 x 0.048 deg, zenith from 30
-    to 130.024 deg, roll 1.026 and pitch 0.746 deg.
+    """The pattern of a RIEGL VZ-400i scan in a forest is as its README documents it.
 
-    RIEGL scanners fire about 1 % faster than nominal, so the true zenith step is that much smaller than the documented one.
+    Coordinates have 1 mm, ranges 1 to 15 m. The scan has 580 lines, steps of 0.622 x 0.048 deg, zenith angles from 30 to 130.024
+    deg, and a roll of 1.026 and a pitch of 0.746 deg. RIEGL scanners fire about 1 % faster than nominal, so the true zenith step
+    is that much smaller than the documented one.
     """
     data = np.load(FOREST)
     found = recover_pattern(np.stack([data[axis] for axis in "XYZ"], axis=1))
@@ -187,7 +190,7 @@ def test_a_real_scan_has_the_documented_pattern() -> None:
 @pytest.mark.skipif(not MEASUREMENTS.exists(), reason=f"the measurements are not there: {MEASUREMENTS}")
 @pytest.mark.parametrize("name", ["tls_no_effect", "tls_one_effect", "tls_outside_catalogue"])
 def test_a_measurement_has_the_pattern_it_states(name: str) -> None:
-    """Made by a generator that is not ours, in the contract's form; stated to 12 decimals."""
+    """Made by an independent generator in the documented form; stated to 12 decimals."""
     stated = yaml.safe_load((MEASUREMENTS / name / "measurement.yaml").read_text())
     found = recover_pattern(read_points(MEASUREMENTS / name / stated["points"]).points)
     for key, values in found.pattern.items():

@@ -38,7 +38,7 @@ LEFT, RIGHT = (-1.0, 5.0, 18.0), (17.0, 5.0, 18.0)
 
 
 def station(position: tuple[float, float, float], pose_sigma: PoseSigma = EXACT_POSE, step_rad: float = 0.002) -> LaserScanner:
-    """A scanner that looks to the wall's middle, its vertical axis along y."""
+    """Return a scanner that faces the wall's middle, with its vertical axis along y."""
     forward = (np.array([8.0, 5.0, 0.0]) - position) * [1, 0, 1]
     forward /= np.linalg.norm(forward)
     up = np.array([0.0, 1.0, 0.0])
@@ -55,21 +55,23 @@ def joined(scanners: list[LaserScanner], seed: int, icp: IcpConfig | None = TO_T
 
 
 def pose_error(scanner: LaserScanner, random: KeyedRandom) -> RigidTransform:
-    """From recorded to true coordinates."""
+    """Return the transform from recorded to true coordinates."""
     position, rotation = scanner.pose_sigma.displaced(scanner.position, scanner.rotation, random.child("pose"))
     turn = rotation @ scanner.rotation.T
     return RigidTransform(turn, position - turn @ scanner.position)
 
 
 def misfit(found: RigidTransform, true: RigidTransform) -> FloatArray:
-    """(n,) how far the transforms lie apart on the wall, m."""
+    """Return how far the transforms are apart on the wall (n,), m."""
     return np.linalg.norm(found.apply(WALL.vertices) - true.apply(WALL.vertices), axis=1)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_stations_with_wrong_poses_are_registered_to_the_noise_over_the_root_of_the_points(seed: int) -> None:
-    """Tolerance 40 sigma / sqrt(n), 0.3 mm here: the relief (slopes about 0.3) tells shifts along the wall three times less well
-    than across, both stations are noisy, neighbouring pairs share reference points, and the wall's worst corner counts."""
+    """The tolerance is 40 sigma / sqrt(n), 0.3 mm here: relief (slopes about 0.3) determines shifts along the wall three times
+    less well than across, both stations have noise, neighbouring pairs share reference points, and the wall's worst corner
+    counts.
+    """
     scanners = [station(LEFT), station(RIGHT, SECOND_POSE)]
     result = joined(scanners, seed)
     true = pose_error(scanners[1], KeyedRandom(seed).child(1))
@@ -81,7 +83,7 @@ def test_stations_with_wrong_poses_are_registered_to_the_noise_over_the_root_of_
 
 
 def test_the_re_setup_error_is_what_the_registration_reports() -> None:
-    """Over ten epochs the registrations scatter as the poses do: nothing where they are exact, the pose error where not."""
+    """Over ten epochs the registrations scatter like the poses: not at all where these are exact, by the pose error otherwise."""
     exact = joined([station(LEFT), station(RIGHT)], 1).registrations[0]
     assert misfit(exact.transform, RigidTransform.identity()).max() < 40 * SIGMA_M / np.sqrt(exact.inliers)
     moved = [
@@ -98,8 +100,9 @@ def test_without_registration_the_surveyed_poses_stand() -> None:
 
 
 def test_the_merged_surface_covers_what_either_station_sees_and_is_the_better_ones_there() -> None:
-    """Stations that each see two thirds of the wall: a height at each pixel that has one in either; equal to one of them, which
-    is the near one's beside each station."""
+    """The stations each see two thirds of the wall: each pixel that has a height in either one has one, equal to one of them, and
+    close to a station equal to that station's.
+    """
     scanners = [station(LEFT), station(RIGHT)]
     random = KeyedRandom(4)
     meshes = []
@@ -164,7 +167,7 @@ def test_a_run_with_two_stations_holds_the_points_of_both(finished: Path) -> Non
 
 
 def test_returns_are_numbered_in_the_file(finished: Path) -> None:
-    """Every pulse's returns follow each other, numbered from 1 to their count."""
+    """The returns of a pulse follow each other, numbered from 1 to their count."""
     cloud = read_laz(finished / "epoch_001/points.laz")
     number, count = (cloud.extra[name] for name in ("return_number", "number_of_returns"))
     assert count.max() >= 2

@@ -1,4 +1,4 @@
-"""`scarpsim surface`: points become a wall that is where they are."""
+"""`scarpsim surface`: points become a wall at the same place."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 @pytest.fixture(scope="module")
 def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Points every 8 cm on a rough wall of 6 x 4 m in survey coordinates, in no order."""
+    """Points about every 8 cm on a rough wall of 6 x 4 m in survey coordinates, in random order."""
     points = heightfield(6.0, 4.0, 0.08, roughness=0.05).vertices
     path = tmp_path_factory.mktemp("cloud") / "scan.laz"
     write_laz(path, PointCloud(np.random.default_rng(1).permutation(points) @ TURN.T + ORIGIN))
@@ -82,7 +82,7 @@ def test_a_step_is_not_bridged_and_a_hole_stays_open() -> None:
 
 
 def test_rounded_points_are_refused_as_those_of_a_wall() -> None:
-    """Survey coordinates in single precision have steps of 3 cm and 0.5 m, which would be meshed to terraces."""
+    """Survey coordinates in single precision have steps of 3 cm and 0.5 m, which would be meshed as terraces."""
     points = (heightfield(6.0, 4.0, 0.08, roughness=0.05).vertices @ TURN.T + ORIGIN).astype(np.float32)
     with pytest.raises(InputError, match=r"x in steps of 0.0312 m \(single precision.* the points' spacing is 0.0"):
         mesh_points(points, STATION)

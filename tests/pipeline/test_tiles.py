@@ -1,4 +1,4 @@
-"""Tiles against the raster they were cut from."""
+"""Tiles compared with the raster they were cut from."""
 
 import numpy as np
 import pytest

@@ -21,7 +21,7 @@ from scene.geometry.mesh import FloatArray
 
 
 def planted(model: VariogramModel, shape: tuple[int, int], gsd: float, random: KeyedRandom) -> FloatArray:
-    """A Gaussian field with the model's covariance, by circulant embedding (Dietrich and Newsam 1997)."""
+    """Return a Gaussian field with the model's covariance, by circulant embedding (Dietrich and Newsam 1997)."""
     padded = tuple(3 * size for size in shape)
     row, column = (np.minimum(np.arange(size), size - np.arange(size)) * gsd for size in padded)
     power = np.maximum(np.fft.fft2(model.covariance(np.hypot(row[:, None], column[None]))).real, 0.0)
@@ -35,7 +35,7 @@ TWO_PARTS = VariogramModel(0.003**2, (Structure("spherical", 0.008**2, 0.4),))
 
 @pytest.mark.parametrize("direction", ["all", "x", "y"])
 def test_all_pairs_of_a_raster_with_holes(direction: str) -> None:
-    """Against every pair by hand: same mean, to rounding."""
+    """The result equals the mean over every pair, computed directly, to rounding."""
     generator = KeyedRandom(3).generator()
     values = generator.normal(5.0, 0.1, (17, 23))
     values[generator.random(values.shape) < 0.3] = np.nan
@@ -52,7 +52,9 @@ def test_all_pairs_of_a_raster_with_holes(direction: str) -> None:
 
 
 def test_planted_nugget_sill_and_range_are_found() -> None:
-    """The mean over four fields of 20 x 20 m; scatter of one field's sill 5 %, of its range 8 %, so the limits are 3.5 sigma."""
+    """The mean over four fields of 20 x 20 m; the sill of one field scatters by 5 %, its range by 8 %, so the limits are 3.5
+    sigma.
+    """
     fits = [fit_variogram(variogram(planted(TWO_PARTS, (200, 200), 0.1, KeyedRandom(seed)), 0.1)) for seed in range(4)]
     assert np.mean([fit.sill_m2 for fit in fits]) == pytest.approx(TWO_PARTS.sill_m2, rel=0.09)
     assert np.mean([fit.structures[0].range_m for fit in fits]) == pytest.approx(0.4, rel=0.14)
@@ -80,7 +82,7 @@ def test_white_noise_is_a_nugget_and_every_pixel_counts() -> None:
 
 
 def test_variance_of_a_mean_by_simulation() -> None:
-    """400 planted fields: the variance of their means has a relative standard error of sqrt(2 / 400) = 7 %; limit 3.5 of them."""
+    """400 planted fields: the variance of their means has a relative standard error of sqrt(2 / 400) = 7 %; the limit is 3.5."""
     generator = KeyedRandom(8).generator()
     mask = generator.random((30, 30)) < 0.7
     means = [planted(TWO_PARTS, mask.shape, 0.05, KeyedRandom(9).child(number))[mask].mean() for number in range(400)]
@@ -95,7 +97,7 @@ def test_nothing_to_compare_is_said() -> None:
 
 
 def test_several_rasters_are_pooled_within_each() -> None:
-    """Constants that differ from raster to raster make no semivariance; pairs add up."""
+    """Constants that differ between rasters add no semivariance; the numbers of pairs are summed."""
     noise = KeyedRandom(4).generator().normal(0, 1, (3, 20, 30))
     one, three = variogram(noise[0], 1.0), variogram(noise + np.array([0.0, 50.0, -9.0])[:, None, None], 1.0)
     assert three.pairs == pytest.approx(3 * one.pairs)

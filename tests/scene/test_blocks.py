@@ -1,4 +1,4 @@
-"""Blocks: their shape, and their placement checked against slow, obvious loops."""
+"""Blocks: their shape, and their placement compared with slow, simple loops."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_irregular_blocks_are_closed_solids_that_do_not_cut_themselves(wall: Tri
 
 
 def centre_of_rays(blocks: Any, index: int) -> np.ndarray:
-    """The point that a block's vertices were moved away from: its placement shifts it along z only."""
+    """Return the point that a block's vertices were moved away from; placement shifts it along z only."""
     x, y, _ = blocks.position_m[index]
     mesh = blocks.mesh(index)
     a = mesh.vertices[mesh.faces[:, 0]]
@@ -92,7 +92,7 @@ def outlines(blocks: Blocks) -> list[np.ndarray]:
 
 
 def brute_force_top(wall: TriangleMesh, outline: np.ndarray) -> float:
-    """The largest z over the convex hull of an outline, by clipping every triangle that is near with the hull's half-planes."""
+    """Return the largest z over the convex hull of an outline, clipping every nearby triangle with the hull's half-planes."""
     hull = ConvexHull(outline)
     low, high = outline.min(axis=0), outline.max(axis=0)
     triangles = wall.vertices[wall.faces]
@@ -115,7 +115,7 @@ def brute_force_top(wall: TriangleMesh, outline: np.ndarray) -> float:
 
 @pytest.mark.parametrize("size", [0.08, 0.4, 1.5])
 def test_the_relief_is_that_within_the_contour(wall: TriangleMesh, size: float) -> None:
-    """Beside vertices the wall is looked up at places, so that an edge that crosses the contour may stand 8 mm higher."""
+    """Besides vertices the wall is sampled at places, so an edge that crosses the contour may be 8 mm higher."""
     found = outlines(place_blocks(config(count=6, size_m=size), wall, RANDOM))
     tops = highest_under(RayCaster(wall), found)
     exact = np.array([brute_force_top(wall, outline) for outline in found])
@@ -124,7 +124,7 @@ def test_the_relief_is_that_within_the_contour(wall: TriangleMesh, size: float) 
 
 
 def test_a_block_at_the_highest_vertex_lies_there_or_where_there_is_none_at_the_highest_relief(wall: TriangleMesh) -> None:
-    """Vertices are 0.08 m apart, so that a contour of 0.04 m holds one or none."""
+    """Vertices are 0.08 m apart, so a contour of 0.04 m contains one or none."""
     holding = set()
     for size in (0.04, 0.4):
         blocks = place_blocks(config(count=30, size_m=size, placement="highest_vertex"), wall, RANDOM)
@@ -151,7 +151,7 @@ def test_a_block_on_the_mean_surface_lies_at_the_median_height_and_takes_more_ro
 
 
 def clipped(polygon: np.ndarray, low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
-    """Sutherland and Hodgman: the part of a polygon inside a box; empty where there is none."""
+    """Return the part of a polygon inside a box (Sutherland and Hodgman); empty if there is none."""
     points = list(polygon)
     for axis, sign, limit in [(0, 1, low[0]), (1, 1, low[1]), (0, -1, high[0]), (1, -1, high[1])]:
         result = []

@@ -1,4 +1,4 @@
-"""Carving against closed forms and independent oracles: volumes, labels, topology, rims without cracks or slivers."""
+"""Carving against closed forms and independent calculations: volumes, labels, topology, rims without cracks or slivers."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ def blocks_on(wall: TriangleMesh, **values: Any) -> Blocks:
 
 
 def edge_counts(faces: np.ndarray) -> np.ndarray:
-    """How many faces each undirected edge has."""
+    """Return how many faces each undirected edge has."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     return np.unique(edges, axis=0, return_counts=True)[1]
 
 
 def loops(mesh: TriangleMesh) -> set[tuple[float, ...]]:
-    """The directed boundary edges by their coordinates."""
+    """Return the directed boundary edges by their coordinates."""
     start, end = boundary(mesh.faces)
     return {tuple(edge) for edge in np.hstack([mesh.vertices[start], mesh.vertices[end]]).tolist()}
 
 
 def rim(mesh: TriangleMesh) -> np.ndarray:
-    """(n,) whether a vertex is in faces of the wall and of a niche."""
+    """Return whether a vertex (n,) is in faces of the wall and of a niche."""
     assert mesh.face_block is not None
     sides = np.zeros((2, len(mesh.vertices)), dtype=bool)
     for side, chosen in enumerate([mesh.face_block == 0, mesh.face_block > 0]):
@@ -50,7 +50,7 @@ def rim(mesh: TriangleMesh) -> np.ndarray:
 
 
 def assert_sound(carved: Carved, wall: TriangleMesh, blocks: Blocks) -> None:
-    """All that holds for every carved wall."""
+    """Assert everything that holds for every carved wall."""
     mesh = carved.mesh
     assert mesh.face_block is not None
     assert mesh.vertex_block is not None
@@ -122,7 +122,7 @@ def test_three_hundred_blocks_in_a_rough_wall(rough: TriangleMesh, rough_blocks:
 
 
 def prisms(mesh: TriangleMesh, base: float) -> float:
-    """Volume above the plane z = base."""
+    """Return the volume between the mesh and the plane z = base."""
     triangles = mesh.vertices[mesh.faces]
     area = np.linalg.det(triangles[:, 1:, :2] - triangles[:, :1, :2]) / 2
     return float(np.sum(area * (triangles[:, :, 2].mean(axis=1) - base)))
@@ -187,7 +187,7 @@ def test_two_triangles_with_many_niches() -> None:
 
 
 def test_blocks_aligned_with_the_wall_edges() -> None:
-    """Sides of cubes along rows of vertices, within micrometres: the worst case for slivers."""
+    """Sides of cubes lie along rows of vertices, to micrometres, which makes the most slivers."""
     wall = plane_wall(6, 6, cell_m=0.1)
     blocks = blocks_on(wall, count=12, shape="cube", size_m=0.4, subdivisions=1, **SMOOTH)
     vertices, position = blocks.vertices.copy(), blocks.position_m.copy()
@@ -201,7 +201,9 @@ def test_blocks_aligned_with_the_wall_edges() -> None:
 
 @pytest.mark.parametrize(("seed", "cell_m", "sigma"), [(4, 0.1, 0.1), (6, 0.05, 0.02)])
 def test_slivers_that_resist_the_simplest_collapse(seed: int, cell_m: float, sigma: float) -> None:
-    """Two walls of some dozens tried on which one sliver outlived a mending that collapsed shortest sides one way only."""
+    """Two walls, of some dozens tried, on which one sliver remained when the repair collapsed shortest sides in one direction
+    only.
+    """
     wall = rough_wall(14, 10, cell_m, seed=seed)
     irregular = {"count": 100, "irregularity": {"kind": "gaussian", "mean": 0, "sigma": sigma}}
     blocks = place_blocks(parse(RockfallConfig, irregular, where="test"), wall, KeyedRandom(seed))

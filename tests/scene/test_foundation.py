@@ -30,7 +30,7 @@ SIGNIFICANCE = 1e-5
 
 
 def leaning_wall(offset: np.ndarray) -> np.ndarray:
-    """Points of a plane that leans back by 20 degrees and faces south-west, with relief, world frame."""
+    """Return points of a plane that leans back by 20 degrees and faces south-west, with relief, world frame."""
     random = np.random.default_rng(1)
     outward = np.array([-0.6, -0.8, 0.0]) * np.cos(0.35) + np.array([0, 0, 1.0]) * np.sin(0.35)
     along = np.array([0.8, -0.6, 0.0])
@@ -92,10 +92,10 @@ def test_hits_are_refined_to_float64() -> None:
 
 
 def test_rays_at_edges_and_silhouettes_are_settled_in_float64() -> None:
-    """Against every triangle in double precision: rays through points within 20 um of edges of a steep wall 100 m away.
+    """Compared with every triangle in double precision: rays through points within 20 um of edges of a steep wall 100 m away.
 
-    At most one in two hundred of these chosen rays may still be wrong by more than 0.1 um (where all the rays beside it meet a
-    third face); of all rays, one in a thousand passes an edge as closely.
+    At most one in two hundred of these chosen rays may be wrong by more than 0.1 um (where all the rays around it meet a third
+    face); only one ray in a thousand passes so close to an edge.
     """
     wall = heightfield(6.0, 4.0, 0.1, roughness=1.5)
     random = np.random.default_rng(4)
@@ -117,7 +117,7 @@ def test_rays_at_edges_and_silhouettes_are_settled_in_float64() -> None:
 
 
 def first_hit(origin: np.ndarray, direction: np.ndarray, mesh: TriangleMesh) -> float:
-    """Distance, in lengths of the direction, to the nearest triangle that the ray goes through; NaN for a miss."""
+    """Return the distance, in lengths of the direction, to the nearest triangle that the ray hits; NaN for a miss."""
     a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
     across = np.cross(direction, c - a)
     scale = 1 / np.einsum("ij,ij->i", b - a, across)
@@ -158,7 +158,7 @@ def test_heights_are_those_of_the_surface_and_nan_beside_it() -> None:
 
 
 def test_no_ray_leaks_through_a_closed_fine_mesh() -> None:
-    """327,680 triangles below a tenth of a metre seen from within: every ray hits."""
+    """327,680 triangles smaller than a tenth of a metre, seen from inside: every ray hits."""
     ball = sphere(np.zeros(3), 5.0, 7)
     directions = np.random.default_rng(3).normal(size=(200_000, 3))
     _, face = RayCaster(ball).cast(np.zeros(3), directions)

@@ -1,4 +1,4 @@
-"""What a JSON file takes in memory is known before it is read, and is bounded."""
+"""The memory that a JSON file will need is estimated before it is read, and is limited."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Dr.Jit takes NumPy's memory as it is, and its kernels read whole packets of 16: nothing may be read past an array's end.
+"""Dr.Jit uses NumPy's memory directly, and its kernels read packets of 16: nothing may be read past an array's end.
 
-Seldom does the memory end there, and then the process dies. Here it always does: the page after the array is forbidden.
+Memory seldom ends there, and then the process dies. Here it always does: the page after the array is protected.
 """
 
 import subprocess

@@ -21,7 +21,7 @@ L_SHAPE = np.array([[0.0, 0, 4], [0, 0, 0], [6, 0, 0], [6, 0, 1], [2, 0, 1], [2,
 @pytest.mark.parametrize("first", range(6))
 @pytest.mark.parametrize("turn", [1, -1])
 def test_a_concave_polygon_is_filled_once(first: int, turn: int) -> None:
-    """From whichever corner it begins and in either direction, tilted in space; normals point to the polygon's own side."""
+    """From any starting corner and in either direction, tilted in space; normals point to the polygon's own side."""
     rotation, _ = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))
     corners = np.roll(L_SHAPE, -first, axis=0)[::turn] @ rotation.T
     triangles = triangulate_polygons(corners, np.arange(6)[None])

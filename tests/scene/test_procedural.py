@@ -25,7 +25,7 @@ class Run(Config):
 
 
 def wall_grid(style, resolution_m, width_m=12.0, height_m=8.0, seed=1):
-    """(rows, columns, 3) vertices and (rows, columns) albedo."""
+    """Return vertices (rows, columns, 3) and albedo (rows, columns)."""
     config = ProceduralWall(style=style, width_m=width_m, height_m=height_m, resolution_m=resolution_m)
     mesh = config.mesh(KeyedRandom(seed))
     columns = round(width_m / resolution_m) + 1
@@ -33,7 +33,7 @@ def wall_grid(style, resolution_m, width_m=12.0, height_m=8.0, seed=1):
 
 
 def normal_relief(mesh):
-    """Heights over the mean plane and the plane's slope, rad."""
+    """Return heights over the mean plane, m, and the plane's slope, rad."""
     frame = WallFrame.fit(mesh.vertices, SENSORS)
     return frame.to_wall(mesh.vertices), np.arccos(frame.rotation[2, 2])
 

@@ -1,4 +1,4 @@
-"""Rounded coordinates: told by their values in any file, refused where they spoil the surface, and nothing else is."""
+"""Rounded coordinates: recognised by their values in any file, refused where they spoil the surface, and only there."""
 
 import numpy as np
 import pytest
@@ -65,7 +65,7 @@ def test_few_decimals_are_refused_by_the_edges_and_told_else(tmp_path):
 
 
 def raster_tin():
-    """An irregular network over nodes of a grid of 0.5 m, the heights in float32, as a terrain model's file gives them."""
+    """Return an irregular network over nodes of a grid of 0.5 m, with heights in float32, as terrain-model files have them."""
     random = np.random.default_rng(5)
     nodes = np.unique(0.5 * random.integers(0, 80, (900, 2)), axis=0)
     from scipy.spatial import Delaunay
@@ -76,7 +76,7 @@ def raster_tin():
 
 
 def box():
-    """A stepped wall of whole half metres, as one builds by hand."""
+    """Return a stepped wall of whole half metres, as one builds by hand."""
     block = trimesh.creation.box((4.0, 1.0, 3.0)).subdivide()
     return TriangleMesh(np.asarray(block.vertices) + UTM, np.asarray(block.faces, np.int32))
 

@@ -1,4 +1,4 @@
-"""Parts of a mesh on vertices of their own, against NumPy's sorting."""
+"""Parts of a mesh with their own vertices, compared with NumPy's sorting."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_submesh_keeps_places_and_channels() -> None:
 
 
 def test_tetrahedra_of_a_sphere_sum_to_its_volume() -> None:
-    """Outwards, from wherever inside: 4/3 pi r^3 less what the facets cut off."""
+    """The sign is positive outwards, for any point inside: 4/3 pi r^3 less what the facets cut off."""
     mesh = sphere(np.zeros(3), 2.0, 4)
     for origin in (np.zeros(3), np.array([0.3, -0.2, 0.5])):
         assert signed_volumes(mesh.corners() - origin).sum() / 6 == pytest.approx(4 / 3 * np.pi * 8, rel=0.05)

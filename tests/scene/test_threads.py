@@ -1,4 +1,4 @@
-"""Work side by side: results in their order, in the context of the caller, and errors of the work itself."""
+"""Parallel work in threads: results in order, in the caller's context, and errors of the work itself."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes whose parts touch: rock is opaque from both sides, and nothing is lost where a rock stands on the ground."""
+"""Scenes with touching parts: rock is opaque from both sides, and nothing is lost where a rock stands on the ground."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SIDE_M, WALL_M = 2.0, 8.0
 
 
 def _wall_with_cube(inside_out: bool) -> TriangleMesh:
-    """A square wall in the plane z = 0 with a cube that stands on it and shares the four edges of its foot."""
+    """Return a square wall in the plane z = 0 with a cube that stands on it and shares the four edges of its foot."""
     steps = np.arange(-WALL_M, WALL_M + 1)
     x, y = np.meshgrid(steps, steps)
     ground = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
@@ -33,7 +33,9 @@ def _wall_with_cube(inside_out: bool) -> TriangleMesh:
 
 
 def _distances(rays: FloatArray) -> FloatArray:
-    """(n,) distance to the wall with the cube along unit vectors from EYE, in closed form (slabs of the cube; the plane)."""
+    """Return the distance (n,) to the wall with the cube along unit vectors from EYE, in closed form (slabs of the cube; the
+    plane).
+    """
     with np.errstate(divide="ignore"):
         low, high = ((np.array(bound) - EYE) / rays for bound in ([-1, -1, 0], [1, 1, 2]))
     enters, leaves = np.minimum(low, high).max(axis=1), np.maximum(low, high).min(axis=1)
@@ -55,7 +57,7 @@ def test_rays_meet_a_rock_that_stands_on_the_wall_however_it_is_wound(inside_out
 
 @pytest.mark.parametrize("sensor", ["tls", "stereo"])
 def test_both_sensors_see_faces_that_are_wound_away_from_them(sensor: str) -> None:
-    """A plane of which every second triangle is turned, as a wall handed in from outside: each gives the same range."""
+    """Every second triangle of a plane is reversed, as on imported walls: each gives the same range."""
     corner = np.array([[x, 0.0, z] for z in range(5) for x in range(7)], dtype=np.float64)
     cells = np.array([(7 * row + column) for row in range(4) for column in range(6)])
     faces = np.concatenate([np.column_stack([cells, cells + 1, cells + 8]), np.column_stack([cells, cells + 8, cells + 7])])

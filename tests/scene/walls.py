@@ -9,7 +9,7 @@ from scene.geometry.mesh import TriangleMesh
 
 
 def grid_wall(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> TriangleMesh:
-    """A wall over a regular grid; x, y, z: (rows, columns), m, columns along x."""
+    """Return a wall over a regular grid; x, y, z: (rows, columns), m, columns along x."""
     number = np.arange(z.size).reshape(z.shape)
     a, b, c, d = (number[rows, columns].ravel() for rows, columns in CORNERS)
     faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]).astype(np.int32)
@@ -21,13 +21,13 @@ CORNERS = [(LOW, LOW), (LOW, HIGH), (HIGH, HIGH), (HIGH, LOW)]
 
 
 def plane_wall(width_m: float, height_m: float, slope: float = 0.0, cell_m: float = 0.1) -> TriangleMesh:
-    """The plane z = slope * x over [0, width] x [0, height]."""
+    """Return the plane z = slope * x over [0, width] x [0, height]."""
     x, y = np.meshgrid(np.arange(0, width_m + cell_m / 2, cell_m), np.arange(0, height_m + cell_m / 2, cell_m))
     return grid_wall(x, y, slope * x)
 
 
 def rough_wall(width_m: float, height_m: float, cell_m: float, seed: int = 0) -> TriangleMesh:
-    """Relief of some decimetres over metres, and of a fifth of a cell from vertex to vertex."""
+    """Return a wall with relief of some decimetres over metres, and of a fifth of a cell from vertex to vertex."""
     x, y = np.meshgrid(np.arange(0, width_m, cell_m), np.arange(0, height_m, cell_m))
     random = np.random.default_rng(seed)
     relief = ndimage.gaussian_filter(random.normal(size=x.shape), 1.0 / cell_m)
@@ -35,7 +35,7 @@ def rough_wall(width_m: float, height_m: float, cell_m: float, seed: int = 0) ->
 
 
 def closed(wall: TriangleMesh, thickness_m: float) -> TriangleMesh:
-    """A grid wall made a closed solid by a copy behind it and sides."""
+    """Return a grid wall closed to a solid by a copy behind it and sides."""
     directed = {(a, b) for face in wall.faces.tolist() for a, b in zip(face, face[1:] + face[:1], strict=True)}
     start, end = np.array([edge for edge in sorted(directed) if edge[::-1] not in directed]).T
     count = len(wall.vertices)

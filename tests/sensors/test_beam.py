@@ -1,4 +1,4 @@
-"""The laser beam's footprint against closed forms on planes and edges, and against a slow twin in NumPy."""
+"""The laser beam's footprint against closed forms on planes and edges, and against a slow implementation in NumPy."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_sub_rays_have_the_moments_of_the_gaussian(count: int) -> None:
 
 @pytest.mark.parametrize(("count", "worst", "typical"), [(7, 0.22, 0.08), (19, 0.11, 0.035), (37, 0.07, 0.025), (61, 0.05, 0.02)])
 def test_a_straight_edge_cuts_off_the_gaussians_energy(count: int, worst: float, typical: float) -> None:
-    """The stated bounds, for edges in all directions, against the error function."""
+    """The error stays within the stated bounds, for edges in all directions, compared with the error function."""
     offsets, edges = unit_offsets(count), np.linspace(-1.0, 1.0, 801)
     for angle in np.linspace(0.0, np.pi, 90):
         across = offsets @ [np.cos(angle), np.sin(angle)]
@@ -68,7 +68,9 @@ def test_on_a_tilted_plane_the_range_is_the_axiss_to_second_order(mode: str) -> 
 
 @pytest.mark.parametrize(("count", "worst"), [(19, 0.11), (37, 0.07)])
 def test_a_mixed_pixel_is_the_centroid_of_what_the_edge_leaves_on_either_side(count: int, worst: float) -> None:
-    """A step of 0.3 m, within c tau / 2 = 0.45 m: the error function's split to the sub-rays' bound, no bias over the edge."""
+    """A step of 0.3 m, within c tau / 2 = 0.45 m: the split by the error function to the sub-rays' bound, without bias over the
+    edge.
+    """
     near, far, divergence = 0.3, 0.0, 2e-3
     seen = edge(step(near, far), divergence, sub_rays=count)
     expected = centroid(seen, near, far, divergence)
@@ -80,7 +82,7 @@ def test_a_mixed_pixel_is_the_centroid_of_what_the_edge_leaves_on_either_side(co
 
 
 def edge(mesh: TriangleMesh, divergence: float, **parameters: Any) -> Observation:
-    """A fine scan across the edge at x = 0, about which the beam leaves in thirty steps."""
+    """Return a fine scan across the edge at x = 0, in thirty steps over the width of the beam."""
     across, along = 300, 12
     sensor = scanner(effects=beam(divergence, **parameters))
     pattern = Pattern(0.006 - 0.003, 2e-5, across, np.pi / 2 - 0.0012, 2e-4, along)
@@ -96,14 +98,16 @@ def nominal(seen: Observation) -> FloatArray:
 
 
 def axis_at(seen: Observation, z: float) -> tuple[FloatArray, FloatArray]:
-    """x of the beams' axes in a plane of constant z, m, and the ranges there."""
+    """Return x of the beams' axes in a plane of constant z, m, and the ranges there."""
     ray = nominal(seen)
     range_m = (z - POSITION[2]) / ray[..., 2]
     return POSITION[0] + range_m * ray[..., 0], range_m
 
 
 def centroid(seen: Observation, near: float, far: float, divergence: float) -> FloatArray:
-    """Range of the two planes' common return: energies by the error function of the angle from axis to edge, over R^2."""
+    """Return the range of the two planes' common return: energies by the error function of the angle from axis to edge,
+    over R^2.
+    """
     (x, near_range), (_, far_range) = axis_at(seen, near), axis_at(seen, far)
     angle = np.arctan2(x, POSITION[2] - near)
     near_energy = stats.norm.cdf(4 * angle / divergence) / near_range**2
@@ -131,7 +135,9 @@ def test_the_mean_of_all_returns_does_not_care_how_far_apart_they_are() -> None:
 
 
 def test_no_footprint_bias_on_a_rough_wall() -> None:
-    """The mean over 60,000 pulses is the pencil's within 0.1 mm, five times the standard error of the beam's smoothing."""
+    """The mean over 60,000 pulses equals that of a thin beam within 0.1 mm, five times the standard error of the beam's
+    smoothing.
+    """
     wall = heightfield(40.0, 30.0, 0.1, roughness=0.2)
     mesh = wall.with_vertices(wall.vertices - [20.0, 15.0, 0.0])
     window = {"lines": 300, "pulses": 200, "step_rad": 0.002}
@@ -148,7 +154,7 @@ def test_one_sub_ray_is_the_pencil() -> None:
 
 
 def terraces() -> TriangleMesh:
-    """The planes of TERRACES, each of them a block of its own."""
+    """Return the planes of TERRACES, each labelled as a block of its own."""
     corners = [(x, y, z) for low, high, z in TERRACES for x, y in ((low, -40), (high, -40), (high, 40), (low, 40))]
     faces = np.array([[[0, 1, 2], [0, 2, 3]]]) + 4 * np.arange(len(TERRACES))[:, None, None]
     labels = np.repeat(np.arange(len(TERRACES)), 2) + 1
@@ -157,7 +163,7 @@ def terraces() -> TriangleMesh:
 
 @dataclass(frozen=True)
 class Twin:
-    """What NumPy says about one pulse: sub-ray by sub-ray on the terraces, returns by a plain loop."""
+    """What NumPy computes for one pulse: sub-ray by sub-ray on the terraces, returns by a plain loop."""
 
     range_m: float
     power: float
@@ -224,7 +230,7 @@ def _returned(
     ],
 )
 def test_returns_are_those_of_the_slow_twin(mode: str, ranging: str, width: float, count: int) -> None:
-    """Ranges to 1 um, powers to 1e-4, blocks and misses exactly."""
+    """Ranges agree to 1 um, powers to 1e-4, blocks and misses exactly."""
     divergence, wave = 8e-3, 1.2
     sensor = scanner(
         effects=beam(divergence, mode=mode, ranging=ranging, sub_rays=count, pulse_width_s=width, modulation_wavelength_m=wave)

@@ -36,7 +36,7 @@ def test_the_inverse_is_exact_over_the_frame() -> None:
 
 
 def test_the_model_is_opencvs_where_both_have_the_parameters() -> None:
-    """OpenCV: p1 and p2 change places, pixel centres lie at integers, no k4 and no b2; b1 widens fx."""
+    """OpenCV has p1 and p2 exchanged, pixel centres at integers, no k4 and no b2; b1 widens fx."""
     one = camera(k4=0.0, b2=0.0)
     x, y = np.random.default_rng(1).uniform(-0.3, 0.3, (2, 500))
     matrix = np.array(
@@ -49,7 +49,7 @@ def test_the_model_is_opencvs_where_both_have_the_parameters() -> None:
 
 @pytest.mark.parametrize("name", INTERIOR)
 def test_every_interior_parameter_moves_pixels_as_its_finite_difference_says(name: str) -> None:
-    """The model printed in the contract, written out once more term by term."""
+    """The expected values come from the documented model, implemented again term by term."""
     x, y = np.array([0.21, -0.17]), np.array([-0.13, 0.08])
     for one in (camera(), replace(camera(), **{name: getattr(camera(), name) + 0.01})):
         r2 = x**2 + y**2

@@ -1,4 +1,4 @@
-"""A sensor that is asked for some of its cells or pulses gives what it gives there when asked for all."""
+"""Observing only some cells or pulses gives the same values there as observing all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Empirical terms against NumPy's own interpolation."""
+"""Interpolation of empirical terms, compared with NumPy's own."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sensors.numerics.curve import Axis, interpolate, interpolate_on_host
 
 @dataclass(frozen=True)
 class Case:
-    """A surface, where it is asked for, and what it is there."""
+    """A curve or surface, the places where it is evaluated, and the expected values."""
 
     along: Axis
     across: Axis
@@ -28,7 +28,7 @@ class Case:
 
 
 def cases(x: Any, y: Any) -> dict[str, Case]:
-    """Of a curve, of one that repeats, and of a surface."""
+    """Return cases of a curve, of a periodic one and of a surface."""
     rng = np.random.default_rng(1)
     row, table = rng.standard_normal(7), rng.standard_normal((4, 6))
     grid = RegularGridInterpolator((np.linspace(-1, 1, 4), np.linspace(-2, 2, 6)), table)
@@ -64,7 +64,7 @@ def test_an_axis_that_runs_backwards_is_an_error() -> None:
 
 
 def test_what_is_not_known_stays_unknown_on_the_host():
-    """A ray that misses the reference has no covariate; its neighbours keep their values."""
+    """A ray that misses the reference has no covariate and gets no value; its neighbours keep theirs."""
     axis = Axis(low=0.0, high=1.0)
     x = np.array([0.25, np.nan, 0.75])
     assert_allclose(interpolate_on_host(x, x, axis, Axis(), [[0.0, 1.0]]), x)

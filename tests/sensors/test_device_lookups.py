@@ -1,4 +1,4 @@
-"""Lookups on the device with places that lie anywhere: a gather outside its array would end the process."""
+"""Table lookups on the device at arbitrary places: a read outside the array would end the process."""
 
 from __future__ import annotations
 
@@ -35,7 +35,9 @@ def test_a_cell_index_stays_in_its_array(kind: type, count: int) -> None:
 @pytest.mark.parametrize("period", [0.0, 2.5])
 @pytest.mark.parametrize("count", SIZES)
 def test_a_curve_is_held_beyond_its_ends_and_nan_stays_nan(count: int, period: float) -> None:
-    """Against the same lookup on the host, with NumPy; a period takes huge places to any place, so they are left out there."""
+    """Compared with the same lookup in NumPy on the host; huge places are left out for a periodic curve, where
+    rounding decides.
+    """
     axis = Axis(low=-1.0, high=3.0, period=period)
     values = (tuple(np.sin(np.arange(count))),)
     odd = ODD if not period else ODD[np.abs(np.nan_to_num(ODD)) < 1e9]
@@ -57,7 +59,7 @@ def test_a_surface_is_held_beyond_its_corners() -> None:
 
 @pytest.mark.parametrize("even", [False, True])
 def test_a_field_on_nodes_can_be_asked_for_places_outside_the_image(even: bool) -> None:
-    """In the image the values are those of the bilinear interpolation; outside no value matters, but nothing is read there."""
+    """Inside the image the values are those of bilinear interpolation; outside no value is defined, but nothing is read there."""
     u, v = (grid.ravel() for grid in np.meshgrid(np.concatenate([ODD, [10.0]]), np.concatenate([ODD, [7.0]])))
     field = smooth_field(_matches(u, v), 8.0, KeyedRandom(1), even=even).numpy()
     expected = smooth_field(_matches(np.array([10.0]), np.array([7.0])), 8.0, KeyedRandom(1), even=even).numpy()
@@ -85,7 +87,7 @@ def test_refinement_leaves_a_disparity_that_points_out_of_the_picture(value: flo
 
 
 def _matches(u: NDArray[np.float64], v: NDArray[np.float64]) -> Matches:
-    """Matches of a frame of 64 x 48 px at these places, all said to be matched."""
+    """Return matches at these places of a frame of 64 x 48 px, all marked as matched."""
     n = len(u)
     zero, index = dr.zeros(mi.Float64, n), dr.arange(mi.UInt32, n)
     seen = dr.zeros(mi.Int32, n), zero, None

@@ -1,8 +1,8 @@
-"""Every effect: what the simulated sensor does, against the mean, variance, losses and semivariogram that the effect states.
+"""Every effect: simulated recordings against the mean, variance, losses and semivariogram that the effect states.
 
-A laser scanner sends 200,000 pulses of one direction at a slanting plane, a stereo pair matches 500 x 500 cells of a plane.
-Means within 5 standard errors, variances within 5 of theirs, sqrt(2 / n), so that each of some 50 comparisons fails by chance
-with less than 1e-6; semivariograms within the stated share.
+A laser scanner sends 200,000 pulses in one direction to a slanting plane; a stereo pair matches 500 x 500 cells of a plane. Means
+within 5 standard errors, variances within 5 of theirs, sqrt(2 / n), so that each of about 50 comparisons fails by chance with
+less than 1e-6; semivariograms within the stated share.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def pulses() -> Pulses:
 
 
 def recorded(effect: Effect) -> np.ndarray:
-    """(n,) recorded less true range: that of where the beam really goes on the plane of the given slopes, and what is timed."""
+    """Return recorded minus true range (n,), where the true one belongs to the beam's real direction on the plane."""
     after = effect.apply(pulses(), KeyedRandom(5))
     azimuth, zenith, timed = (np.array(each) for each in (after.aim_azimuth, after.aim_zenith, after.range_m))
     return (azimuth - AZIMUTH) * BY_AZIMUTH + (zenith - ZENITH) * BY_ZENITH + timed - RANGE
@@ -87,7 +87,9 @@ def test_a_scanner_s_ranges_have_the_mean_and_the_variance_that_the_effect_state
 
 
 def _moves(effect: type[Effect]) -> bool:
-    """Time walk is relative to the median power, which all of these pulses have."""
+    """Return whether the effect has a mean: time walk has none here, because it is relative to the median power, which all pulses
+    have.
+    """
     return "reference_power" not in effect.model_fields
 
 
@@ -148,7 +150,7 @@ def matches(disparity: Any = 60.0) -> Matches:
 
 
 def noise(effect: MatchingNoise, seeds: range) -> np.ndarray:
-    """(seeds, rows, columns) what the effect adds, px."""
+    """Return what the effect adds (seeds, rows, columns), px."""
     fields = [np.array(effect.apply(matches(), KeyedRandom(seed)).disparity).reshape(CELLS, CELLS) - 60.0 for seed in seeds]
     return np.stack(fields)
 
@@ -160,7 +162,7 @@ LAGS = np.array([[4, 0], [8, 0], [0, 12], [16, 16], [40, 0], [400, 400]])
 @pytest.mark.parametrize("effect", NOISES, ids=lambda each: each.tag())
 @pytest.mark.parametrize("step", [24.0, 40.0])
 def test_disparities_differ_between_neighbours_as_the_effect_states(effect: type[MatchingNoise], step: float) -> None:
-    """5 % of each semivariogram: 12 images of some thousand independent nodes scatter by 1 % (heavy tails: by 1.5 %)."""
+    """5 % of each semivariogram: 12 images of about a thousand independent nodes scatter by 1 % (heavy tails: by 1.5 %)."""
     values = {"sigma_px": 0.4} | ({"step_px": step} if effect.shared else {})
     chosen = effect(**values)
     field = noise(chosen, range(12))
@@ -173,7 +175,7 @@ def test_disparities_differ_between_neighbours_as_the_effect_states(effect: type
 
 
 def test_smooth_noise_with_heavy_tails_is_not_white() -> None:
-    """What the diagnosis took it for: at four pixels neighbours differ by a twentieth of that."""
+    """At a distance of four pixels, neighbours differ by a twentieth of what white noise would, for which it used to be taken."""
     effect = HeavyTailedNoise(sigma_px=0.5, step_px=24.0)
     assert effect.semivariogram(np.array([[4.0, 0.0]]))[0] < 0.1 * effect.total_variance
 
@@ -183,8 +185,10 @@ def test_smooth_noise_with_heavy_tails_is_not_white() -> None:
 )
 @pytest.mark.parametrize("side", [20, 80, 200])
 def test_the_mean_of_a_square_has_the_variance_that_its_pairs_give(effect: MatchingNoise, side: int) -> None:
-    """side: px; means over the squares of 20 images, at least 2,000 of them: 20 %, what bilinear nodes half a
-    step apart are off by (heavy tails: 8 %) and four times what they scatter."""
+    """side: px; means over the squares of 20 images, at least 2,000 of them.
+
+    20 % are allowed: the error for bilinear nodes half a step apart (heavy tails: 8 %) and four times the scatter.
+    """
     cells = side // REDUCTION
     count = CELLS // cells
     field = noise(effect, range(20))[:, : count * cells, : count * cells]
@@ -225,6 +229,6 @@ def test_locking_moves_disparities_as_the_effect_states() -> None:
 
 
 def test_a_searched_sine_without_what_it_runs_along_is_no_class() -> None:
-    """Else the diagnosis would end in the middle, with an effect of another package."""
+    """Otherwise an effect from another package would stop a diagnosis half-way."""
     with pytest.raises(TypeError, match="needs `argument` too"):
         type("Half", (Effect,), {"searched": Search("period_m", "range", shortest=0.1), "__annotations__": {}})

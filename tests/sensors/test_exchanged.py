@@ -1,4 +1,4 @@
-"""The right depth map: its rays are the right camera's, and its camera errors those of the left depth map."""
+"""The right depth map: its rays are those of the right camera, its camera errors those of the left depth map."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def camera(x: float, **changes: Any) -> Camera:
 
 
 def both(pair: CameraPair, model: dict[str, Any], normal: tuple[float, ...] = (0, 0, 1)) -> tuple[StereoPair, list[Observation]]:
-    """The left and the right depth map of a plane through the origin."""
+    """Return the left and the right depth map of a plane through the origin."""
     sensor = StereoPair(pair, FRAME, StereoModel(**{"noise": QUIET, **model}), "high", truth=True)
     scene = RayCaster(plane(np.array(normal, dtype=float), np.zeros(3)))
     return sensor, [sensor.observe(scene, KeyedRandom(5)), observe_right(sensor, scene, KeyedRandom(5))]
@@ -78,7 +78,7 @@ def test_points_lie_on_the_depth_cameras_rays_and_on_the_plane(lens: dict[str, f
 
 
 def test_both_maps_show_the_same_camera_effects() -> None:
-    """Camera errors bend the plane; the right map has to show the surface of the left one, drawn from the same numbers."""
+    """Camera errors bend the plane; the right map must show the same surface as the left one, from the same random numbers."""
     pair = CameraPair(camera(-8.0, k1=-0.05), camera(8.0, k1=-0.05))
     orientation = {"phi_rad": 3e-5, "cx_px": 0.5, "k1": 1e-3, "p1": 1e-4, "x_m": 0.01}
     _, (left, right) = both(pair, {"noise": {**QUIET, "orientation": orientation}})
@@ -97,7 +97,7 @@ def test_both_maps_show_the_same_camera_effects() -> None:
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_both_maps_show_the_same_exposures(side: str) -> None:
-    """Row jitter in a normal pair: a row of the frame is too near or too far by dz = -dx Z^2 / (f B), in both maps alike."""
+    """Row jitter in a normal pair: a row of the frame is too near or too far by dz = -dx Z^2 / (f B), equally in both maps."""
     jitter = {"name": "row_jitter", "camera": side, "amplitude_px": 0.2, "rows_per_cycle": 400.0, "phase_rad": 0.7}
     _, seen = both(CameraPair(camera(-8.0), camera(8.0)), {"effects": [jitter]})
     first_row = (0.0, 1229.0 - 2 * 614)  # the left map's cells begin at the frame's first row, the right map's end at its last
@@ -110,7 +110,7 @@ def test_both_maps_show_the_same_exposures(side: str) -> None:
 
 
 def test_matching_errors_are_drawn_anew() -> None:
-    """Correlation of 100,000 independent pairs is beyond 0.02 with a probability of 1e-9."""
+    """The correlation of 100,000 independent pairs exceeds 0.02 with a probability of 1e-9."""
     noise = {"parallax_sigma_px": 0.3, "regularization_sigma_px": 0.0}
     _, (left, right) = both(CameraPair(camera(-8.0), camera(8.0)), {"noise": noise})
     shift = round(16.0 / 100 * 2560 / 2)  # disparity in cells: the cell of the right map that sees the same place

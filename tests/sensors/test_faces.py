@@ -1,4 +1,4 @@
-"""Both faces of the scanner, and a pose that is not as surveyed."""
+"""Both faces of the scanner, and a real pose that differs from the surveyed one."""
 
 from __future__ import annotations
 
@@ -75,7 +75,9 @@ def test_the_mean_of_two_faces_has_a_noise_smaller_by_the_root_of_two() -> None:
 
 
 def test_faces_that_look_past_an_edge_on_either_side_are_not_averaged() -> None:
-    """Vertical index moves no azimuth; collimation does: at a vertical edge some faces see near and far."""
+    """A vertical index does not change the azimuth, but collimation does: at a vertical edge the faces may see near and far
+    surface.
+    """
     sensor = scanner(effects=[{"name": "collimation", "angle_rad": 4 * ANGLE}], lines=100, pulses=20, step_rad=0.002)
     seen = seen_by(two_faced(sensor), step(1.5, 0.0))
     faces = [seen_by(each, step(1.5, 0.0)).depth for each in (sensor, second_face(sensor))]
@@ -114,7 +116,7 @@ def test_points_are_recorded_from_the_surveyed_pose_while_the_scanner_stands_els
 
 
 def test_poses_scatter_as_the_config_says_and_anew_for_every_look() -> None:
-    """2,000 draws: each coordinate's and turn's standard deviation within 5 standard errors (12 x 6e-7)."""
+    """2,000 draws: the standard deviation of each coordinate and rotation is within 5 standard errors (12 x 6e-7)."""
     sigma, count = PoseSigma(position_m=0.03, rotation_rad=1e-3), 2000
     poses = [sigma.displaced(np.zeros(3), np.eye(3), KeyedRandom(1).child(number)) for number in range(count)]
     positions, turns = np.array([p for p, _ in poses]), np.array([[r[2, 1], r[0, 2], r[1, 0]] for _, r in poses])

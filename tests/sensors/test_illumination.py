@@ -55,7 +55,7 @@ def test_a_sun_below_the_horizon_and_half_a_place_are_refused() -> None:
 
 
 def irradiance(mesh: TriangleMesh, light: Illumination, x: FloatArray) -> FloatArray:
-    """Of the points that vertical rays hit at (x, 0)."""
+    """Return the irradiance of the points that vertical rays hit at (x, 0)."""
     caster = RayCaster(mesh)
     origin = mi.Array3f64(mi.Float64(x), mi.Float64(0.0), mi.Float64(50.0))
     hits = caster.intersect(origin, mi.Array3f64(0.0, 0.0, -1.0))
@@ -71,7 +71,8 @@ def test_irradiance_of_an_open_plane_is_lambert_s() -> None:
 
 
 def test_a_step_casts_the_shadow_of_its_height_over_the_tangent_of_the_sun() -> None:
-    """The edge at x = 0, 2 m high, with the sun in the direction (0.6, 0, 0.8), shades x > -1.5 m of the ground left of it.
+    """The edge at x = 0 is 2 m high; the sun in the direction (0.6, 0, 0.8) leaves the ground from x = -1.5 m to the edge in
+    shadow.
 
     A wall closes the step: without it the sun would shine in under the upper half plane.
     """
@@ -85,7 +86,7 @@ def test_a_step_casts_the_shadow_of_its_height_over_the_tangent_of_the_sun() -> 
 
 
 def test_texture_has_its_contrast_and_stays_with_the_rock() -> None:
-    """Noise of unit deviation: 40,000 points 20 grains apart on average are independent: 5 sigma is 5 / sqrt(2 n) = 1.8 %."""
+    """Noise of unit deviation: 40,000 points 20 grains apart on average are independent, so 5 sigma is 5 / sqrt(2 n) = 1.8 %."""
     points = np.random.default_rng(1).uniform(-2000, 2000, (3, 40_000))
     noise = np.array(solid_noise(mi.Array3f64(points), 0.3, 7))
     assert noise.std() == pytest.approx(1.0, abs=0.018)

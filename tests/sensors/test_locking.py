@@ -15,7 +15,7 @@ COUNT = 12
 
 @pytest.mark.parametrize("tilt", [0.0, 0.05, -0.1])
 def test_locking_counts_the_disparities_of_a_rectification_that_is_turned_about_the_base(tilt: float) -> None:
-    """d' = d_inf + (d - d_inf) / (1 + y tan w), worked out in NumPy; not turned, it counts its own."""
+    """d' = d_inf + (d - d_inf) / (1 + y tan w), computed in NumPy; without rotation the effect uses its own disparities."""
     rng = np.random.default_rng(6)
     disparity, tangent, infinity = rng.uniform(40, 90, COUNT), rng.uniform(-0.3, 0.3, COUNT), -250.0
     zero, seen = dr.zeros(mi.Float64, COUNT), (dr.zeros(mi.Int32, COUNT), dr.zeros(mi.Float64, COUNT), None)

@@ -1,4 +1,4 @@
-"""Real matching against ray-traced truth: plane, sphere and step edge; locking, occlusion, tiles, threads."""
+"""Real matching against ray-traced truth: plane, sphere and step edge; pixel locking, occlusion, tiles, threads."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def sensor(model: StereoModel | None = None, **matching: object) -> MatchedStere
 
 @dataclass(frozen=True)
 class Compared:
-    """Matched against ray-traced: both observations, and the errors of the disparity, cells, with the true disparities."""
+    """A matched and a ray-traced observation, and the errors of the disparity, cells, with the true disparities."""
 
     matched: Observation
     truth: Observation
@@ -69,7 +69,7 @@ def compare(mesh: TriangleMesh, **matching: object) -> Compared:
 
 
 def disparities(points: FloatArray) -> FloatArray:
-    """Disparity of (n, 3) points in the rectified pair, cells."""
+    """Return the disparity of points (n, 3) in the rectified pair, cells."""
     nominal = cameras().in_wall_frame(FRAME)
     geometry = rectify(nominal)
     depth = (points - nominal.left.position) @ nominal.left.rotation @ geometry.left.T[:, 2]
@@ -81,12 +81,12 @@ def robust_sigma(error: FloatArray) -> float:
 
 
 def locking(compared: Compared) -> float:
-    """Amplitude of the sine of the disparity's fraction in the errors, by least squares, px."""
+    """Return the amplitude of the sine of the disparity's fraction in the errors, by least squares, px."""
     return amplitude(compared.error, compared.disparity)
 
 
 def amplitude(error: FloatArray, disparity: FloatArray) -> float:
-    """As `locking`, of errors (n,) at true disparities (n,), px."""
+    """Return the same as `locking`, for errors (n,) at true disparities (n,), px."""
     inlier = np.abs(error) < 0.5
     phase = 2 * np.pi * disparity[inlier]
     design = np.stack([np.ones_like(phase), np.sin(phase), np.cos(phase)], axis=1)
@@ -95,7 +95,7 @@ def amplitude(error: FloatArray, disparity: FloatArray) -> float:
 
 
 def test_a_tilted_plane_comes_back_and_refinement_takes_out_the_locking() -> None:
-    """Measured: bias 0.001, robust sigma 0.02, locking 0.013 px after refinement, 0.12 px before."""
+    """Measured: bias 0.001 px, robust sigma 0.02 px, locking 0.013 px after refinement and 0.12 px before."""
     coarse, fine = compare(TILTED, refinement=None), compare(TILTED)
     assert fine.matched.valid.sum() > 0.9 * fine.truth.valid.sum()
     assert abs(np.median(fine.error)) < 0.01
@@ -106,7 +106,7 @@ def test_a_tilted_plane_comes_back_and_refinement_takes_out_the_locking() -> Non
 
 
 def test_refinement_adds_no_outliers_on_rough_rock() -> None:
-    """On the cells that both give, fewer errors beyond 1 px and a smaller scatter than SGBM's own, without its locking.
+    """On cells that both have, fewer errors beyond 1 px and a smaller scatter than SGBM's own, without its locking.
 
     Measured: 4.0 % beyond 1 px after SGBM's 4.4 %, robust sigma 0.25 after 0.31, locking 0.006 after 0.068 px.
     """
@@ -133,7 +133,7 @@ def test_refinement_adds_no_outliers_on_rough_rock() -> None:
 
 
 def test_a_sphere_comes_back_where_it_does_not_turn_away() -> None:
-    """Its rim is fattened by the matcher's window: the tolerance is for the part that faces the cameras within 45 deg."""
+    """Its rim is fattened by the matcher's window; the tolerance is for the part that faces the cameras within 45 deg."""
     radius = 12.0
     compared = compare(sphere(ORIGIN, radius, 6))
     both = compared.matched.valid & compared.truth.valid
@@ -148,9 +148,9 @@ def test_a_sphere_comes_back_where_it_does_not_turn_away() -> None:
 
 
 def test_the_left_right_check_empties_the_half_occluded_strip() -> None:
-    """A near plane 8 m before a far one: 14 x 8 / 97 = 1.15 m of the far plane, 9 cells, are hidden from the right camera.
+    """A near plane 8 m before a far one hides 14 x 8 / 97 = 1.15 m of the far plane, 9 cells, from the right camera.
 
-    As nothing joins the planes, the left camera sees as much sky between them. Without the check half of the strip is matched;
+    Nothing joins the planes, so the left camera sees as much sky between them. Without the check half of the strip is matched;
     measured with it: 11 %, at the strip's ends, and 6 % after the refinement.
     """
     settings: tuple[dict[str, object], ...] = ({"left_right_tolerance_px": 1000, "refinement": None}, {"refinement": None}, {})
@@ -167,7 +167,7 @@ def test_the_left_right_check_empties_the_half_occluded_strip() -> None:
 
 
 def test_tiles_agree_with_the_whole() -> None:
-    """Semi-global paths reach beyond any overlap, so few cells differ: under 1 % beyond 1/16, none of the median."""
+    """Semi-global paths reach beyond any overlap, so few cells differ: under 1 % by more than 1/16, and the median not at all."""
     one = sensor()
     caster, nominal = RayCaster(TILTED), cameras().in_wall_frame(FRAME)
     left, right = one.photograph(caster, nominal, (), KeyedRandom(1))
@@ -204,7 +204,7 @@ def test_block_labels_are_those_of_the_pixels() -> None:
 
 
 def test_real_cameras_and_displaced_rows_act_on_the_photographs() -> None:
-    """The same effects move the points of the real matcher as those of the simulated one, to a tenth of the effects' 2 px."""
+    """The same effects move the points of the real matcher and of the simulated one, to a tenth of the effects' 2 px."""
     effects = [
         {"name": "principal_point_x", "camera": "right", "delta_px": 2.0},
         {"name": "row_jitter", "camera": "left", "amplitude_px": 2.0, "rows_per_cycle": 200},

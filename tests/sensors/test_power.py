@@ -1,4 +1,4 @@
-"""Received power: extinction in hazy air and wet rock against closed forms; nothing changes where they are off."""
+"""Received power: extinction in hazy air and wet rock against closed forms; without them nothing changes."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def cloud(count: int = 200_000, reach_m: float = 4000.0) -> FloatArray:
 
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.5, 0.9])
 def test_the_share_of_wet_rock_is_the_configs(share: float) -> None:
-    """Points in many patches: within 5 standard errors of a binomial count, at most 6e-7 false failures; hems are half wet."""
+    """Points in many patches: within 5 standard errors of a binomial count, at most 6e-7 false failures; fringes are half wet."""
     wet = WetnessConfig(share=share, patch_m=0.5).wetness(cloud())
     assert np.mean(wet > 0.5) == pytest.approx(share, abs=5 * np.sqrt(share * (1 - share) / 2e5) + 5 * 0.5 / np.sqrt(2**18))
 
@@ -94,7 +94,7 @@ def test_wet_rock_is_darker_by_the_factor_and_dry_rock_as_it_was() -> None:
 
 
 def test_patches_are_smooth_and_fixed_in_space() -> None:
-    """The same for a part of the wall, in another order; another seed, other patches.
+    """Part of the wall in another order has the same patches; another seed has others.
 
     Slopes are bounded by those of the smoothsteps: 1.5 of the lattice's range, 2 / 0.37 deviations, per patch; 1.5 / 0.2 per
     deviation.

@@ -32,7 +32,7 @@ def on_terraces(mode: str, *effects: dict[str, Any], noise: dict[str, float] | N
 
 @pytest.mark.parametrize("beyond", [1.001, 1.5, 4.0])
 def test_a_step_farther_than_the_pulses_length_gives_two_returns_on_its_two_planes(beyond: float) -> None:
-    """Both where the beam meets both, the nearer numbered 1; pulses whose sub-rays straddle the edge have two."""
+    """Where the beam hits both planes there are two returns, the nearer numbered 1."""
     near, far = beyond * LIGHT * 3e-9 / 2, 0.0
     seen = edge(step(near, far), DIVERGENCE, mode="multiple")
     further = further_of(seen)
@@ -57,7 +57,9 @@ def test_a_step_within_the_pulses_length_gives_one_merged_centroid() -> None:
 
 @pytest.mark.parametrize("width", [3e-9, 8e-9])
 def test_all_returns_together_are_those_of_the_other_modes(width: float) -> None:
-    """The grid is the strongest's; number 1 is the first; powers add up to the mean's, and so do ranges weighted by power."""
+    """The grid is that of `strongest`; number 1 is `first`; powers add up to those of `mean`, and so do ranges weighted
+    by power.
+    """
     seen, first, strongest, mean = (on_terraces(mode, width=width) for mode in ("multiple", "first", "strongest", "mean"))
     further = further_of(seen)
     assert seen.points.tobytes() == strongest.points.tobytes()

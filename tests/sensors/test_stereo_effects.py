@@ -1,7 +1,8 @@
-"""Every stereo effect: its equation against an independent oracle or a slow twin, its identity at null, the order of a stage.
+"""Every stereo effect: its equation against an independent calculation or a slow loop, no effect at zero, the order of the
+stages.
 
-The oracle below shares no code with `sensors/`: Metashape's equations and their inverse by fixed-point iteration, Bouguet's
-rectification with SciPy's rotations, triangulation in NumPy.
+The independent calculation shares no code with `sensors/`: Metashape's equations and their inverse by fixed-point iteration,
+Bouguet's rectification with SciPy's rotations, triangulation in NumPy.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ HUNDREDTH_MM = 1e-5
 
 
 def rig() -> CameraPair:
-    """A converging pair 28 m apart, 105 m from the wall, every interior parameter but k4 in use."""
+    """A converging pair 28 m apart, 105 m from the wall, with every interior parameter except k4 in use."""
     front = TriangleMesh(
         FRAME.to_world(plane(np.array([0, 0, 1.0]), np.zeros(3)).vertices), np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     )
@@ -66,7 +67,7 @@ def observe(
 
 
 def pixel(camera: Camera, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Metashape user manual, appendix D."""
+    """Return pixel coordinates by the Metashape user manual, appendix D."""
     r = np.hypot(x, y)
     radial = 1 + camera.k1 * r**2 + camera.k2 * r**4 + camera.k3 * r**6 + camera.k4 * r**8
     xd = x * radial + camera.p1 * (r**2 + 2 * x**2) + 2 * camera.p2 * x * y
@@ -76,7 +77,7 @@ def pixel(camera: Camera, x: FloatArray, y: FloatArray) -> tuple[FloatArray, Flo
 
 
 def ray(camera: Camera, u: FloatArray, v: FloatArray) -> FloatArray:
-    """(n, 3) directions (x, y, 1) in the camera's frame: the pixel's error is fed back until it is gone."""
+    """Return directions (x, y, 1) (n, 3) in the camera's frame, by fixed-point iteration of the pixel's error."""
     x, y = np.zeros_like(u), np.zeros_like(v)
     for _ in range(25):
         seen_u, seen_v = pixel(camera, x, y)
@@ -85,9 +86,9 @@ def ray(camera: Camera, u: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def bouguet(left: Camera, right: Camera) -> tuple[FloatArray, FloatArray, float]:
-    """Rotations of the left and the right camera into the rectified frame, and the base.
+    """Return the rotations of the left and the right camera into the rectified frame, and the base.
 
-    Half of the relative rotation each, then the base is turned to x.
+    Each camera is turned by half of the relative rotation, then the base is turned to x.
     """
     half = Rotation.from_rotvec(0.5 * Rotation.from_matrix(left.rotation.T @ right.rotation).as_rotvec())
     base = half.inv().apply(left.rotation.T @ (right.position - left.position))
@@ -102,7 +103,9 @@ def bouguet(left: Camera, right: Camera) -> tuple[FloatArray, FloatArray, float]
 
 @dataclass(frozen=True)
 class Change:
-    """Real minus nominal camera: interior, rotation vector in its own frame, shift in the world; row jitter (A, n, phase)."""
+    """Real minus nominal camera: interior, rotation vector in its own frame, shift in the world; row jitter (amplitude, period,
+    phase).
+    """
 
     interior: dict[str, float]
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -110,7 +113,7 @@ class Change:
     jitter: tuple[float, float, float] = (0.0, 1.0, 0.0)
 
     def apply(self, camera: Camera) -> Camera:
-        """camera: wall frame."""
+        """Return the changed camera; camera: in the wall frame."""
         return replace(
             camera,
             **{name: getattr(camera, name) + value for name, value in self.interior.items()},
@@ -127,7 +130,9 @@ NONE = Change({})
 
 
 def recorded(pair: CameraPair, left: Change, right: Change, normal: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
-    """(n, 3) points, wall frame, that a matcher on the nominal calibration reports for left pixels, on the plane through 0."""
+    """Return the points (n, 3), wall frame, that a matcher with the nominal calibration reports for left pixels of a plane
+    through 0.
+    """
     nominal = pair.in_wall_frame(FRAME)
     real_left, real_right = left.apply(nominal.left), right.apply(nominal.right)
     sight = ray(real_left, u - left.displacement(v), v) @ real_left.rotation.T
@@ -165,7 +170,7 @@ CAMERA_EFFECTS: list[tuple[str, dict[str, Any], Change]] = [
 def test_camera_and_exposure_effects_act_as_brute_force_projection_says(
     name: str, parameters: dict[str, float], change: Change, side: str
 ) -> None:
-    """Every fifth matched cell of a tilted plane to 0.01 mm, and a change that is a hundred times larger somewhere."""
+    """Every fifth matched cell of a tilted plane to 0.01 mm; somewhere the change must be a hundred times larger."""
     seen = observe(plane(NORMAL, np.zeros(3)), [{"name": name, "camera": side, **parameters}], "low")
     row, column = (indices[::5] for indices in np.nonzero(seen.valid))
     left, right = (change if side in (camera, "both") else NONE for camera in ("left", "right"))
@@ -190,10 +195,10 @@ def parallel_pair(distance: float, base: float) -> CameraPair:
 
 
 def test_radial_distortion_domes_a_parallel_pair_by_the_closed_form() -> None:
-    """dZ = -Z k1 [3 (u - b/2)^2 + v^2 + b^2/4]: to 0.01 mm for k1 = 5e-5, the remainder being of second order in k1.
+    """The depth error is dZ = -Z k1 [3 (u - b/2)^2 + v^2 + b^2/4], to 0.01 mm for k1 = 5e-5.
 
-    Undistorting the left pixel and inverting the disparity both add terms of Z (k1 r^2)^2; so twice the k1 has four times the
-    remainder.
+    The remainder is of second order in k1. Undistorting the left pixel and inverting the disparity both add terms of Z (k1
+    r^2)^2; so twice the k1 has four times the remainder.
     """
     distance, base = 105.0, 28.0
     pair = parallel_pair(distance, base)
@@ -215,7 +220,7 @@ def test_radial_distortion_domes_a_parallel_pair_by_the_closed_form() -> None:
 
 
 def steps_with_texture() -> TriangleMesh:
-    """Two planes, 6 m apart in depth, with an albedo: every effect finds something to act on."""
+    """Two planes, 6 m apart in depth, with an albedo, so that every effect changes something."""
     mesh = step(6.0, 0.0)
     return replace(mesh, vertex_albedo=np.linspace(0.2, 0.8, len(mesh.vertices), dtype=np.float32))
 
@@ -256,7 +261,7 @@ def test_the_registry_has_the_whole_catalogue() -> None:
 
 
 def disparity(seen: Observation, pair: CameraPair) -> FloatArray:
-    """(rows, columns) the disparity, px of the frame, that an observation's depths stand for."""
+    """Return the disparity (rows, columns), px of the frame, that corresponds to an observation's depths."""
     nominal = pair.in_wall_frame(FRAME)
     geometry = rectify(nominal)
     z = (seen.points - nominal.left.position) @ nominal.left.rotation @ geometry.left[2]
@@ -281,7 +286,7 @@ def test_pixel_locking_is_a_sine_of_the_fraction_of_the_matched_images_pixel(qua
 def test_matching_effects_act_in_the_chains_order_whatever_the_configs(turn: list[list[float]]) -> None:
     """Fattening, smoothing, locking, then filling; noise before locking: parallax noise of a locked matcher is locked too.
 
-    An upright edge has a half-occluded strip to fill; at a level one, fattening and smoothing meet and do not commute.
+    A vertical edge has a half-occluded strip to fill; at a horizontal one, fattening and smoothing meet and do not commute.
     """
     flat = step(6.0, 0.0)
     mesh, pair = flat.with_vertices(flat.vertices @ np.array(turn)), rig()
@@ -324,7 +329,7 @@ def test_heavy_tailed_noise_has_its_standard_deviation_kurtosis_and_grain() -> N
 
 
 def random_relief(seed: int) -> FloatArray:
-    """(30, 40) disparities with smooth parts, steps and unmatched cells."""
+    """Return disparities (30, 40) with smooth parts, steps and unmatched cells."""
     random = np.random.default_rng(seed)
     relief = np.cumsum(random.uniform(-0.5, 0.5, (30, 40)), axis=1) + 8.0 * (
         cv2.blur(random.uniform(0, 1, (30, 40)), (7, 7)) > 0.5
@@ -465,7 +470,7 @@ def textured_matches(albedo: FloatArray) -> Matches:
 
 
 def test_texture_noise_has_the_cramer_rao_bounds_variance_and_an_end_where_there_is_no_texture() -> None:
-    """A ramp of g grey values per px has sum gx^2 = 25 g^2; g rises over the rows from nothing."""
+    """A ramp of g grey values per px has sum gx^2 = 25 g^2; g rises over the rows from zero."""
     steps = np.repeat(np.array([0.0, 0.3, 0.6, 1.2]), 100)
     albedo = 0.1 + np.outer(steps, np.arange(300)) * 4 / 255 / 2000
     coefficient = 25 * (0.6 / 2000) ** 2 * 0.3**2  # sigma is 0.3 px where g is 0.6 / 2000

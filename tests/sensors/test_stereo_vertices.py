@@ -1,4 +1,6 @@
-"""The stereo pair vertex by vertex: the truth without noise, the analytic covariance, the ray-traced way where both agree."""
+"""The stereo pair measured vertex by vertex: exact without noise, the analytic covariance, and agreement with the
+ray-traced way.
+"""
 
 from __future__ import annotations
 
@@ -117,7 +119,7 @@ def test_regularization_noise_is_the_depth_maps_own_and_parallax_noise_is_each_v
 
 
 def test_fattening_changes_the_far_side_of_a_step_as_it_does_in_the_depth_map() -> None:
-    """A ledge 3 m high: the far plane beside it comes to the near one, as far as the outline grows.
+    """A ledge 3 m high: the far plane beside it gets the near depth, as far as the outline grows.
 
     From the left camera, 14 m aside, the ledge's edge (0.1, 3) is seen over x = 14.1 105 / 102 - 14 of the far plane.
     """

@@ -50,7 +50,7 @@ def test_without_noise_a_tilted_plane_comes_back_to_a_nanometre() -> None:
 
 
 def test_without_noise_points_lie_on_a_rough_wall_to_a_micrometre() -> None:
-    """Against double-precision distances to the mesh; float32 tracing may take the neighbour of a triangle's edge."""
+    """Compared with double-precision distances to the mesh; at a triangle's edge float32 tracing may take the neighbour."""
     wall = heightfield(30.0, 20.0, 0.25)
     mesh = wall.with_vertices(wall.vertices - [15.0, 10.0, 0.0])
     seen = scan(mesh, lines=300, pulses=200, step_rad=0.002)
@@ -58,7 +58,7 @@ def test_without_noise_points_lie_on_a_rough_wall_to_a_micrometre() -> None:
 
 
 def distance_to_mesh(points: np.ndarray, mesh: TriangleMesh) -> np.ndarray:
-    """(n,) m, in double precision, to the nearest of the 16 triangles whose centres are nearest."""
+    """Return distances (n,), m, in double precision, to the nearest of the 16 triangles whose centres are nearest."""
     corners = mesh.vertices[mesh.faces]
     _, near = cKDTree(corners.mean(axis=1)).query(points, k=16)
     on_triangle = trimesh.triangles.closest_point(corners[near.ravel()], np.repeat(points, 16, axis=0))
@@ -82,7 +82,10 @@ def test_a_step_edge_is_recorded_without_points_between_its_two_planes() -> None
 
 
 def test_directions_are_the_contracts_angles() -> None:
-    """azimuth = atan2(y, x), zenith from +z, in the scanner's frame; rows are lines in azimuth, columns run in zenith."""
+    """In the scanner's frame azimuth = atan2(y, x), and zenith is from +z.
+
+    Rows are lines in azimuth, columns run in zenith.
+    """
     sensor = scanner()
     seen = sensor.observe(RayCaster(plane(np.array([0, 0, 1.0]), np.zeros(3))), KeyedRandom(1))
     local = (seen.points - POSITION) @ ROTATION

@@ -48,7 +48,7 @@ SYSTEMATIC_EFFECTS = [
 
 @dataclass(frozen=True)
 class Oracle:
-    """The plane through the origin, as an ideal scanner at the tests' station sees it in nominal directions (NumPy, float64)."""
+    """The plane through the origin, as an ideal scanner at the tests' position sees it in nominal directions (NumPy, float64)."""
 
     sensor: LaserScanner
 
@@ -90,7 +90,7 @@ def unit(azimuth: np.ndarray, zenith: np.ndarray) -> np.ndarray:
 
 
 def look(effects: list[dict[str, Any]], noise: dict[str, float] | None = None, seed: int = 1) -> tuple[Observation, Oracle]:
-    """A scan of the slanting plane, which fills the whole window, and what NumPy says about it."""
+    """Return a scan of the slanting plane, which fills the whole window, and what NumPy computes for it."""
     mesh = plane(NORMAL, np.zeros(3), half_side=200.0)
     return scan(mesh, noise, seed, effects=effects), Oracle(scanner())
 
@@ -119,7 +119,7 @@ def look(effects: list[dict[str, Any]], noise: dict[str, float] | None = None, s
     ids=lambda value: value["name"] if isinstance(value, dict) else "",
 )
 def test_a_range_effect_adds_its_equation(entry: dict[str, Any], error: Callable[[Oracle], np.ndarray]) -> None:
-    """To 10 nm: incidence and power are traced in float32."""
+    """To 10 nm, because incidence and power are traced in float32."""
     seen, oracle = look([entry])
     np.testing.assert_allclose(seen.depth - oracle.range_m, error(oracle), atol=1e-8)
     assert np.abs(error(oracle)).max() > 1e-3
@@ -166,7 +166,7 @@ def test_a_range_effect_adds_its_equation(entry: dict[str, Any], error: Callable
     ids=lambda value: value["name"] if isinstance(value, dict) else "",
 )
 def test_an_angle_effect_is_recorded_minus_true(entry: dict[str, Any], azimuth_error: Any, zenith_error: Any) -> None:
-    """The point lies in the nominal direction, its range is that of the true one, nominal less error, to a nanometre."""
+    """The point lies in the nominal direction; its range is that of the true direction, nominal minus error, to a nanometre."""
     seen, oracle = look([entry])
     emitted = unit(oracle.azimuth - azimuth_error(oracle), oracle.zenith - zenith_error(oracle))
     np.testing.assert_allclose(seen.depth, oracle.range_towards(emitted), atol=1e-9)
@@ -194,7 +194,7 @@ def test_axis_errors_turn_their_sign_in_the_second_face(entry: str) -> None:
 
 
 def test_tilt_drift_turns_the_recorded_directions_as_the_scan_goes_on() -> None:
-    """Against rotation matrices, true = R(-w) recorded; the effect is of first order in w = 5e-5: 1e-7 m at 50-80 m."""
+    """Compared with rotation matrices, true = R(-w) recorded; the effect is of first order in w = 5e-5: 1e-7 m at 50-80 m."""
     rates = np.array([5e-5, -3e-5, 0.0])
     seen, oracle = look([{"name": "tilt_drift", "rate_x_rad": rates[0], "rate_y_rad": rates[1]}])
     turn = Rotation.from_rotvec(-oracle.share.reshape(-1, 1) * rates)
@@ -248,7 +248,9 @@ def test_the_detection_limit_cuts_by_the_range_equation() -> None:
 
 
 def test_precipitation_loses_and_shortens_returns_as_its_equations_say() -> None:
-    """Losses and early returns by their binomial variances, the drops' ranges by their distribution between 1 m and the wall."""
+    """Losses and early returns agree within their binomial variances, the drops' ranges with their distribution from 1 m to the
+    wall.
+    """
     rate, share = 0.005, 0.4
     seen, oracle = look([{"name": "precipitation", "rate_per_m": rate, "early_share": share}])
     lost_chance = -np.expm1(-2 * rate * oracle.range_m)
@@ -264,7 +266,7 @@ def test_precipitation_loses_and_shortens_returns_as_its_equations_say() -> None
 
 
 def test_the_order_of_a_config_changes_nothing() -> None:
-    """The same points to the rounding of sums of errors, the same returns: random numbers are keyed by the effects' names."""
+    """The points agree to the rounding of summed errors, the returns exactly: random numbers are keyed by the effects' names."""
     effects = [*SYSTEMATIC_EFFECTS, *RANDOM_EFFECTS, {"name": "wobble", "amplitude_rad": 1e-4}]
     effects += [{"name": "tilt_drift", "rate_x_rad": 1e-4}, {"name": "range_intensity_bias", "coefficient_m": 0.005}]
     first, _ = look(effects, NOISY)
@@ -283,7 +285,7 @@ def test_all_effects_at_their_null_leave_the_bytes_alone() -> None:
 
 @pytest.mark.parametrize("start", [0.0, 0.5, 0.3])
 def test_a_window_scanned_alone_gives_the_points_of_the_whole_scan(start: float) -> None:
-    """Wherever the pattern starts between two steps of the instrument; directions agree to their rounding, 1e-12 m here."""
+    """Wherever the pattern starts between two steps of the instrument; directions agree to rounding, 1e-12 m here."""
     mesh = heightfield(60.0, 60.0, 0.5)
     caster = RayCaster(mesh.with_vertices(mesh.vertices - [30.0, 30.0, 0.0]))
     whole = scanner(NOISY, effects=[*SYSTEMATIC_EFFECTS, *RANDOM_EFFECTS])
@@ -341,6 +343,6 @@ def test_wrong_effects_are_named(effects: list[dict[str, Any]], message: str) ->
 
 
 def test_an_effect_may_be_set_to_null() -> None:
-    """As a run's own record has it, and a config that is to be varied."""
+    """A run's own record has nulls, and so has a config that is to be varied."""
     entry = {"name": "range_offset", "offset_m": 0}
     assert parse(TlsModel, {"effects": [entry]}, "config").effects[0].is_null

@@ -1,4 +1,4 @@
-"""The pictures of the viewer's page and what is clicked on them."""
+"""The pictures of the viewer's page, and what a click on them selects."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_clicks_and_zooms() -> None:
 
 @pytest.mark.parametrize(("width", "height"), [(24.0, 15.0), (100.0, 30.0), (3.0, 3.0), (5.0, 20.0)])
 def test_the_first_view_holds_the_whole_wall(width: float, height: float) -> None:
-    """Plotly's camera: 45 degrees up and down, at the eye, towards the middle; units in which the extents' product is 1."""
+    """Plotly's camera: 45 degrees up and down, at the eye, towards the middle; in units in which the product of extents is 1."""
     x, y = np.linspace(0, width, 9), np.linspace(0, height, 7)
     relief = np.add.outer(np.sin(y), np.sin(x))
     patch = Patch(x, y, relief, relief, np.zeros((7, 9), dtype=int), 1)

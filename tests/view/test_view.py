@@ -61,7 +61,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def gap(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A diagnosis as scarpsim gap writes it: a plane that leans back at 70 degrees, in survey coordinates, with residuals."""
+    """A diagnosis as `scarpsim gap` writes it: a plane that leans back at 70 degrees, in survey coordinates, with residuals."""
     out = tmp_path_factory.mktemp("gap") / "gap"
     x, up = np.meshgrid(np.linspace(0, 20, 101), np.linspace(0, 10, 51))
     lean = np.deg2rad(70)
@@ -180,7 +180,7 @@ def test_clouds_that_are_of_no_diagnosis_are_told(gap: Path, tmp_path: Path) -> 
         ({}, cloud.points, "no channel residual_m"),
         ({"residual_m": cloud.extra["residual_m"]}, cloud.points, "no channel held_out"),
         ({**cloud.extra, "residual_m": cloud.extra["residual_m"] * np.nan}, cloud.points, "not numbers"),
-        ({key: value[:2] for key, value in cloud.extra.items()}, cloud.points[:2], "holds 2 points"),
+        ({key: value[:2] for key, value in cloud.extra.items()}, cloud.points[:2], "contains only 2 points"),
     ):
         shutil.copytree(gap, tmp_path / said)
         write_laz(tmp_path / said / "after.laz", PointCloud(points, extra=extra))
@@ -217,7 +217,7 @@ def test_a_file_that_breaks_under_the_page_is_told_on_it(run: Path, tmp_path: Pa
 
 
 def test_a_diagnosis_in_the_wall_s_own_frame(gap: Path) -> None:
-    """The wall is 20 x 10 m in its own plane, x runs along it, and the residual grows with x: 0 to 20 mm."""
+    """The wall is 20 x 10 m in its own plane, x runs along it, and the residual grows with x from 0 to 20 mm."""
     results = open_results(gap)
     layer = results.layers("before")[0]
     assert (layer.diverging, layer.unit) == (True, "mm")
@@ -236,7 +236,7 @@ def test_a_diagnosis_in_the_wall_s_own_frame(gap: Path) -> None:
 
 
 def test_effects_of_a_diagnosis_are_switched_on_and_off(gap: Path, tmp_path: Path) -> None:
-    """Before 1 mm a metre of x; the first effect takes half of it away, the second 0.3 mm everywhere."""
+    """Without effects the residual is 1 mm per metre of x; the first effect removes half of it, the second 0.3 mm everywhere."""
     shutil.copytree(gap, tmp_path / "gap")
     before = read_laz(gap / "before.laz")
     x = 1e3 * before.extra["residual_m"]
@@ -261,7 +261,7 @@ def test_effects_of_a_diagnosis_are_switched_on_and_off(gap: Path, tmp_path: Pat
 
 
 def test_what_stands_beside_begins_at_the_border() -> None:
-    """The right one has cells twice as large, ends sooner and has no data in its last column."""
+    """The right map has cells twice as large, ends sooner and has no data in its last column."""
     left = Patch(np.arange(10.0), np.arange(4.0)[::-1], np.zeros((4, 10)), np.zeros((4, 10)), np.zeros((4, 10), int), 1)
     value = np.array([[1.0, 2.0, 3.0, np.nan], [5.0, 6.0, 7.0, np.nan]])
     right = Patch(np.array([0.5, 2.5, 4.5, 6.5]), np.array([2.5, 0.5]), value, value, np.ones((2, 4), int), 1)
@@ -293,7 +293,7 @@ def test_two_runs_of_one_wall_stand_side_by_side(run: Path, gap: Path, tmp_path:
     record = json.loads((run / "run.json").read_text())
     record["wall_frame"]["matrix_world_to_wall"][0][3] += 1.0
     write_json(tmp_path / "moved/run.json", record)
-    with pytest.raises(InputError, match="is of another wall, or in another frame"):
+    with pytest.raises(InputError, match="shows another wall or uses another wall frame"):
         open_second(tmp_path / "moved", first)
 
 
@@ -324,9 +324,9 @@ def test_windows_beyond_the_raster_keep_a_pixel() -> None:
     ("make", "expected"),
     [
         (lambda _: Path("/nowhere"), "there is no such folder"),
-        (lambda folder: folder, "holds nothing to look at"),
+        (lambda folder: folder, "contains no results that can be shown"),
         (lambda folder: _written(folder, "run.json", "{"), "run.json: is not JSON"),
-        (lambda folder: _written(folder, "run.json", '{"sensor": "tls", "config": {}}'), "holds no finished epoch"),
+        (lambda folder: _written(folder, "run.json", '{"sensor": "tls", "config": {}}'), "contains no finished epoch"),
         (lambda folder: _written(folder, "gap.json", "[]"), "gap.json: expected a mapping"),
         (lambda folder: _written(folder, "annotations.json", "{}"), "is not a COCO annotation file"),
     ],
@@ -387,7 +387,7 @@ def test_a_name_out_of_a_file_stays_text(run: Path, tmp_path: Path) -> None:
 
 
 def test_the_page_runs_its_own_scripts_only(address: str) -> None:
-    """Every script in the page itself is named by its hash, none is allowed that is not, on any answer."""
+    """In every response, each script of the page is allowed by its hash, and no other script is."""
     with urllib.request.urlopen(asked(address), timeout=30) as answer:
         page, policy = answer.read().decode(), answer.headers["Content-Security-Policy"]
     allowed = dict(part.strip().split(" ", 1) for part in policy.split(";"))
@@ -411,7 +411,9 @@ def test_the_page_answers_to_this_machine_s_names_only(address: str) -> None:
 
 
 def test_the_page_answers_to_those_who_know_the_token_only(address: str) -> None:
-    """Not to another user of the machine who finds the port; the address of the command gives a cookie and leaves no token."""
+    """Another user of the machine who finds the port is refused; the address that the command prints sets a cookie and shows no
+    token.
+    """
     name = cookie_name(address)
     for place in ("/", "/_dash-layout", "/_dash-update-component", "/?token=", "/?token=another", "/assets/page.css"):
         for cookie in ("", f"{name}=", f"{name}=another", f"{name}0={TOKEN}"):
@@ -440,7 +442,7 @@ def open_results_of_nothing() -> Any:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine; the server's answers are tested above")
 def test_a_browser_draws_the_page(address: str, tmp_path: Path) -> None:
-    """Headless Chromium without any way out: every script runs, and wall and map are drawn."""
+    """Headless Chromium without network access: every script runs, and wall and map are drawn."""
     flags = ["--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     flags.append(f"--user-data-dir={tmp_path}")
     offline = ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1", "--virtual-time-budget=60000", "--timeout=90000"]

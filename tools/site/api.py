@@ -23,7 +23,7 @@ A module's folder says what it knows: `scene` knows no sensor, `sensors` know th
 
 
 def pages() -> dict[str, str]:
-    """The index and a page for each folder that holds modules."""
+    """Return the index and a page for each folder that holds modules."""
     made, rows = {}, []
     for package in _PACKAGES:
         for folder in sorted({path.parent for path in (ROOT / package).rglob("*.py")}):

@@ -45,7 +45,7 @@ def _named(entry: Any) -> Iterator[str]:
 
 
 def _written_out(entry: Any, pages: list[str], named: set[str]) -> Any:
-    """The navigation with folders replaced by the pages in them (an index first) that are named nowhere else."""
+    """Return the navigation with folders replaced by the pages in them (an index first) that are named nowhere else."""
     if isinstance(entry, list):
         parts = [_written_out(part, pages, named) for part in entry]
         return [page for part in parts for page in (part if isinstance(part, list) else [part])]

@@ -59,7 +59,7 @@ def _table(title: str, names: set[str]) -> str:
 
 
 def _licence(stated: metadata.PackageMetadata) -> str:
-    """The shortest sure statement: expression, else the field where it is a name and no text, else classifiers."""
+    """Return the shortest sure statement: expression, else the field where it is a name and no text, else classifiers."""
     classifiers = [each.removeprefix(_CLASSIFIER) for each in stated.get_all("Classifier") or [] if each.startswith(_CLASSIFIER)]
     field = (stated.get("License") or "").strip()
     named = field if 0 < len(field) <= _LONGEST and "\n" not in field else ""

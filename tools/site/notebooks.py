@@ -13,7 +13,7 @@ _PICTURE = re.compile(r"!\[png\]\((output_(\d+)_\d+\.png)\)")
 
 
 def pages() -> dict[str, str | bytes]:
-    """A page for each notebook and the pictures in it."""
+    """Return a page for each notebook and the pictures in it."""
     made: dict[str, str | bytes] = {}
     for path in sorted(FOLDER.glob("*.ipynb")):
         made |= _page(path)
@@ -21,7 +21,7 @@ def pages() -> dict[str, str | bytes]:
 
 
 def _page(path: Path) -> dict[str, str | bytes]:
-    """The page and its pictures; a cell that makes pictures says in its metadata, as `alt`, what they show."""
+    """Return the page and its pictures. A cell's metadata say, as `alt`, what its pictures show."""
     notebook = nbformat.read(path, as_version=4)
     text, resources = MarkdownExporter().from_notebook_node(notebook)
 

@@ -26,7 +26,7 @@ _DIVERGENCE = (
 
 
 def pages() -> dict[str, str]:
-    """The index and a page for each preset."""
+    """Return the index and a page for each preset."""
     names = sorted(path.stem for path in (configs_folder() / "scanners").glob("*.yaml"))
     presets = {name: read_preset(name) for name in names}
     rows = ["| preset | instrument | ranging | range precision | beam, full angle at 1/e² |", "|---|---|---|---|---|"]
@@ -101,7 +101,7 @@ def _in_words(preset: ScannerPreset) -> str:
 
 
 def _section(preset: ScannerPreset) -> str:
-    """The config sections that the preset stands for."""
+    """Return the config sections that the preset stands for."""
     known = preset.scanner_values().items()
     scanner = {key: [round(each, 6) for each in value] if isinstance(value, tuple) else value for key, value in known}
     model: TlsModel = preset.model()

@@ -41,8 +41,9 @@ def detect(model: Any, difference: NDArray[np.float32], minimum_score: float = 0
 
 
 def _data_range(known: NDArray[np.bool_], size: int) -> tuple[int, int]:
-    """Return the first and the end index of the rows or columns (n,) to search: all of them, or those with data in a
-    larger map.
+    """Return the first and the end index of the rows or columns (n,) to search.
+
+    They are all of them, or those with data if the map is larger than `size`.
     """
     if len(known) <= size:
         return 0, len(known)

@@ -56,8 +56,9 @@ def intersection_over_union(left: Tensor, right: Tensor) -> Tensor:
 
 
 def share_inside(left: Tensor, right: Tensor) -> Tensor:
-    """Return the (..., n, m) share of boxes (..., n, 4) that lies in boxes (..., m, 4), COCO's overlap with a crowd; 0 for empty
-    boxes.
+    """Return the share (..., n, m) of boxes (..., n, 4) that lies in boxes (..., m, 4); 0 for empty boxes.
+
+    This is COCO's overlap with a crowd.
     """
     left, right = ops.expand_dims(left, -2), ops.expand_dims(right, -3)
     return _common(left, right) / ops.maximum(_area(left), 1e-6)
@@ -73,8 +74,9 @@ def _common(left: Tensor, right: Tensor) -> Tensor:
 
 
 def encode(boxes: Tensor, reference: Tensor) -> Tensor:
-    """Code (..., 4) boxes relative to reference boxes: shift of the centre in units of their size, and logarithm of the size
-    ratio.
+    """Code boxes (..., 4) relative to reference boxes.
+
+    The code is the shift of the centre in units of the reference's size, and the logarithm of the size ratio.
     """
     centre, size = _centre_size(boxes)
     at, scale = _centre_size(reference)

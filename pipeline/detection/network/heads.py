@@ -36,7 +36,9 @@ def proposal_head(channels: int, ratios: int, size_px: int) -> keras.Model:
 
 
 def box_head(channels: int, hidden: int) -> keras.Model:
-    """Build the head from a box's features (n, POOLED_PX, POOLED_PX, channels) to class logits (n, CLASSES) and a box code (n,
+    """Build the head that classifies and refines a box.
+
+    Its input is the box's features (n, POOLED_PX, POOLED_PX, channels); outputs are class logits (n, CLASSES) and a box code (n,
     4).
     """
     features = keras.Input((POOLED_PX, POOLED_PX, channels))

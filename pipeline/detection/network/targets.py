@@ -61,8 +61,9 @@ class BoxTargets:
 def anchor_targets(
     anchors: np.ndarray, blocks: Tensor, valid: Tensor, config: ProposalConfig, seed: random.SeedGenerator
 ) -> AnchorTargets:
-    """Sample positive and negative anchors. Positive are those with a large overlap with a block, and the nearest one to each
-    block.
+    """Sample positive and negative anchors.
+
+    Positive are those with a large overlap with a block, and the nearest one to each block.
 
     Parameters
     ----------
@@ -118,8 +119,9 @@ def box_targets(proposals: Tensor, blocks: Tensor, valid: Tensor, config: HeadCo
 
 
 def _counted(boxes: Tensor, blocks: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """Return (b, 1, g) 1 for blocks that count, and (b, n) 0 for boxes whose share in an ignored block reaches _IGNORED,
-    else 1.
+    """Tell which blocks and boxes count, given that some blocks are to be ignored.
+
+    Returns (b, 1, g) 1 for blocks that count, and (b, n) 0 for boxes whose share in an ignored block reaches _IGNORED, else 1.
     """
     ignored = ops.cast(valid < 0, "float32")[:, None]
     free = ops.max(share_inside(boxes, blocks) * ignored, axis=2) < _IGNORED

@@ -22,8 +22,9 @@ are none.
 
 @dataclass(frozen=True)
 class EventPlaces:
-    """A run's wall frame, and the vertices (n, 3) of its reference surface, wall frame, m, sorted by x; empty if the run wrote
-    none.
+    """A run's wall frame and the vertices of its reference surface, which place events in the world.
+
+    The vertices (n, 3), wall frame, m, are sorted by x; they are empty if the run wrote none.
     """
 
     frame: WallFrame

@@ -63,8 +63,9 @@ def detector(model: str, *, unmirrored: bool = False) -> Detector:
 
 
 def sorted_confidences(values: Sequence[float]) -> tuple[float, ...]:
-    """Return the values in rising order without repetition; raise InputError unless they are between the lowest kept score
-    and 1.
+    """Return the values in rising order without repetition.
+
+    Raises InputError unless they are between the lowest kept score and 1.
     """
     for value in values:
         if not LOWEST_SCORE <= value <= 1:
@@ -75,8 +76,9 @@ def sorted_confidences(values: Sequence[float]) -> tuple[float, ...]:
 
 
 def find_inputs(places: Sequence[Path]) -> list[InputMap]:
-    """Find the difference maps at some paths: TIFF files, folders with annotations.json, run folders; ids are COCO's, or count
-    from 1.
+    """Find the difference maps at some paths: TIFF files, folders with annotations.json, run folders.
+
+    Ids are COCO's, or count from 1.
     """
     result: list[InputMap] = []
     for place in places:
@@ -86,8 +88,9 @@ def find_inputs(places: Sequence[Path]) -> list[InputMap]:
             continue
         files = sorted(place.glob("difference_*.tif")) if place.is_dir() else [place]
         if not files:
-            allowed = "a TIFF, a run folder, or a folder with annotations.json"
-            raise InputError("no difference map found", where=str(place), allowed=allowed)
+            raise InputError(
+                "no difference map found", where=str(place), allowed="a TIFF, a run folder, or a folder with annotations.json"
+            )
         result += [InputMap(file, file.name, {"file_name": file.name}) for file in files]
     for path, count in Counter(item.path for item in result).items():
         if count > 1:

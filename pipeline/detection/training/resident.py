@@ -167,8 +167,9 @@ class ResidentLearner:
         return [{name: float(np.mean(np.asarray(values))) for name, values in losses.items()}]
 
     def validate(self) -> list[dict[str, float]]:
-        """Return the losses in the middles of all validation tiles, batch by batch; the last batch is filled with its own first
-        tiles.
+        """Return the losses in the middles of all validation tiles, batch by batch.
+
+        The last batch is filled with its own first tiles.
         """
         count, size = self._judging.tiles, self._training.batch
         weights, others, _ = ([variable.value for variable in group] for group in self._variables())

@@ -1,5 +1,6 @@
-"""Train the detector: epochs, validation, checkpoints and early stopping; an interrupted training can be resumed without a
-difference.
+"""Train the detector: epochs, validation, checkpoints and early stopping.
+
+An interrupted training can be resumed with the same result.
 """
 
 from __future__ import annotations
@@ -209,14 +210,17 @@ def _restore_or_start(out: Path, config: TrainConfig, model: MaskRCNN, *, resume
     except InputError:
         raise
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        problem = f"the checkpoint is damaged ({' '.join(str(error).split())[:200]})"
-        raise InputError(problem, where=str(out), remedy=_NO_CHECKPOINT) from None
+        raise InputError(
+            f"the checkpoint is damaged ({' '.join(str(error).split())[:200]})", where=str(out), remedy=_NO_CHECKPOINT
+        ) from None
     return History(state.training, state.validation)
 
 
 def _save(out: Path, config: TrainConfig, model: MaskRCNN, history: History) -> None:
-    """Write a checkpoint. The state names the files of its epoch and is written last, so that a kill leaves the previous one
-    complete.
+    """Write a checkpoint.
+
+    The state names the files of its epoch and is written last, so that the previous checkpoint stays complete if the process is
+    killed.
     """
     folder, epoch = out / CHECKPOINT, len(history.training)
     names = {"weights": f"epoch_{epoch:04d}.weights.h5", "optimizer": f"epoch_{epoch:04d}.{_OPTIMIZER}"}

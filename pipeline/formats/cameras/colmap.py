@@ -112,8 +112,9 @@ def read_map(path: Path) -> NDArray[np.float32]:
 
 
 def _records(path: Path, words: int, stride: int) -> list[tuple[list[str], str]]:
-    """Return the words of every `stride`-th line that is not a comment, and its place; raise InputError if there are fewer than
-    `words`.
+    """Return the words of every `stride`-th line that is not a comment, and its place in the file.
+
+    Raises InputError if a line has fewer than `words` words.
     """
     remedy = "export the model as text (colmap model_converter --output_type TXT)"
     lines = read_text(path, remedy=remedy).splitlines()

@@ -37,8 +37,9 @@ class Projection:
     where: str
 
     def pose(self, matrix: FloatArray) -> FloatArray:
-        """Convert a (4, 4) pose, camera to geocentric coordinates, to camera to easting, northing and ellipsoidal height; a scale
-        is kept.
+        """Convert a pose (4, 4) from camera to geocentric coordinates to one to easting, northing, height.
+
+        The height is ellipsoidal; a scale is kept.
         """
         position = matrix[:3, 3]
         shifted = position + _STEP_M * np.concatenate([np.eye(3), -np.eye(3)])
@@ -68,8 +69,9 @@ class Projection:
         try:
             crs = CRS.from_user_input(self.text)
         except (CRSError, UnicodeError) as error:
-            problem = f"names an unknown coordinate system ({' '.join(str(error).split())[:100]})"
-            raise InputError(problem, where=self.where, remedy=_REMEDY) from None
+            raise InputError(
+                f"names an unknown coordinate system ({' '.join(str(error).split())[:100]})", where=self.where, remedy=_REMEDY
+            ) from None
         self._check(crs)
         return crs.sub_crs_list[0] if crs.is_compound else crs
 

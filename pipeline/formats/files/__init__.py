@@ -1,5 +1,5 @@
-"""Write files safely: completely or not at all, by one writer at a time, in their own folder; checksums and XML of other
-programs.
+"""Write files safely: completely or not at all, by one writer at a time, in their own folder.
 
-Formats themselves are in the other subfolders of `pipeline/formats`. Start with `atomic.py`.
+Checksums and the reading of other programs' XML are here too. Formats themselves are in the other subfolders of
+`pipeline/formats`. Start with `atomic.py`.
 """

@@ -58,8 +58,9 @@ def writing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _made_for(folder: Path) -> Iterator[None]:
-    """Allow the block to create `folder` and its parents; if it fails, those that it created are removed again if they
-    are empty.
+    """Allow the block to create `folder` and its parents.
+
+    If it fails, those that it created are removed again if they are empty.
     """
     made = _missing(folder)
     try:

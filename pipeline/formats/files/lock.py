@@ -18,10 +18,10 @@ LOCK = ".lock"
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of `folder`, creating the folder if needed; afterwards, remove the lock file and created folders that are
-    empty.
+    """Hold the lock of `folder`, creating the folder if needed.
 
-    Raises InputError if another process holds it, or the folder cannot be created.
+    Afterwards the lock file and created folders that are empty are removed. Raises InputError if another process holds the lock,
+    or the folder cannot be created.
     """
     if folder.exists() and not folder.is_dir():
         raise InputError("is a file", where=f"--out {folder}", remedy="choose a folder")

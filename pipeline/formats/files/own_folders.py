@@ -9,8 +9,9 @@ from scene.common.errors import InputError
 
 
 def require_own_folder(path: Path) -> None:
-    """Raise InputError unless `path` is a folder or does not exist; a file, a pipe (at which `rmtree` waits forever) and a link
-    are refused.
+    """Raise InputError unless `path` is a folder or does not exist.
+
+    A file, a pipe (at which `rmtree` waits forever) and a link are refused.
     """
     if os.path.lexists(path) and (path.is_symlink() or not path.is_dir()):
         raise InputError("is not a folder", where=str(path), remedy="move it away, the command needs its own folder there")

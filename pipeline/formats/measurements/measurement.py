@@ -1,5 +1,6 @@
-"""The measurement that `scarpsim gap` analyses: points, reference surface, instrument and sensor model; reading it from
-a folder.
+"""Define the measurement that `scarpsim gap` analyses, and read it from a folder.
+
+A measurement holds points, reference surface, instrument and sensor model.
 """
 
 from __future__ import annotations
@@ -125,8 +126,9 @@ class MeasurementBase(ABC):
         return self.changed(cloud=self.cloud.part(rows))
 
     def moved(self, pose: FloatArray) -> Self:
-        """Shift (m) and rotate (rad) the sensor (a camera pair about its left camera) and its points by a pose (6,),
-        wall frame.
+        """Shift (m) and rotate (rad) the sensor and its points by a pose (6,), wall frame.
+
+        A camera pair rotates about its left camera.
         """
         turn, centre = rotation_matrix(pose[3:]), self.viewpoint
         points = (self.cloud.points - centre) @ turn.T + centre + pose[:3]
@@ -161,6 +163,7 @@ class TlsMeasurement(MeasurementBase):
 
     @property
     def viewpoint(self) -> FloatArray:
+        """Position (3,) of the scanner in the first scan, wall frame, m."""
         return self.station[0]
 
     @property
@@ -176,6 +179,7 @@ class TlsMeasurement(MeasurementBase):
 
     @property
     def fit(self) -> PointFit:
+        """How the points of the scan that fits worst fit the reference."""
         several = self.each_scan()
         fits = [PointFit.of(one.cloud.points, one.viewpoint, self.scene, self.sensor) for _, rows, one in several if len(rows)]
         return min(fits, key=lambda each: (each.good, each.near)) if fits else super().fit
@@ -192,6 +196,7 @@ class TlsMeasurement(MeasurementBase):
         return self.changed(cloud=replace(self.cloud, points=points), scans=tuple(scans), station=scans[0].pose)
 
     def part(self, rows: NDArray[np.int64]) -> Self:
+        """Return a copy with some of the points, with their scan lines and times."""
         line, share = (None if values is None else values[rows] for values in self.order or (None, None))
         return super().part(rows).changed(order=self.order and (line, share))
 
@@ -215,11 +220,13 @@ class StereoMeasurement(MeasurementBase):
     surroundings: Surroundings | None = None
 
     def part(self, rows: NDArray[np.int64]) -> Self:
+        """Return a copy with some of the points, with what is known of their neighbourhoods."""
         shaped = None if self.shaped_px is None else self.shaped_px[rows]
         return super().part(rows).changed(shaped_px=shaped, surroundings=self.surroundings and self.surroundings.part(rows))
 
     @property
     def viewpoint(self) -> FloatArray:
+        """Position (3,) of the left camera, wall frame, m."""
         return self.frame.to_wall(self.cameras.left.position)
 
     def _moved_sensor(self, turn: FloatArray, shift: FloatArray) -> dict[str, Any]:
@@ -268,9 +275,11 @@ class SurfaceMeasurement(MeasurementBase):
         return SurfaceFit.of(self.cloud.points, self.reference)
 
     def check_near(self, where: str) -> None:
+        """Raise InputError if most points are too far from the reference surface."""
         self.surface_fit.check(where)
 
     def changed(self, **values: Any) -> Self:
+        """Return a copy with other points that keeps the ray caster, the surface's shape and the datum."""
         other = super().changed(**values)
         other.__dict__["shape"], other.__dict__["datum"] = self.shape, self.datum
         return other
@@ -303,8 +312,20 @@ def sensor_model(values: Any, where: str) -> TlsModel | StereoModel:
 
 @dataclass(frozen=True)
 class Material:
-    """The parts of a measurement: reference surface, world frame, and notes on it; clouds by file name, one for each epoch, in
-    the frame of the config; sensor model; stereo pair, world frame, if known.
+    """The parts of a measurement in memory, from which `assembled` makes it.
+
+    Attributes
+    ----------
+    reference : TriangleMesh
+        Reference surface, world frame, m.
+    points : dict of PointCloud
+        Clouds by file name, one for each epoch, in the frame of the config.
+    model : TlsModel or StereoModel
+        Sensor model.
+    cameras : CameraPair, optional
+        Stereo pair, world frame, if known.
+    notes : tuple of str
+        Notes on the reference surface.
     """
 
     reference: TriangleMesh
@@ -339,10 +360,21 @@ def _mended(config: MeasurementConfig, values: Any) -> tuple[str, ...]:
 
 
 def assembled(config: MeasurementConfig, material: Material, reference: str, where: str) -> Measurement:
-    """Make a measurement from its parts in memory, ignoring the config's paths; reference, where: names of mesh and config, for
-    errors.
+    """Make a measurement from its parts in memory, ignoring the config's paths.
 
-    Raises InputError if the parts do not fit together.
+    Parameters
+    ----------
+    config : MeasurementConfig
+        Content of measurement.yaml.
+    material : Material
+        The parts.
+    reference, where : str
+        Names of the reference's file and of the config, for errors.
+
+    Raises
+    ------
+    InputError
+        If the parts do not fit together.
     """
     mesh, model, cameras = material.reference, material.model, material.cameras
     _check_sensor(config, model, where)

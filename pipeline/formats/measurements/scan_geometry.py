@@ -200,8 +200,24 @@ def _with_pulses(
     rotation: FloatArray,
     shape: FloatArray,
 ) -> ScanGeometry | None:
-    """Return the geometry once the lines are known; None if zenith angles have no step. straight: (n,) azimuth without the line's
-    shape.
+    """Find the grid of zenith angles and return the scan's geometry; None if they have no step.
+
+    Parameters
+    ----------
+    distance : (n,) array
+        Ranges, m.
+    azimuth, straight, zenith : (n,) arrays
+        Angles in the frame of the axis, rad; straight is the azimuth without the line's shape.
+    lines : AngularGrid
+        Azimuths of the scan lines.
+    line : (n,) array
+        Scan line of each point.
+    far : (n,) bool array
+        Points that are far enough for exact angles.
+    rotation : (3, 3) array
+        From the frame of the axis to the scanner's.
+    shape : (3,) array
+        Shape of the line.
     """
     try:
         step = _period(_longest_lines(zenith[far], line[far]))
@@ -270,8 +286,9 @@ def _phasor(values: FloatArray, step: float) -> complex:
 
 
 def _grid(values: FloatArray, step: float, far: NDArray[np.bool_]) -> tuple[AngularGrid, IntArray]:
-    """Return the grid of the values, by least squares over the far ones, and each value's index; raise InputError for a single
-    index.
+    """Return the grid of the values, by least squares over the far ones, and each value's index.
+
+    Raises InputError for a single index.
     """
     start = float(np.angle(_phasor(values[far], step))) / (2 * np.pi) * step
     for _ in range(3):
@@ -319,8 +336,18 @@ def _refined_step(zenith: FloatArray, line: IntArray, far: NDArray[np.bool_], st
 
 @dataclass(frozen=True)
 class _AxisFit:
-    """Fit of the scan's axis. rotation: scanner's frame to that of the axis; shape: d, c, t; step: of azimuth; cut: azimuth at
-    the start.
+    """Fit of the scan's axis.
+
+    Attributes
+    ----------
+    rotation : (3, 3) array
+        From the scanner's frame to that of the axis.
+    shape : (3,) array
+        Shape d, c, t of the line.
+    step : float
+        Step of azimuth, rad.
+    cut : float
+        Azimuth at which the scan starts, rad.
     """
 
     rotation: FloatArray

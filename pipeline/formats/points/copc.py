@@ -99,8 +99,9 @@ def octree(steps: NDArray[np.integer]) -> Octree:
 
 
 def _taken(curve: NDArray[np.int64], level: int) -> NDArray[np.bool_]:
-    """Return the (n,) mask of points that a level takes, of those left in the curve's order: the first of each cell, or all of a
-    node.
+    """Return the mask (n,) of points that a level takes, of those left in the curve's order.
+
+    These are the first of each cell, or all of a node.
     """
     if level == _DEEPEST:
         return np.ones(len(curve), dtype=bool)

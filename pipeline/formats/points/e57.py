@@ -132,8 +132,9 @@ def _check_length(path: Path) -> None:
 
 
 def _check_metres(root: Any, where: str) -> tuple[str, ...]:
-    """Return a note on a coordinate system that is not understood; raise InputError if its unit is not the metre, which E57
-    requires.
+    """Return a note on a coordinate system that is not understood.
+
+    Raises InputError if its unit is not the metre, which E57 requires.
     """
     text = root["coordinateMetadata"].value().strip() if root.isDefined("coordinateMetadata") else ""
     if not text:

@@ -133,8 +133,9 @@ def _check_kind(lines: Sequence[str], where: str) -> None:
 
 
 def form_of(sample: Sequence[str], first_line: int, where: str) -> RowForm:
-    """Detect how rows are written from a sample; first_line: number of its first line. Raises InputError for thousands
-    separators.
+    """Detect how rows are written, from a sample of them.
+
+    first_line: number of the sample's first line in the file. Raises InputError for thousands separators.
     """
     separator, decimal_comma = _separator(sample)
     rows = [split_row(line, separator) for line in sample]
@@ -225,5 +226,9 @@ def _no_rows(lines: Sequence[str], where: str) -> InputError:
     if not any(line.strip() for line in lines):
         return InputError("has no points and no line of numbers", where=where, allowed=_ROWS, remedy="export it again")
     first = next(line.strip() for line in lines if line.strip())
-    problem = f"has no line of numbers, at least x y z, among its first {_HEADER_LINES} lines (it begins with '{first:.60}')"
-    return InputError(problem, where=where, allowed=_ROWS, remedy="use a file of points, or remove the lines before them")
+    return InputError(
+        f"has no line of numbers, at least x y z, among its first {_HEADER_LINES} lines (it begins with '{first:.60}')",
+        where=where,
+        allowed=_ROWS,
+        remedy="use a file of points, or remove the lines before them",
+    )

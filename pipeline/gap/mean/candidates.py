@@ -376,8 +376,9 @@ def harmonics(covariate: str, sine: Candidate, last: int) -> Candidate:
 
 
 def line_pattern_terms(covariate: str, number: FloatArray, step: float) -> list[Candidate]:
-    """Make terms with free values within a few scan lines, columns or rows, which repeat: facets of a mirror, blocks of a
-    read-out.
+    """Make terms with free values for each of a few lines, which repeat along the covariate.
+
+    Lines are scan lines, columns or rows. Such patterns come from the facets of a mirror or a read-out in blocks.
 
     Parameters
     ----------

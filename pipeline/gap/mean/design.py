@@ -1,5 +1,6 @@
-"""Set up the columns of all candidates of the mean model on one set of points, with their normal equations. Designs are
-immutable.
+"""Set up the columns of all candidates of the mean model on one set of points.
+
+Their normal equations are part of the design. Designs are immutable.
 """
 
 from __future__ import annotations
@@ -286,8 +287,9 @@ class Design:
         return np.split(values[len(self.pose_columns) :], np.cumsum(widths)[:-1]) if candidates else []
 
     def reference_sigma(self, candidates: list[Candidate]) -> float:
-        """Return the standard deviation of the reference's correlated error beside some candidates, in the unit of the
-        observable.
+        """Return the standard deviation of the reference's correlated error beside some candidates.
+
+        It is in the unit of the observable.
         """
         return float(np.sqrt(self.fit(candidates).cell_covariance.variance_ratio)) * self.model.typical_sigma
 

@@ -1,5 +1,6 @@
-"""Hold the normal equations of all candidates under every covariance of the cells' means, to compare any sets of candidates
-quickly.
+"""Hold the normal equations of all candidates under every covariance of the cells' means.
+
+With them any sets of candidates are compared quickly.
 
 There are two kinds of columns. Products of fixed columns with each other are all known. Of each searched sine only the products
 with itself and with the held columns are known: those of the effects that others are fitted beside (`with_sine_products`). A sine
@@ -30,8 +31,9 @@ _AT_ONCE = 8
 
 @dataclass(frozen=True)
 class SineProducts:
-    """Products of w sines (2 w columns) with other columns: within cells weighted by the inverse covariance, between cells as
-    means.
+    """Products of w sines (2 w columns) with other columns.
+
+    Within cells they are weighted by the inverse covariance; between cells they are means.
 
     Attributes
     ----------

@@ -60,16 +60,17 @@ class NullDistribution:
         )
 
     def penalty(self, family: str) -> float:
-        """Return the penalty of a family's score: twice its mean log-likelihood ratio under the null (k for k linear
-        coefficients).
+        """Return the penalty of a family's score.
+
+        It is twice the family's mean log-likelihood ratio under the null (k for k linear coefficients).
         """
         return 2 * float(self.log_likelihood_ratios[family].mean())
 
     def p_value(self, score: float, larger: Mapping[str, float] | None = None) -> float:
-        """Return the p-value (1 + b) / (1 + N) of a score: b of N simulations have a largest score over all families that
-        reaches it.
+        """Return the p-value (1 + b) / (1 + N) of a score.
 
-        It is corrected for multiple testing, because the maximum over all families is the test statistic.
+        In b of N simulations the largest score over all families reaches it. The p-value is corrected for multiple testing,
+        because the maximum over all families is the test statistic.
 
         Parameters
         ----------

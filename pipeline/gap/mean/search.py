@@ -240,8 +240,9 @@ class MeanSearch:
         return float(np.std(columns @ values)), fit
 
     def leading_effects(self) -> list[Candidate]:
-        """List the effects of the catalogue that explain much alone, with their variants, best first. They are refitted
-        without linearising.
+        """List the effects of the catalogue that explain much alone, with their variants, best first.
+
+        They are refitted without linearising.
         """
         plain, fixed, _ = self._profile(())
         ratios = fixed[:, 0] - plain[0]

@@ -104,8 +104,9 @@ class _Set:
 
     @property
     def nonparametric(self) -> FamilyScore | None:
-        """The best non-parametric term, or None. It must clearly beat the spatial null candidates if its covariate varies
-        along the wall.
+        """The best non-parametric term, or None.
+
+        It must clearly beat the spatial null candidates if its covariate varies along the wall.
         """
         null_score = self.spatial_null_score
         terms = [
@@ -245,8 +246,9 @@ class ForwardSelection:
         return [_Set(found[names], scores[names], self.search.score_families(found[names])) for names in ranked], scores
 
     def _nonparametric_term(self, levels: list[list[_Set]]) -> tuple[EffectSet, FamilyScore] | None:
-        """A non-parametric term that the data require, beside or instead of effects, and those effects; None if they require
-        none.
+        """Return a non-parametric term that the data require beside or instead of effects, and those effects.
+
+        None if the data require none.
         """
         best, empty = levels[-1][0], levels[0][0]
         if (

@@ -1,5 +1,7 @@
-"""List the candidate explanations of the mean (families) that a measurement allows: the catalogue, non-parametric terms and
-nulls."""
+"""List the candidate explanations of the mean (families) that a measurement allows.
+
+They are the effects of the catalogue, non-parametric terms and spatial null candidates.
+"""
 
 from __future__ import annotations
 
@@ -49,8 +51,10 @@ def catalogue_families(measurement: Measurement, part: Residuals) -> list[Candid
 
 
 def candidate_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
-    """Return every explanation of the mean that the recorded fields allow: catalogue, non-parametric terms, spatial null
-    candidates."""
+    """Return every candidate explanation of the mean that the measurement's recorded fields allow.
+
+    They are the effects of the catalogue, non-parametric terms and spatial null candidates.
+    """
     named = catalogue_families(measurement, part)
     lowest = {PERIODIC[each.name]: each.frequencies[0] for each in named if isinstance(each, SineGrid) and each.name in PERIODIC}
     free = [

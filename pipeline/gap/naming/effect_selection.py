@@ -87,8 +87,10 @@ class SelectionResult:
     noise_ratio: float
 
     def p_beside(self, named: Sequence[NamedEffect]) -> float | None:
-        """Return the p-value of the misfit beside the systematic effects that were kept; None where it was not computed for this
-        set."""
+        """Return the p-value of the misfit that remains beside the systematic effects that were kept.
+
+        None if it was not computed for this set of effects.
+        """
         kept = self.systematic & {item.name for item in named}
         if kept == self.systematic:
             return self.p_value

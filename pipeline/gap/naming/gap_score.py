@@ -252,8 +252,17 @@ def _draw_ensemble(measurement: Measurement, version: RegisteredModel, residuals
 
 
 def _patch_statistics(draws: FloatArray, patch: NDArray[np.int64], error: FloatArray | None = None) -> FloatArray:
-    """(2, d, p) mean and standard deviation of each of p patches in draws (d, n). error: (d, p) error of the reference of each
-    patch."""
+    """Return the mean and the standard deviation of each of p patches, (2, d, p), in d simulated draws.
+
+    Parameters
+    ----------
+    draws : (d, n) array
+        Simulated residuals.
+    patch : (n,) array
+        Patch of each point.
+    error : (d, p) array, optional
+        Error of the reference of each patch, in each draw.
+    """
     count = np.bincount(patch)
     mean = np.stack([np.bincount(patch, row) for row in draws]) / count
     square = np.stack([np.bincount(patch, (row - m[patch]) ** 2) for row, m in zip(draws, mean, strict=True)])

@@ -280,8 +280,10 @@ def _empirical_effect(candidate: Candidate, values: FloatArray, item: SelectedEf
 
 
 def _angle_term(candidate: Candidate, error: FloatArray, item: SelectedEffect, part: TlsResiduals) -> NamedEffect:
-    """Describe an error of an angle by a curve, recovered from the ranges where the surface slants more than at half of the
-    points."""
+    """Describe an error of an angle by a curve, which is recovered from the ranges.
+
+    Only the half of the points is used at which the range depends most on the angle.
+    """
     levers = {"azimuth": part.geometry.by_azimuth, "zenith": part.geometry.by_zenith}
     lever = -levers[candidate.angle]
     steep = np.abs(lever) > np.median(np.abs(lever))
@@ -363,8 +365,10 @@ def _surface_nodes(candidate: Candidate, error: FloatArray, part: Residuals) -> 
 
 
 def _covariate_offset(covariate: str, part: Residuals) -> float:
-    """Return an effect's covariate minus that of the residuals: not zero only for the power, which is relative in the
-    residuals."""
+    """Return an effect's covariate minus that of the residuals.
+
+    It differs from zero only for the power, which is relative in the residuals.
+    """
     if covariate != "intensity" or not isinstance(part, TlsResiduals):
         return 0.0
     return float(np.median(np.log(np.maximum(part.geometry.power, 1e-12)) - part.covariates[covariate]))

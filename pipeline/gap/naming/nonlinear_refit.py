@@ -239,8 +239,21 @@ def _estimate_of_size(candidate: Candidate, values: FloatArray) -> Estimate:
 
 
 def _gauss_newton_step(at: Residuals, columns: FloatArray, precision: FloatArray, values: FloatArray) -> FloatArray:
-    """(k,) change of the coefficients: weighted least squares with the Jacobian (n, k), free pose and a Gaussian prior around
-    0."""
+    """Return the change (k,) of the coefficients in one Gauss-Newton step.
+
+    It is the weighted least-squares solution with free pose and a Gaussian prior around 0.
+
+    Parameters
+    ----------
+    at : Residuals
+        Residuals at the present coefficients, with the Jacobian of the pose.
+    columns : (n, k) array
+        Jacobian of the coefficients.
+    precision : (k,) array
+        Inverse variances of the prior.
+    values : (k,) array
+        Present coefficients.
+    """
     design = np.concatenate([at.pose_jacobian, columns], axis=1) / at.sigma[:, None]
     known, pull = np.zeros(design.shape[1]), np.zeros(design.shape[1])
     start = at.pose_jacobian.shape[1]

@@ -143,8 +143,10 @@ class Validation:
         return ValidationResult(named, self.reduced_noise, self._model(named), value, pose, self._gap(named, versions, rows))
 
     def _registered(self, named: list[NamedEffect]) -> tuple[FloatArray, FloatArray]:
-        """(n,) registered residuals of the same points with some effects, NaN where their rays miss the reference, and the pose
-        (6,)."""
+        """Return the residuals (n,) and the pose (6,) after registration with some effects in the model.
+
+        The points are always the same. Residuals are NaN where rays miss the reference.
+        """
         if not (named or self.reduced_noise):
             return self.residuals.value - self.residuals.pose_jacobian @ self.pose, self.pose
         registered_points = self.residuals.index[self.registration_rows]
@@ -173,6 +175,8 @@ def _without_losses(named: list[NamedEffect]) -> list[NamedEffect]:
 
 
 def _may_be_dropped(item: NamedEffect) -> bool:
-    """Whether an effect may be dropped for slight harm. An empirical term on the mean may not: it is inexact, but describes a
-    misfit."""
+    """Whether an effect may be dropped although it harms the score only slightly.
+
+    An empirical term on the mean may not: it is inexact, but describes a misfit.
+    """
     return item.adds_variance or (item.kind == "physical" and item.effect.shows_in != ShowsIn.VALUES)

@@ -92,8 +92,10 @@ def validate_effects(
 
 
 def _is_weak(item: NamedEffect) -> bool:
-    """Whether an effect beside others gains no more than its standard error, sqrt(2 g) for a gain g, or is consistent with
-    zero."""
+    """Whether an effect beside others is not significant.
+
+    This is so if its log-likelihood ratio g is at most its standard error sqrt(2 g), or if the effect is consistent with zero.
+    """
     by = thresholds().validation
     return (
         item.kind == "physical"
@@ -199,8 +201,10 @@ def _gain_needed(expected: float) -> float:
 def _registered_residuals(
     measurement: Measurement, named: list[NamedEffect], residuals: Residuals, training: BoolArray
 ) -> _RegisteredResiduals:
-    """Residuals of all points with some effects in the model, the pose estimated from the training points; NaN where not
-    smooth."""
+    """Return the residuals of all points with some effects in the model.
+
+    The pose is estimated from the training points. Residuals are NaN where the surface is not smooth.
+    """
     found = aligned_with(measurement, named, residuals.index[training]).residuals
     count = len(measurement.cloud.points)
     place = np.full(count, -1)

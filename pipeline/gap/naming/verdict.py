@@ -82,8 +82,10 @@ class Evidence:
 
     @property
     def agrees(self) -> bool:
-        """Whether the model without any effect is accepted: by the gap on validation points, the misfit, the tails and the
-        noise."""
+        """Whether the model without any effect is accepted.
+
+        Tested are the gap on validation points, the misfit, the outliers and the noise.
+        """
         measured = self.gap is not None and not self.gap.above_floor and self.p_value is not None
         return measured and not (self.rejects or self.far or self.is_overdispersed)
 

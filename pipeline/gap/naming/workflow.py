@@ -338,8 +338,12 @@ def _with_heavy_tails(
 
 
 def _smooth_residuals_with(measurement: Measurement, named: list[NamedEffect]) -> tuple[Residuals, FloatArray, float]:
-    """Residuals on smooth rock with some effects in the model, the registered ones (n,), and their noise over the predicted
-    one."""
+    """Return the residuals on smooth rock with some effects in the model.
+
+    Returns
+    -------
+    The residuals, their registered values (n,), and their noise over the predicted one.
+    """
     found = aligned_with(measurement, named).residuals
     part = found.part(np.flatnonzero(found.usable))
     value, _, scale = fit_pose_robustly(part)
@@ -368,8 +372,10 @@ class _Clock:
 
 
 def _remaining_entry(evidence: Evidence, notes: list[str], lower_noise: dict[str, float]) -> dict[str, Any]:
-    """Return the entry `remaining` of gap.json; its numbers are those of `Evidence`, and lower_noise holds noise values that
-    fit."""
+    """Return the entry `remaining` of gap.json: what the named effects leave unexplained.
+
+    Its numbers are those of `Evidence`; lower_noise holds noise values that fit.
+    """
     return {
         "p_value": evidence.p_value,
         "note": "; ".join(notes),

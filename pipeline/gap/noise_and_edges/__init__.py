@@ -1,5 +1,5 @@
-"""Fit what is no systematic effect: the variance model, grid-correlated noise, edge effects, missing returns, rounding and
-locking.
+"""Fit everything that is not a systematic effect of the mean.
 
-Systematic effects are in `pipeline/gap/mean`. Start with the module named after the effect in question.
+This comprises the variance model, grid-correlated noise, edge effects, missing returns, rounding and pixel locking. Systematic
+effects are in `pipeline/gap/mean`. Start with the module named after the effect in question.
 """

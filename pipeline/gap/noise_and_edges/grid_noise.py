@@ -87,11 +87,11 @@ class _Variogram:
         return _VariogramFit(chi2, float(best[0]), error, shares)
 
     def p_value(self, random: KeyedRandom) -> float:
-        """Return the p-value (1 + b) / (1 + N) of the largest grid variance over its error, for any step, with signs flipped by
-        wall block.
+        """Return the p-value (1 + b) / (1 + N) of the largest grid variance over its error, for any step.
 
-        Blocks of noise that the model contains deviate to both sides alike. Lags are weighted by their own scatter, because
-        weights from the covariance of so few blocks would be fitted to these very blocks.
+        The null distribution has the signs flipped by wall block. Blocks of noise that the model contains deviate to both sides
+        alike. Lags are weighted by their own scatter, because weights from the covariance of so few blocks would be fitted to
+        these very blocks.
         """
         size = np.linalg.norm(self.blocks, axis=1)
         forms = (np.stack([_grid_semivariogram(self.lag, step), self._smooth], axis=1) for _, step in self._trials)
@@ -122,8 +122,10 @@ class _Variogram:
 
     @property
     def chi2_of_reference_error(self) -> float:
-        """chi^2 of the best fit without grid noise. Errors of the reference of all lengths are tried; short ones have a lower
-        bound."""
+        """Return chi^2 of the best fit without grid noise.
+
+        Errors of the reference of all correlation lengths are tried; short ones have a lower bound.
+        """
         by = thresholds().grid_noise
         chi2 = self.chi2_without_grid
         for length in _RELATIVE_LENGTHS:
@@ -142,8 +144,10 @@ class _Variogram:
         return (error_m / self.unit_m) ** 2
 
     def best_grid(self) -> tuple[_VariogramFit, float, list[float]] | None:
-        """Return the fit in the middle of those that are best, its step, px, and the steps of all of them; None where all are too
-        fine."""
+        """Return the fit in the middle of those that are best, its step, px, and the steps of all of them.
+
+        None if all steps are too fine.
+        """
         trials = self._trials
         if not trials:
             return None
@@ -268,8 +272,10 @@ def _with_variance(found: VarianceTerm, fit: _VariogramFit, share: float) -> Var
 
 
 def _variogram(part: StereoResiduals, value: FloatArray, model: StereoModel) -> _Variogram | None:
-    """Compute the semivariogram along rows and columns, with its covariance from wall blocks; None where the pixels are on no
-    raster."""
+    """Compute the semivariogram along rows and columns, with its covariance from wall blocks.
+
+    None if the pixels are on no raster.
+    """
     g = part.geometry
     steps = [step for step in (raster_spacing_px(g.v), raster_spacing_px(g.u)) if step is not None]
     if len(steps) < 2:

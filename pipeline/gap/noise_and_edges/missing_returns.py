@@ -239,8 +239,10 @@ def _fit_precipitation(losses: LossData, range_m: FloatArray, early: int, points
 
 
 def _first_parameter_std(cost: Callable[[FloatArray], float], top: FloatArray) -> float:
-    """Standard deviation of the first of two parameters, from the curvature of the cost; 1 where that is not positive
-    definite."""
+    """Return the standard deviation of the first of two parameters, from the curvature of the cost.
+
+    It is 1 where the curvature is not positive definite.
+    """
     step = 0.05
     moves = step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1]])
     a, b, c, d, e, f = (cost(top + move) for move in moves)

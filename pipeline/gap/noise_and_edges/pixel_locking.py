@@ -137,11 +137,11 @@ def find_locking(
 def _strongest_crowding(
     disparity: FloatArray, tangent: FloatArray, whole: float, share: float
 ) -> tuple[float, float, float, float]:
-    """Return the frequency (1/px) within a share of `whole`, and the tilt, at which disparities crowd most; how much; number of
-    trials.
+    """Find the frequency (1/px) and the tilt at which disparities crowd most around whole pixels.
 
-    The mean of exp(2 pi i f d (1 - w y)) for all f and w is a Fourier transform over d and d y of the phasors of whole pixels.
-    Its frequencies are low, so the phasors are gathered in bins of an eighth of their shortest cycle.
+    Returns the frequency, which is within a share of `whole`, the tilt, how strongly they crowd, and the number of trials. The
+    mean of exp(2 pi i f d (1 - w y)) for all f and w is a Fourier transform over d and d y of the phasors of whole pixels. Its
+    frequencies are low, so the phasors are gathered in bins of an eighth of their shortest cycle.
     """
     phasor = np.exp(2j * np.pi * whole * disparity)
     axes = [disparity - disparity.mean(), disparity * tangent]
@@ -185,10 +185,10 @@ def _refine_frequency(disparity: FloatArray, tangent: FloatArray, frequency: flo
 
 
 def _amplitude(strength: FloatArray, count: int, noise: NoiseBounds | None) -> tuple[float, float]:
-    """Amplitude and its standard deviation, matched pixels: least squares over amplitude and noise from the mean of each
-    multiple.
+    """Estimate the amplitude of pixel locking and its standard deviation, in matched pixels.
 
-    noise: in matched pixels.
+    This is a least-squares fit of amplitude and noise to the mean phasor of each multiple of the frequency. noise: bounds, in
+    matched pixels.
     """
 
     def chi2(share: FloatArray, blur: FloatArray) -> FloatArray:

@@ -155,8 +155,10 @@ def variance_candidates(residuals: Residuals) -> list[VarianceCandidate]:
 
 
 def _candidate(effect: type[Effect], geometry: Geometry, fixed: dict[str, float]) -> VarianceCandidate:
-    """The candidate of an effect, one column for each typical size. Extreme values are clipped, so that a few points cannot
-    decide."""
+    """Return the variance candidate of an effect, with one column for each typical size.
+
+    Extreme values are clipped, so that a few points cannot decide.
+    """
     sizes = effect.typical_sizes()
     columns = np.stack([effect(**fixed, **{key: size}).variance(geometry) for key, size in sizes.items()], axis=1)
     columns = np.minimum(columns, np.quantile(columns, _HIGHEST_QUANTILE, axis=0))
@@ -268,8 +270,19 @@ def _describe_shared_variance(excess: float, unshared: float, sigma: FloatArray)
 
 
 def _unshared_share(residuals: Residuals, value: FloatArray, used: BoolArray, added: FloatArray) -> float:
-    """Share of an added variance that shows in the differences of neighbours, from the points `used`. added: over the predicted
-    variance."""
+    """Return the share of an added variance that shows in the differences of neighbouring points.
+
+    Parameters
+    ----------
+    residuals : Residuals
+        Residuals.
+    value : (n,) array
+        Values of the points.
+    used : (n,) bool array
+        Points to use.
+    added : (n,) array
+        Added variance over the predicted one.
+    """
     part = residuals.part(used)
     value, predicted = value[used], part.sigma**2
     other = cKDTree(part.wall_xy).query(part.wall_xy, k=2)[1][:, 1]
@@ -308,8 +321,10 @@ class NoiseRatio:
 
 
 def _expected_mean_square(residuals: Residuals, cells: WallCells, random: KeyedRandom) -> float:
-    """Mean square of standardised deviations if the model is right, by simulation: planes absorb more correlated than white
-    noise."""
+    """Return the mean square of standardised deviations if the model is right, by simulation.
+
+    Planes absorb more of correlated noise than of white noise.
+    """
     field = residuals.correlated_noise.node_field(len(residuals))
     if not field.weights.shape[1]:
         return 1.0
@@ -392,8 +407,10 @@ def _blocks_prefer_binned(squares: FloatArray, first: FloatArray, free: FloatArr
 
 
 def _gain_over(squares: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> tuple[float, float]:
-    """Log-likelihood ratio of one variance over another, and the same over the root sum of squares of the blocks'
-    contributions."""
+    """Return the log-likelihood ratio of one variance over another, and its significance.
+
+    The significance is the ratio over the root sum of squares of the wall blocks' contributions.
+    """
     terms = 0.5 * (squares * (second - first) / ((1 + first) * (1 + second)) + np.log1p(first) - np.log1p(second))
     sums = np.bincount(np.unique(block, return_inverse=True)[1], terms)
     return float(sums.sum()), float(sums.sum() / max(float(np.linalg.norm(sums)), 1e-300))
@@ -405,8 +422,9 @@ def _log_likelihood_gain(squares: FloatArray, added: FloatArray) -> float:
 
 
 def null_p_value(squares: FloatArray, shapes: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
-    """Return the p-value (1 + b) / (1 + N) of the largest standardised score over the candidates, with signs flipped by wall
-    block.
+    """Return the p-value (1 + b) / (1 + N) of the largest standardised score over the candidates.
+
+    The null distribution has the signs flipped by wall block.
 
     Parameters
     ----------

@@ -28,10 +28,10 @@ _MARGIN_M = 0.3
 
 
 def rank_disagreements(found: GapDiagnosis) -> list[dict[str, Any]]:
-    """Return the entry `where` of gap.json: the bin of each covariate that differs most, for each statistic, most significant
-    first.
+    """Return the entry `where` of gap.json: where along each covariate measurement and model differ.
 
-    `size_m` of a mean is positive where the measured surface lies deeper than the predicted one.
+    It has the bin of each covariate that differs most, for each statistic, most significant first. `size_m` of a mean is positive
+    where the measured surface lies deeper than the predicted one.
     """
     residuals = found.residuals
     rows = [row for name, x, z in standardised_by_covariate(found) for row in _rank_statistics(name, x, z, residuals)]
@@ -46,8 +46,10 @@ def rank_disagreements(found: GapDiagnosis) -> list[dict[str, Any]]:
 
 
 def standardised_by_covariate(found: GapDiagnosis) -> list[tuple[str, FloatArray, FloatArray]]:
-    """Return name and values of each covariate, with the residuals before over their predicted standard deviation; inliers
-    only."""
+    """Return name and values of each covariate, with the standardised residuals of the inliers.
+
+    They are the residuals before effects are named, over their predicted standard deviation.
+    """
     residuals = found.residuals
     used = inliers(found)
     z = found.before[used] / residuals.sigma[used]

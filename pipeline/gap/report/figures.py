@@ -178,8 +178,10 @@ def gap_figure(gap: Gap) -> bytes:
 
 
 def matrix_figure(names: list[str], cosines: FloatArray, survival: FloatArray) -> bytes:
-    """Draw the absolute cosines of the signatures after the pose fit, and beside them the share of each that the pose fit
-    leaves."""
+    """Draw how alike the effects' signatures are after the pose fit, and how much of each it leaves.
+
+    Shown are the absolute cosines of the signatures, and beside them the share of each that the pose fit leaves.
+    """
     short, count = [name.partition(".")[2] for name in names], len(names)
     figure = Figure(figsize=(2.8 + 0.62 * count, 1.9 + 0.44 * count), layout="constrained")
     matrix, bars = figure.subplots(1, 2, width_ratios=[count, 3.0], sharey=True)

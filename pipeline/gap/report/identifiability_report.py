@@ -1,5 +1,7 @@
-"""Write the files of an identifiability analysis: identifiability.json, report.html and a figure of the matrix for each
-sensor."""
+"""Write the files of an identifiability analysis.
+
+They are identifiability.json, report.html and a figure of the matrix for each sensor.
+"""
 
 from __future__ import annotations
 

@@ -45,8 +45,11 @@ def format_with_std(key: str, value: float, std: float | None = None) -> str:
 
 
 def _choose_unit(key: str, value: float, std: float | None) -> tuple[str, float, float | None]:
-    """Name of a unit, its number in one of the key's unit, and the smallest step in it; None for the step: by the digits of the
-    value."""
+    """Choose the unit in which a value is written.
+
+    Returns the unit's name, its number in one of the key's unit, and the smallest step to write in it. The step is None if the
+    value's own digits decide.
+    """
     choice = _UNITS.get(key.rpartition("_")[2])
     if choice is None:
         return "", 1.0, None

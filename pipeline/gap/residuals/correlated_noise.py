@@ -93,11 +93,11 @@ def _empty_field(count: int) -> NodeField:
 
 
 def _on_nodes(effects: list[NodeNoise], pixels: FloatArray, area: float) -> NodeField:
-    """The joint covariance of all effects on one grid, with half the spacing of the finest effect's grid (whose offset is
-    unknown).
+    """Return the joint covariance of all effects on one grid of nodes.
 
-    If that would be too many nodes, a coarser grid gets the same power at long wavelengths, which is 9/4 of the variance times
-    the square of the spacing (for bilinear interpolation).
+    The grid has half the spacing of the finest effect's grid, whose offset is unknown. If that would be too many nodes, a coarser
+    grid gets the same power at long wavelengths, which is 9/4 of the variance times the square of the spacing (for bilinear
+    interpolation).
     """
     step = max(min(effect.step_px for effect in effects) / 2, float(np.sqrt(area / _MOST_NODES)))
     weights, nodes = _bilinear(pixels, step)

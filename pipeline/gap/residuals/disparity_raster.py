@@ -259,8 +259,9 @@ def raster_cell_px(u: FloatArray, v: FloatArray) -> float | None:
 
 
 def raster_spacing_px(u: FloatArray) -> float | None:
-    """Return the spacing of neighbouring columns in a raster of pixels, px, even if a registration has shifted the pixels a
-    little.
+    """Return the spacing of neighbouring columns in a raster of pixels, px.
+
+    It is found even if a registration has shifted the pixels a little.
 
     Parameters
     ----------

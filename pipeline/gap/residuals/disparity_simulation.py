@@ -63,10 +63,10 @@ def simulate_disparities(
 def _on_own_raster(
     pair: StereoPair, measurement: StereoMeasurement, geometry: PixelGeometry, step: int
 ) -> tuple[StereoPair, FloatArray]:
-    """Remove the effects that are applied on the measurement's own raster, and return what they add (n,), px, beside the other
-    pair.
+    """Remove the effects that are applied on the measurement's own raster from the pair.
 
-    Edge fattening grows by whole cells, so that it depends on their size.
+    Returns the other pair and what these effects add to the disparities, (n,), px. Edge fattening grows by whole cells, so that
+    it depends on their size.
     """
     shapes = [effect for effect in pair.model.effects if isinstance(effect, RasterEffect) and effect.stage == Stage.MATCH]
     raster = DisparityRaster.of(measurement.changed(model=pair.model), geometry) if shapes else None

@@ -59,8 +59,9 @@ class DirectedScanner(LaserScanner):
         )
 
     def ranges(self, scene: RayCaster, random: KeyedRandom) -> FloatArray:
-        """Simulate the recorded ranges, (n,), m; NaN without a return. `scene` is the surface, `random` the source of random
-        numbers.
+        """Simulate the recorded ranges, (n,), m; NaN without a return.
+
+        `scene` is the surface, `random` the source of random numbers.
         """
         pulses, beam = self.emitted(self.emit(), random)
         return self._recorded_ranges(pulses, self.echo(scene, self._traced_pulses(pulses), beam, beam.combine_echoes), random)

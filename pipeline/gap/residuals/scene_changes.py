@@ -238,7 +238,15 @@ def _significant(z: FloatArray, level: float, ratio: float, pairs: Pairs, eligib
 
 
 def _log_expected(count: NDArray[np.int64], points: int, stray: int, agreeing: float) -> FloatArray:
-    """log E(m) of components of m = `count` points (see the module), if `stray` of `points` exceed the level by chance."""
+    """Return log E(m), the logarithm of the number of components of m points expected by chance.
+
+    Parameters
+    ----------
+    count : (k,) m, the number of points of each component.
+    points : Number of points searched.
+    stray : How many of them exceed the level by chance.
+    agreeing : Share of pairs of values that agree.
+    """
     shapes = np.where(
         count <= len(_SHAPES),
         _SHAPES[np.minimum(count, len(_SHAPES)) - 1],
@@ -319,8 +327,9 @@ def _compact(label: NDArray[np.int64], view: SensorView, points: int) -> NDArray
 
 
 def _measure_changes(label: NDArray[np.int64], departure: FloatArray, error: FloatArray, view: SensorView) -> list[SceneChange]:
-    """Measure the changes; largest volume first. `error`: (2, n) independent and common standard deviation of each ray's
-    residual, m.
+    """Measure the changes; largest volume first.
+
+    error: (2, n) independent and common standard deviation of each ray's residual, m.
     """
     rows = np.flatnonzero(label >= 0)
     if not len(rows):

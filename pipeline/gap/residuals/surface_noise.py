@@ -112,8 +112,9 @@ def estimate_surface_noise(measurement: SurfaceMeasurement, where: str) -> Surfa
 
 
 def _fit_noise(points: FloatArray, value: FloatArray) -> SurfaceNoise:
-    """Fit the noise to distances (n,) at points (n, 3), m; grid-correlated noise only if chi² and its share of the variance
-    justify it.
+    """Fit the noise to distances (n,) at points (n, 3), m.
+
+    There is grid-correlated noise only if chi² and its share of the variance justify it.
     """
     spacing = point_spacing_m(points)
     lag, gamma, weight = _semivariogram(points, value, spacing)

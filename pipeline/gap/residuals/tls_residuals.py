@@ -58,8 +58,9 @@ class TlsResiduals(Residuals):
 
     @property
     def with_sigma_of_means(self) -> Self:
-        """Return the residuals with the sigma that counts for means: neighbouring rays share the errors of the vertices
-        between them.
+        """Return the residuals with the sigma that counts for means.
+
+        It differs because neighbouring rays share the errors of the vertices between them.
         """
         corner, weight = self.geometry.corner, self.geometry.weight
         if not self.reference_error_m or self.error_is_relief or corner is None or weight is None:

@@ -1,5 +1,6 @@
-"""Describe points of known position that a survey could measure in addition to the wall, and what they say about effects and
-pose.
+"""Describe points of known position that a survey could measure in addition to the wall.
+
+Compute what they say about effects and pose.
 """
 
 from __future__ import annotations

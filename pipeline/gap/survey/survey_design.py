@@ -59,8 +59,9 @@ def group_by_effect(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
 
 
 def parameter_label(candidate: Candidate) -> str:
-    """Return the name of the parameter whose detectable size is given; several names, separated by commas, for parameters of
-    one kind.
+    """Return the name of the parameter whose detectable size is given.
+
+    For parameters of one kind these are several names, separated by commas.
     """
     hidden = {"phase_rad", "" if candidate.wave is None else candidate.wave.key}
     return ", ".join(name for name in candidate.names if name not in hidden)

@@ -290,8 +290,9 @@ def _subsample_rows(found: Residuals, most: int) -> NDArray[np.int64]:
 
 
 def _scan_observer(scanner: ScannerConfig) -> Callable[[TlsMeasurement, int], TlsView]:
-    """Return a function that scans the wall from a measurement's pose. The scan covers the whole wall, unless the config has a
-    window.
+    """Return a function that scans the wall from a measurement's pose.
+
+    The scan covers the whole wall, unless the config has a window.
     """
 
     def observe(base: TlsMeasurement, number: int) -> TlsView:

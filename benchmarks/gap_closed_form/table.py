@@ -1,0 +1,199 @@
+"""Write the results as a page of the documentation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+Json = dict[str, Any]
+_SENSORS = {"tls": "laser scanner", "stereo": "stereo pairs"}
+_ANSWERS = (
+    "right, alone",
+    "right, in a class",
+    "other effect only",
+    "wrong name",
+    "unknown",
+    "no_gap",
+    "insufficient_data",
+    "error",
+)
+
+_NUISANCES = """| always present | size |
+| --- | --- |
+| pose | wrong by millimetres and some 10 microradians |
+| error of the reference | 0.2 to 0.8 mm for the laser, 1 to 4 mm for stereo, correlated over 1.5 to 6 m |
+| albedo | varies smoothly and from point to point |
+| missing returns | 1 to 2 %; in a third of the cases also shrubs (round patches without returns) |
+| changes of the scene | fallen blocks and debris in all cases but those without an effect |
+| optional fields | each absent in a quarter of the cases |
+| effects that the model has right already | in one of eight laser cases |
+
+Strengths are spread evenly in their logarithm from 2 to 120, up to three times the catalogue's largest typical size."""
+
+_LABELS = {
+    "gap closed, all cases' metres summed": "gap closed, summed over all cases in metres",
+    "the same, as the angle to the nearest other effect lets it (1 - sin^2, median)": "its expectation by the angle to the "
+    "nearest other effect, 1 - sin^2 (median)",
+    "the same, where that angle leaves it 5 % at most": "the same, where the expectation is 5 % at most",
+}
+"""Rows of the results whose names need more words on the page."""
+
+_READING = """"Undecided" means that the 95 % interval (Wilson) holds values that reach the goal and values that do not. The best
+wrong effect closes much of the gap wherever two signatures are alike: fitted freely, an effect at the angle a to the true one
+takes 1 - sin^2 a of its square, whatever the method."""
+
+
+def markdown(found: Json) -> str:
+    """docs/validation/gap_closed_form.md, or that of one sensor, from results.json."""
+    sensor = _SENSORS.get(found["settings"].get("sensor", ""), "both sensors")
+    parts = [
+        f"# Measurements simulated in closed form: {sensor}",
+        _introduction(found),
+        _made_by(found),
+        "## Results\n\n" + _figures(found["figures"], found["by_sensor"]),
+        _READING,
+        "## What the measurements hold\n\n" + _NUISANCES,
+        "## Compared with two simple methods\n\nBoth take residuals as independent and give one name: the effect with the "
+        "largest |z| above 3, or the best effect by BIC if it is ahead by more than 10.\n\n" + _baselines(found),
+        "## Answers by effect\n\nEach true effect counts once, also those of measurements with several effects, "
+        "which the figures above leave out. Weak effects,\nwith S/N x sin(angle) below 8, are in brackets. "
+        "A name that begins with `off_` is an error outside the catalogue.\n\n" + _by_effect(found["by_effect"]),
+        "## Detection by strength\n\nSingle effects: found at all by S/N, in the right class by S/N x sin(angle).\n\n"
+        + _curves(found["detection"]),
+        "## Coverage of the 90 % intervals\n\n" + _coverage(found["coverage"]),
+        "## Failures\n\n" + _failures(found["failures"]),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _introduction(found: Json) -> str:
+    """Say what was evaluated, and with which result."""
+    figures = {row["what"].split(" at S/N")[0]: row for row in found["figures"]}
+
+    def counted(what: str) -> str:
+        return f"{figures[what]['successes']} of {figures[what]['count']}"
+
+    return f"""This page shows how often `scarpsim gap` names the right effect in {_cases(found)} simulated measurements whose
+truth it cannot see. It is for users who want to know how far to trust an answer. The generator (`benchmarks/gap_closed_form`)
+works in closed form and shares no code with the sensors or the diagnosis.
+
+- {counted("right class")} clear effects are in the right class.
+- {counted("wrong names among committed answers")} answers that name an effect hold a wrong name.
+- {counted("false alarms on no-effect cases")} measurements without an effect raise a false alarm.
+
+S/N is the strength of an effect: its signature after the pose fit, against the noise and the correlated error of the reference.
+S/N x sin(angle) is what is left of it when the nearest effect of another class is fitted too. An effect is clear if that is 8 or
+more. Signatures with a sine below 0.1 form one class."""
+
+
+def _cases(found: Json) -> int:
+    """How many measurements were diagnosed."""
+    return next(int(row["count"]) for row in found["figures"] if row["what"] == "cases without an answer")
+
+
+def _made_by(found: Json) -> str:
+    settings, seconds = found["settings"], found["seconds"]
+    sensor = settings.get("sensor")
+    page = f"docs/validation/gap_closed_form{f'_{sensor}' if sensor else ''}.md"
+    words = f"python benchmarks/gap_closed_form/run.py --cases {settings['cases']} --seed {settings['seed']}"
+    chosen = "".join(f" --{key} {settings[key]}" for key in ("stratum", "sensor") if key in settings)
+    command = f"`{words}{chosen}{' --small' if settings['small'] else ''} --jobs 2 --out DIR --table {page}`"
+    took = f"{seconds.get('median', 0):.0f} s (median), {seconds.get('longest', 0):.0f} s at most"
+    row = (_cases(found), settings["seed"], settings.get("commit", ""), took, command)
+    return _table(("cases", "seed", "commit", "time of a case", "command"), [row])
+
+
+def _table(head: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
+    names = list(head)
+    lines = [names, ["---"] * len(names), *([str(cell) for cell in row] for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _figures(figures: list[Json], by_sensor: dict[str, list[Json]]) -> str:
+    def value(row: Json) -> str:
+        if row["value"] is None:
+            return "no cases"
+        if "interval" in row:
+            low, high = row["interval"]
+            return f"{100 * row['value']:.1f} % ({row['successes']} of {row['count']}; 95 %: {100 * low:.0f}-{100 * high:.0f})"
+        return f"{100 * row['value']:.1f} % (of {row['count']})" if row["percent"] else f"{row['value']:g} (of {row['count']})"
+
+    reached = {"yes": "yes", "no": "**no**", "undecided": "undecided", None: ""}
+
+    def cell(row: Json) -> str:
+        said = reached[row["reached"]]
+        return f"{value(row)}, {said}" if said else value(row)
+
+    shown = {_SENSORS[sensor]: rows for sensor, rows in by_sensor.items() if rows[-1]["count"]}
+    columns = {"both sensors": figures, **shown} if len(shown) > 1 else shown
+    lines = zip(*columns.values(), strict=True)
+    return _table(
+        ("what", "goal", *columns),
+        ((_LABELS.get(each[0]["what"], each[0]["what"]), each[0]["goal"], *map(cell, each)) for each in lines),
+    )
+
+
+def _baselines(found: Json) -> str:
+    figures = {row["what"]: row for row in found["figures"]}
+    ours = [
+        figures[what] for what in list(figures) if what.startswith(("false alarms", "real change", "right class", "wrong names"))
+    ]
+    order = sorted(ours, key=lambda row: ("false", "real ", "right", "wrong").index(row["what"][:5]))
+    rows = [("scarpsim gap", *(f"{row['successes']} of {row['count']}" for row in order))]
+    for name, label in (("largest_z", "largest abs(z)"), ("plain_bic", "plain BIC")):
+        values = found["baselines"][name]
+        cells = (values[key] for key in ("false_alarms", "change_blamed", "right", "wrong_names"))
+        rows.append((label, *(f"{hits} of {count}" for hits, count in cells)))
+    return _table(("", "false alarms", "change blamed", "right class, clear", "wrong names among committed"), rows)
+
+
+def _by_effect(counts: Json) -> str:
+    rows = []
+    for key, answers in counts.items():
+        cells = []
+        for name in _ANSWERS:
+            clear, weak, plain = (answers.get(f"{prefix}{name}", 0) for prefix in ("clear: ", "weak: ", ""))
+            cells.append(f"{clear or ''}{f' (+{weak} weak)' if weak else ''}{plain or ''}".strip())
+        rows.append((key, *cells))
+    return _table(("truth", *_ANSWERS), rows)
+
+
+def _curves(detection: Json) -> str:
+    rows = []
+    for sensor, bins in detection.items():
+        if not any(row["cases"] or row["cases_by_angle"] for row in bins):
+            continue
+        for row in bins:
+            upper = "" if row["to"] is None else f"{row['to']:g}"
+            rows.append(
+                (
+                    sensor,
+                    f"{row['from']:g}-{upper}",
+                    f"{row['detected']} of {row['cases']}",
+                    f"{row['right']} of {row['cases_by_angle']}",
+                )
+            )
+    return _table(("sensor", "bin", "found at all", "right class"), rows)
+
+
+def _coverage(coverage: Json) -> str:
+    return _table(("parameter", "inside", "of"), ((key, row["inside"], row["count"]) for key, row in coverage.items()))
+
+
+def _failures(failures: list[Json]) -> str:
+    rows = (
+        (
+            f["case"],
+            f["sensor"],
+            f["stratum"],
+            f["wrong"],
+            "; ".join(f["true"]),
+            f"{f['verdict']}: {'; '.join(f['said'])}" + _last(f["error"]),
+        )
+        for f in sorted(failures, key=lambda f: (f["wrong"], f["sensor"]))
+    )
+    return _table(("case", "sensor", "effects", "what is wrong", "truth", "answer"), rows)
+
+
+def _last(error: str) -> str:
+    return " ".join(error.strip().splitlines()[-1:]).replace("|", "/")
