@@ -54,7 +54,7 @@ THRESHOLDS = Thresholds()
 
 
 class _Residuals(list[int]):
-    sensor, called = "tls", "ranges of a laser scan"
+    sensor, label = "tls", "ranges of a laser scan"
 
 
 @dataclass
