@@ -86,10 +86,7 @@ def ray(camera: Camera, u: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def bouguet(left: Camera, right: Camera) -> tuple[FloatArray, FloatArray, float]:
-    """Return the rotations of the left and the right camera into the rectified frame, and the base.
-
-    Each camera is turned by half of the relative rotation, then the base is turned to x.
-    """
+    """Return rotations into the rectified frame (x along the base), each by half of the relative rotation, and the base."""
     half = Rotation.from_rotvec(0.5 * Rotation.from_matrix(left.rotation.T @ right.rotation).as_rotvec())
     base = half.inv().apply(left.rotation.T @ (right.position - left.position))
     axis = np.cross(base, [1.0, 0, 0])
@@ -103,8 +100,8 @@ def bouguet(left: Camera, right: Camera) -> tuple[FloatArray, FloatArray, float]
 
 @dataclass(frozen=True)
 class Change:
-    """Real minus nominal camera: interior, rotation vector in its own frame, shift in the world; row jitter (amplitude, period,
-    phase).
+    """Real minus nominal camera: interior, rotation vector in its own frame, shift in the world; jitter: amplitude, period,
+    phase.
     """
 
     interior: dict[str, float]
