@@ -33,10 +33,10 @@ from pipeline.gap.report.covariate_ranking import quantile_bins, rank_disagreeme
 from pipeline.gap.report.figures import gap_figure, maps_figure
 from pipeline.gap.report.report import summarise
 from pipeline.gap.report.wording import paragraph
-from pipeline.gap.residuals.registration import residuals_of
+from pipeline.gap.residuals.alignment import compute_residuals
 from pipeline.gap.residuals.residuals import Residuals
-from pipeline.gap.survey.identifiability import ALIKE, Identifiability, identifiability
-from pipeline.gap.survey.planned import planned_survey
+from pipeline.gap.survey.identifiability import SIMILAR_COSINE, Identifiability, identifiability
+from pipeline.gap.survey.survey_views import planned_survey
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from scene.walls.procedural import ProceduralWall
@@ -104,7 +104,7 @@ class View:
                 frame=frame,
             )  # fmt: skip
         measurement.__dict__["scene"] = stage.caster
-        found = residuals_of(measurement)
+        found = compute_residuals(measurement)
         return cls(found, valid[found.index])
 
 
@@ -112,11 +112,11 @@ def symptom(view: View, effect: type[Effect], comparison: Comparison, *, on_the_
     """Return what an effect leaves after registration and what that depends on. on_the_mean: whether it is systematic."""
     name, r = f"{effect.sensor}.{effect.model_fields['name'].default}", view.residuals
     metres = comparison.difference.ravel()[view.cells]
-    known = np.isfinite(metres) & r.smooth
+    known = np.isfinite(metres) & r.usable
     value = np.where(np.isfinite(metres), metres, 0.0) / r.unit_m
     kept = known & (np.abs(value) <= 8 * max(1.4826 * float(np.median(np.abs(value[known]))), 1e-9))
-    pose = np.linalg.lstsq(r.pose[kept], value[kept], rcond=None)[0]
-    left = np.where(np.isfinite(metres), value - r.pose @ pose, np.nan)
+    pose = np.linalg.lstsq(r.pose_jacobian[kept], value[kept], rcond=None)[0]
+    left = np.where(np.isfinite(metres), value - r.pose_jacobian @ pose, np.nan)
     whole = float(np.linalg.norm(value[kept]))
     share = float(np.linalg.norm(left[kept])) / whole if whole > 0 else 1.0
     lost = comparison.lost.ravel()[view.cells]
@@ -142,7 +142,7 @@ def _mean_pattern(r: Residuals, left: FloatArray, kept: NDArray[np.bool_]) -> tu
 
 def _other_pattern(r: Residuals, left: FloatArray, kept: NDArray[np.bool_], lost: NDArray[np.bool_]) -> tuple[str, str]:
     covariates = {name: x for name, x in r.covariates.items() if name not in _SKIPPED}
-    size, edges = np.abs(left), np.isfinite(left) & ~r.smooth
+    size, edges = np.abs(left), np.isfinite(left) & ~r.usable
     if lost.mean() > _LOST and np.median(size[kept]) < _NOTHING:
         shares = {name: _explained(x, lost.astype(float)) for name, x in covariates.items()}
         return "lost", f"returns are missing, mostly depending on {_WORDS[max(shares, key=lambda key: shares[key])]}"
@@ -172,13 +172,13 @@ def _explained_by(group: Any, values: FloatArray) -> float:
 
 
 def _pixels(r: Residuals) -> NDArray[np.int64]:
-    column, row = (np.floor((r.at[:, axis] - r.at[:, axis].min()) / (4 * _PIXEL_M)).astype(np.int64) for axis in (0, 1))
+    column, row = (np.floor((r.wall_xy[:, axis] - r.wall_xy[:, axis].min()) / (4 * _PIXEL_M)).astype(np.int64) for axis in (0, 1))
     return np.asarray(column + 10_000 * row)
 
 
 def _picture(r: Residuals, millimetres: FloatArray, lost: NDArray[np.bool_]) -> bytes:
-    low = r.at.min(axis=0)
-    column, row = (np.floor((r.at[:, axis] - low[axis]) / _PIXEL_M).astype(np.int64) for axis in (0, 1))
+    low = r.wall_xy.min(axis=0)
+    column, row = (np.floor((r.wall_xy[:, axis] - low[axis]) / _PIXEL_M).astype(np.int64) for axis in (0, 1))
     shape = int(row.max()) + 1, int(column.max()) + 1
     known = np.isfinite(millimetres)
     pixel, size = row * shape[1] + column, shape[0] * shape[1]
@@ -225,7 +225,7 @@ def symptoms_page(found: list[Symptom], tables: dict[str, Identifiability]) -> s
         "sensor are fitted**, in mm. Black: returns lost. The pattern depends on wall and distance. `scarpsim gap "
         "--identifiability CONFIG` computes which effects can be told apart at your site.",
         "",
-        f'"Looks like" lists effects whose signature has a cosine of at least {ALIKE:g} with this one on that wall.',
+        f'"Looks like" lists effects whose signature has a cosine of at least {SIMILAR_COSINE:g} with this one on that wall.',
     ]
     for kind, title in _KINDS.items():
         rows = [each for each in found if each.kind == kind]

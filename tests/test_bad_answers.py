@@ -298,4 +298,4 @@ def test_an_empty_config_is_not_taken_for_one(content: str, tmp_path: Path, caps
     (tmp_path / "site.yaml").write_text(content, encoding="utf-8")
     words = ["simulate", "--sensor", "tls", "--config", str(tmp_path / "site.yaml"), "--out", str(tmp_path / "out")]
     assert main(words) == 2
-    assert "holds no key" in capsys.readouterr().err
+    assert "contains no key" in capsys.readouterr().err

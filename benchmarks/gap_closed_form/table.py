@@ -55,9 +55,9 @@ def markdown(found: Json) -> str:
         "## What the measurements hold\n\n" + _NUISANCES,
         "## Compared with two simple methods\n\nBoth take residuals as independent and give one name: the effect with the "
         "largest |z| above 3, or the best effect by BIC if it is ahead by more than 10.\n\n" + _baselines(found),
-        "## Answers by effect\n\nEach true effect counts once, also those of measurements with several effects, which the "
-        "figures above leave out. Weak effects,\nwith S/N x sin(angle) below 8, are in brackets. A name that begins with `off_` "
-        "is an error outside the catalogue.\n\n" + _by_effect(found["by_effect"]),
+        "## Answers by effect\n\nEach true effect counts once, also those of measurements with several effects, "
+        "which the figures above leave out. Weak effects,\nwith S/N x sin(angle) below 8, are in brackets. "
+        "A name that begins with `off_` is an error outside the catalogue.\n\n" + _by_effect(found["by_effect"]),
         "## Detection by strength\n\nSingle effects: found at all by S/N, in the right class by S/N x sin(angle).\n\n"
         + _curves(found["detection"]),
         "## Coverage of the 90 % intervals\n\n" + _coverage(found["coverage"]),

@@ -31,7 +31,7 @@ from benchmarks.gap_injections.score import Json, scored
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
-from pipeline.gap.residuals.registration import registered, residuals_of
+from pipeline.gap.residuals.alignment import compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.residuals import Residuals
 from scene.common.errors import InputError
 
@@ -115,22 +115,22 @@ def strength(effect: str, base: Path, folder: Path) -> float | None:
         before, after = registered_residuals(base), registered_residuals(folder)
     except InputError:
         return None
-    there, spread = after.of_points(after.value, before.index), nmad(before.value[before.smooth] / before.sigma[before.smooth])
-    used = before.smooth & np.isfinite(there) & (np.abs(before.value) < 4 * spread * before.sigma)
+    there, spread = after.values_at(after.value, before.index), nmad(before.value[before.usable] / before.sigma[before.usable])
+    used = before.usable & np.isfinite(there) & (np.abs(before.value) < 4 * spread * before.sigma)
     if not used.any():
         return None
     sigma = spread * before.sigma[used]
     if "noise" in effect:
         return float(abs(nmad(there[used] / sigma) ** 2 - nmad(before.value[used] / sigma) ** 2) * np.sqrt(used.sum() / 2))
-    columns, change = before.pose[used] / sigma[:, None], (there - before.value)[used] / sigma
+    columns, change = before.pose_jacobian[used] / sigma[:, None], (there - before.value)[used] / sigma
     return float(np.linalg.norm(change - columns @ np.linalg.lstsq(columns, change, rcond=None)[0]))
 
 
 @cache
 def registered_residuals(folder: Path) -> Residuals:
     """Return the residuals of a measurement's folder after registration."""
-    found = residuals_of(read_measurement(folder))
-    return replace(found, value=registered(found)[0])
+    found = compute_residuals(read_measurement(folder))
+    return replace(found, value=fit_pose_robustly(found)[0])
 
 
 def answered(case: Case, out: Path) -> Json:

@@ -84,7 +84,11 @@ def raster_of(array: Any, where: str) -> tuple[NDArray[np.float32], Grid]:
     steps = np.concatenate([np.diff(x), -np.diff(y)])
     gsd = float(np.median(steps))
     if not (gsd > 0 and np.ptp(steps) <= _SPREAD * gsd):
-        problem = f"has pixels of {steps.min():g} to {steps.max():g} m"
-        raise InputError(problem, where=where, allowed="square pixels of one size", remedy="resample it with array.interp")
+        raise InputError(
+            f"has pixels of {steps.min():g} to {steps.max():g} m",
+            where=where,
+            allowed="square pixels of one size",
+            remedy="resample it with array.interp",
+        )
     grid = Grid(float(x[0] - gsd / 2), float(y[0] + gsd / 2), gsd, len(x), len(y))
     return np.asarray(array.values, dtype=np.float32), grid

@@ -53,7 +53,7 @@ class Picture:
 def pick(pictures: Mapping[str, Any], kind: str | None, where: str) -> Any:
     """Return the picture called `kind`, or the first if `kind` is None; raise InputError with the available names otherwise."""
     if not pictures:
-        raise InputError("has no pictures", where=where)
+        raise InputError("the result has no pictures to plot", where=where)
     if kind is None:
         return next(iter(pictures.values()))
     if kind not in pictures:

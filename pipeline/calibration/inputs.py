@@ -165,11 +165,14 @@ def _check_noise(maps: NDArray[np.floating], names: Sequence[str]) -> None:
     for number, (values, name) in enumerate(zip(maps, names, strict=True)):
         known = values[~np.isnan(values)]
         if known.size and np.ptp(known) == 0:
-            problem = f"the difference is {known[0]:g} m everywhere, so the map has no noise"
-            raise InputError(problem, where=name, remedy="give measured maps, noise included")
+            raise InputError(
+                f"the difference is {known[0]:g} m everywhere, so the map has no noise",
+                where=name,
+                remedy="give measured maps, noise included",
+            )
         for other, other_name in zip(maps[:number], names, strict=False):
             if np.array_equal(values, other, equal_nan=True):
-                raise InputError(f"the map equals {other_name}", where=name, remedy="give each epoch's map once")
+                raise InputError(f"the map has the same values as {other_name}", where=name, remedy="give each epoch's map once")
 
 
 def _covered(maps: NDArray[np.floating], of_points: bool) -> BoolArray:
@@ -227,6 +230,9 @@ def _angular_spacing(measurement: TlsMeasurement) -> float:
     reach = cKDTree(ray).query(ray[:: max(len(ray) // _SAMPLE, 1)], [count + 1])[0]
     step = float(np.median(reach) * np.sqrt(np.pi / (count + 0.5)))
     if not step > 0:
-        problem = f"more than {count} points lie in one direction from the scanner, so its angular steps are unknown"
-        raise InputError(problem, where=FILE, remedy="add `pattern`, or remove repeated points")
+        raise InputError(
+            f"more than {count} points lie in one direction from the scanner, so its angular steps are unknown",
+            where=FILE,
+            remedy="add `pattern`, or remove repeated points",
+        )
     return step

@@ -88,8 +88,12 @@ def tiles(values: NDArray[np.float32], block: IntArray, grid: Grid, config: Tile
     size = config.size_px
     count = len(tile_starts(grid.height, config)) * len(tile_starts(grid.width, config))
     if count > MOST_TILES:
-        problem = f"{count:,} tiles of a map of {grid.width} x {grid.height} px"
-        raise InputError(problem, where="tiles", allowed=f"up to {MOST_TILES:,}", remedy="raise size_px or lower overlap_px")
+        raise InputError(
+            f"{count:,} tiles of a map of {grid.width} x {grid.height} px",
+            where="tiles",
+            allowed=f"up to {MOST_TILES:,}",
+            remedy="raise size_px or lower overlap_px",
+        )
     for row in tile_starts(grid.height, config):
         for column in tile_starts(grid.width, config):
             window = np.s_[row : row + size, column : column + size]

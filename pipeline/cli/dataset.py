@@ -59,8 +59,11 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
         ("--report-only", arguments.report_only, "verify"),
     ):
         if given and action != goes_with:
-            remedy = f"write scarpsim dataset {goes_with} DIR, or leave the option out"
-            raise InputError(f"works only with {goes_with}, not with '{action}'", where=option, remedy=remedy)
+            raise InputError(
+                f"works only with {goes_with}, not with '{action}'",
+                where=option,
+                remedy=f"write scarpsim dataset {goes_with} DIR, or leave the option out",
+            )
     if action == "verify":
         return _verify(arguments, _single_folder(folders, "verify"))
     if action == "merge":

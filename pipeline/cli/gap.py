@@ -77,11 +77,12 @@ def _measurement_folder(arguments: argparse.Namespace, out: Path) -> Path:
     if len(given) == 1 and (given[0].is_dir() or given[0].suffix in ("", ".yaml", ".yml")) and not arguments.reference:
         return given[0]
     if not arguments.reference:
-        remedy = (
-            "add --reference (a mesh, a cloud, or half) and --scanner, or --photographs for a cloud from photographs without "
-            "cameras; or give the folder of a measurement"
+        raise InputError(
+            "is a raw file, and no reference is given to compare it with",
+            where=str(given[0]),
+            remedy="add --reference (a mesh, a cloud, or half) and --scanner, or --photographs for a cloud from photographs "
+            "without cameras; or give the folder of a measurement",
         )
-        raise InputError("is a raw file, and no reference is given to compare it with", where=str(given[0]), remedy=remedy)
     return build_measurement_folder(arguments, given, out / "measurement").folder
 
 
@@ -113,13 +114,13 @@ def _diagnosis(arguments: argparse.Namespace, out: Path) -> CommandOutput:
 def _identifiability(arguments: argparse.Namespace, out: Path) -> CommandOutput:
     """Report which effects the geometry of a measurement or config can tell apart."""
     from pipeline.gap.report.identifiability_report import summarise, write_identifiability
-    from pipeline.gap.survey.identifiability import identifiability, table
-    from pipeline.gap.survey.surveys import surveys
+    from pipeline.gap.survey.identifiability import format_table, identifiability
+    from pipeline.gap.survey.load_surveys import load_surveys
 
     if len(arguments.measurement) > 1:
         raise InputError(f"got {len(arguments.measurement)} inputs", where="--identifiability", allowed="one")
-    wanted = surveys(arguments.measurement[0], arguments.overrides, arguments.sensor)
+    wanted = load_surveys(arguments.measurement[0], arguments.overrides, arguments.sensor)
     found = [identifiability(survey, arguments.reference_error) for survey in wanted]
     report = write_identifiability(out, found)
-    told = "\n\n".join(f"{summarise(each)}\n{table(each)}" for each in found)
+    told = "\n\n".join(f"{summarise(each)}\n{format_table(each)}" for each in found)
     return CommandOutput(f"{told}\nreport: {report}", record_document(report, "identifiability.json"))

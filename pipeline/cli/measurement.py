@@ -112,8 +112,7 @@ def _request(arguments: argparse.Namespace, scans: list[Path]) -> Request:
     from pipeline.measurement.request import Request
 
     if arguments.reference is None:
-        remedy = "give a mesh, a cloud, another epoch, or half"
-        raise InputError("is missing", where="--reference", remedy=remedy)
+        raise InputError("is missing", where="--reference", remedy="give a mesh, a cloud, another epoch, or half")
     return Request(
         scans,
         arguments.reference,

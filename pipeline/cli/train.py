@@ -80,8 +80,11 @@ def _check_training(out: Path) -> None:
     from pipeline.formats.files.own_folders import require_own_folder
 
     if not any((out / name).exists() for name in (CHECKPOINT, BEST, EVENTS, CURVES)):
-        remedy = "start a training without --resume, in a new folder"
-        raise InputError("there is no training to continue", where=f"--resume, --out {out}", remedy=remedy)
+        raise InputError(
+            "there is no training to continue",
+            where=f"--resume, --out {out}",
+            remedy="start a training without --resume, in a new folder",
+        )
     for name in (CHECKPOINT, BEST, EVENTS):
         require_own_folder(out / name)
 

@@ -92,8 +92,11 @@ def _check_given_once(names: Sequence[Given]) -> None:
         )  # Path.resolve raises at a loop of links
         if file in given:
             as_what = "" if given[file] == name else f", as {given[file]} and as {name}"
-            remedy = "name each sensor once; to vary its settings, copy the file"
-            raise InputError(f"the sensor is given twice{as_what}", where=name, remedy=remedy)
+            raise InputError(
+                f"the sensor is given twice{as_what}",
+                where=name,
+                remedy="name each sensor once; to vary its settings, copy the file",
+            )
         given[file] = name
 
 

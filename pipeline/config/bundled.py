@@ -62,5 +62,6 @@ def config_path(kind: str, given: Path) -> Path:
     try:
         return bundled_config(kind, given.name)
     except InputError as error:
-        what = "is no file, and no bundled config has that name"
-        raise InputError(what, where=str(given), allowed=error.allowed, remedy=error.remedy) from None
+        raise InputError(
+            "is no file, and no bundled config has that name", where=str(given), allowed=error.allowed, remedy=error.remedy
+        ) from None

@@ -260,7 +260,9 @@ def load_config(path: Path, overrides: Sequence[str | Override], sensor: SensorN
     """
     values = load_yaml(path)
     if values is None:
-        raise InputError("holds no key", where=str(path), remedy="write at least one, or begin with what `scarpsim init` writes")
+        raise InputError(
+            "contains no key", where=str(path), remedy="write at least one, or begin with what `scarpsim init` writes"
+        )
     return resolved(values, overrides, sensor, seed, path)
 
 

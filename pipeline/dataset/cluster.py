@@ -103,8 +103,9 @@ def _require_distributed(where: str) -> None:
         import cryptography  # noqa: F401
         import distributed  # noqa: F401
     except ImportError as error:
-        problem = f"needs Dask's distributed and cryptography ({error})"
-        raise InputError(problem, where=where, remedy=how_to_install("dataset")) from None
+        raise InputError(
+            f"needs Dask's distributed and cryptography ({error})", where=where, remedy=how_to_install("dataset")
+        ) from None
 
 
 def _make(orders: list[EpochOrder], count: int, scheduler: str) -> Iterator[tuple[int, dict[str, Any]]]:

@@ -46,7 +46,7 @@ def merge_datasets(folders: Sequence[Path], out: Path) -> DatasetSummary:
     for folder, dataset in sets:
         for source, indices in dataset["epochs"].items():
             if set(epochs[source]) & set(indices):
-                raise InputError("an earlier set has the same epochs", where=str(folder), remedy="give each set once")
+                raise InputError("another of the given sets has the same epochs", where=str(folder), remedy="give each set once")
             epochs[source] = sorted({*epochs[source], *indices})
             sources[source] = {**dataset["sources"][source], "prefix": f"{source}_"}
     with locked(_new(out)), _all_or_nothing(out):
@@ -112,8 +112,7 @@ def _finished(folder: Path) -> Record:
     """Read dataset.json, and raise InputError if the set is not finished."""
     dataset = read_dataset_file(folder)
     if not dataset["complete"]:
-        remedy = "run the command that makes it once more"
-        raise InputError("the set is not finished", where=str(folder), remedy=remedy)
+        raise InputError("the set is not finished", where=str(folder), remedy="run the command that makes it once more")
     return dataset
 
 

@@ -217,7 +217,11 @@ def _only_source(values: dict[str, Any], path: Path) -> dict[str, Any]:
     sources = values["sources"]
     configs = [each.get("config") for each in sources.values() if isinstance(each, dict)] if isinstance(sources, dict) else []
     if len(configs) > 1:
-        raise InputError(f"the set was merged from {len(configs)} sets", where=str(path), remedy="make each of them")
+        raise InputError(
+            f"the set was merged from {len(configs)} sets, so it has no single config",
+            where=str(path),
+            remedy="make each of them",
+        )
     if not configs or not isinstance(configs[0], dict):
         raise InputError(
             "the file is damaged: it has no config", where=str(path), remedy="use the config that the set was made with"

@@ -100,9 +100,11 @@ def block_count(config: DatasetConfig, size: str, grid: Grid) -> int:
     area = grid.width * grid.height * grid.gsd**2
     count = config.sizes[size].blocks_per_m2 * area
     if count > MOST_BLOCKS:
-        problem = f"this gives {count:,.3g} blocks on {area:,.0f} m2"
-        allowed = f"up to {MOST_BLOCKS / area:.3g}, {MOST_BLOCKS:,} blocks"
-        raise InputError(problem, where=f"sizes.{size}.blocks_per_m2", allowed=allowed)
+        raise InputError(
+            f"this gives {count:,.3g} blocks on {area:,.0f} m2",
+            where=f"sizes.{size}.blocks_per_m2",
+            allowed=f"up to {MOST_BLOCKS / area:.3g}, {MOST_BLOCKS:,} blocks",
+        )
     return max(1, round(count))
 
 

@@ -47,8 +47,11 @@ class Workers:
         """Raise InputError if there are more local processes than the machine can start."""
         cores = len(os.sched_getaffinity(0))
         if self.count > _MOST_WORKERS * cores:
-            allowed = f"1 to {_MOST_WORKERS * cores} here, {_MOST_WORKERS} for each of {cores} cores"
-            raise InputError(f"got {self.count:,} workers", where="--workers", allowed=allowed)
+            raise InputError(
+                f"got {self.count:,} workers",
+                where="--workers",
+                allowed=f"1 to {_MOST_WORKERS * cores} here, {_MOST_WORKERS} for each of {cores} cores",
+            )
 
 
 @dataclass
@@ -212,8 +215,11 @@ def _stages(known: dict[str, Any], source: str, folder: Path) -> list[tuple[str,
     require_same_versions(entry, where)
     config = parse(DatasetConfig, entry["config"], where)
     if fingerprint(config) != source:
-        remedy = "restore dataset.json and the files that it names"
-        raise InputError(f"the config of {source} was changed after its epochs were made", where=where, remedy=remedy)
+        raise InputError(
+            f"the config of {source} was changed after its epochs were made",
+            where=where,
+            remedy="restore dataset.json and the files that it names",
+        )
     return [epoch.stage for epoch in planned_epochs(config)]
 
 

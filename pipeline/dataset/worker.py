@@ -84,7 +84,7 @@ def require_same_versions(entry: dict[str, Any], where: str) -> None:
     if differ:
         told = ", ".join(f"{key} {before[key]} (here {here.get(key, 'none')})" for key in differ)
         raise InputError(
-            f"the set was started with {told}",
+            f"the set was started with other versions: {told}",
             where=where,
             remedy="use the same versions, or make the set in another folder",
         )

@@ -19,7 +19,7 @@ class ExportedRun(RunFiles):
         """Contents of run.json."""
         found = super().record
         if len(found["epochs"]) < 2:
-            raise InputError("holds no finished epoch", where=str(self.folder), remedy=RESUME)
+            raise InputError("contains no finished epoch", where=str(self.folder), remedy=RESUME)
         return found
 
     @property

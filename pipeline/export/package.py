@@ -31,11 +31,14 @@ def package(folder: Path) -> dict[str, Any]:
     found = [path for path in sorted(folder.rglob("*")) if _is_listed(path.relative_to(folder))]
     for path in found:
         if path.is_symlink() and not path.resolve().is_relative_to(folder.resolve()):
-            problem = f"is a link out of the folder, to {path.resolve()}"
-            raise InputError(problem, where=str(path), remedy="replace it by the file that it points to, or remove it")
+            raise InputError(
+                f"is a link out of the folder, to {path.resolve()}",
+                where=str(path),
+                remedy="replace it by the file that it points to, or remove it",
+            )
     files = [path for path in found if path.is_file()]
     if not files:
-        raise InputError("holds no file", where=str(folder), remedy="give the folder that a command filled")
+        raise InputError("contains no file", where=str(folder), remedy="give the folder that a command filled")
     return {"$schema": _PROFILE, "name": _slug(folder.resolve().name), "resources": [_resource(folder, path) for path in files]}
 
 

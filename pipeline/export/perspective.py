@@ -75,7 +75,9 @@ class PerspectiveView:
         ahead = own[:, 2] - middle[2]
         needed = np.maximum(across, down / _TALLEST) / _HALF_VIEW
         if needed.max() <= _LEAST_SHARE * np.ptp(own[:, 2]):
-            raise InputError("lies on one place or line of sight", where="what is drawn", remedy="make the run again")
+            raise InputError(
+                "all points lie on one line of sight, so there is nothing to draw", where="export", remedy="make the run again"
+            )
         distance = float((np.maximum(needed, _LEAST_SHARE * needed.max()) - ahead).max())
         focal_px = width / 2 / _HALF_VIEW
         height = 2 * int(np.ceil(float((down / (distance + ahead)).max()) * focal_px))

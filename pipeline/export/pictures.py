@@ -65,12 +65,19 @@ def save_scan(run: ExportedRun, number: int, path: Path) -> None:
     Raises InputError for a run of a stereo pair, which records all its points at once.
     """
     if run.record["sensor"] != "tls":
-        raise InputError("is of a stereo pair", where=str(run.folder), allowed="a run of a laser scanner")
+        raise InputError(
+            "is a run of a stereo pair, which records all points at once",
+            where=str(run.folder),
+            allowed="a run of a laser scanner",
+        )
     cloud = run.points(number)
     count, clock = len(cloud.points), np.zeros(len(cloud.points)) if cloud.gps_time is None else cloud.gps_time
     if not np.isfinite(clock).all() or np.ptp(clock) > _LONGEST_SCAN_S:
-        allowed = f"numbers of seconds over at most {_LONGEST_SCAN_S:g} s"
-        raise InputError(f"the points of epoch {number} have no valid times", where=str(run.folder), allowed=allowed)
+        raise InputError(
+            f"the points of epoch {number} have no valid times",
+            where=str(run.folder),
+            allowed=f"numbers of seconds over at most {_LONGEST_SCAN_S:g} s",
+        )
     order = np.argsort(clock, kind="stable")[:: max(1, count // _SCAN_POINTS)]
     places, time = cloud.points[order], clock[order]
     view = PerspectiveView.on(places, _ANIMATED_PX)

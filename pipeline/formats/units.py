@@ -102,8 +102,9 @@ def not_understood(text: str, where: str) -> str:
     """
     problem = f"states a coordinate system that is not understood: '{text:.60}'"
     if word := re.search(r"foot|feet|yard|\bft\b|us-ft", text, re.IGNORECASE):
-        remedy = "export the file with its EPSG code or valid WKT"
-        raise InputError(f"{problem}, and names the unit '{word[0]}'", where=where, remedy=remedy)
+        raise InputError(
+            f"{problem}, and names the unit '{word[0]}'", where=where, remedy="export the file with its EPSG code or valid WKT"
+        )
     return f"the file {problem}; its coordinates are read as metres"
 
 
@@ -163,8 +164,12 @@ def _metres(axis: Any, name: str, where: str) -> float:
     if not factor:
         factor = metres_of_word(axis.unit_name)
     if not factor or "degree" in axis.unit_name:
-        problem = f"states the unit '{axis.unit_name}' in the coordinate system '{name}'"
-        raise InputError(problem, where=where, allowed="a unit of length", remedy=_PROJECT)
+        raise InputError(
+            f"states the unit '{axis.unit_name}' in the coordinate system '{name}'",
+            where=where,
+            allowed="a unit of length",
+            remedy=_PROJECT,
+        )
     return _exact(float(factor))
 
 

@@ -210,14 +210,13 @@ def surfaces_of_run(folder: Path, epochs: int) -> tuple[SimulationConfig, str, l
     """Read config, sensor, reference and the first `epochs` epochs of a run. Raises InputError if it has fewer epochs."""
     path = folder / RUN_FILE
     if not path.exists():
-        raise InputError(f"holds no {RUN_FILE}", where=str(folder), remedy="name a run's folder or a config file")
+        raise InputError(f"contains no {RUN_FILE}", where=str(folder), remedy="name a run's folder or a config file")
     run = read_run(path, "run it again with simulate")
     sensor, records = run["sensor"], [(record["epoch"], _applied(record)) for record in run.get("epochs", [])]
     if len(records) < 2:
         raise InputError("has no epoch after the reference", where=str(folder), remedy="finish it with simulate --resume")
     if epochs >= len(records):
-        has = f"1 to {len(records) - 1}, as many epochs as {folder} has"
-        raise InputError(f"got {epochs}", where="--epochs", allowed=has)
+        raise InputError(f"got {epochs}", where="--epochs", allowed=f"1 to {len(records) - 1}, as many epochs as {folder} has")
     config = load_config(path, [], None, None)
     found = []
     for number, applied in records[: epochs + 1]:

@@ -104,8 +104,11 @@ def build_stereo(request: Request, cameras: Path, labels: tuple[str, str] | None
         As `build` does, and if the pair does not see the cloud.
     """
     if request.reference == HALF:
-        raise InputError("half needs scans: neighbours in a matched cloud share their errors", where="--reference half",
-                         remedy="name a mesh, a cloud or a DEM")  # fmt: skip
+        raise InputError(
+            "half works only with laser scans: neighbouring points of a photogrammetric cloud share their errors",
+            where="--reference half",
+            remedy="name a mesh, a cloud or a DEM",
+        )
     pair = read_pair(cameras, labels)
     model = StereoModel() if request.model is None else read_model(request.model)
     if not isinstance(model, StereoModel):

@@ -11,8 +11,8 @@ from pipeline.formats.measurements.config import MeasurementConfig
 from pipeline.formats.measurements.measurement import Material, SurfaceMeasurement, assembled, read_model
 from pipeline.formats.measurements.surface_fit import air_side, check_in_metres
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.gap.residuals.surface_noise import estimated_noise
-from pipeline.gap.residuals.surface_residuals import NO_CAMERAS, spacing_m
+from pipeline.gap.residuals.surface_noise import estimate_surface_noise
+from pipeline.gap.residuals.surface_residuals import NO_CAMERAS, point_spacing_m
 from pipeline.measurement.folder import Interpretation, MeasurementContent, write
 from pipeline.measurement.reference import DEMS, HALF, Reference, is_cloud, reference_from_dem, reference_from_file
 from pipeline.measurement.request import Request
@@ -66,8 +66,11 @@ def build_surface(request: Request, out: Path) -> Interpretation:
 def _check(request: Request) -> None:
     """Raise InputError for options that only scans have, or a file that is given twice."""
     if request.reference == HALF:
-        raise InputError("half needs scans: neighbours in a matched cloud share their errors", where="--reference half",
-                         remedy="name a mesh, a cloud or a DEM")  # fmt: skip
+        raise InputError(
+            "half works only with laser scans: neighbouring points of a photogrammetric cloud share their errors",
+            where="--reference half",
+            remedy="name a mesh, a cloud or a DEM",
+        )
     if request.scanner is not None:
         raise InputError("the option needs laser scans", where="--scanner", remedy="leave out --scanner or --photographs")
     if len(set(request.scans)) < len(request.scans):
@@ -148,7 +151,7 @@ def _model(request: Request, cloud: RawScan, reference: Reference) -> tuple[Ster
         noise=StereoNoise(
             parallax_sigma_px=0.0,
             regularization_sigma_px=0.0,
-            point_sigma_m=max(_FIRST_GUESS * spacing_m(cloud.cloud.points), 1e-6),
+            point_sigma_m=max(_FIRST_GUESS * point_spacing_m(cloud.cloud.points), 1e-6),
         )
     )
     config = MeasurementConfig(sensor="stereo", reference=Path("reference"), points=Path("points"), model=Path("model"))
@@ -156,9 +159,9 @@ def _model(request: Request, cloud: RawScan, reference: Reference) -> tuple[Ster
     measurement = assembled(config, material, request.reference, cloud.name)
     if not isinstance(measurement, SurfaceMeasurement):
         raise TypeError("a measurement without cameras is one of a surface")
-    noise = estimated_noise(measurement, cloud.name)
+    noise = estimate_surface_noise(measurement, cloud.name)
     said = "this cloud cannot show whether that is too much; --model FILE gives other values"
-    return noise.model, (noise.words, said)
+    return noise.model, (noise.summary, said)
 
 
 def _notes_of(cloud: RawScan) -> str:

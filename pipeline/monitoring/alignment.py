@@ -141,9 +141,13 @@ def refine(reference: HeightRaster, epoch: HeightRaster, areas: Sequence[Area]) 
         compared &= in_areas(areas, *_places(reference.grid))
     if int(compared.sum()) < _LEAST_PIXELS:
         place = "in the stable areas" if areas else "of the epoch on the reference"
-        problem = f"only {int(compared.sum()):,} pixels {place} have data in both epochs"
         remedy = "give larger stable areas" if areas else "check that both epochs show the same wall, or give a larger --gsd"
-        raise InputError(problem, where="registration", allowed=f"at least {_LEAST_PIXELS}", remedy=remedy)
+        raise InputError(
+            f"only {int(compared.sum()):,} pixels {place} have data in both epochs",
+            where="registration",
+            allowed=f"at least {_LEAST_PIXELS}",
+            remedy=remedy,
+        )
     x, y = _places(reference.grid)
     centre = np.array([x[compared].mean(), y[compared].mean(), float(epoch.height[compared].mean())])
     fitted = _thinned(compared)

@@ -60,9 +60,9 @@ def follow(
         out.
     """
     if not folder.is_dir():
-        raise InputError("is no folder", where=f"--follow {folder}", remedy="name the folder in which new scans come")
+        raise InputError("is not a folder", where=f"--follow {folder}", remedy="name the folder in which new scans come")
     if times:
-        raise InputError("goes without --follow: new epochs have their times by themselves", where="--times")
+        raise InputError("cannot be combined with --follow, which reads the time of each epoch from its file", where="--times")
     keys: dict[str, Any] = {"workers": workers, "progress": Progress()}
     resume = resume or (out / "monitor.json").exists()
     result = monitor_paths(paths, out, options, resume=resume, **keys) if len(paths) > 1 else None
@@ -81,5 +81,5 @@ def follow(
         before = now
         time.sleep(every_s)
     if result is None:
-        raise InputError("has not held an epoch yet", where=f"--follow {folder}")
+        raise InputError("no complete epoch has arrived in it yet", where=f"--follow {folder}")
     return result

@@ -78,8 +78,10 @@ def read_areas(path: Path) -> tuple[Area, ...]:
     except ValidationError as error:
         wrong = error.errors()[0]["msg"]
         raise InputError(
-            f"holds no areas ({wrong})", where=str(path), allowed="a list of boxes [x0, y0, x1, y1] or polygons [[x, y], ...]"
+            f"is not a list of areas ({wrong})",
+            where=str(path),
+            allowed="a list of boxes [x0, y0, x1, y1] or polygons [[x, y], ...]",
         ) from None
     if not found:
-        raise InputError("names no area", where=str(path), remedy="leave --stable out, or draw an area")
+        raise InputError("contains no area", where=str(path), remedy="leave --stable out, or draw an area")
     return found

@@ -113,13 +113,15 @@ def find_epochs(paths: Sequence[Path], times: Sequence[str] = ()) -> list[EpochS
     found = [source for path in paths for source in _sources(path)]
     if len(found) < 2:
         raise InputError(
-            f"{len(found)} epoch is given",
+            f"only {len(found)} epoch is given",
             where="EPOCH",
             allowed="two and more",
             remedy="name one before and one after",
         )
     if times and len(times) != len(found):
-        raise InputError(f"holds {len(times)} times for {len(found)} epochs", where="--times", remedy="give one for each epoch")
+        raise InputError(
+            f"contains {len(times)} times for {len(found)} epochs", where="--times", remedy="give one for each epoch"
+        )
     seen: dict[Path, str] = {}
     for source in found:
         for file in source.files:
@@ -142,7 +144,11 @@ def read_epoch(source: EpochSource, options: MonitorOptions) -> EpochData:
     if len(parts) == 1:
         return parts[0]
     if any(part.mesh is not None for part in parts):
-        raise InputError("holds meshes or elevation models among scans", where=str(source.path), allowed="scans alone")
+        raise InputError(
+            "contains a mesh or an elevation model beside scans, which cannot be joined",
+            where=str(source.path),
+            allowed="scans only, or one mesh",
+        )
     notes = tuple(dict.fromkeys(note for part in parts for note in part.notes))
     positions = [part.position for part in parts if part.position is not None]
     position = np.mean(positions, axis=0) if positions else None
@@ -164,18 +170,17 @@ def _sources(path: Path) -> list[EpochSource]:
         return _epochs_of_run(path)
     files = tuple(epoch_files(path))
     if not files:
-        allowed = f"files of scans ({', '.join(_ANY)}), or a run of simulate"
-        raise InputError("holds no scan", where=str(path), allowed=allowed)
+        raise InputError("contains no scan", where=str(path), allowed=f"files of scans ({', '.join(_ANY)}), or a run of simulate")
     return [EpochSource(path, files, unknown)]
 
 
 def _epochs_of_run(folder: Path) -> list[EpochSource]:
     record = read_run(folder / RUN_FILE, "make the run again")
     if not record.get("wall_frame"):
-        raise InputError("names no wall frame", where=str(folder / RUN_FILE), remedy="make the run again")
+        raise InputError("does not state its wall frame", where=str(folder / RUN_FILE), remedy="make the run again")
     epochs = sorted(each for each in folder.glob("epoch_*") if (each / "points.laz").is_file())
     if not epochs:
-        raise InputError("holds no epoch with points", where=str(folder), remedy="make the run again")
+        raise InputError("contains no epoch with points", where=str(folder), remedy="make the run again")
     return [EpochSource(each, (each / "points.laz",), EpochTime(None, ""), record) for each in epochs]
 
 

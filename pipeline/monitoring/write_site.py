@@ -32,7 +32,11 @@ def write_site(result: Result, path: Path) -> None:
             raise InputError("exists already", where=str(file), remedy="choose another name with --write-site")
     mesh = mesh_of_raster(site.reference.raster.height, site.grid).submesh()
     if not len(mesh.faces):
-        raise InputError("has no surface to write", where=site.source.name, remedy="give a larger --gsd")
+        raise InputError(
+            "the epoch gives no surface: no pixels with data lie side by side",
+            where=site.source.name,
+            remedy="give a larger --gsd",
+        )
     write_ply(wall, mesh.with_vertices(site.frame.to_world(mesh.vertices)))
     middle = np.array(
         [site.grid.x_min + site.grid.width * site.grid.gsd / 2, site.grid.y_max - site.grid.height * site.grid.gsd / 2, 0]

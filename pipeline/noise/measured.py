@@ -83,12 +83,17 @@ def read_measured(folder: Path, config: DifferenceConfig, icp: IcpConfig | None,
         return _from_points(folder, config, icp, random)
     files = sorted(folder.glob("difference_*.tif")) or sorted(folder.glob("*.tif"))
     if not files:
-        remedy = f"name a folder with {FILE} or with difference maps (*.tif)"
-        raise InputError("holds no measured epochs", where=str(folder), remedy=remedy)
+        raise InputError(
+            "contains no measured epochs", where=str(folder), remedy=f"name a folder with {FILE} or with difference maps (*.tif)"
+        )
     maps, grids = zip(*map(read_geotiff, files), strict=True)
     for file, grid in zip(files, grids, strict=True):
         if grid != grids[0]:
-            raise InputError(f"{grid} is not {grids[0]} of {files[0].name}", where=str(file), remedy="bring the maps to one grid")
+            raise InputError(
+                f"its grid {grid} differs from {grids[0]} of {files[0].name}",
+                where=str(file),
+                remedy="bring the maps to one grid",
+            )
     return MeasuredMaps(folder.name, grids[0], np.stack(maps), None)
 
 

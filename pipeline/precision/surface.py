@@ -82,7 +82,9 @@ def wall_raster(caster: RayCaster, gsd_m: float | None = None) -> WallRaster:
     dr.eval(valid, point, normal, albedo)
     found = np.array(valid)
     if not found.any():
-        raise InputError("nothing of it is visible along its mean plane's normal", where="wall", remedy="check the mesh")
+        raise InputError(
+            "no part of the wall is visible along the normal of its mean plane", where="wall", remedy="check the mesh"
+        )
     points, normals = (np.array(array, dtype=np.float64).T[found] for array in (point, normal))
     places = Places(points, normals, np.array(albedo, dtype=np.float64)[found])
     return WallRaster(grid, found.reshape(grid.shape), places)

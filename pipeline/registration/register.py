@@ -362,7 +362,7 @@ class _Alignment:
         used = round(total * (1 - self.config.subsample_ratio)) if self.config.subsample_points else total
         if used < LEAST_POINTS:
             raise InputError(
-                f"leaves {used} of {total:,} points",
+                f"the subsample would leave only {used} of {total:,} points",
                 where="icp.subsample_ratio",
                 allowed=f"at most {1 - LEAST_POINTS / total:.6g}",
             )

@@ -78,12 +78,16 @@ def acquire(config: SimulationConfig, site: SensorSite, scene: RayCaster, random
     if config.reconstruction == "vertices":
         if not isinstance(sensor, StereoPair):
             allowed = "direct, for the tls sensor" if isinstance(sensor, LaserScanner) else "direct, colmap, for matcher: sgbm"
-            raise InputError("vertices are measured by the simulated stereo pair", where="reconstruction", allowed=allowed)
+            raise InputError(
+                "only a stereo pair with simulated matching can measure vertices", where="reconstruction", allowed=allowed
+            )
         vertices = observe_vertices(sensor, scene, random)
     seen = sensor.observe(scene, random)
     if not isinstance(sensor, StereoPair | MatchedStereoPair):
         if colmap:
-            raise InputError("colmap fuses depth maps", where="reconstruction", allowed="direct, for the tls sensor")
+            raise InputError(
+                "colmap needs the depth maps of a stereo pair", where="reconstruction", allowed="direct, for the tls sensor"
+            )
         return Acquisition(seen, None, _join_stations(config, site, scene, seen, random))
     if not (colmap or config.products.metashape):
         return Acquisition(seen, None, vertices=vertices)

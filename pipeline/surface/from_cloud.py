@@ -92,8 +92,11 @@ def _triangulation(points: FloatArray, viewpoint: FloatArray, where: str) -> Tri
     """Triangulate the points as seen from the viewpoint. Raises InputError for points at the viewpoint itself."""
     apart = np.linalg.norm(points - viewpoint, axis=1) > _SAME_PLACE_M
     if not apart.all():
-        problem = f"{int((~apart).sum()):,} points lie where the sensor stands"
-        raise InputError(problem, where=where, remedy="remove these points, or give the sensor's place with --seen-from")
+        raise InputError(
+            f"{int((~apart).sum()):,} points lie where the sensor stands",
+            where=where,
+            remedy="remove these points, or give the sensor's place with --seen-from",
+        )
     return triangulate_seen_points(points, viewpoint, _looking_at(np.median(points, axis=0) - viewpoint), where).mesh
 
 

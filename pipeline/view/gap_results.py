@@ -150,7 +150,9 @@ def _cloud(path: Path) -> PointCloud:
     if not all(np.isfinite(cloud.extra[name]).all() and cloud.extra[name].ndim == 1 for name in _CHANNELS):
         raise InputError(f"has values in {' or '.join(_CHANNELS)} that are not finite", where=str(path), remedy=remedy)
     if len(cloud.points) < _FEWEST:
-        raise InputError(f"holds {len(cloud.points)} points", where=str(path), allowed=f"at least {_FEWEST}", remedy=remedy)
+        raise InputError(
+            f"contains only {len(cloud.points)} points", where=str(path), allowed=f"at least {_FEWEST}", remedy=remedy
+        )
     check_reach(cloud.points, str(path))
     return cloud
 

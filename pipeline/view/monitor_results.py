@@ -42,11 +42,11 @@ class MonitorResults:
             self._levels = {str(each["epoch"]): float(each["level_of_detection_median_m"]) for each in epochs}
             self._events = [dict(each) for each in self._record["events"]]
         except (KeyError, TypeError, ValueError):
-            raise InputError("is no record of scarpsim monitor", where=str(folder / MONITOR_FILE), remedy=_REMEDY) from None
+            raise InputError("is not a record of scarpsim monitor", where=str(folder / MONITOR_FILE), remedy=_REMEDY) from None
         self.title = f"{folder.name}: {len(epochs)} epochs against {names.get('0', 'the reference')}"
         self.steps = {key: f"epoch {key}, {names.get(key, '')}" for key in self._levels}
         if not self.steps:
-            raise InputError("holds no epoch", where=str(folder), remedy=_REMEDY)
+            raise InputError("contains no epoch", where=str(folder), remedy=_REMEDY)
         self._map = lru_cache(6)(read_geotiff)
         self._cloud = lru_cache(1)(read_laz)
         self._numbers = lru_cache(2)(self._event_raster)

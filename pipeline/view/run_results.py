@@ -39,7 +39,7 @@ class RunResults:
         record = read_run(folder / RUN_FILE, "continue it with simulate --resume")
         self._epochs = {str(each["epoch"]): each for each in record.get("epochs", []) if each["epoch"] > 0}
         if not self._epochs or "wall" not in record or any("statistics" not in each for each in self._epochs.values()):
-            raise InputError("holds no finished epoch", where=str(folder), remedy="continue it with simulate --resume")
+            raise InputError("contains no finished epoch", where=str(folder), remedy="continue it with simulate --resume")
         self.world_to_wall = np.array(record["wall_frame"]["matrix_world_to_wall"]) if "wall_frame" in record else np.eye(4)
         self.title = f"{folder.name}: {INSTRUMENTS[record['sensor']]}, {record['wall']['name']}"
         self.steps = {key: f"epoch {key}" for key in self._epochs}
@@ -47,7 +47,7 @@ class RunResults:
         self._found = _detections(detections) if detections else {}
         if detections and not set(self._found) & set(self.steps):
             allowed = ", ".join(f"difference_{int(key):03d}.tif" for key in self.steps)
-            raise InputError("holds no detections of this run's maps", where=str(detections), allowed=allowed)
+            raise InputError("contains no detections of this run's maps", where=str(detections), allowed=allowed)
         self._map = lru_cache(4)(read_geotiff)
         self._heights = lru_cache(3)(self._raster_of)
         self._cloud = lru_cache(1)(read_own_points)
@@ -144,7 +144,7 @@ def _detections(folder: Path) -> dict[str, list[Item]]:
     """Read the events of `scarpsim detect` at its lowest confidence, by epoch."""
     tables = sorted((_confidence(path), path) for path in folder.glob("events_*.csv"))
     if not tables:
-        raise InputError("holds no events_*.csv", where=str(folder), remedy="give the folder that scarpsim detect filled")
+        raise InputError("contains no events_*.csv", where=str(folder), remedy="give the folder that scarpsim detect filled")
     found: dict[str, list[Item]] = {}
     for event in read_events(tables[0][1]):
         number = re.search(r"difference_(\d{1,9})", event.image)
@@ -160,7 +160,7 @@ def _confidence(path: Path) -> float:
     except ValueError:
         value = np.nan
     if not 0 <= value <= 1:
-        raise InputError("is no name of a table of events", where=str(path), allowed="such as events_0.9.csv")
+        raise InputError("is not the name of a table of events", where=str(path), allowed="such as events_0.9.csv")
     return value
 
 

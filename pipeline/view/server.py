@@ -52,18 +52,21 @@ def open_results(folder: Path, detections: Path | None = None) -> Results:
     if (folder / "run.json").exists():
         return RunResults(folder, detections)
     if detections:
-        raise InputError("belong to a run", where="--detections", remedy="leave it out, or give the run's folder")
+        raise InputError(
+            "detections can only be shown with a run", where="--detections", remedy="leave it out, or give the run's folder"
+        )
     if (folder / "gap.json").exists():
         return GapResults(folder)
     if (folder / MONITOR_FILE).exists():
         return MonitorResults(folder)
     if (folder / "annotations.json").exists():
         return TileResults(folder)
-    allowed = (
-        "a run (run.json), a result of scarpsim gap (gap.json) or monitor (monitor.json), "
-        "a split of a data set (annotations.json)"
+    raise InputError(
+        "contains no results that can be shown",
+        where=str(folder),
+        allowed="a run (run.json), a result of scarpsim gap (gap.json) or monitor (monitor.json), "
+        "a split of a data set (annotations.json)",
     )
-    raise InputError("holds nothing to look at", where=str(folder), allowed=allowed)
 
 
 def make_app(results: Results, token: str, other: Results | None = None) -> dash.Dash:
@@ -107,15 +110,18 @@ def make_page_server(results: Results, port: int, token: str, other: Results | N
         with redirect_stderr(io.StringIO()):  # werkzeug's own message is long
             return make_server(HOST, port, make_app(results, token, other).server, threaded=True, request_handler=_Silent)
     except (OSError, SystemExit, OverflowError):
-        remedy = "choose another, or 0 for any that is free"
-        raise InputError(f"port {port} cannot be used", where="--port", remedy=remedy) from None
+        raise InputError(
+            f"port {port} cannot be used", where="--port", remedy="choose another, or 0 for any that is free"
+        ) from None
 
 
 def open_second(folder: Path, first: Results) -> Results:
     """Open a second run of the same wall as `first`. Raises InputError if either is not a run, or if walls or frames differ."""
     second = open_results(folder)
     if not isinstance(first, RunResults) or not isinstance(second, RunResults):
-        raise InputError("is to be shown beside another", where=str(folder), allowed="two runs of one wall")
+        raise InputError(
+            "only two runs of one wall can be shown side by side", where=str(folder), remedy="give the folders of two runs"
+        )
     check_same_wall(first.world_to_wall, second.world_to_wall, first.extent_m, str(folder))
     return second
 

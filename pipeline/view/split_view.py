@@ -97,5 +97,8 @@ def check_same_wall(first: FloatArray, second: FloatArray, extent_m: float, wher
     """Raise InputError if the matrices (4, 4), world to wall frame, of two runs differ on a wall of size `extent_m`."""
     difference = np.abs(first - second)
     if float(difference[:3, :3].max()) * extent_m > _APART_M or float(difference[:3, 3].max()) > _APART_M:
-        remedy = "compare runs of one wall, as `scarpsim compare` makes them"
-        raise InputError("is of another wall, or in another frame", where=where, remedy=remedy)
+        raise InputError(
+            "shows another wall or uses another wall frame than the first run",
+            where=where,
+            remedy="compare runs of one wall, as `scarpsim compare` makes them",
+        )

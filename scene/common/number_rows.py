@@ -155,8 +155,11 @@ def _value(word: str, form: RowForm, found: RowsFound, where: str) -> float:
         return float(plain.replace(",", ".").replace("d", "e"))
     if _POINT.fullmatch(word):
         if form.decimal_comma and "." in word:
-            problem = f"'{word:.40}' has a decimal point, where other numbers of the file have decimal commas"
-            raise InputError(problem, where=where, remedy="export all numbers with decimal points")
+            raise InputError(
+                f"'{word:.40}' has a decimal point, where other numbers of the file have decimal commas",
+                where=where,
+                remedy="export all numbers with decimal points",
+            )
         return float(plain.replace("d", "e"))
     if plain in _MISSING:
         found.missing += 1
@@ -171,10 +174,17 @@ def _no_number(word: str, form: RowForm, where: str) -> InputError:
     if is_grouped(word, decimal_comma=form.decimal_comma):
         return InputError(f"'{word:.40}': {GROUPED}", where=where, allowed="plain numbers", remedy=_UNGROUPED)
     if _COMMA.fullmatch(word):
-        problem = f"'{word:.40}' has a decimal comma, where other numbers of the file have decimal points"
-        return InputError(problem, where=where, remedy="export all numbers with decimal points")
-    remedy = "correct or remove the line, or export the file again"
-    return InputError(f"'{word:.40}' is not a number", where=where, allowed="numbers, one point a line", remedy=remedy)
+        return InputError(
+            f"'{word:.40}' has a decimal comma, where other numbers of the file have decimal points",
+            where=where,
+            remedy="export all numbers with decimal points",
+        )
+    return InputError(
+        f"'{word:.40}' is not a number",
+        where=where,
+        allowed="numbers, one point a line",
+        remedy="correct or remove the line, or export the file again",
+    )
 
 
 def _wrong_width(text: str, width: int, number: int, form: RowForm, where: str) -> InputError:

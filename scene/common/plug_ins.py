@@ -41,8 +41,9 @@ def load_plug_ins(group: str, needs: str, is_one: Callable[[Any], bool], taken: 
         try:
             value = entry.load()
         except Exception as error:  # the code of another package fails in any way
-            problem = f"does not load ({type(error).__name__}: {error})"
-            raise InputError(problem, where=where, remedy="mend or uninstall that package") from error
+            raise InputError(
+                f"does not load ({type(error).__name__}: {error})", where=where, remedy="mend or uninstall that package"
+            ) from error
         if not is_one(value):
             raise InputError(f"is a {type(value).__name__}", where=where, allowed=needs)
         found[entry.name] = value

@@ -84,8 +84,11 @@ def read_text(path: Path, *, most_bytes: int | None = None, remedy: str = "check
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy=remedy) from None
     except UnicodeDecodeError as error:
-        problem = f"is no text in UTF-8 (byte {error.start:,}: {error.reason})"
-        raise InputError(problem, where=str(path), remedy="save it in UTF-8, or give the file that is meant") from None
+        raise InputError(
+            f"is no text in UTF-8 (byte {error.start:,}: {error.reason})",
+            where=str(path),
+            remedy="save it in UTF-8, or give the file that is meant",
+        ) from None
 
 
 def read_json(path: Path, *, remedy: str = "make it again") -> Any:
@@ -102,8 +105,12 @@ def read_json(path: Path, *, remedy: str = "make it again") -> Any:
         raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy=remedy) from None
     if needed > most:
         problem = f"holds so much that it may take {needed:.1f} GB of memory"
-        smaller = f"cut it into parts, or set the variable {READ_LIMIT}={math.ceil(1.1 * needed)}"
-        raise InputError(problem, where=str(path), allowed=f"up to {most:g} GB", remedy=smaller)
+        raise InputError(
+            problem,
+            where=str(path),
+            allowed=f"up to {most:g} GB",
+            remedy=f"cut it into parts, or set the variable {READ_LIMIT}={math.ceil(1.1 * needed)}",
+        )
     text = read_text(path, most_bytes=int(most * 1e9), remedy=remedy)
     try:
         return json.loads(text)

@@ -53,8 +53,11 @@ class FrameConfig(Config):
         if not 0 < np.linalg.norm(normal) < np.inf:
             raise InputError(f"got {self.normal}", where="frame.normal", allowed="a direction x, y, z that is not zero")
         if np.dot(towards - middle, normal) < 0:
-            remedy = "change its sign: the wall frame's z axis points towards the sensors"
-            raise InputError(f"{self.normal} points away from the sensors", where="frame.normal", remedy=remedy)
+            raise InputError(
+                f"{self.normal} points away from the sensors",
+                where="frame.normal",
+                remedy="change its sign: the wall frame's z axis points towards the sensors",
+            )
         return WallFrame.along(normal / np.linalg.norm(normal), vertices)
 
 

@@ -129,8 +129,12 @@ def read_reference(path: Path) -> tuple[TriangleMesh, tuple[str, ...]]:
     """
     mesh, notes = read_mesh(path)
     if (extent := _extent(mesh)) > _LARGEST_M:
-        size = f"the surface is {extent:.4g} m in size"
-        raise InputError(size, where=str(path), allowed=f"up to {_LARGEST_M:.0f} m", remedy="give it in metres, cut to the scene")
+        raise InputError(
+            f"the surface is {extent:.4g} m in size",
+            where=str(path),
+            allowed=f"up to {_LARGEST_M:.0f} m",
+            remedy="give it in metres, cut to the scene",
+        )
     mesh, words = drop_unused(mesh)
     return mesh, (*notes, *([words] if words else []))
 
@@ -184,7 +188,7 @@ def _read(path: Path, unit: str) -> TriangleMesh:
     faces = np.asarray(getattr(mesh, "faces", np.empty((0, 3))))
     if not len(faces):
         raise InputError(
-            "holds no triangles",
+            "contains no triangles",
             where=where,
             remedy="mesh the points first: scarpsim surface CLOUD --seen-from X Y Z --out wall.ply",
         )

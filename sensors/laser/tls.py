@@ -219,7 +219,11 @@ class LaserScanner:
         """Scan in one face. real: the scanner in its real pose."""
         pulses, beam = self.emitted(self.emit(), random)
         if beam.records_several and self.config.faces == 2:
-            raise InputError("two faces are averaged pulse by pulse", where="scanner.faces", allowed="1, for the mode multiple")
+            raise InputError(
+                "two faces cannot be measured in the mode multiple, because faces are averaged pulse by pulse",
+                where="scanner.faces",
+                allowed="1",
+            )
         echo = real.echo(scene, pulses, beam, beam.combine_echoes)
         seen = self._record(self.measured(pulses, echo, random), real)
         if echo.returns is None or not np.any(echo.returns.numpy() > 1):

@@ -124,8 +124,11 @@ class OrientationNoise(Config):
             return self._effects(side, value)
         except ValidationError as error:
             problem = "; ".join(f"{item['loc'][-1]} {item['input']:.4g}: {item['msg'].lower()}" for item in error.errors())
-            remedy = "lower its sigma; angles are in radians"
-            raise InputError(f"a drawn value is out of bounds: {problem}", where="noise.orientation", remedy=remedy) from None
+            raise InputError(
+                f"a drawn value is out of bounds: {problem}",
+                where="noise.orientation",
+                remedy="lower its sigma; angles are in radians",
+            ) from None
 
     def _effects(self, side: Side, value: dict[str, float]) -> tuple[Effect, ...]:
         """Convert drawn values to effects."""

@@ -191,7 +191,7 @@ def mistakes(scans: Path, folder: Path) -> dict[str, tuple[list[str], str]]:
     (folder / "areas.yaml").write_text("- [1, 2]\n")
     (folder / "empty").mkdir()
     return {
-        "one epoch": ([first, *station], "1 epoch is given"),
+        "one epoch": ([first, *station], "only 1 epoch is given"),
         "twice": ([first, first, *station], "is given twice"),
         "not there": ([first, "nowhere.laz", *station], "no such file"),
         "times backwards": ([second, first, *station], "is earlier than"),
@@ -200,8 +200,8 @@ def mistakes(scans: Path, folder: Path) -> dict[str, tuple[list[str], str]]:
         "elsewhere": ([first, str(folder / "elsewhere.las"), *station], "lies elsewhere"),
         "other unit": ([first, str(folder / "feet.las"), *station], "lies elsewhere"),
         "other system": ([first, str(folder / "zone33.las"), *station], "another coordinate system"),
-        "no areas": ([first, second, *station, "--stable", str(folder / "areas.yaml")], "holds no areas"),
-        "empty folder": ([first, str(folder / "empty"), *station], "holds no scan"),
+        "no areas": ([first, second, *station, "--stable", str(folder / "areas.yaml")], "is not a list of areas"),
+        "empty folder": ([first, str(folder / "empty"), *station], "contains no scan"),
         "two models": ([first, second, *station, "--scanner", "riegl_vz400i", "--model", "m.yaml"], "--scanner"),
         "pixel too large": ([first, second, *station, "--gsd", "50"], "--gsd"),
         "no detector": ([first, second, *station, "--detector", "nothing_here"], "nothing_here"),

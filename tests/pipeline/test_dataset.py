@@ -217,7 +217,7 @@ def test_sets_merge_and_split(made: Path, tmp_path: Path) -> None:
     tls = Tiles(tmp_path / "parts/tls/train")
     assert {record["sensor"] for record in tls.records} == {"tls"}
     assert len(tls) == sum(image["sensor"] == "tls" for image in entries(merged, "train", "images"))
-    with pytest.raises(InputError, match="an earlier set has the same epochs"):
+    with pytest.raises(InputError, match="another of the given sets has the same epochs"):
         merge_datasets([made, made], tmp_path / "twice")
     assert not (tmp_path / "twice").exists()
     with pytest.raises(InputError, match="unknown key 'sensr'"):

@@ -153,7 +153,7 @@ def test_a_package_refuses_links_out_of_its_folder(tmp_path: Path, capsys: pytes
         (["picture", "--epoch", "9"], "--epoch: there is no epoch 9; allowed: 0 to 2"),
         (["gltf", "--out", "wall.obj"], "--out: got 'wall.obj'; allowed: .glb"),
         (["movie"], "got 'movie'; allowed: picture"),
-        (["yolo"], "holds no split of a data set"),
+        (["yolo"], "contains no split of a data set"),
     ],
 )
 def test_what_cannot_be_made_is_told_in_one_line(

@@ -17,7 +17,7 @@ from surfaces import sphere
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.formats.measurements.measurement import Measurement, read_measurement
 from pipeline.formats.meshes.ply import read_ply, write_ply
-from pipeline.gap.residuals.registration import residuals_of
+from pipeline.gap.residuals.alignment import compute_residuals
 from pipeline.run.site import prepare_site
 from scene.common.config import parse
 from scene.common.errors import InputError
@@ -119,9 +119,9 @@ def test_a_reference_wound_the_wrong_way_gives_the_same_residuals_and_gap(tmp_pa
     other = turned_reference(tmp_path, which)
     assert right.notes == ()
     assert "triangles" in other.notes[0]
-    assert other.notes[0] in residuals_of(other).notes
+    assert other.notes[0] in compute_residuals(other).notes
     np.testing.assert_array_equal(other.reference.faces, right.reference.faces)
-    np.testing.assert_array_equal(residuals_of(other).value, residuals_of(right).value)
+    np.testing.assert_array_equal(compute_residuals(other).value, compute_residuals(right).value)
 
 
 def moebius() -> TriangleMesh:
@@ -146,8 +146,8 @@ def changed(**values: Any) -> TriangleMesh:
 NOTHING = "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nelement face 0\n"
 NOTHING += "property list uchar int vertex_indices\nend_header\n"
 BAD = {
-    "nothing in it": (NOTHING, "holds no triangles|is not a valid ply file"),
-    "points alone": (replace(sheet(), faces=np.empty((0, 3), np.int32)), "holds no triangles"),
+    "nothing in it": (NOTHING, "contains no triangles|is not a valid ply file"),
+    "points alone": (replace(sheet(), faces=np.empty((0, 3), np.int32)), "contains no triangles"),
     "nan": (changed(v7=np.nan), r"1 of 48 vertices are not finite, the first is vertex 7 at \(nan, nan, nan\)"),
     "infinite": (changed(v7=np.inf), "1 of 48 vertices are not finite"),
     "1e300": (changed(v7=1e300), r"1 of 48 vertices are not on earth, the first is vertex 7 at \(1e\+300"),

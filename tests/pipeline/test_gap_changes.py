@@ -1,4 +1,4 @@
-"""Changes of the scene, found by `pipeline.gap.residuals.changes`: each is listed once with box and volume; none on quiet walls.
+"""Scene changes found by `pipeline.gap.residuals.scene_changes`: each is listed once with box and volume; none on quiet walls.
 
 The volume of a block of n points is known to 20 % (because its sides are partly seen, obliquely) plus 1.6 / sqrt(n) (because of
 which points lie on it).
@@ -17,9 +17,9 @@ from gap_cases import STEP, smooth_noise, write_scan
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.report.report import summarise, to_dict
-from pipeline.gap.residuals.changes import SceneChange, find_changes
-from pipeline.gap.residuals.rays import RayGeometry
-from pipeline.gap.residuals.sight import Sight
+from pipeline.gap.residuals.ray_hits import RayGeometry
+from pipeline.gap.residuals.scene_changes import SceneChange, find_scene_changes
+from pipeline.gap.residuals.sensor_view import SensorView
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 
 STEPS = [4e-3, 2e-3, 1e-3]
@@ -34,8 +34,8 @@ def found_in(seen: Scan, value: Array, epoch: Any = None) -> list[SceneChange]:
     geometry = RayGeometry(seen.azimuth, seen.zenith)
     residuals = TlsResiduals(value, SIGMA * one, one, true, true, np.zeros((n, 6)), at, covariates, np.arange(n), geometry)
     plane = np.stack([seen.azimuth, seen.zenith], axis=1)
-    sight = Sight(plane, np.zeros(n, dtype=int) if epoch is None else epoch, np.zeros(3), seen.ray, seen.plane)
-    return find_changes(residuals, sight, true)[0]
+    sight = SensorView(plane, np.zeros(n, dtype=int) if epoch is None else epoch, np.zeros(3), seen.ray, seen.plane)
+    return find_scene_changes(residuals, sight, true)[0]
 
 
 def touches(box: Box, change: SceneChange) -> bool:

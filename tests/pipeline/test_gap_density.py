@@ -11,7 +11,7 @@ from gap_cases import write_scan
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.naming.candidate_families import candidate_families
-from pipeline.gap.residuals.registration import settled
+from pipeline.gap.residuals.alignment import align
 from scene.common.keyed_random import KeyedRandom
 
 TRUE = 0.008
@@ -27,8 +27,8 @@ def _search(folder: Path, step_rad: float, bent: float = BENT) -> tuple[list[str
     """
     folder.mkdir()
     write_scan(folder, 5, step_rad=step_rad, ranges=lambda scan: scan.R)
-    there, residuals, _ = settled(read_measurement(folder))
-    part = residuals.part(residuals.smooth & (residuals.geometry.cos_incidence > 0.3))
+    there, residuals, _ = align(read_measurement(folder))
+    part = residuals.part(residuals.usable & (residuals.geometry.cos_incidence > 0.3))
     slant = 1 / part.geometry.cos_incidence - 1
     noise = 0.001 * np.random.default_rng(6).standard_normal(len(part))
     value = TRUE * (slant + bent * np.std(slant) * np.sin(6 * part.covariates["incidence"])) + noise

@@ -10,7 +10,7 @@ from gap_cases import Scan, write_scan
 
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
-from pipeline.gap.residuals.registration import residuals_of
+from pipeline.gap.residuals.alignment import compute_residuals
 
 
 def found_in(folder: Path, seed: int, **how: Any) -> GapDiagnosis:
@@ -41,9 +41,9 @@ def half_that_moved(scan: Scan) -> Any:
 
 def still_half(folder: Path) -> list[float]:
     """Return the other half as a box in the wall frame."""
-    residuals = residuals_of(read_measurement(folder))
+    residuals = compute_residuals(read_measurement(folder))
     azimuth = residuals.geometry.azimuth
-    x = residuals.at[azimuth < (azimuth.min() + azimuth.max()) / 2 - 0.03, 0]
+    x = residuals.wall_xy[azimuth < (azimuth.min() + azimuth.max()) / 2 - 0.03, 0]
     return [float(x.min()), -1e3, float(x.max()), 1e3]
 
 
@@ -57,7 +57,7 @@ def test_a_rockfall_beyond_stable_ground_is_reported(tmp_path: Path) -> None:
     write_scan(tmp_path, 16, fall=(20.0, 12.0, 0.4))
     (change,) = diagnose(read_measurement(tmp_path)).changes
     low, high = map(float, change.bounds[:, 0])
-    x = residuals_of(read_measurement(tmp_path)).at[:, 0]
+    x = compute_residuals(read_measurement(tmp_path)).wall_xy[:, 0]
     sides = ([float(x.min()), low - 1.0], [high + 1.0, float(x.max())])
     start, stop = max(sides, key=lambda side: side[1] - side[0])
     write_scan(tmp_path, 16, fall=(20.0, 12.0, 0.4), stable_areas=[[start, -1e3, stop, 1e3]])

@@ -14,15 +14,15 @@ import pytest
 from gap_cases import Array, Scan, smooth_noise, write_scan
 
 from pipeline.formats.measurements.measurement import read_measurement
-from pipeline.gap.mean.candidates import Candidate
-from pipeline.gap.mean.selection import Choice, Members, Tried
+from pipeline.gap.mean.candidates import SPATIAL_NULL, Candidate
+from pipeline.gap.mean.selection import EffectSet, FamilyScore, ForwardSelection
 from pipeline.gap.naming.named_effects import NamedEffect
 from pipeline.gap.naming.selection_passes import subsample
 from pipeline.gap.naming.validation_scores import describe_weakness, validate_effects
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.noise_and_edges.variance_model import fit_variance_model
-from pipeline.gap.residuals.cells import Cells, held_out_blocks
-from pipeline.gap.residuals.registration import registered, settled
+from pipeline.gap.residuals.alignment import align, fit_pose_robustly
+from pipeline.gap.residuals.wall_blocks import WallCells, in_validation_blocks
 from scene.common.keyed_random import KeyedRandom
 
 
@@ -34,9 +34,9 @@ def test_debris_on_blocks_that_were_held_out_does_not_speak_against_an_effect(tm
         write_scan(
             folder, 8, step_rad=0.007, ranges=lambda scan: _bulging(scan) - 0.2 * (scan.rng.uniform(size=len(scan.R)) < share)
         )
-        there, found, _ = settled(read_measurement(folder))
-        held_out = held_out_blocks(found.at, Cells.over(found.at).side_m)
-        rows = np.flatnonzero(held_out | (np.abs(registered(found)[0]) < 0.05))  # the others no step of naming looks at
+        there, found, _ = align(read_measurement(folder))
+        held_out = in_validation_blocks(found.wall_xy, WallCells.over(found.wall_xy).side_m)
+        rows = np.flatnonzero(held_out | (np.abs(fit_pose_robustly(found)[0]) < 0.05))  # the others no step of naming looks at
         entry = {"name": "range_incidence_bias", "coefficient_m": 0.004}
         effect = NamedEffect("tls.range_incidence_bias", "physical", entry, {}, (), 0.001, 9.0)
         scored = validate_effects(*subsample(there, found, rows), [effect], ~held_out[rows], 0.0004)
@@ -60,14 +60,16 @@ def test_an_effect_beside_others_whose_one_value_may_be_none_is_only_mentioned(
     A real case: a kappa of -0.36 +- 0.63 mrad was named beside a skew of the other camera, which compensates it.
     """
     write_scan(tmp_path, 8, step_rad=0.007, ranges=lambda scan: _bulging(scan) + 0.004 * np.sin(2 * np.pi * scan.R / 1.7))
-    there, found, _ = settled(read_measurement(tmp_path))
+    there, found, _ = align(read_measurement(tmp_path))
     bias = {"name": "range_incidence_bias", "coefficient_m": 0.004}
     sine = {"name": "range_cyclic", "amplitude_m": 0.004, "period_m": 1.7, "phase_rad": 0.0}
     named = [
         NamedEffect("tls.range_incidence_bias", "physical", bias, {"coefficient_m": std}, (), 0.001, 9.0),
         NamedEffect("tls.range_cyclic", "physical", sine, {"amplitude_m": 0.01, "period_m": 1.0}, (), 0.001, 9.0),
     ]
-    scored = validate_effects(there, found, named, ~held_out_blocks(found.at, Cells.over(found.at).side_m), 0.0004)
+    scored = validate_effects(
+        there, found, named, ~in_validation_blocks(found.wall_xy, WallCells.over(found.wall_xy).side_m), 0.0004
+    )
     assert [item.name for item in scored.weak] == weak
     assert all("within its uncertainty of zero" in describe_weakness(item) for item in scored.weak)
     assert not scored.failed
@@ -81,17 +83,17 @@ def test_noise_differs_between_neighbours_and_an_error_of_the_reference_does_not
     cell of the search, it is not.
     """
     write_scan(tmp_path, 3, step_rad=0.005)
-    _, residuals, _ = settled(read_measurement(tmp_path))
-    part = residuals.part(residuals.smooth)
+    _, residuals, _ = align(read_measurement(tmp_path))
+    part = residuals.part(residuals.usable)
     rng = np.random.default_rng(4)
     if length_m:
         field = smooth_noise((140, 140), length_m, rng)
-        column, row = (np.rint((x - x.min()) / 0.35).astype(int) for x in part.at.T)
+        column, row = (np.rint((x - x.min()) / 0.35).astype(int) for x in part.wall_xy.T)
         extra = field[column, row]
     else:
         extra = rng.standard_normal(len(part))
-    value = registered(replace(part, value=part.value + 0.002 * extra))[0]
-    spread, _, _ = fit_variance_model(part, Cells.over(part.at), value, KeyedRandom(1))
+    value = fit_pose_robustly(replace(part, value=part.value + 0.002 * extra))[0]
+    spread, _, _ = fit_variance_model(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
     assert len(spread) == count
 
 
@@ -106,8 +108,8 @@ def test_what_a_free_form_misses_of_a_drift_gets_no_name(tmp_path: Path) -> None
 def test_two_effects_that_only_make_up_for_each_other_both_fail(tmp_path: Path) -> None:
     """Without either one the other would be wrong by 20 mm; together they add 2 mm where there is no error."""
     write_scan(tmp_path, 8, step_rad=0.007)
-    there, residuals, _ = settled(read_measurement(tmp_path))
-    held_out = held_out_blocks(residuals.at, Cells.over(residuals.at).side_m)
+    there, residuals, _ = align(read_measurement(tmp_path))
+    held_out = in_validation_blocks(residuals.wall_xy, WallCells.over(residuals.wall_xy).side_m)
     incidence = np.linspace(0.0, 1.4, 141)
     against = -0.022 * (1 / np.cos(incidence) - 1)
     form = {"covariate": "incidence", "along": {"low": 0.0, "high": 1.4}, "values_m": [against.tolist()]}
@@ -130,10 +132,10 @@ class _Scripted:
     def __init__(self, scores: Callable[[set[str]], dict[tuple[str, str], float]]) -> None:
         self._scores = scores
 
-    def tried(self, members: Members) -> tuple[Tried, ...]:
+    def score_families(self, members: EffectSet) -> tuple[FamilyScore, ...]:
         known = {member.name for member in members}
         found = [
-            Tried(name, bool(form), score, score, Candidate(name, np.zeros((1, 1)), lambda _: {}, (), {}, bool(form), form))
+            FamilyScore(name, bool(form), score, score, Candidate(name, np.zeros((1, 1)), lambda _: {}, (), {}, bool(form), form))
             for (name, form), score in self._scores(known).items()
             if name not in known
         ]
@@ -142,16 +144,16 @@ class _Scripted:
     def p_value(self, score: float) -> float:
         return 0.001
 
-    def score(self, members: Members) -> float:
+    def joint_score(self, members: EffectSet) -> float:
         return sum(member.score for member in members)
 
-    def kin(self, form: Tried) -> set[str]:
+    def correlated_covariates(self, form: FamilyScore) -> set[str]:
         return {form.name}
 
-    def folded(self, members: Any, form: Any) -> Any:
+    def with_harmonics(self, members: Any, form: Any) -> Any:
         return form
 
-    def may_be_the_reference(self, members: Members, form: Tried) -> bool:
+    def may_be_reference_error(self, members: EffectSet, form: FamilyScore) -> bool:
         return False
 
 
@@ -171,7 +173,7 @@ class _Cameras(_Scripted):
     def __init__(self) -> None:
         super().__init__(lambda known: {})
 
-    def tried(self, members: Members) -> tuple[Tried, ...]:
+    def score_families(self, members: EffectSet) -> tuple[FamilyScore, ...]:
         found = []
         for key, score in self._SCORES.get(
             " ".join(" ".join([one.name, *one.candidate.fixed.values()]) for one in members), {}
@@ -179,14 +181,14 @@ class _Cameras(_Scripted):
             name, *camera = key.split()
             fixed = {"camera": camera[0]} if camera else {}
             candidate = Candidate(name, np.zeros((1, 1)), lambda _: {}, (), fixed, empirical=False)
-            found.append(Tried(name, empirical=False, score=score, gain=score, candidate=candidate))
+            found.append(FamilyScore(name, empirical=False, score=score, log_likelihood_ratio=score, candidate=candidate))
         return tuple(found)
 
 
 def test_what_does_as_well_beside_the_other_camera_is_of_the_class() -> None:
     """Both sets score 102 and 101; beside the right camera's distortion alone, focal_length would score 18 less."""
-    chosen, _ = Choice(_Cameras()).select()
-    assert {each.candidate.name: each.alike for each in chosen} == {
+    chosen, _ = ForwardSelection(_Cameras()).select()
+    assert {each.candidate.name: each.indistinguishable for each in chosen} == {
         "tangential_distortion": (),
         "camera_shift": ("focal_length",),
     }
@@ -197,9 +199,9 @@ def test_a_name_says_more_than_mere_places_do(places: float, named: set[str]) ->
     """One effect explains much, a second one something beside it; a step at a place along the wall always explains as much."""
 
     def scores(known: set[str]) -> dict[tuple[str, str], float]:
-        return {("collimation", ""): 40.0, ("range_scale", ""): 28.0 if known else 18.0, ("place along 30", "wave"): places}
+        return {("collimation", ""): 40.0, ("range_scale", ""): 28.0 if known else 18.0, (f"{SPATIAL_NULL} 30", "wave"): places}
 
-    chosen, _ = Choice(_Scripted(scores)).select()
+    chosen, _ = ForwardSelection(_Scripted(scores)).select()
     assert {each.candidate.name for each in chosen} == named
 
 
@@ -211,7 +213,7 @@ def test_an_effect_beside_a_free_form_says_more_than_a_form_of_two_covariates(su
 
     def scores(known: set[str]) -> dict[tuple[str, str], float]:
         form = 70.0 if "camera_shift" in known else 60.0
-        return {("camera_shift", ""): 20.0, ("radius", "smooth"): form, ("image_x and image_y", "surface"): surface}
+        return {("camera_shift", ""): 20.0, ("radius", "spline"): form, ("image_x and image_y", "polynomial"): surface}
 
-    chosen, _ = Choice(_Scripted(scores)).select()
+    chosen, _ = ForwardSelection(_Scripted(scores)).select()
     assert {each.candidate.name for each in chosen} == named

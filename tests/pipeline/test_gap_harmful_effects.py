@@ -14,8 +14,8 @@ from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.gap_score import Gap
 from pipeline.gap.naming.named_effects import NamedEffect
 from pipeline.gap.naming.validation import Validation
-from pipeline.gap.residuals.cells import Cells, held_out_blocks
-from pipeline.gap.residuals.registration import settled
+from pipeline.gap.residuals.alignment import align
+from pipeline.gap.residuals.wall_blocks import WallCells, in_validation_blocks
 from scene.common.keyed_random import KeyedRandom
 
 
@@ -27,14 +27,14 @@ def _biased(coefficient_m: float) -> Callable[[Scan], Array]:
 def _validation(folder: Path, ranges: Callable[[Scan], Array]) -> Validation:
     """Return the input for measuring a gap, for a scan with the given ranges."""
     write_scan(folder, 8, ranges=ranges, step_rad=0.007)
-    there, residuals, _ = settled(read_measurement(folder))
-    held_out = held_out_blocks(residuals.at, Cells.over(residuals.at).side_m)
+    there, residuals, _ = align(read_measurement(folder))
+    held_out = in_validation_blocks(residuals.wall_xy, WallCells.over(residuals.wall_xy).side_m)
     return Validation(
         measurement=there,
         residuals=residuals,
-        registration_rows=np.flatnonzero(residuals.smooth & ~held_out),
-        tested=residuals.smooth & held_out,
-        training=residuals.smooth & ~held_out,
+        registration_rows=np.flatnonzero(residuals.usable & ~held_out),
+        tested=residuals.usable & held_out,
+        training=residuals.usable & ~held_out,
         losses=None,
         reference_sigma=0.0004,
         most_sigmas=20.0,

@@ -12,8 +12,8 @@ from gap_cases import HEIGHT, STEP, WIDTH, Array, Field, smooth_noise, unit, wri
 
 from pipeline.cli.main import main
 from pipeline.config.simulation import load_config
-from pipeline.gap.survey.identifiability import Identifiability, identifiability, table
-from pipeline.gap.survey.planned import planned_survey
+from pipeline.gap.survey.identifiability import Identifiability, format_table, identifiability
+from pipeline.gap.survey.survey_views import planned_survey
 
 POSITION = np.array([WIDTH * 0.42, -34.0, 2.5])
 SIGMA = 0.003
@@ -57,7 +57,7 @@ def moved_by(azimuth: Array, zenith: Array, distance: Array, name: str) -> Array
 
 
 def test_the_table_writes_shares_with_a_space(found: Identifiability) -> None:
-    head, *rows = table(found).splitlines()
+    head, *rows = format_table(found).splitlines()
     for row, share in zip(rows, found.survival, strict=True):
         assert row[: head.index("seen from")].endswith(f" {100 * share:.1f} %  ")
 
@@ -121,4 +121,4 @@ def test_a_measurement_gives_its_own_geometry_and_refuses_overrides(tmp_path: Pa
     assert main(["gap", "--identifiability", str(tmp_path), "--out", str(tmp_path / "out")]) == 0
     assert json.loads((tmp_path / "out/identifiability.json").read_text())["surveys"][0]["points"] > 10_000
     assert main(["gap", "--identifiability", str(tmp_path), "--set", "seed=2"]) == 2
-    assert "belong to a config" in capsys.readouterr().err
+    assert "--set and another --sensor need a config" in capsys.readouterr().err

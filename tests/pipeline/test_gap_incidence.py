@@ -11,8 +11,8 @@ import yaml
 from pipeline.formats.measurements.config import MeasurementConfig
 from pipeline.formats.measurements.measurement import TlsMeasurement, read_measurement
 from pipeline.gap.naming.workflow import diagnose
-from pipeline.gap.residuals.rays import RayGeometry
-from pipeline.gap.residuals.scan_simulation import simulated_ranges
+from pipeline.gap.residuals.ray_hits import RayGeometry
+from pipeline.gap.residuals.scan_simulation import predict_ranges
 from pipeline.gap.residuals.tls_residuals import tls_residuals
 from pipeline.measurement.build import Request, build
 from scene.common.config import parse
@@ -73,7 +73,7 @@ def test_the_simulation_takes_the_same_incidence(level: TlsMeasurement) -> None:
     biased = level.changed(model=level.model.model_copy(update={"effects": (effect,)}))
     geometry = tls_residuals(biased).geometry
     expected = 0.01 * (1 / geometry.cos_incidence - 1)
-    np.testing.assert_allclose(simulated_ranges(biased, geometry) - geometry.range_m, expected, atol=2e-7)
+    np.testing.assert_allclose(predict_ranges(biased, geometry) - geometry.range_m, expected, atol=2e-7)
 
 
 def test_a_bias_of_the_incidence_is_named_on_half_of_a_scan(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.mean.design import Design
-from pipeline.gap.mean.mean_model import MeanModel, fitted
+from pipeline.gap.mean.mean_model import MeanModel, fit_reml
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.naming import nonlinear_refit
 from pipeline.gap.naming.candidate_families import candidate_families
@@ -34,9 +34,9 @@ from pipeline.gap.naming.nonlinear_refit import (
 from pipeline.gap.naming.validation_scores import validate_effects
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm, fit_variance_model
-from pipeline.gap.residuals.cells import Cells, held_out_blocks
-from pipeline.gap.residuals.registration import registered, settled
+from pipeline.gap.residuals.alignment import align, fit_pose_robustly
 from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.wall_blocks import WallCells, in_validation_blocks
 from pipeline.gap.thresholds import Thresholds, use_thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -92,9 +92,9 @@ def turned_and_zoomed(tmp_path_factory: pytest.TempPathFactory) -> tuple[SearchI
         patched.setattr(stereo_cases, "Target", _Strong)
         make(Case(0, (9241, 310), "two", "stereo", kinds, 3_000, 3_000), folder / "case", folder / "truth.json")
     truth = {each["name"]: each["parameters"] for each in json.loads((folder / "truth.json").read_text())["effects"]}
-    there, residuals, _ = settled(read_measurement(folder / "case"))
-    part = residuals.part(residuals.smooth)
-    there, part = there.part(part.index), replace(part, index=np.arange(residuals.smooth.sum()))
+    there, residuals, _ = align(read_measurement(folder / "case"))
+    part = residuals.part(residuals.usable)
+    there, part = there.part(part.index), replace(part, index=np.arange(residuals.usable.sum()))
     return SearchInput(there, part, candidate_families(there, part), lambda _: [], 0.0, KeyedRandom(1)), truth
 
 
@@ -109,15 +109,15 @@ def test_slopes_are_the_true_ones_where_all_effects_together_fit_best(
     def both(families: list[Candidate | SineGrid], part: Residuals, value: FloatArray) -> list[float]:
         physical = [each for each in families if isinstance(each, Candidate) and not each.empirical]
         chosen = [each for each in physical if each.name in truth and each.fixed["camera"] == truth[each.name]["camera"]]
-        columns = np.concatenate([part.pose, *(each.columns for each in chosen)], axis=1) / part.sigma[:, None]
+        columns = np.concatenate([part.pose_jacobian, *(each.columns for each in chosen)], axis=1) / part.sigma[:, None]
         found = np.linalg.lstsq(columns, value / part.sigma, rcond=None)[0][6:]
         wanted = [next(v for key, v in truth[each.name].items() if key != "camera") for each in chosen]
         return [abs(one / other - 1) for one, other in zip(found, wanted, strict=True)]
 
     assert max(both(points.families, points.part, points.part.value)) > 0.3
-    fitted = fit_jointly(points, [each for each in points.families if isinstance(each, Candidate) and not each.empirical])
-    assert fitted is not None
-    there, at, explained = fitted
+    fit_reml = fit_jointly(points, [each for each in points.families if isinstance(each, Candidate) and not each.empirical])
+    assert fit_reml is not None
+    there, at, explained = fit_reml
     assert max(both(candidate_families(there, at), at, at.value + explained)) < 0.15
 
 
@@ -133,11 +133,11 @@ def test_noise_beside_effects_is_asked_for_with_these_in_the_model(
     (at,) = asked
 
     def noise_in(part: Residuals) -> list[VarianceTerm]:
-        return fit_variance_model(part, Cells.over(part.at), registered(part)[0], KeyedRandom(1), frozenset())[0]
+        return fit_variance_model(part, WallCells.over(part.wall_xy), fit_pose_robustly(part)[0], KeyedRandom(1), frozenset())[0]
 
     assert noise_in(points.part)
     assert noise_in(at) == []
-    assert nmad(registered(at)[0] / at.sigma) == pytest.approx(1.0, abs=0.1)
+    assert nmad(fit_pose_robustly(at)[0] / at.sigma) == pytest.approx(1.0, abs=0.1)
 
 
 def test_the_class_of_an_effect_taken_exactly_is_by_exact_likelihoods(
@@ -150,7 +150,7 @@ def test_the_class_of_an_effect_taken_exactly_is_by_exact_likelihoods(
     first = MeanSearch(with_fitted_variance(points.part, [], 1.0), points.families, KeyedRandom(1))
     classes = {}
     for margin in (0.0, 1e9):
-        monkeypatch.setattr(nonlinear_refit, "class_margin", lambda _, margin=margin: margin)
+        monkeypatch.setattr(nonlinear_refit, "equivalence_margin", lambda _, margin=margin: margin)
         one = _with_equivalence_class(_strongest_single_fits(points, first, first.select()[0]))
         classes[margin] = set(effect_from_estimate(one.estimate, points.part).alike)
     exactly = classes[1e9] - classes[0.0]
@@ -169,15 +169,17 @@ def test_slopes_do_not_serve_where_what_they_miss_is_as_much_as_something_gains(
     chosen = first.select()[0]
     (leading, *_) = _strongest_single_fits(points, first, chosen)
     wrong_by = abs(leading.log_likelihood - first.design.log_likelihood(points.part.value, leading.estimate.candidate))
-    monkeypatch.setattr(first, "leading", lambda: [leading.estimate.candidate])
+    monkeypatch.setattr(first, "leading_effects", lambda: [leading.estimate.candidate])
     monkeypatch.setattr(nonlinear_refit, "_single_fit", lambda *_: leading)
     monkeypatch.setattr(nonlinear_refit, "_best_variants", lambda *_: [leading])
     monkeypatch.setattr(nonlinear_refit, "_with_alternatives", lambda _points, _first, alone, _names: alone)
     by = Thresholds().model_copy(update={"mean": Thresholds().mean.model_copy(update={"linearisation_error": 2 * wrong_by})})
     with use_thresholds(by):
-        assert _strongest_single_fits(points, first, [replace(chosen[0], gain=3 * wrong_by)]) == []
+        assert _strongest_single_fits(points, first, [replace(chosen[0], log_likelihood_ratio=3 * wrong_by)]) == []
         assert _strongest_single_fits(
-            points, first, [replace(chosen[0], gain=3 * wrong_by), replace(chosen[0], gain=1.5 * wrong_by)]
+            points,
+            first,
+            [replace(chosen[0], log_likelihood_ratio=3 * wrong_by), replace(chosen[0], log_likelihood_ratio=1.5 * wrong_by)],
         )
 
 
@@ -198,15 +200,15 @@ def test_what_is_known_before_shrinks_a_coefficient_as_bayes_says() -> None:
     """
     rng = np.random.default_rng(1)
     at = rng.uniform(0, 20, (4000, 2))
-    cells = Cells.over(at)
+    cells = WallCells.over(at)
     model = MeanModel(cells, at, np.full(4000, 0.5))
     x, y = rng.standard_normal((len(cells), 1))[cells.cell], rng.standard_normal((4000, 1))
     columns, value = (model.project(each[model.rows] / 0.5) for each in (x, y))
-    white = [each for each in model.fine if each.ratio == 0.0]
+    white = [each for each in model.covariances if each.variance_ratio == 0.0]
     gram = float((x[model.rows] ** 2).sum()) / 0.25
     right = float((x[model.rows] * y[model.rows]).sum()) / 0.25
     for known in (0.0, gram, 100 * gram):
-        found = fitted(white, columns, value, np.array([[known]]))
+        found = fit_reml(white, columns, value, np.array([[known]]))
         assert found.coefficients[0] == pytest.approx(right / (gram + known), rel=1e-6)
         assert found.covariance[0, 0] == pytest.approx(1 / (gram + known), rel=1e-6)
 
@@ -216,14 +218,16 @@ def test_what_is_known_of_one_effect_holds_beside_another(tmp_path: Path) -> Non
     data determine.
     """
     write_scan(tmp_path, 8, ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1), step_rad=0.012)
-    there, residuals, _ = settled(read_measurement(tmp_path))
-    part = residuals.part(residuals.smooth)
+    there, residuals, _ = align(read_measurement(tmp_path))
+    part = residuals.part(residuals.usable)
     families = candidate_families(there, part)
     bias = next(each for each in families if isinstance(each, Candidate) and each.name == "range_incidence_bias")
     rng = np.random.default_rng(1)
     faint = 1e-7 * (bias.columns[:, :1] + rng.standard_normal((len(part), 1)))
     precision = np.concatenate([np.zeros(6), [25.0]])
-    design = Design.of(replace(part, pose=np.concatenate([part.pose, faint], axis=1)), families, KeyedRandom(1), precision)
+    design = Design.of(
+        replace(part, pose_jacobian=np.concatenate([part.pose_jacobian, faint], axis=1)), families, KeyedRandom(1), precision
+    )
     found = design.fit([bias])
     assert abs(found.coefficients[6]) < 0.01
     assert found.covariance[6, 6] == pytest.approx(0.2**2, rel=1e-3)
@@ -233,8 +237,8 @@ def test_what_is_known_of_one_effect_holds_beside_another(tmp_path: Path) -> Non
 def test_an_effect_that_is_not_there_fails_on_blocks_that_were_held_out(tmp_path: Path) -> None:
     """The ranges grow with the incidence angle; a scale error of nine parts in 10,000 is also named, but is not there."""
     write_scan(tmp_path, 8, ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1), step_rad=0.007)
-    there, residuals, _ = settled(read_measurement(tmp_path))
-    trained = ~held_out_blocks(residuals.at, Cells.over(residuals.at).side_m)
+    there, residuals, _ = align(read_measurement(tmp_path))
+    trained = ~in_validation_blocks(residuals.wall_xy, WallCells.over(residuals.wall_xy).side_m)
     true, wrong = (
         NamedEffect(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
         for name, key, value in (("range_incidence_bias", "coefficient_m", 0.01), ("range_scale", "scale_ppm", 900.0))
@@ -248,8 +252,8 @@ def test_an_effect_that_is_not_there_fails_on_blocks_that_were_held_out(tmp_path
 def test_an_effect_that_gains_no_more_than_its_standard_error_is_only_mentioned_beside_others(tmp_path: Path) -> None:
     """The ranges grow with the incidence angle; a scale error of 1 ppm, which cannot be told from zero, is also named."""
     write_scan(tmp_path, 8, ranges=lambda scan: scan.R + 0.01 * (1 / scan.cos_i - 1), step_rad=0.007)
-    there, residuals, _ = settled(read_measurement(tmp_path))
-    trained = ~held_out_blocks(residuals.at, Cells.over(residuals.at).side_m)
+    there, residuals, _ = align(read_measurement(tmp_path))
+    trained = ~in_validation_blocks(residuals.wall_xy, WallCells.over(residuals.wall_xy).side_m)
     true, slight = (
         NamedEffect(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
         for name, key, value in (("range_incidence_bias", "coefficient_m", 0.01), ("range_scale", "scale_ppm", 1.0))

@@ -14,8 +14,8 @@ from scipy.stats import norm
 from pipeline.formats.measurements.measurement import TlsMeasurement, read_measurement
 from pipeline.gap.naming.gap_score import measure_losses
 from pipeline.gap.noise_and_edges.missing_returns import LossExplanation, count_isolated_returns, explain_missing_returns
-from pipeline.gap.residuals.residuals import Missing
-from pipeline.gap.residuals.tls_residuals import missing_returns, tls_residuals
+from pipeline.gap.residuals.residuals import ExpectedPulses
+from pipeline.gap.residuals.tls_residuals import find_expected_pulses, tls_residuals
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 COUNT = 30_000
@@ -42,7 +42,7 @@ def found(chance: Array, early: int = 0, seed: int = 6) -> LossExplanation | Non
     x, y, covariates = pulses()
     lost = np.random.default_rng(seed).uniform(size=COUNT) < chance
     every = np.arange(COUNT) % 5 != 0
-    return explain_missing_returns(Missing(lost, covariates, np.stack([x, y], axis=1)), every, early, COUNT, None)
+    return explain_missing_returns(ExpectedPulses(lost, covariates, np.stack([x, y], axis=1)), every, early, COUNT, None)
 
 
 def test_a_limit_is_found_with_its_spread_of_albedo() -> None:
@@ -113,7 +113,7 @@ def test_the_score_of_losses_closes_the_gap_of_the_true_chance() -> None:
     chance = np.where(covariates["zenith"] < 1.2, 0.62, 0.02)
     lost = np.random.default_rng(8).uniform(size=COUNT) < chance
     held_out = np.arange(COUNT) % 5 == 0
-    gap = measure_losses(Missing(lost, covariates, np.stack([x, y], axis=1)), chance, held_out)
+    gap = measure_losses(ExpectedPulses(lost, covariates, np.stack([x, y], axis=1)), chance, held_out)
     assert gap is not None
     assert gap.unit == "1"
     floor = chance[held_out] * (1 - chance[held_out])
@@ -143,7 +143,7 @@ def test_a_wall_on_both_sides_of_the_azimuth_pi_is_one_wall(tmp_path: Path) -> N
     assert_allclose(after.value, before.value, atol=1e-9)
     turns = after.geometry.azimuth - before.geometry.azimuth - angle
     assert_allclose(turns, 2 * np.pi * np.rint(turns[0] / (2 * np.pi)), atol=1e-9)
-    counted = [missing_returns(each, residuals) for each, residuals in ((plain, before), (turned, after))]
+    counted = [find_expected_pulses(each, residuals) for each, residuals in ((plain, before), (turned, after))]
     assert counted[0] is not None
     assert counted[1] is not None
     assert_array_equal(counted[0].lost, counted[1].lost)

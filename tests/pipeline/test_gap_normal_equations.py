@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from test_gap_shared_noise import NOISE, SIGMA, noisy, raster
 
-from pipeline.gap.mean.candidates import Candidate, SineGrid, free_forms
+from pipeline.gap.mean.candidates import Candidate, SineGrid, nonparametric_terms
 from pipeline.gap.mean.design import Design
-from pipeline.gap.mean.mean_model import MeanFit, MeanModel, _Normal
+from pipeline.gap.mean.mean_model import MeanFit, MeanModel, _NormalEquations
 from pipeline.gap.mean.search import MeanSearch
-from pipeline.gap.residuals import cells
-from pipeline.gap.residuals.registration import pose_of
-from pipeline.gap.residuals.shared_noise import SharedNoise
+from pipeline.gap.residuals import wall_blocks
+from pipeline.gap.residuals.alignment import fit_pose
+from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise
 from scene.common.keyed_random import KeyedRandom
 
 
@@ -22,17 +22,17 @@ from scene.common.keyed_random import KeyedRandom
 def families() -> list[Candidate | SineGrid]:
     """Free forms along both axes, the linear ones of which stand for effects of the catalogue."""
     pixels = raster(48)
-    found = [form for axis, name in enumerate(("image_x", "image_y")) for form in free_forms(name, pixels[:, axis])]
+    found = [form for axis, name in enumerate(("image_x", "image_y")) for form in nonparametric_terms(name, pixels[:, axis])]
     return [replace(each, empirical=False) if isinstance(each, Candidate) and each.form == "line" else each for each in found]
 
 
 @pytest.fixture(scope="module")
 def design(families: list[Candidate | SineGrid]) -> Design:
     pixels = raster(48)
-    field = SharedNoise((NOISE,), pixels).field(len(pixels))
+    field = GridCorrelatedNoise((NOISE,), pixels).node_field(len(pixels))
     residuals = noisy(1, pixels, np.asarray(field.weights @ np.linalg.cholesky(field.covariance)))
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(cells, "_MOST_CELLS", 100)
+        patched.setattr(wall_blocks, "_MOST_CELLS", 100)
         return Design.of(residuals, families, KeyedRandom(1))
 
 
@@ -44,23 +44,23 @@ def test_every_explanation_gains_beside_others_what_a_fit_of_both_gains(design: 
     def unmoved(_: Design, candidates: list[Candidate]) -> tuple[list[Candidate], MeanFit | None]:
         return candidates, None
 
-    monkeypatch.setattr(Design, "refined", unmoved)
+    monkeypatch.setattr(Design, "fit_refined", unmoved)
     plain = design.families.plain
     effect, form, sine = plain[0], next(each for each in plain if each.form == "parabola"), design.families.sine(7)
     assert not effect.empirical
     for members in ([], [effect], [form], [sine, effect], [form, sine]):
         beside = design
         for each in members:
-            beside = beside.holding(each)
+            beside = beside.conditioned_on(each)
         base = beside.columns(members)
-        alone, fixed, searched = beside.equations.profile(base, beside.plain_columns)
+        alone, fixed, searched = beside.equations.profile_log_likelihood(base, beside.plain_columns)
         assert alone[0] == pytest.approx(beside.equations.log_likelihood(base).max(), rel=1e-9)
         others = [row for row, each in enumerate(plain) if each not in members]
-        expected = [beside.equations.log_likelihood([*base, *beside.place[plain[row]]]).max() for row in others]
+        expected = [beside.equations.log_likelihood([*base, *beside.column_numbers[plain[row]]]).max() for row in others]
         np.testing.assert_allclose(fixed[others, 0], expected, atol=1e-5)
         for number in range(30, len(searched), 50):
             one = beside.families.sine(number)
-            both = beside.holding(one)
+            both = beside.conditioned_on(one)
             assert searched[number, 0] == pytest.approx(
                 both.equations.log_likelihood(both.columns([*members, one])).max(), abs=1e-5
             )
@@ -69,12 +69,12 @@ def test_every_explanation_gains_beside_others_what_a_fit_of_both_gains(design: 
 def test_a_search_asks_for_a_set_of_effects_once(
     families: list[Candidate | SineGrid], design: Design, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cells, "_MOST_CELLS", 100)
+    monkeypatch.setattr(wall_blocks, "_MOST_CELLS", 100)
     search = MeanSearch(design.residuals, families, KeyedRandom(1))
-    first = search.tried(())
+    first = search.score_families(())
     assert search._profile(()) is search._profile(())
     assert search._profile((first[0].candidate,)) is search._profile((first[0].candidate,))
-    assert search.tried(())[0].candidate is first[0].candidate
+    assert search.score_families(())[0].candidate is first[0].candidate
 
 
 @pytest.mark.parametrize("told", [6, 4])
@@ -86,25 +86,24 @@ def test_the_pose_is_that_of_least_squares_however_many_points(design: Design, t
         part = design.residuals.part(rows)
         pose = random.standard_normal((count, 6)) * [1, 10, 1e-3, 1, 1, 1]
         pose[:, told:] = np.stack([np.zeros(count), pose[:, 0]], axis=1)[:, : 6 - told]
-        part = replace(part, pose=pose, value=pose @ np.arange(1.0, 7.0) + random.standard_normal(count))
+        part = replace(part, pose_jacobian=pose, value=pose @ np.arange(1.0, 7.0) + random.standard_normal(count))
         expected = np.linalg.lstsq(pose / SIGMA, part.value / SIGMA, rcond=None)[0]
-        np.testing.assert_allclose(pose_of(part, np.ones(count, dtype=bool)), expected, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(fit_pose(part, np.ones(count, dtype=bool)), expected, rtol=1e-9, atol=1e-12)
 
 
 def test_covariances_that_are_kept_are_those_that_were_likely(design: Design) -> None:
-    """The reference has an error with waves of 3.5 cells, so some correlation forms are dropped; the remaining ones reach the
-    same largest likelihood, with the pose alone, as all of them.
-    """
-    random, at = np.random.default_rng(2), design.residuals.at
+    """Of a reference that is wrong by waves of 3.5 cells some forms of correlation are left out; with those that stay the largest
+    likelihood with the pose alone is what it was with all of them."""
+    random, at = np.random.default_rng(2), design.residuals.wall_xy
     angle, phase = random.uniform(0, 2 * np.pi, (2, 12))
     waves = np.cos(2 * np.pi / (3.5 * design.cells.side_m) * (at @ np.stack([np.cos(angle), np.sin(angle)])) + phase)
     wrong = design.residuals.value + 0.5 * waves.sum(axis=1)
-    whole = MeanModel(design.cells, at, design.residuals.sigma, design.residuals.shared_noise)
-    rows, root = whole.rows, whole.root[:, None]
-    of_all = [whole.project(part[rows] * root) for part in (design.residuals.pose, wrong[:, None])]
-    highest = max(_Normal.of(*of_all).log_likelihood(each) for each in whole.fine)
-    model, covariances, kept = whole.narrowed([of_all[0]], of_all[1])
+    whole = MeanModel(design.cells, at, design.residuals.sigma, design.residuals.correlated_noise)
+    rows, root = whole.rows, whole.inverse_sigma[:, None]
+    of_all = [whole.project(part[rows] * root) for part in (design.residuals.pose_jacobian, wrong[:, None])]
+    highest = max(_NormalEquations.of(*of_all).log_likelihood(each) for each in whole.covariances)
+    model, covariances, kept = whole.restrict([of_all[0]], of_all[1])
     assert 0 not in kept
-    normal = _Normal.of(*(each.kept(kept) for each in of_all))
+    normal = _NormalEquations.of(*(each.in_bases(kept) for each in of_all))
     assert max(normal.log_likelihood(each) for each in covariances) == pytest.approx(highest, abs=1e-6)
-    assert max(normal.log_likelihood(each) for each in model.fine) == pytest.approx(highest, abs=1e-6)
+    assert max(normal.log_likelihood(each) for each in model.covariances) == pytest.approx(highest, abs=1e-6)

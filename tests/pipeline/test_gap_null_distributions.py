@@ -12,17 +12,17 @@ from scipy.spatial.distance import cdist
 from scipy.stats import kstest
 from threadpoolctl import threadpool_limits
 
-from pipeline.gap.mean.candidates import free_forms
+from pipeline.gap.mean.candidates import nonparametric_terms
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.noise_and_edges.grid_noise import _variogram
 from pipeline.gap.noise_and_edges.variance_model import null_p_value
-from pipeline.gap.residuals import cells
-from pipeline.gap.residuals.cells import block_numbers
+from pipeline.gap.residuals import wall_blocks
+from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise
 from pipeline.gap.residuals.nominal_pair import PixelGeometry
-from pipeline.gap.residuals.rays import RayGeometry
-from pipeline.gap.residuals.shared_noise import SharedNoise
+from pipeline.gap.residuals.ray_hits import RayGeometry
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.residuals.wall_blocks import wall_block_numbers
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.regularization_noise import RegularizationNoise
@@ -57,32 +57,31 @@ def of_the_mean(count: int, reference: float, length_m: float, added: float = 0.
         random = np.random.default_rng(seed)
         value = SIGMA * random.standard_normal(len(at)) + reference * root @ random.standard_normal(len(at))
         residuals = ranges(value + added * np.sin(2 * np.pi * at[:, 0] / 1.7), at)
-        families = [form for name, values in residuals.covariates.items() for form in free_forms(name, values)]
+        families = [form for name, values in residuals.covariates.items() for form in nonparametric_terms(name, values)]
         with threadpool_limits(1, "blas"):  # as `diagnose` has it
             search = MeanSearch(residuals, families, KeyedRandom(seed))
-            found.append(search.p_value(search.tried(())[0].score))
+            found.append(search.p_value(search.score_families(())[0].score))
     return found
 
 
 @pytest.mark.parametrize(("reference", "length_m"), [(0.0, 1.0), (0.002, 1.0)])
 def test_of_a_mean_of_ranges(monkeypatch: pytest.MonkeyPatch, reference: float, length_m: float) -> None:
-    """Cells of 0.5 m, range noise of 3 mm, reference errors (m) correlated over two cells. The second case shows the limit: it
-    passes, but 11 of its 40 p-values are below 0.05.
-    """
-    monkeypatch.setattr(cells, "_MOST_CELLS", 100)
+    """Cells of 0.5 m, ranges of 3 mm; the reference's error (m) is correlated over two cells. The second is what is reached: it
+    passes, but 11 of its 40 lie below 0.05."""
+    monkeypatch.setattr(wall_blocks, "_MOST_CELLS", 100)
     found = of_the_mean(40, reference, length_m)
     assert kstest(found, "uniform").pvalue > 0.001, sorted(found)
 
 
 def test_of_a_mean_that_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cells, "_MOST_CELLS", 100)
+    monkeypatch.setattr(wall_blocks, "_MOST_CELLS", 100)
     assert max(of_the_mean(4, 0.002, 1.0, added=0.002)) < 0.01
 
 
 def of_the_spread(count: int, excess: float) -> list[float]:
     """Return p-values of a variance that grows over the wall, of one that is constant and of one of few points."""
     at = over_the_wall()
-    block = block_numbers(at, 0.15)
+    block = wall_block_numbers(at, 0.15)
     forms = [np.ones(len(at)), at[:, 0], np.exp(-at[:, 1])]
     found = []
     for seed in range(count):
@@ -107,7 +106,7 @@ def of_nodes(count: int, sigma_px: float) -> list[float]:
     zero = np.zeros(len(pixels))
     geometry = PixelGeometry(pixels[:, 0], pixels[:, 1], *[zero] * 10)
     model = StereoModel(noise=StereoNoise(parallax_sigma_px=0.3, regularization_sigma_px=0.0))
-    field = SharedNoise((RegularizationNoise(sigma_px=1.0, step_px=32.0),), pixels).field(len(pixels))
+    field = GridCorrelatedNoise((RegularizationNoise(sigma_px=1.0, step_px=32.0),), pixels).node_field(len(pixels))
     nodes = sigma_px * np.linalg.cholesky(field.covariance)
     found = []
     for seed in range(count):

@@ -11,14 +11,22 @@ from gap_cases import write_scan
 
 from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.formats.measurements.measurement import read_measurement
-from pipeline.gap.mean.candidates import FOLDED, REPEATED, Candidate, SineGrid, free_forms, repeated, twice_a_pixel
+from pipeline.gap.mean.candidates import (
+    HARMONIC_SERIES,
+    LINE_PATTERN,
+    Candidate,
+    SineGrid,
+    half_pixel_sine,
+    line_pattern_terms,
+    nonparametric_terms,
+)
 from pipeline.gap.mean.search import MeanSearch
-from pipeline.gap.mean.signatures import _searched, mean_families
+from pipeline.gap.mean.signatures import _searched, systematic_families
 from pipeline.gap.naming.candidate_families import candidate_families
 from pipeline.gap.naming.named_effects import Estimate, effect_from_estimate
-from pipeline.gap.residuals.disparity_raster import cell_px, spacing
+from pipeline.gap.residuals.alignment import compute_residuals
+from pipeline.gap.residuals.disparity_raster import raster_cell_px, raster_spacing_px
 from pipeline.gap.residuals.nominal_pair import PixelGeometry
-from pipeline.gap.residuals.registration import residuals_of
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
@@ -46,11 +54,13 @@ def residuals(error: FloatArray) -> StereoResiduals:
 def best(found: Residuals, families: list[Candidate | SineGrid]) -> tuple[MeanSearch, Estimate]:
     """Return the form that a search chooses, with its values."""
     search = MeanSearch(
-        found, [*free_forms("image_x", PIXELS[:, 0]), *free_forms("image_y", PIXELS[:, 1]), *families], KeyedRandom(1)
+        found,
+        [*nonparametric_terms("image_x", PIXELS[:, 0]), *nonparametric_terms("image_y", PIXELS[:, 1]), *families],
+        KeyedRandom(1),
     )
     (chosen,), _ = search.select()
-    candidates, fit = search.design.refined([chosen.candidate])
-    width = len(fit.coefficients) - found.pose.shape[1]
+    candidates, fit = search.design.fit_refined([chosen.candidate])
+    width = len(fit.coefficients) - found.pose_jacobian.shape[1]
     return search, Estimate(chosen, candidates[0], fit.coefficients[-width:], fit.covariance[-width:, -width:])
 
 
@@ -70,7 +80,7 @@ def test_periods_are_searched_as_far_as_the_rows_tell_them_apart(stride: float, 
 def test_cells_are_as_fine_as_the_finer_of_columns_and_rows(across: float, down: float, side: float) -> None:
     """Larger cells would mix pixels of two rows."""
     u, v = (PIXELS / STRIDE * [across, down]).T
-    assert cell_px(u, v) == side
+    assert raster_cell_px(u, v) == side
 
 
 def square(x: FloatArray, period: float) -> FloatArray:
@@ -84,7 +94,7 @@ def test_a_square_wave_is_folded_over_its_period_in_pixels(period: float, least:
     """
     found = residuals(square(PIXELS[:, 0], period))
     _, estimate = best(found, [])
-    assert estimate.candidate.form == FOLDED
+    assert estimate.candidate.form == HARMONIC_SERIES
     assert estimate.candidate.columns.shape[1] == (10 if period == PERIOD else 22)
     entry = effect_from_estimate(estimate, found).entry
     assert entry["along"]["period"] == pytest.approx(period, rel=0.01)
@@ -106,8 +116,8 @@ def test_offsets_of_every_few_columns_are_found_with_their_number(lines: int) ->
     column = PIXELS[:, 0] / STRIDE
     error = 0.1 * np.array([0.0, 1.0, -0.6, 0.3, -0.2])[(column % lines).astype(int)]
     found = residuals(error)
-    _, estimate = best(found, [*repeated("image_x", column, STRIDE)])
-    assert estimate.candidate.form == f"{REPEATED} {lines}"
+    _, estimate = best(found, [*line_pattern_terms("image_x", column, STRIDE)])
+    assert estimate.candidate.form == f"{LINE_PATTERN} {lines}"
     entry = effect_from_estimate(estimate, found).entry
     assert entry["along"]["period"] == lines * STRIDE
     effect = DisparityEmpirical.model_validate(entry)
@@ -124,7 +134,7 @@ def test_a_matcher_that_is_off_alike_at_each_half_of_a_pixel_is_found(scale: flo
     disparity = 500 + 40 * (x + 0.3 * np.sin(5 * y) + 0.1 * np.sin(9 * x * y))
     error = 0.1 * np.sin(4 * np.pi * scale * disparity + 0.7)
     found = replace(residuals(error), covariates={"image_x": PIXELS[:, 0], "image_y": PIXELS[:, 1], "disparity": disparity})
-    _, estimate = best(found, [*free_forms("disparity", disparity), *twice_a_pixel("disparity", disparity)])
+    _, estimate = best(found, [*nonparametric_terms("disparity", disparity), *half_pixel_sine("disparity", disparity)])
     entry = effect_from_estimate(estimate, found).entry
     assert entry["covariate"] == "disparity"
     assert entry["along"]["period"] == pytest.approx(0.5 / scale, rel=1e-3)
@@ -140,10 +150,10 @@ def test_waves_along_the_columns_are_tried_as_far_as_the_raster_shows_them(tmp_p
     """
     make(Case(0, (3, 1), "none", "stereo", (), points, 6_000), tmp_path / "case", tmp_path / "truth.json")
     measurement = read_measurement(tmp_path / "case")
-    found = residuals_of(measurement)
+    found = compute_residuals(measurement)
     waves = [each for each in candidate_families(measurement, found) if isinstance(each, SineGrid) and each.name == "image_x"]
     shortest = float(found.covariates["image_x"].std()) / max(float(each.frequencies[-1]) for each in waves)
-    reach, step = float(np.ptp(found.covariates["image_x"])), spacing(found.covariates["image_x"])
+    reach, step = float(np.ptp(found.covariates["image_x"])), raster_spacing_px(found.covariates["image_x"])
     assert step is not None
     assert shortest >= 0.99 * 2 * step
     assert least <= reach / shortest < 42
@@ -156,10 +166,10 @@ def test_periods_are_tried_as_finely_as_the_lines_tell_them_apart(tmp_path: Path
     """
     write_scan(tmp_path, 3, step_rad=0.01)
     measurement = read_measurement(tmp_path)
-    found = residuals_of(measurement)
+    found = compute_residuals(measurement)
     assert isinstance(found, TlsResiduals)
     line = np.linspace(0, lines, len(found.value)).round()
-    grids = mean_families(replace(found, geometry=replace(found.geometry, line=line)), measurement)
+    grids = systematic_families(replace(found, geometry=replace(found.geometry, line=line)), measurement)
     [wobble] = [each for each in grids if isinstance(each, SineGrid) and each.name == "wobble"]
     assert float(np.diff(wobble.frequencies).max()) * lines < 1.05 * cycles
     assert wobble.frequencies[-1] == pytest.approx(1 / 4)

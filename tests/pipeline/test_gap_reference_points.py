@@ -86,22 +86,18 @@ def test_chords_across_a_ball_are_bent_back(tmp_path: Path) -> None:
 
 
 def test_residuals_spread_as_the_vertices_errors_say(residuals: TlsResiduals) -> None:
-    """Ranges and vertices both have 2.3 mm of noise: the estimate for the vertices, and what residuals have beyond it, both give
-    that.
-    """
-    smooth = residuals.smooth
+    """Ranges have 2.3 mm, and so have vertices; the model's 1 mm and the estimate of the latter from lines predict the rest."""
+    smooth = residuals.usable
     own = np.sqrt(np.median(residuals.value[smooth] ** 2) / 0.4549 - np.median(residuals.reference_variance[smooth]))
     assert abs(residuals.reference_error_m - workshop.NOISE_M) < 0.00025
     assert abs(own - workshop.NOISE_M) < 0.00025
 
 
 def test_draws_of_the_vertices_errors_have_the_stated_variances(residuals: TlsResiduals) -> None:
-    """200 draws: the variances of single points agree within 5 % on average, those of the mean within 4 standard errors of
-    10 %.
-    """
-    draws = np.stack([residuals.drawn_reference(KeyedRandom(3, ("test",)).child(number)) for number in range(200)])
+    """200 draws: variances of single points within 5 % on average, of the mean of all within 4 standard errors (10 % each)."""
+    draws = np.stack([residuals.draw_reference_error(KeyedRandom(3, ("test",)).child(number)) for number in range(200)])
     assert np.mean(draws.var(axis=0)) == pytest.approx(np.mean(residuals.reference_variance), rel=0.05)
-    shared = residuals.averaged.sigma**2 - residuals.sigma**2 + residuals.reference_variance
+    shared = residuals.with_sigma_of_means.sigma**2 - residuals.sigma**2 + residuals.reference_variance
     assert draws.mean(axis=1).var() * len(residuals) == pytest.approx(np.mean(shared), rel=0.4)
 
 
@@ -118,7 +114,7 @@ def test_slopes_do_not_share_the_noise_of_the_ranges(tmp_path: Path) -> None:
     assert isinstance(measurement, TlsMeasurement)
 
     def sigmas(found: TlsResiduals) -> float:
-        part = found.part(found.smooth & (np.abs(found.value) < 0.02))
+        part = found.part(found.usable & (np.abs(found.value) < 0.02))
         return float(abs(np.corrcoef(part.value, part.geometry.by_azimuth)[0, 1]) * np.sqrt(len(part)))
 
     assert sigmas(tls_residuals(measurement)) < 3
@@ -129,8 +125,8 @@ def test_edges_between_points_have_no_say(residuals: TlsResiduals) -> None:
     """Most points with large residuals lie where the reference itself scatters about planes."""
     far = np.abs(residuals.value) > 5 * 1.4826 * np.median(np.abs(residuals.value))
     assert far.mean() > 0.01
-    assert far[residuals.smooth].mean() < 0.05 * far.mean()
-    assert residuals.smooth.mean() > 0.7
+    assert far[residuals.usable].mean() < 0.05 * far.mean()
+    assert residuals.usable.mean() > 0.7
 
 
 def test_too_small_a_noise_is_named_and_then_nothing_is_missing(folder: Path, tmp_path: Path) -> None:
@@ -174,5 +170,5 @@ def test_errors_of_vertices_are_of_laser_scans() -> None:
 
 def test_nothing_is_added_to_exact_references(residuals: TlsResiduals) -> None:
     exact = replace(residuals, reference_error_m=0.0)
-    assert exact.averaged is exact
-    assert not exact.drawn_reference(KeyedRandom(1, ("test",))).any()
+    assert exact.with_sigma_of_means is exact
+    assert not exact.draw_reference_error(KeyedRandom(1, ("test",))).any()

@@ -27,7 +27,7 @@ from pipeline.gap.report.covariate_ranking import rank_disagreements
 from pipeline.gap.report.figures import gap_figure, maps_figure
 from pipeline.gap.report.quantities import format_with_std
 from pipeline.gap.residuals.nominal_pair import PixelGeometry
-from pipeline.gap.residuals.residuals import Missing
+from pipeline.gap.residuals.residuals import ExpectedPulses
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.thresholds import read_thresholds
 from sensors.models.sensor_model import StereoModel
@@ -250,8 +250,8 @@ def test_losses_behind_shrubs_are_told_from_losses_by_a_covariate(few: tuple[Gap
         lost = random.uniform(0, 1, len(at)) < 0.01 + 0.2 * (half & (at[:, 0] > 20))
         for centre in random.uniform(0, 1, (6, 2)) * (40, 20):
             lost |= np.hypot(*(at - centre).T) < 0.8
-        missing = Missing(lost, {"azimuth": at[:, 0]}, at)
-        rows = rank_disagreements(replace(few_found, residuals=replace(few_found.residuals, missing=missing)))
+        missing = ExpectedPulses(lost, {"azimuth": at[:, 0]}, at)
+        rows = rank_disagreements(replace(few_found, residuals=replace(few_found.residuals, expected_pulses=missing)))
         least[half] += [row["p_value"] for row in rows if row["statistic"] == "missing"] or [1.0]
     assert sum(p < 0.01 for p in least[False]) <= 3
     assert all(p < 0.01 for p in least[True])

@@ -17,12 +17,12 @@ from pipeline.formats.points.e57 import E57Scan, write_e57
 from pipeline.formats.points.points import read_points
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.report.report import to_dict
-from pipeline.gap.residuals.registration import registered, residuals_of
-from pipeline.gap.residuals.several_scans import simulate_departures
-from pipeline.gap.residuals.sight import Sight
-from pipeline.gap.residuals.tls_residuals import TlsResiduals, with_order
+from pipeline.gap.residuals.alignment import compute_residuals, fit_pose_robustly
+from pipeline.gap.residuals.sensor_view import SensorView
+from pipeline.gap.residuals.several_scans import simulate_range_errors
+from pipeline.gap.residuals.tls_residuals import TlsResiduals, with_scan_order
 from pipeline.gap.survey.identifiability import identifiability
-from pipeline.gap.survey.planned import TlsSurvey, measured_survey
+from pipeline.gap.survey.survey_views import TlsSurvey, measured_survey
 from pipeline.measurement.build import Request, build
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
@@ -51,47 +51,47 @@ def rows_of(found: TlsResiduals, measurement: TlsMeasurement, number: int) -> An
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> TlsMeasurement:
     """Scans from two positions, without an effect."""
-    return with_order(of(tmp_path_factory.mktemp("scans") / "pair", (HERE, 1), (NEAR, 1), step_rad=0.02))
+    return with_scan_order(of(tmp_path_factory.mktemp("scans") / "pair", (HERE, 1), (NEAR, 1), step_rad=0.02))
 
 
 @pytest.fixture(scope="module")
 def residuals(pair: TlsMeasurement) -> TlsResiduals:
-    found = residuals_of(pair)
+    found = compute_residuals(pair)
     assert isinstance(found, TlsResiduals)
     return found
 
 
 def test_each_scan_has_the_residuals_that_it_has_alone(pair: TlsMeasurement, residuals: TlsResiduals) -> None:
     for number, (_, rows, one) in enumerate(pair.each_scan()):
-        alone = residuals_of(one)
+        alone = compute_residuals(one)
         here = residuals.part(rows_of(residuals, pair, number))
         assert_allclose(here.value, alone.value)
         assert (here.index == rows[alone.index]).all()
-        assert_allclose(here.pose[:, 6 * number : 6 * number + 6], alone.pose)
-        assert not here.pose[:, 6 - 6 * number : 12 - 6 * number].any()
+        assert_allclose(here.pose_jacobian[:, 6 * number : 6 * number + 6], alone.pose_jacobian)
+        assert not here.pose_jacobian[:, 6 - 6 * number : 12 - 6 * number].any()
 
 
 def test_every_set_up_is_registered_for_itself(pair: TlsMeasurement, residuals: TlsResiduals) -> None:
     """After each scan is moved by its own pose, the residuals are as linearised, to second order."""
     pose = np.array([0.004, -0.003, 0.002, 1e-5, 2e-5, -3e-5, -0.002, 0.001, 0.003, -2e-5, 1e-5, 4e-5])
-    moved = residuals_of(pair.moved(pose))
-    common = np.isin(residuals.index, moved.index) & residuals.smooth
-    change = moved.of_points(moved.value, residuals.index)[common] - residuals.value[common]
-    assert_allclose(np.quantile(np.abs(change + residuals.pose[common] @ pose), 0.95), 0, atol=3e-4)
-    assert len(registered(residuals)[1]) == 12
+    moved = compute_residuals(pair.moved(pose))
+    common = np.isin(residuals.index, moved.index) & residuals.usable
+    change = moved.values_at(moved.value, residuals.index)[common] - residuals.value[common]
+    assert_allclose(np.quantile(np.abs(change + residuals.pose_jacobian[common] @ pose), 0.95), 0, atol=3e-4)
+    assert len(fit_pose_robustly(residuals)[1]) == 12
 
 
 def test_simulation_stands_where_each_scan_did(pair: TlsMeasurement, residuals: TlsResiduals) -> None:
     quiet = TlsModel(noise={"range_sigma_m": 0.0, "angle_sigma_rad": 0.0})
-    found = simulate_departures(pair, quiet, residuals, KeyedRandom(1))
-    assert_allclose(found[residuals.smooth], 0, atol=1e-5)
+    found = simulate_range_errors(pair, quiet, residuals, KeyedRandom(1))
+    assert_allclose(found[residuals.usable], 0, atol=1e-5)
 
 
 def test_scans_lie_apart_as_the_scanner_sees_them(pair: TlsMeasurement, residuals: TlsResiduals) -> None:
-    sight = Sight.of(pair, residuals)
-    first, second = (sight.plane[rows_of(residuals, pair, number), 0] for number in (0, 1))
+    sight = SensorView.of(pair, residuals)
+    first, second = (sight.coordinates[rows_of(residuals, pair, number), 0] for number in (0, 1))
     assert first.max() < second.min()
-    assert_allclose(sight.points_at(np.arange(len(residuals)), sight.reference_m)[:, :2], residuals.at, atol=0.05)
+    assert_allclose(sight.points_at(np.arange(len(residuals)), sight.reference_m)[:, :2], residuals.wall_xy, atol=0.05)
 
 
 def test_the_second_face_counts_angles_on(tmp_path: Path) -> None:
@@ -99,14 +99,14 @@ def test_the_second_face_counts_angles_on(tmp_path: Path) -> None:
     pose do not.
     """
     both = of(tmp_path / "faces", (HERE, 1), (HERE, 2), step_rad=0.02)
-    found = residuals_of(both)
+    found = compute_residuals(both)
     assert isinstance(found, TlsResiduals)
-    assert found.pose.shape[1] == 6
+    assert found.pose_jacobian.shape[1] == 6
     first, second = (found.part(rows_of(found, both, number)) for number in (0, 1))
     assert first.geometry.zenith.max() < np.pi < second.geometry.zenith.min()
     assert_allclose(np.median(second.geometry.azimuth) - np.median(first.geometry.azimuth), np.pi, atol=0.02)
     assert_allclose(np.median(second.geometry.by_zenith), -np.median(first.geometry.by_zenith), rtol=0.05)
-    assert_allclose(np.median(second.pose, axis=0), np.median(first.pose, axis=0), rtol=0.1, atol=0.05)
+    assert_allclose(np.median(second.pose_jacobian, axis=0), np.median(first.pose_jacobian, axis=0), rtol=0.1, atol=0.05)
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from gap_cases import write_scan
 
 from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.formats.measurements.measurement import StereoMeasurement, read_measurement
-from pipeline.gap.mean.candidates import PLACE
+from pipeline.gap.mean.candidates import SPATIAL_NULL
 from pipeline.gap.naming import workflow
 from pipeline.gap.naming.effect_selection import NONPARAMETRIC_TERMS, _note_most_similar
 from pipeline.gap.naming.gap_score import simulate_errors
@@ -25,9 +25,9 @@ from pipeline.gap.naming.selection_passes import PassInput, PassInputs, Selectio
 from pipeline.gap.naming.validation_scores import ValidatedEffects
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
+from pipeline.gap.residuals.alignment import align, compute_residuals
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.nominal_pair import NominalPair
-from pipeline.gap.residuals.registration import residuals_of, settled
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
 from scene.common.keyed_random import KeyedRandom
 from sensors.effects.edge_fattening import EdgeFattening
@@ -42,10 +42,10 @@ def test_an_effect_that_turns_all_rays_off_the_wall_leaves_no_residuals(tmp_path
     measurement = read_measurement(tmp_path / "case")
     assert isinstance(measurement, StereoMeasurement)
     away = [{"name": "principal_point_x", "camera": "left", "delta_px": 1e4}, {"name": "smoothing", "sigma_px": 2.0}]
-    found = settled(measurement.changed(model=with_effects(measurement.model, away)))
+    found = align(measurement.changed(model=with_effects(measurement.model, away)))
     assert len(found.residuals) == 0
     assert not found.pose.any()
-    assert len(at_points_of(found.residuals, residuals_of(measurement))) == 0
+    assert len(at_points_of(found.residuals, compute_residuals(measurement))) == 0
 
 
 def test_noise_found_on_some_points_adds_alike_to_all() -> None:
@@ -68,7 +68,7 @@ def test_where_a_free_form_fails_all_is_named_again_without_any(
     without: list[NamedEffect], kept: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_scan(tmp_path, 10, step_rad=0.007)
-    there, plain, _ = settled(read_measurement(tmp_path))
+    there, plain, _ = align(read_measurement(tmp_path))
     nowhere = np.zeros(len(there.cloud.points), dtype=bool)
     pass_input = PassInput.of(there, plain, nowhere, [])
     seen: list[bool] = []
@@ -100,14 +100,14 @@ def test_a_simulation_without_noise_departs_nowhere_from_the_surface(tmp_path: P
     surface does between them must not count as an error of the sensor.
     """
     make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
-    there, residuals, _ = settled(read_measurement(tmp_path / "case"))
+    there, residuals, _ = align(read_measurement(tmp_path / "case"))
     assert isinstance(there, StereoMeasurement)
     noise = StereoNoise(parallax_sigma_px=1e-6, regularization_sigma_px=0.0)
     (seen,) = simulate_errors(there, there.model.model_copy(update={"noise": noise}), residuals, [KeyedRandom(1)])
     nominal, u, v = NominalPair.of(there), there.cloud.extra["pixel_x"], there.cloud.extra["pixel_y"]
-    between = nominal.of_surface(there.scene, u + 0.5, v + 0.5) - nominal.of_surface(there.scene, u, v)
-    assert np.nanstd(between[residuals.index[residuals.smooth]]) > 0.01, "px of disparity on smooth surface"
-    known = residuals.smooth & np.isfinite(seen)
+    between = nominal.surface_disparity(there.scene, u + 0.5, v + 0.5) - nominal.surface_disparity(there.scene, u, v)
+    assert np.nanstd(between[residuals.index[residuals.usable]]) > 0.01, "px of disparity on smooth surface"
+    known = residuals.usable & np.isfinite(seen)
     assert known.sum() > 5000
     np.testing.assert_allclose(seen[known], 0, atol=2e-4)
 
@@ -116,7 +116,7 @@ def test_outlines_grow_among_the_measurement_s_own_pixels_when_it_is_simulated(t
     """On a depth map with finer cells the same radius would have another reach and start at other steps."""
     make(Case(0, (4, 1), "one", "stereo", ("edge_fattening",), 6_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     read = read_measurement(tmp_path / "case")
-    plain = residuals_of(read)
+    plain = compute_residuals(read)
     raster = DisparityRaster.of(read, plain.geometry)
     assert raster is not None
     assert raster.step not in REDUCTION.values()
@@ -124,7 +124,7 @@ def test_outlines_grow_among_the_measurement_s_own_pixels_when_it_is_simulated(t
     model = with_effects(read.model, [grown])
     quiet = StereoNoise(parallax_sigma_px=1e-6, regularization_sigma_px=0.0)
     (seen,) = simulate_errors(read, model.model_copy(update={"noise": quiet}), plain, [KeyedRandom(1)])
-    expected = raster.moved([EdgeFattening(radius_px=2.5 * raster.step)], plain.geometry.disparity)
+    expected = raster.added_by([EdgeFattening(radius_px=2.5 * raster.step)], plain.geometry.disparity)
     known = np.isfinite(seen)
     assert np.count_nonzero(expected[known]) > 50
     assert np.mean(np.abs(seen - expected)[known] < 1e-3) > 0.99
@@ -219,14 +219,16 @@ def test_an_unknown_without_a_name_says_what_remains_is_most_like() -> None:
     def item(name: str, score: float, form: str) -> Any:
         return SimpleNamespace(name=name, score=score, empirical=bool(form), candidate=SimpleNamespace(form=form))
 
-    tried = (item(f"{PLACE} 30", 9.0, "step"), item("azimuth", 8.0, "smooth"), item("row_jitter", 3.0, ""))
+    tried = (item(f"{SPATIAL_NULL} 30", 9.0, "step"), item("azimuth", 8.0, "spline"), item("row_jitter", 3.0, ""))
     part: Any = SimpleNamespace(unit_m=np.full(3, 0.1))
     for p_value, estimates, expected in ((0.004, [], 1), (0.02, [], 0), (None, [], 0), (0.004, ["effect"], 0)):
-        search = SimpleNamespace(p_of_rest=lambda _, p_value=p_value: p_value, size=lambda each: 0.01 * each.score)
+        search = SimpleNamespace(
+            goodness_of_fit_p_value=lambda _, p_value=p_value: p_value, fitted_std=lambda each: 0.01 * each.score
+        )
         found: Any = SimpleNamespace(search=search, tried=tried, estimates=estimates)
         said = _note_most_similar(found, part)
         assert len(said) == expected
-        assert all("a change with azimuth (smooth), 8 mm" in words for words in said)
+        assert all("a change with azimuth (spline), 8 mm" in words for words in said)
 
 
 def test_what_shapes_do_is_found_once_for_a_search(tmp_path: Path) -> None:
@@ -236,14 +238,14 @@ def test_what_shapes_do_is_found_once_for_a_search(tmp_path: Path) -> None:
     make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     read = read_measurement(tmp_path / "case")
     there = read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 40.0}]))
-    plain, nowhere = residuals_of(there), np.zeros(len(there.cloud.points), dtype=bool)
+    plain, nowhere = compute_residuals(there), np.zeros(len(there.cloud.points), dtype=bool)
     pass_input = PassInput.of(there, plain, nowhere, [])
     part, residuals = pass_input.training_part
-    found = residuals_of(part).value
+    found = compute_residuals(part).value
     assert len(found) > 1000
     np.testing.assert_allclose(found, residuals.value, atol=1e-6)
     assert isinstance(part, StereoMeasurement)
     assert part.shaped_px is not None
     assert np.std(part.shaped_px) > 0.01, "px that the low-pass does"
-    moved = residuals_of(part.changed(shaped_px=part.shaped_px + 1))
+    moved = compute_residuals(part.changed(shaped_px=part.shaped_px + 1))
     np.testing.assert_allclose(moved.value, found - 1)

@@ -27,12 +27,12 @@ from pipeline.gap.noise_and_edges.edge_effects import WallBlocks
 from pipeline.gap.noise_and_edges.grid_noise import find_grid_noise, separate_white_and_grid_noise
 from pipeline.gap.noise_and_edges.variance_model import fit_variance_model
 from pipeline.gap.residuals import disparity_raster, stereo_residuals
-from pipeline.gap.residuals.cells import Cells
-from pipeline.gap.residuals.disparity_raster import DisparityRaster, spacing
+from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
+from pipeline.gap.residuals.disparity_raster import DisparityRaster, raster_spacing_px
 from pipeline.gap.residuals.nominal_pair import NominalPair, project
-from pipeline.gap.residuals.registration import registered, residuals_of, settled
 from pipeline.gap.residuals.residuals import Residuals
-from pipeline.gap.residuals.scan_simulation import mean_model, simulate_modes, simulate_ranges
+from pipeline.gap.residuals.scan_simulation import simulate_ranges, simulate_ranges_by_mode, systematic_part
+from pipeline.gap.residuals.wall_blocks import WallCells
 from scene.common.keyed_random import KeyedRandom
 from sensors.effects.beam_divergence import BeamDivergence
 from sensors.effects.edge_fattening import EdgeFattening
@@ -48,7 +48,7 @@ def made(tmp_path: Path, sensor: str, kinds: tuple[str, ...], seed: int) -> Made
     stratum = "one" if kinds else "none"
     make(Case(0, (seed, 1), stratum, sensor, kinds, 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     effects = json.loads((tmp_path / "truth.json").read_text())["effects"]
-    there, residuals, _ = settled(read_measurement(tmp_path / "case"))
+    there, residuals, _ = align(read_measurement(tmp_path / "case"))
     return there, residuals, effects[0]["parameters"] if effects else {}
 
 
@@ -57,7 +57,9 @@ def shapes_of(case: Made) -> dict[str, Any]:
     there, residuals, _ = case
     return {
         each.name: each
-        for each in find_disparity_edge_effects(there, residuals, registered(residuals)[0], np.zeros(len(residuals), dtype=bool))
+        for each in find_disparity_edge_effects(
+            there, residuals, fit_pose_robustly(residuals)[0], np.zeros(len(residuals), dtype=bool)
+        )
     }
 
 
@@ -82,7 +84,7 @@ def test_outlines_that_grow_at_high_steps_alone_are_found(tmp_path: Path, monkey
     there, residuals, truth = case = made(tmp_path, "stereo", ("edge_fattening",), 4)
     raster = DisparityRaster.of(there, residuals.geometry)
     assert raster is not None
-    assert raster.jump_px < 2
+    assert raster.depth_step_px < 2
     found = shapes_of(case)["edge_fattening"]
     assert isinstance(found.effect, EdgeFattening)
     assert 2 < found.effect.step_px < 8
@@ -97,15 +99,15 @@ def test_a_low_pass_takes_the_relief_off_what_a_move_changes(tmp_path: Path) -> 
     make(Case(0, (5, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     read = read_measurement(tmp_path / "case")
     there = read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 40.0}]))
-    plain, found = residuals_of(read), residuals_of(there)
+    plain, found = compute_residuals(read), compute_residuals(there)
     step = np.array([2e-3, 0, 1e-3, 0, 2e-5, 0])
-    moved = residuals_of(there.moved(step))
-    inner = ~DisparityRaster.of(read, plain.geometry).beside_border(60.0)[np.searchsorted(plain.index, found.index)]
-    both, ours, theirs = np.intersect1d(found.index[found.smooth & inner], moved.index, return_indices=True)
-    rows = np.flatnonzero(found.smooth & inner)[ours]
+    moved = compute_residuals(there.moved(step))
+    inner = ~DisparityRaster.of(read, plain.geometry).near_border(60.0)[np.searchsorted(plain.index, found.index)]
+    both, ours, theirs = np.intersect1d(found.index[found.usable & inner], moved.index, return_indices=True)
+    rows = np.flatnonzero(found.usable & inner)[ours]
     assert len(both) > 3000
     change = found.value[rows] - moved.value[theirs]
-    low_passed, raw = (float(np.std(change - each.pose[rows] @ step)) for each in (found, plain))
+    low_passed, raw = (float(np.std(change - each.pose_jacobian[rows] @ step)) for each in (found, plain))
     assert low_passed < 0.1 * np.std(change)
     assert low_passed < 0.3 * raw
 
@@ -115,10 +117,10 @@ def test_a_cut_cloud_has_the_low_pass_of_the_whole_picture(tmp_path: Path) -> No
     make(Case(0, (5, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
     read = read_measurement(tmp_path / "case")
     there = read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 30.0}]))
-    whole = residuals_of(there)
+    whole = compute_residuals(there)
     u = whole.geometry.u
     kept = whole.index[(u > np.quantile(u, 0.3)) & (u < np.quantile(u, 0.7))]
-    part = residuals_of(there.part(kept))
+    part = compute_residuals(there.part(kept))
     both, ours, theirs = np.intersect1d(kept[part.index], whole.index, return_indices=True)
     assert len(both) > 4000
     np.testing.assert_allclose(part.geometry.shaped[ours], whole.geometry.shaped[theirs], atol=1e-3)
@@ -128,7 +130,7 @@ def test_a_cut_cloud_has_the_low_pass_of_the_whole_picture(tmp_path: Path) -> No
 def test_nothing_is_matched_outside_of_the_right_picture(tmp_path: Path) -> None:
     make(Case(0, (5, 1), "none", "stereo", (), 8_000, 8_000), tmp_path / "case", tmp_path / "truth.json")
     there = read_measurement(tmp_path / "case")
-    geometry = residuals_of(there).geometry
+    geometry = compute_residuals(there).geometry
     right = there.cameras.right
     column = right.width // 2
     narrow = there.changed(cameras=replace(there.cameras, right=replace(right, width=column, cx_px=right.cx_px + column / 2)))
@@ -147,7 +149,7 @@ def test_a_low_pass_sees_over_a_straight_border_from_so_many_sigmas(sigma_px: fl
     """More than a hundredth of a Gaussian lies beyond 2.326 standard deviations; cell centres are half a cell inside."""
     row, column = (np.ravel(each) for each in np.indices((120, 120)))
     raster = DisparityRaster(1.0, np.full((120, 120), 30.0), np.zeros((120, 120), dtype=bool), row, column)
-    away, found = np.minimum(column, 119 - column) + 0.5, raster.beside_border(sigma_px)
+    away, found = np.minimum(column, 119 - column) + 0.5, raster.near_border(sigma_px)
     middle = np.abs(row - 59.5) < 20
     np.testing.assert_array_equal(found[middle], away[middle] < 2.326 * sigma_px)
 
@@ -157,7 +159,7 @@ def test_a_raster_too_large_for_shapes_is_told(tmp_path: Path, monkeypatch: pyte
     there, residuals, _ = made(tmp_path, "stereo", (), 1)
     assert any("more than 1,000 cells" in note for note in residuals.notes)
     monkeypatch.undo()
-    assert not any("cells" in note for note in residuals_of(there).notes)
+    assert not any("cells" in note for note in compute_residuals(there).notes)
 
 
 def banded(monkeypatch: pytest.MonkeyPatch, cells: int, rows: int) -> None:
@@ -176,15 +178,15 @@ def test_bands_of_a_large_raster_hold_what_the_whole_does(shape: tuple[int, int]
     disparity[hidden] = np.nan
     points = np.flatnonzero(random.random(shape).ravel() < 0.5)
     raster = DisparityRaster(1.0, disparity, hidden, row.ravel()[points], column.ravel()[points])
-    part, rows = raster.searched()
+    part, rows = raster.search_part()
     assert len(np.unique(rows)) == len(rows)
     assert len(rows) < len(points) or shape[0] < 80
     assert len(np.unique(part.row)) == len(np.unique(raster.row[rows]))
     np.testing.assert_array_equal(part.at_points(part.disparity), raster.at_points(raster.disparity)[rows])
-    np.testing.assert_array_equal(part.filled([]), raster.filled([])[rows])
+    np.testing.assert_array_equal(part.in_filled_occlusions([]), raster.in_filled_occlusions([])[rows])
     believed = raster.at_points(raster.disparity)
     for effect in (EdgeFattening(radius_px=6.5), Smoothing(sigma_px=8.0), OcclusionFill(reach_px=30.0)):
-        np.testing.assert_allclose(part.moved([effect], believed[rows]), raster.moved([effect], believed)[rows], atol=1e-9)
+        np.testing.assert_allclose(part.added_by([effect], believed[rows]), raster.added_by([effect], believed)[rows], atol=1e-9)
 
 
 def test_filled_gaps_show_as_copies_of_their_neighbours() -> None:
@@ -200,7 +202,9 @@ def test_filled_gaps_show_as_copies_of_their_neighbours() -> None:
     known = ~((row == 30) & (column == 41))
     there = DisparityRaster(1.0, np.zeros(cells.shape), np.zeros(cells.shape, dtype=bool), row[known], column[known])
     copies = np.zeros(cells.shape, dtype=bool)
-    copies[row[known], column[known]] = there.copies(cells.ravel()[known] + 1e-4 * random.uniform(size=int(known.sum())), 3e-4)
+    copies[row[known], column[known]] = there.copied_from_neighbour(
+        cells.ravel()[known] + 1e-4 * random.uniform(size=int(known.sum())), 3e-4
+    )
     assert copies[5, 9:14].all()
     assert not copies[20:23, 30].any()
     assert not copies[30, [40, 42]].any()
@@ -230,7 +234,7 @@ def test_shapes_are_found_in_bands_of_a_large_raster(
     there, residuals, _ = case
     raster = DisparityRaster.of(there, residuals.geometry)
     assert raster is not None
-    assert len(raster.searched()[1]) < 0.6 * len(residuals)
+    assert len(raster.search_part()[1]) < 0.6 * len(residuals)
     found = shapes_of(case)[kind]
     (name,) = whole.std
     least = np.hypot(found.std[name], whole.std[name])
@@ -250,13 +254,13 @@ def test_a_wall_without_effects_shows_no_shape(tmp_path: Path, seed: int) -> Non
 
 def test_points_that_are_held_out_have_no_say(tmp_path: Path) -> None:
     there, residuals, _ = made(tmp_path, "stereo", ("smoothing",), 1)
-    assert not find_disparity_edge_effects(there, residuals, registered(residuals)[0], np.ones(len(residuals), dtype=bool))
+    assert not find_disparity_edge_effects(there, residuals, fit_pose_robustly(residuals)[0], np.ones(len(residuals), dtype=bool))
 
 
 @pytest.mark.parametrize("seed", [2, 3])
 def test_a_footprint_is_found_with_divergence_and_mode(tmp_path: Path, seed: int) -> None:
     there, residuals, truth = made(tmp_path, "tls", ("beam_divergence",), seed)
-    rough, _, scale = registered(residuals)
+    rough, _, scale = fit_pose_robustly(residuals)
     (found,) = find_footprint(there, residuals, rough, scale, np.zeros(len(residuals), dtype=bool))
     assert isinstance(found.effect, BeamDivergence)
     # the generator's beam has other sub-rays: 15 %
@@ -266,12 +270,12 @@ def test_a_footprint_is_found_with_divergence_and_mode(tmp_path: Path, seed: int
 
 def test_modes_that_share_their_sub_rays_record_what_each_would_alone(tmp_path: Path) -> None:
     there, residuals, _ = made(tmp_path, "tls", ("beam_divergence",), 2)
-    random, modes, plain = KeyedRandom(0), ("strongest", "mean", "first"), mean_model(there.model)
+    random, modes, plain = KeyedRandom(0), ("strongest", "mean", "first"), systematic_part(there.model)
     beams = {
         mode: plain.model_copy(update={"effects": (*plain.effects, BeamDivergence(divergence_rad=2e-3, mode=mode))})
         for mode in modes
     }
-    together = simulate_modes(there, beams["mean"], modes, residuals.geometry, random)
+    together = simulate_ranges_by_mode(there, beams["mean"], modes, residuals.geometry, random)
     for mode in modes:
         np.testing.assert_array_equal(together[mode], simulate_ranges(there, beams[mode], residuals.geometry, random))
     assert np.nanmax(np.abs(together["first"] - together["mean"])) > 1e-3
@@ -280,7 +284,7 @@ def test_modes_that_share_their_sub_rays_record_what_each_would_alone(tmp_path: 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_thin_beam_shows_no_footprint(tmp_path: Path, seed: int) -> None:
     there, residuals, _ = made(tmp_path, "tls", (), seed)
-    rough, _, scale = registered(residuals)
+    rough, _, scale = fit_pose_robustly(residuals)
     assert not find_footprint(there, residuals, rough, scale, np.zeros(len(residuals), dtype=bool))
 
 
@@ -289,9 +293,9 @@ def test_the_noise_of_angles_is_no_footprint(tmp_path: Path) -> None:
     beam of four times that divergence does (a case of the second generator, which has no footprints).
     """
     build(schedule(78, 40)[26], 78, tmp_path / "case")
-    there, residuals, _ = settled(read_measurement(tmp_path / "case"))
+    there, residuals, _ = align(read_measurement(tmp_path / "case"))
     assert isinstance(there, TlsMeasurement)
-    rough, _, scale = registered(residuals)
+    rough, _, scale = fit_pose_robustly(residuals)
     assert not find_footprint(there, residuals, rough, scale, np.zeros(len(residuals), dtype=bool))
     unaware = there.changed(model=there.model.without_noise())
     (feigned,) = find_footprint(unaware, residuals, rough, scale, np.zeros(len(residuals), dtype=bool))
@@ -304,12 +308,12 @@ def test_the_noise_of_angles_is_no_footprint(tmp_path: Path) -> None:
 def test_white_noise_and_noise_on_a_grid_are_told_apart(tmp_path: Path, kind: str, seed: int, every: int) -> None:
     """Also where rows lie twice as far apart as columns, because every second row of a map is compared."""
     there, residuals, truth = made(tmp_path, "stereo", (kind,), seed)
-    row = residuals.geometry.plane[:, 1]
-    step = spacing(row)
+    row = residuals.geometry.sensor_coordinates[:, 1]
+    step = raster_spacing_px(row)
     assert step is not None
-    part = residuals.part(residuals.smooth & (np.rint((row - row.min()) / step) % every == 0))
-    value = registered(part)[0]
-    spread, _, _ = fit_variance_model(part, Cells.over(part.at), value, KeyedRandom(1))
+    part = residuals.part(residuals.usable & (np.rint((row - row.min()) / step) % every == 0))
+    value = fit_pose_robustly(part)[0]
+    spread, _, _ = fit_variance_model(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
     assert isinstance(there.model, StereoModel)
     (found,) = separate_white_and_grid_noise(spread, part, value, there.model)
     assert found.name == kind
@@ -323,9 +327,9 @@ def test_noise_on_a_grid_goes_before_an_empirical_term(tmp_path: Path, kind: str
     noise keeps it.
     """
     there, residuals, _ = made(tmp_path, "stereo", (kind,), seed)
-    part = residuals.part(residuals.smooth)
-    value = registered(part)[0]
-    spread, _, _ = fit_variance_model(part, Cells.over(part.at), value, KeyedRandom(1))
+    part = residuals.part(residuals.usable)
+    value = fit_pose_robustly(part)[0]
+    spread, _, _ = fit_variance_model(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
     assert isinstance(there.model, StereoModel)
     described = [replace(each, name="variance by disparity", empirical=True) for each in spread]
     (found,) = separate_white_and_grid_noise(described, part, value, there.model)
@@ -336,9 +340,9 @@ def test_noise_on_a_grid_goes_before_an_empirical_term(tmp_path: Path, kind: str
 def test_noise_on_a_coarse_grid_is_found_where_no_point_is_noisier_than_it_should_be(tmp_path: Path) -> None:
     """Nodes are 64 px apart, with 0.23 px: within a cell of the search all points have the same error."""
     there, residuals, truth = made(tmp_path, "stereo", ("regularization_noise",), 8)
-    part = residuals.part(residuals.smooth)
+    part = residuals.part(residuals.usable)
     assert isinstance(there.model, StereoModel)
-    found, _ = find_grid_noise(part, registered(part)[0], there.model, KeyedRandom(1))
+    found, _ = find_grid_noise(part, fit_pose_robustly(part)[0], there.model, KeyedRandom(1))
     assert found is not None
     assert found.parameters["step_px"] == pytest.approx(truth["step_px"], rel=0.5)
     assert found.parameters["sigma_px"] == pytest.approx(truth["sigma_px"], rel=0.2)
@@ -355,7 +359,7 @@ def test_noise_on_a_coarse_grid_counts_as_no_error_of_the_reference(tmp_path: Pa
     """
     there, residuals, _ = made(tmp_path, "stereo", (), 1)
     left = residuals.covariates["image_x"]
-    part = residuals.part(residuals.smooth & (left < np.median(left)))
+    part = residuals.part(residuals.usable & (left < np.median(left)))
     x, y = (part.covariates[name] for name in ("image_x", "image_y"))
     lines = [np.arange(place.min() - 64, place.max() + 128, 64.0) for place in (x, y)]
     nodes = 0.4 * np.random.default_rng(5).standard_normal([len(line) for line in lines])
@@ -365,7 +369,7 @@ def test_noise_on_a_coarse_grid_counts_as_no_error_of_the_reference(tmp_path: Pa
         "candidate_families",
         lambda *known: [each for each in candidate_families(*known) if isinstance(each, Candidate)][:3],
     )
-    named, naming = steps.select_effects(there, part, registered(part)[2], KeyedRandom(1))
+    named, naming = steps.select_effects(there, part, fit_pose_robustly(part)[2], KeyedRandom(1))
     assert [item.name for item in named] == ["stereo.regularization_noise"]
     assert naming.p_value is not None
     assert naming.p_value > 0.01
@@ -377,9 +381,9 @@ def test_noise_on_a_coarse_grid_counts_as_no_error_of_the_reference(tmp_path: Pa
 def test_the_reference_error_is_not_taken_for_noise_on_a_grid(tmp_path: Path, seed: int) -> None:
     """The reference's error is a few millimetres, correlated over metres."""
     there, residuals, _ = made(tmp_path, "stereo", (), seed)
-    part = residuals.part(residuals.smooth)
+    part = residuals.part(residuals.usable)
     assert isinstance(there.model, StereoModel)
-    assert find_grid_noise(part, registered(part)[0], there.model, KeyedRandom(1))[0] is None
+    assert find_grid_noise(part, fit_pose_robustly(part)[0], there.model, KeyedRandom(1))[0] is None
 
 
 @pytest.mark.parametrize(("off_m", "length_m", "found"), [(0.012, 0.8, False), (0.015, 0.3, True), (0.0, 0.3, False)])
@@ -390,13 +394,13 @@ def test_noise_that_neighbours_share_is_the_reference_s_error_only_where_that_ma
     says so.
     """
     there, residuals, _ = made(tmp_path, "stereo", (), 1)
-    part = residuals.part(residuals.smooth)
+    part = residuals.part(residuals.usable)
     random = np.random.default_rng(3)
     k = random.normal(scale=1 / length_m, size=(400, 2))  # spectrum of a Gaussian correlation exp(-h^2 / 2 l^2)
     phase = random.uniform(0, 2 * np.pi, 400)
-    field = np.sqrt(2 / 400) * np.cos(part.at @ k.T + phase).sum(axis=1)
+    field = np.sqrt(2 / 400) * np.cos(part.wall_xy @ k.T + phase).sum(axis=1)
     part = replace(part, value=part.value + off_m * field / part.unit_m)
     assert isinstance(there.model, StereoModel)
-    nodes, words = find_grid_noise(part, registered(part)[0], there.model, KeyedRandom(1))
+    nodes, words = find_grid_noise(part, fit_pose_robustly(part)[0], there.model, KeyedRandom(1))
     assert (nodes is not None) == found
     assert ("attributed to the reference" in words) == (off_m > 0 and not found)

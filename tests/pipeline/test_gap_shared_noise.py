@@ -9,17 +9,17 @@ import pytest
 from scipy.stats import kstest, multivariate_normal
 from threadpoolctl import threadpool_limits
 
-from pipeline.gap.mean.candidates import free_forms
+from pipeline.gap.mean.candidates import nonparametric_terms
 from pipeline.gap.mean.mean_model import MeanModel
 from pipeline.gap.mean.normal_equations import NoiseDraws
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.naming.validation_scores import _RegisteredResiduals
 from pipeline.gap.noise_and_edges.variance_model import NoiseRatio, standardised_deviations
-from pipeline.gap.residuals import cells
-from pipeline.gap.residuals.cells import Cells, patches
+from pipeline.gap.residuals import wall_blocks
+from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise, NodeField
 from pipeline.gap.residuals.nominal_pair import PixelGeometry
-from pipeline.gap.residuals.shared_noise import NodeField, SharedNoise
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.residuals.wall_blocks import WallCells, wall_blocks_by_points
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.regularization_noise import RegularizationNoise
@@ -46,9 +46,11 @@ def model_of(pixels: FloatArray) -> tuple[MeanModel, FloatArray]:
     """Return a mean model on cells of 16 points, and the covariance of the noise over sigma, for the model's rows."""
     number = np.unique(pixels // (4 * STRIDE) @ np.array([1, 1000]), return_inverse=True)[1]
     centre = np.stack([np.bincount(number, pixels[:, axis]) / 16 for axis in (0, 1)], axis=1)
-    model = MeanModel(Cells(4.0 * STRIDE, number, centre), pixels, np.full(len(pixels), SIGMA), SharedNoise((NOISE,), pixels))
-    shared = dense(SharedNoise((NOISE,), pixels[model.rows]).field(len(pixels))) / SIGMA**2
-    return model, model.noise.white * np.eye(len(pixels)) + shared
+    model = MeanModel(
+        WallCells(4.0 * STRIDE, number, centre), pixels, np.full(len(pixels), SIGMA), GridCorrelatedNoise((NOISE,), pixels)
+    )
+    shared = dense(GridCorrelatedNoise((NOISE,), pixels[model.rows]).node_field(len(pixels))) / SIGMA**2
+    return model, model.within_noise.white * np.eye(len(pixels)) + shared
 
 
 def test_products_within_cells_are_those_of_the_inverse_covariance() -> None:
@@ -58,12 +60,12 @@ def test_products_within_cells_are_those_of_the_inverse_covariance() -> None:
     found = model.project(columns)
     off = np.eye(len(pixels)) - _planes(model, len(pixels))
     expected = (off @ columns).T @ np.linalg.pinv(off @ covariance @ off.T, rcond=1e-9) @ (off @ columns)
-    np.testing.assert_allclose(found.within.T @ found.weighed, expected, rtol=1e-6)
+    np.testing.assert_allclose(found.within.T @ found.within_weighted, expected, rtol=1e-6)
 
 
 def _planes(model: MeanModel, count: int) -> FloatArray:
     whole = np.eye(count)
-    return whole - model.within(whole, model.planes(whole))
+    return whole - model.deviations(whole, model.plane_coefficients(whole))
 
 
 @pytest.mark.parametrize("step_px", [16.0, 48.0])
@@ -73,8 +75,10 @@ def test_noise_of_two_makers_is_that_of_both_on_one_grid_of_nodes(step_px: float
     """
     pixels = raster(32)
     makers = NOISE, RegularizationNoise(sigma_px=0.2, step_px=step_px)
-    both = SharedNoise(makers, pixels).field(len(pixels))
-    assert both.weights.shape[1] == max(SharedNoise((each,), pixels).field(len(pixels)).weights.shape[1] for each in makers)
+    both = GridCorrelatedNoise(makers, pixels).node_field(len(pixels))
+    assert both.weights.shape[1] == max(
+        GridCorrelatedNoise((each,), pixels).node_field(len(pixels)).weights.shape[1] for each in makers
+    )
     lag = (pixels[:, None] - pixels).reshape(-1, 2)
     expected = sum(each.covariance(lag) for each in makers).reshape(len(pixels), -1)
     total = sum(each.total_variance for each in makers)
@@ -88,16 +92,16 @@ def test_draws_have_the_variance_of_the_products_that_they_stand_for() -> None:
     slow = np.sin(2 * np.pi * pixels[:, :1] / 80)
     found = model.project(np.concatenate([slow, np.random.default_rng(2).standard_normal((len(pixels), 1))], axis=1)[model.rows])
     noise = NoiseDraws.of(model, 4000, len(pixels), KeyedRandom(3))
-    drawn = noise.products(found.within[noise.rows], model.noise.on_nodes(found.within))
-    np.testing.assert_allclose(drawn.var(axis=1), np.diag(found.within.T @ found.weighed), rtol=0.1)
+    drawn = noise.products(found.within[noise.rows], model.within_noise.to_nodes(found.within))
+    np.testing.assert_allclose(drawn.var(axis=1), np.diag(found.within.T @ found.within_weighted), rtol=0.1)
 
 
 def test_the_score_on_held_out_blocks_is_the_density_of_all_points_together() -> None:
     pixels = raster(20)
     count, reference = len(pixels), 0.07
-    patch = patches(pixels, 30.0)
-    shared = SharedNoise((NOISE,), pixels)
-    field = shared.field(count)
+    patch = wall_blocks_by_points(pixels, 30.0)
+    shared = GridCorrelatedNoise((NOISE,), pixels)
+    field = shared.node_field(count)
     together = (patch[:, None] == patch[None]) * reference**2 + dense(field) + (SIGMA**2 - field.variance) * np.eye(count)
     value = multivariate_normal(np.zeros(count), together).rvs(random_state=4)
     other = multivariate_normal(np.zeros(count), together).rvs(random_state=5)
@@ -119,22 +123,22 @@ def noisy(seed: int, pixels: FloatArray, cholesky: FloatArray) -> StereoResidual
     covariates = {"image_x": pixels[:, 0], "image_y": pixels[:, 1]}
     nowhere, sigma, unit = NOWHERE.part(np.zeros(len(at), dtype=int)), np.full(len(at), SIGMA), np.full(len(at), 0.1)
     found = StereoResiduals(value, sigma, unit, every, every, pose, at, covariates, np.arange(len(at)), nowhere)
-    return replace(found, shared_noise=SharedNoise((NOISE,), pixels))
+    return replace(found, correlated_noise=GridCorrelatedNoise((NOISE,), pixels))
 
 
 def p_values(seeds: int, monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Return p-values of the remainder in measurements of noise alone, with all free forms along both axes searched."""
-    monkeypatch.setattr(cells, "_MOST_CELLS", 100)
+    monkeypatch.setattr(wall_blocks, "_MOST_CELLS", 100)
     pixels = raster(60)
-    field = SharedNoise((NOISE,), pixels).field(len(pixels))
+    field = GridCorrelatedNoise((NOISE,), pixels).node_field(len(pixels))
     cholesky = field.weights @ np.linalg.cholesky(field.covariance)
     found = []
     for seed in range(seeds):
         residuals = noisy(seed, pixels, cholesky)
-        families = [form for name, values in residuals.covariates.items() for form in free_forms(name, values)]
+        families = [form for name, values in residuals.covariates.items() for form in nonparametric_terms(name, values)]
         with threadpool_limits(1, "blas"):  # as `diagnose` has it
             search = MeanSearch(residuals, families, KeyedRandom(seed))
-            found.append(search.p_value(search.tried(())[0].score))
+            found.append(search.p_value(search.score_families(())[0].score))
     return found
 
 
@@ -144,10 +148,10 @@ def test_noise_that_neighbours_share_is_not_said_to_be_too_large_since_cells_tak
     with about 150 nodes the share scatters by 6 %; 20 % are allowed.
     """
     pixels = raster(100)
-    field = SharedNoise((NOISE,), pixels).field(len(pixels))
+    field = GridCorrelatedNoise((NOISE,), pixels).node_field(len(pixels))
     residuals = noisy(seed, pixels, field.weights @ np.linalg.cholesky(field.covariance))
     residuals = replace(residuals, sigma=np.full(len(pixels), np.sqrt(WHITE**2 + field.variance)))
-    found = Cells.over(residuals.at)
+    found = WallCells.over(residuals.wall_xy)
     assert np.nanmean(standardised_deviations(residuals, found, residuals.value) ** 2) < 0.8
     assert NoiseRatio.of(residuals, found, residuals.value, KeyedRandom(1)).at_most_one == 1.0
     assert NoiseRatio.of(residuals, found, 0.7 * residuals.value, KeyedRandom(1)).at_most_one == pytest.approx(0.7, rel=0.2)

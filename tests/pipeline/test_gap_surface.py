@@ -16,10 +16,10 @@ from pipeline.cli.main import main
 from pipeline.formats.measurements.measurement import SurfaceMeasurement, read_measurement, read_model
 from pipeline.formats.meshes.ply import write_ply
 from pipeline.formats.rasters.geotiff import write_geotiff
-from pipeline.gap.mean.signatures import mean_families
+from pipeline.gap.mean.signatures import systematic_families
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
 from pipeline.gap.report.report import to_dict
-from pipeline.gap.residuals.registration import residuals_of, settled
+from pipeline.gap.residuals.alignment import align, compute_residuals
 from pipeline.measurement.request import Request
 from pipeline.measurement.surface import build_surface
 from scene.geometry.grid import Grid
@@ -133,26 +133,26 @@ def test_distances_places_and_slopes_are_those_of_the_wall(wall: Path, tmp_path:
     """The cloud has no noise and lies 5 mm above the wall, at the right place."""
     points = cloud(1, sigma=0.0, above=lambda x, z: np.full_like(x, 0.005), moved=(0.0, 0.0, 0.0), turn_rad=0.0, points=4000)
     measurement = built(wall, tmp_path, points + 1e-4 * np.random.default_rng(2).standard_normal(points.shape))
-    found = residuals_of(measurement)
+    found = compute_residuals(measurement)
     assert len(found) == 4000
     np.testing.assert_allclose(np.median(found.value), 0.005, atol=2e-5)
     world = measurement.frame.to_world(found.geometry.point)
     np.testing.assert_allclose(world[:, 1], depth(world[:, 0], world[:, 2]), atol=4e-4)
     true = measurement.frame.direction_to_wall(normals(world[:, 0], world[:, 2]))
     assert np.median(np.einsum("ni,ni->n", true, found.geometry.normal)) > 0.9999
-    assert mean_families(found, measurement) == []
+    assert systematic_families(found, measurement) == []
 
 
 @pytest.mark.parametrize("column", range(7))
 def test_the_datum_is_differentiated(column: int, coarse: Path, tmp_path: Path) -> None:
     """The derivatives by each of the seven datum parameters are compared with a cloud that is actually moved."""
     measurement = built(coarse, tmp_path, cloud(1, sigma=1e-4, moved=(0.0, 0.0, 0.0), turn_rad=0.0, points=3000))
-    before = residuals_of(measurement)
+    before = compute_residuals(measurement)
     step = np.eye(7)[column] * (2e-3 if column < 3 else 2e-4)
-    after = residuals_of(measurement.moved(step))
-    change = after.of_points(after.value, before.index) - before.value
-    np.testing.assert_allclose(change, -before.pose @ step, atol=2e-4)
-    there, _, pose = settled(measurement.moved(step))
+    after = compute_residuals(measurement.moved(step))
+    change = after.values_at(after.value, before.index) - before.value
+    np.testing.assert_allclose(change, -before.pose_jacobian @ step, atol=2e-4)
+    there, _, pose = align(measurement.moved(step))
     np.testing.assert_allclose(there.cloud.points, measurement.cloud.points, atol=1e-3)
     np.testing.assert_allclose(pose, -step, atol=5e-4)
 
@@ -168,8 +168,8 @@ def test_a_plane_tells_no_scale(tmp_path: Path) -> None:
     write_ply(tmp_path / "plane.ply", TriangleMesh(flat, faces))
     points = np.stack([rng.uniform(0.3, 7.7, 6000), 0.002 * rng.standard_normal(6000), rng.uniform(0.3, 4.7, 6000)], axis=1)
     measurement = built(tmp_path / "plane.ply", tmp_path, points)
-    found = residuals_of(measurement)
-    assert found.pose.shape[1] == 3, "a shift and two turns"
+    found = compute_residuals(measurement)
+    assert found.pose_jacobian.shape[1] == 3, "a shift and two turns"
     assert set(found.covariates) == {"along", "up", "edge_distance"}
     answer = to_dict(diagnose(measurement), measurement)
     assert answer["registration"]["scale_ppm"] == {"value": None, "std": None}
@@ -220,7 +220,7 @@ BAD = {
     "one point": "has 1 points",
     "all NaN": "no point with finite values",
     "scanner": "needs laser scans",
-    "half": "half needs scans",
+    "half": "half works only with laser scans",
     "cameras too": "whose cameras are not at hand",
     "a model in pixels": "a model whose noise is in metres",
     "cameras in the model": "the model has focal_length",

@@ -39,11 +39,13 @@ def test_a_pair_that_stands_still_casts_one_ray_a_pixel(measurement: StereoMeasu
     known = with_surroundings(measurement, plain)
     found = stereo_residuals(known)
     assert counts == [len(measurement.cloud.points)]
-    for name in ("value", "smooth", "even"):
+    for name in ("value", "usable", "on_smooth_surface"):
         np.testing.assert_array_equal(getattr(found, name), getattr(plain, name))
     np.testing.assert_array_equal(found.covariates["edge_step"], plain.covariates["edge_step"])
     some = np.arange(0, len(plain), 7)
-    np.testing.assert_array_equal(stereo_residuals(known.part(plain.index[some])).even, plain.even[some])
+    np.testing.assert_array_equal(
+        stereo_residuals(known.part(plain.index[some])).on_smooth_surface, plain.on_smooth_surface[some]
+    )
 
 
 def test_pixels_that_see_other_places_are_looked_at_again(
@@ -55,7 +57,7 @@ def test_pixels_that_see_other_places_are_looked_at_again(
     assert about is not None
     depth = float(np.nanmedian(np.linalg.norm(about.point - measurement.viewpoint, axis=1)))
     pixel_m = depth / float(measurement.cameras.left.f_px)
-    assert not expected.even.all()
+    assert not expected.on_smooth_surface.all()
     for pixels, again in ((0.3, False), (5.0, True)):
         beside = Surroundings(
             about.point + np.array([pixels * pixel_m, 0, 0]), np.zeros(len(about.point)), np.zeros_like(about.hidden)
@@ -63,5 +65,7 @@ def test_pixels_that_see_other_places_are_looked_at_again(
         counts = _casts(monkeypatch)
         found = stereo_residuals(measurement.changed(surroundings=beside))
         assert (max(counts[1:], default=0) > 0.9 * len(found)) == again
-        np.testing.assert_array_equal(found.even, expected.even if again else np.ones(len(found), dtype=bool))
+        np.testing.assert_array_equal(
+            found.on_smooth_surface, expected.on_smooth_surface if again else np.ones(len(found), dtype=bool)
+        )
         monkeypatch.undo()

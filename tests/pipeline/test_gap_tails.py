@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.gap.mean.selection import Chosen
+from pipeline.gap.mean.selection import SelectedEffect
 from pipeline.gap.naming import effect_selection
 from pipeline.gap.naming.effect_selection import keep_implausible_in_class
 from pipeline.gap.naming.named_effects import NamedEffect
@@ -81,7 +81,9 @@ def test_such_an_effect_stands_where_it_leaves_no_more_than_chance(
 ) -> None:
     """An effect that is implausibly large is kept if it leaves nothing; one that only looks similar has another signature."""
     estimate = SimpleNamespace(candidate=SimpleNamespace(empirical=empirical))
-    found: Any = SimpleNamespace(search=SimpleNamespace(p_of_rest=lambda _: p_value), tried=(), estimates=[estimate])
+    found: Any = SimpleNamespace(
+        search=SimpleNamespace(goodness_of_fit_p_value=lambda _: p_value), tried=(), estimates=[estimate]
+    )
     assert effect_selection._explains_everything(found) is all_of_it
 
 
@@ -90,7 +92,7 @@ def test_an_effect_that_is_not_believed_stays_in_the_class_of_what_looks_like_it
     named alone.
     """
     turn: Any = SimpleNamespace(name="camera_omega", empirical=False)
-    chosen = Chosen(turn, ("tangential_distortion",), 0.002, 70.0, 67.0, ())
+    chosen = SelectedEffect(turn, ("tangential_distortion",), 0.002, 70.0, 67.0, ())
     named = [
         NamedEffect(f"stereo.{name}", "physical", {"name": name}, {}, (), 0.002, 70.0)
         for name in ("smoothing", "tangential_distortion")
@@ -109,7 +111,7 @@ def test_what_is_named_in_the_place_of_an_effect_that_is_not_believed_shares_its
     not.
     """
     index: Any = SimpleNamespace(name="vertical_index", empirical=False)
-    chosen = Chosen(index, (), 0.002, 70.0, 67.0, ())
+    chosen = SelectedEffect(index, (), 0.002, 70.0, 67.0, ())
     named = [
         NamedEffect(f"tls.{name}", "physical", {"name": name}, {}, (), 0.002, 70.0) for name in ("tilt_drift", "range_offset")
     ]

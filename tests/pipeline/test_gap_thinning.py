@@ -10,8 +10,8 @@ from gap_cases import Array, write_scan
 
 from pipeline.formats.measurements.measurement import TlsMeasurement, read_measurement
 from pipeline.gap.naming.workflow import diagnose
-from pipeline.gap.residuals.thinning import thinned
-from pipeline.gap.residuals.tls_residuals import missing_returns, tls_residuals, with_order
+from pipeline.gap.residuals.subsampling import subsample_measurement
+from pipeline.gap.residuals.tls_residuals import find_expected_pulses, tls_residuals, with_scan_order
 from pipeline.gap.thresholds import Thresholds, use_thresholds
 from scene.common.keyed_random import KeyedRandom
 
@@ -30,7 +30,7 @@ def _scan(folder: Path) -> TlsMeasurement:
     write_scan(folder, 3, angles=wobble, lost=lambda scan: scan.rng.uniform(size=len(scan.power)) < 0.1)
     found = read_measurement(folder)
     assert isinstance(found, TlsMeasurement)
-    return with_order(found)
+    return with_scan_order(found)
 
 
 def test_points_are_drawn_alike_all_over_the_scan_and_lost_pulses_as_often(tmp_path: Path) -> None:
@@ -38,8 +38,8 @@ def test_points_are_drawn_alike_all_over_the_scan_and_lost_pulses_as_often(tmp_p
     scan = _scan(tmp_path)
     share = _MOST / len(scan.cloud.points)
     with use_thresholds(_few()):
-        part, rows = thinned(scan, KeyedRandom(1))
-        again, others = (thinned(scan, KeyedRandom(seed))[1] for seed in (1, 2))
+        part, rows = subsample_measurement(scan, KeyedRandom(1))
+        again, others = (subsample_measurement(scan, KeyedRandom(seed))[1] for seed in (1, 2))
     assert isinstance(part, TlsMeasurement)
     np.testing.assert_array_equal(part.cloud.points, scan.cloud.points[rows])
     assert scan.order is not None
@@ -50,7 +50,7 @@ def test_points_are_drawn_alike_all_over_the_scan_and_lost_pulses_as_often(tmp_p
     assert len(rows) == pytest.approx(_MOST, abs=4 * np.sqrt(_MOST))
     first = float(np.mean(rows < len(scan.cloud.points) / 2))
     assert first == pytest.approx(0.5, abs=4 * 0.5 / np.sqrt(_MOST))
-    whole, drawn = missing_returns(scan, tls_residuals(scan)), missing_returns(part, tls_residuals(part))
+    whole, drawn = find_expected_pulses(scan, tls_residuals(scan)), find_expected_pulses(part, tls_residuals(part))
     assert whole is not None
     assert drawn is not None
     assert len(drawn.lost) == pytest.approx(share * len(whole.lost), abs=4 * np.sqrt(share * len(whole.lost)))
@@ -72,6 +72,6 @@ def test_a_part_of_the_points_names_the_same(tmp_path: Path) -> None:
 
 def test_fewer_points_than_the_bound_are_all_looked_at(tmp_path: Path) -> None:
     scan = _scan(tmp_path)
-    part, rows = thinned(scan, KeyedRandom(1))
+    part, rows = subsample_measurement(scan, KeyedRandom(1))
     assert part is scan
     np.testing.assert_array_equal(rows, np.arange(len(scan.cloud.points)))

@@ -126,4 +126,4 @@ def test_odd_records_and_options_are_one_line(
 
 def test_a_folder_without_a_run_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["icp-study", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
-    assert "holds no run.json" in capsys.readouterr().err
+    assert "contains no run.json" in capsys.readouterr().err

@@ -84,8 +84,8 @@ def test_places_of_a_national_grid_are_relative_to_an_offset_that_is_told(name: 
 def test_residuals_of_a_national_grid_are_mapped_and_of_a_narrow_strip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_scan(tmp_path, 1, step_rad=0.05)
     found = diagnose(read_measurement(tmp_path))
-    for at in (found.residuals.at + np.array([EAST, NORTH]), found.residuals.at * [1.0, 1e-9]):
-        moved = replace(found, residuals=replace(found.residuals, at=at))
+    for at in (found.residuals.wall_xy + np.array([EAST, NORTH]), found.residuals.wall_xy * [1.0, 1e-9]):
+        moved = replace(found, residuals=replace(found.residuals, wall_xy=at))
         figure = drawn(monkeypatch, lambda moved=moved: gap_figures.maps_figure(moved))
         assert all(max(axes.images[0].get_array().shape) <= 500 for axes in figure.axes[:4])
         shown = [float(label.get_text().replace("\N{MINUS SIGN}", "-")) for label in figure.axes[2].get_xticklabels()]

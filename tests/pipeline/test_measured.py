@@ -56,7 +56,7 @@ def test_a_folder_of_maps_and_a_folder_of_points(tmp_path: Path) -> None:
     found = read_measured(tmp_path / "maps", DifferenceConfig(), None, KeyedRandom(1))
     assert found.maps[:, 3, 3] == pytest.approx([0.01, 0.02])
     assert found.grid == grid
-    with pytest.raises(InputError, match="holds no measured epochs"):
+    with pytest.raises(InputError, match="contains no measured epochs"):
         read_measured(tmp_path, DifferenceConfig(), None, KeyedRandom(1))
 
     folder = tmp_path / "scan"

@@ -188,5 +188,5 @@ def test_a_run_by_colmap_shows_the_blocks(pycolmap: Any, tmp_path: Path) -> None
 
 def test_a_scan_has_no_depth_maps_to_fuse(tmp_path: Path) -> None:
 
-    with pytest.raises(InputError, match="colmap fuses depth maps; allowed: direct"):
+    with pytest.raises(InputError, match="colmap needs the depth maps of a stereo pair; allowed: direct"):
         simulate(parse(SimulationConfig, RUN, "test"), "tls", tmp_path / "run")

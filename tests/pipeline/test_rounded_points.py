@@ -15,7 +15,7 @@ from pipeline.formats.measurements.rounded_points import check_rounded_points
 from pipeline.formats.meshes.ply import read_ply_points, write_ply_points
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points.laz import write_laz
-from pipeline.gap.residuals.registration import residuals_of
+from pipeline.gap.residuals.alignment import compute_residuals
 from scene.common.errors import InputError
 
 
@@ -45,7 +45,7 @@ def test_a_centimetre_is_told_and_a_millimetre_is_not(tmp_path: Path) -> None:
     (note,) = found.notes
     assert note.startswith("scan_0.ply: the coordinates are rounded, x in steps of 0.01 m")
     assert "2.9 mm along the lines of sight, and the model has a noise of 3 mm" in note
-    assert note in residuals_of(found).notes
+    assert note in compute_residuals(found).notes
     assert rounded(tmp_path, [0.001, 0.001, 0.001]).notes == ()
 
 

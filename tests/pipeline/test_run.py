@@ -244,7 +244,7 @@ def test_a_folder_in_use_is_refused_with_the_way_on(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(InputError, match="choose another --out"):
         simulate(config(), "tls", tmp_path)
-    with pytest.raises(InputError, match="holds no run"):
+    with pytest.raises(InputError, match="contains no run"):
         simulate(config(), "tls", tmp_path / "nothing", resume=True)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 

@@ -268,7 +268,7 @@ def line():
 WRONG = {
     "nan": (broken(np.nan), {}, r"2 of 48 vertices are not finite, the first is vertex 7 at \(nan, nan, nan\); allowed: finite"),
     "infinite": (broken(np.inf), {}, r"2 of 48 vertices are not finite, the first is vertex 7 at \(inf"),
-    "empty": (replace(sheet(), faces=np.empty((0, 3), np.int32)), {}, "holds no triangles"),
+    "empty": (replace(sheet(), faces=np.empty((0, 3), np.int32)), {}, "contains no triangles"),
     "line": (line(), {}, "no triangle has an area"),
     "millimetres": (sheet(step=1e4), {}, r"7e\+04 m in size with `unit: m`; allowed: 0.5 m to 5000 m; set `unit` to cm or mm"),
     "tiny": (sheet(), {"unit": "mm"}, "set `unit` to m or ft"),
@@ -295,7 +295,7 @@ def test_each_wrong_mesh_is_answered_in_one_line(tmp_path, name):
         ("empty.ply", b"", "is not a valid ply file"),
         ("cut.off", b"OFF\n3 1 0\n0 0 0\n", "is not a valid off file"),
         ("wild.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "names vertex 7 of 3|is not a valid off file"),
-        ("points.xyz", b"0 0 0\n1 0 0\n0 1 0\n", "holds no triangles"),
+        ("points.xyz", b"0 0 0\n1 0 0\n0 1 0\n", "contains no triangles"),
     ],
 )
 def test_each_wrong_file_is_answered_in_one_line(tmp_path, name, content, words):

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from pipeline.gap.residuals.shared_noise import SharedNoise
+from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise
 from scene.common.backend import dr, mi
 from scene.common.keyed_random import KeyedRandom
 from sensors.effects import EFFECTS
@@ -194,7 +194,7 @@ def test_the_mean_of_a_square_has_the_variance_that_its_pairs_give(effect: Match
     means = field.reshape(20, count, cells, count, cells).mean(axis=(2, 4))
     across = REDUCTION * (np.arange(NODE_CELLS) + 0.5)
     pixels = np.stack(np.meshgrid(across, across), axis=-1).reshape(-1, 2)
-    nodes = SharedNoise((effect,), pixels).field(len(pixels))
+    nodes = GridCorrelatedNoise((effect,), pixels).node_field(len(pixels))
     per_side = NODE_CELLS // cells
     number = np.minimum(pixels // side, per_side).astype(int) @ np.array([1, per_side + 1])
     gathered = csr_array((np.full(len(number), 1 / cells**2), (number, np.arange(len(number)))))

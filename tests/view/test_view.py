@@ -180,7 +180,7 @@ def test_clouds_that_are_of_no_diagnosis_are_told(gap: Path, tmp_path: Path) -> 
         ({}, cloud.points, "no channel residual_m"),
         ({"residual_m": cloud.extra["residual_m"]}, cloud.points, "no channel held_out"),
         ({**cloud.extra, "residual_m": cloud.extra["residual_m"] * np.nan}, cloud.points, "not numbers"),
-        ({key: value[:2] for key, value in cloud.extra.items()}, cloud.points[:2], "holds 2 points"),
+        ({key: value[:2] for key, value in cloud.extra.items()}, cloud.points[:2], "contains only 2 points"),
     ):
         shutil.copytree(gap, tmp_path / said)
         write_laz(tmp_path / said / "after.laz", PointCloud(points, extra=extra))
@@ -293,7 +293,7 @@ def test_two_runs_of_one_wall_stand_side_by_side(run: Path, gap: Path, tmp_path:
     record = json.loads((run / "run.json").read_text())
     record["wall_frame"]["matrix_world_to_wall"][0][3] += 1.0
     write_json(tmp_path / "moved/run.json", record)
-    with pytest.raises(InputError, match="is of another wall, or in another frame"):
+    with pytest.raises(InputError, match="shows another wall or uses another wall frame"):
         open_second(tmp_path / "moved", first)
 
 
@@ -324,9 +324,9 @@ def test_windows_beyond_the_raster_keep_a_pixel() -> None:
     ("make", "expected"),
     [
         (lambda _: Path("/nowhere"), "there is no such folder"),
-        (lambda folder: folder, "holds nothing to look at"),
+        (lambda folder: folder, "contains no results that can be shown"),
         (lambda folder: _written(folder, "run.json", "{"), "run.json: is not JSON"),
-        (lambda folder: _written(folder, "run.json", '{"sensor": "tls", "config": {}}'), "holds no finished epoch"),
+        (lambda folder: _written(folder, "run.json", '{"sensor": "tls", "config": {}}'), "contains no finished epoch"),
         (lambda folder: _written(folder, "gap.json", "[]"), "gap.json: expected a mapping"),
         (lambda folder: _written(folder, "annotations.json", "{}"), "is not a COCO annotation file"),
     ],

@@ -45,8 +45,11 @@ def load_weights(model: Any, path: Path) -> None:
 def load_config(folder: Path) -> DetectorConfig:
     """Read the config of the detector in the folder; raise InputError if there is none."""
     if not (folder / CONFIG).is_file():
-        remedy = "name a folder made by `scarpsim train`, or `default` for the one that comes with scarpsim"
-        raise InputError(f"the folder holds no detector ({CONFIG} is missing)", where=str(folder), remedy=remedy)
+        raise InputError(
+            f"the folder holds no detector ({CONFIG} is missing)",
+            where=str(folder),
+            remedy="name a folder made by `scarpsim train`, or `default` for the one that comes with scarpsim",
+        )
     return parse(DetectorConfig, load_yaml(folder / CONFIG), where=str(folder / CONFIG))
 
 
@@ -84,8 +87,9 @@ def _check_contents(path: Path) -> None:
                     claimed += item.nbytes
                     outside += [str(item.name)] if item.external else []
     except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
-        problem = f"the HDF5 file is incomplete ({' '.join(str(error).split())[:200]})"
-        raise InputError(problem, where=str(path), remedy=_REMEDY) from None
+        raise InputError(
+            f"the HDF5 file is incomplete ({' '.join(str(error).split())[:200]})", where=str(path), remedy=_REMEDY
+        ) from None
     if outside:
         raise InputError(f"the file refers to data in other files ('{outside[0]:.80}')", where=str(path), remedy=_REMEDY)
     if claimed > size:
@@ -128,5 +132,8 @@ def take_weights(model: Any, folder: Path) -> None:
         load_weights(model, path)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         problem = " ".join(str(error).split())[:200]
-        remedy = f"use the {CONFIG} that was saved with the weights"
-        raise InputError(f"the weights do not fit the network ({problem})", where=str(path), remedy=remedy) from None
+        raise InputError(
+            f"the weights do not fit the network ({problem})",
+            where=str(path),
+            remedy=f"use the {CONFIG} that was saved with the weights",
+        ) from None

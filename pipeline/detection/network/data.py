@@ -102,9 +102,12 @@ class CocoFolder:
         path = self.path(image)
         difference = read_tiff(path)
         if difference.shape != (image["height"], image["width"]):
-            allowed = f"{image['height']} x {image['width']} px as annotated"
-            problem = f"the image has {difference.shape[0]} x {difference.shape[1]} px"
-            raise InputError(problem, where=str(path), allowed=allowed, remedy="use the image that was annotated")
+            raise InputError(
+                f"the image has {difference.shape[0]} x {difference.shape[1]} px",
+                where=str(path),
+                allowed=f"{image['height']} x {image['width']} px as annotated",
+                remedy="use the image that was annotated",
+            )
         return difference
 
 

@@ -125,9 +125,12 @@ def read_events(path: Path) -> list[Event]:
         raise InputError(f"not a table of events ({error})", where=str(path), remedy=remedy) from None
     except ValidationError as error:
         wrong = error.errors()[0]
-        problem = f"'{wrong['loc'][0]}' is {wrong['input']!r:.80}"
-        allowed = "finite numbers and an image's name"
-        raise InputError(problem, where=f"{path}, line {table.line_num}", allowed=allowed, remedy=remedy) from None
+        raise InputError(
+            f"'{wrong['loc'][0]}' is {wrong['input']!r:.80}",
+            where=f"{path}, line {table.line_num}",
+            allowed="finite numbers and an image's name",
+            remedy=remedy,
+        ) from None
     return found
 
 

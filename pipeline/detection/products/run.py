@@ -86,8 +86,9 @@ def find_inputs(places: Sequence[Path]) -> list[InputMap]:
             continue
         files = sorted(place.glob("difference_*.tif")) if place.is_dir() else [place]
         if not files:
-            allowed = "a TIFF, a run folder, or a folder with annotations.json"
-            raise InputError("no difference map found", where=str(place), allowed=allowed)
+            raise InputError(
+                "no difference map found", where=str(place), allowed="a TIFF, a run folder, or a folder with annotations.json"
+            )
         result += [InputMap(file, file.name, {"file_name": file.name}) for file in files]
     for path, count in Counter(item.path for item in result).items():
         if count > 1:

@@ -209,8 +209,9 @@ def _restore_or_start(out: Path, config: TrainConfig, model: MaskRCNN, *, resume
     except InputError:
         raise
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        problem = f"the checkpoint is damaged ({' '.join(str(error).split())[:200]})"
-        raise InputError(problem, where=str(out), remedy=_NO_CHECKPOINT) from None
+        raise InputError(
+            f"the checkpoint is damaged ({' '.join(str(error).split())[:200]})", where=str(out), remedy=_NO_CHECKPOINT
+        ) from None
     return History(state.training, state.validation)
 
 

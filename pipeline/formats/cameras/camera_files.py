@@ -30,7 +30,7 @@ def read_oriented(path: Path) -> MetashapeCameras | None:
         return read_metashape(path)
     if root or _is_opencv_yaml(path):
         raise InputError(
-            "holds a calibration and no poses",
+            "contains a calibration but no poses",
             where=str(path),
             remedy="name it as `calibration:` of a camera in cameras.yaml, beside position_m and rotation",
         )
@@ -79,8 +79,12 @@ def stereo_pair(found: MetashapeCameras, left: str | None, right: str | None, wh
     if left is not None and right is not None:
         return CameraPair(found.cameras[left], found.cameras[right])
     if left is not None or right is not None or len(found.cameras) != 2:
-        what = f"has {len(found.cameras)} aligned cameras, but a pair has two"
-        raise InputError(what, where=where, allowed=known, remedy="name both as cameras.left and cameras.right")
+        raise InputError(
+            f"has {len(found.cameras)} aligned cameras, but a pair has two",
+            where=where,
+            allowed=known,
+            remedy="name both as cameras.left and cameras.right",
+        )
     if found.unaligned:
         warnings.warn(f"{where}: left out as not aligned: {', '.join(found.unaligned)}", stacklevel=2)
     if found.rigged:

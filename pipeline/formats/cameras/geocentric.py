@@ -68,8 +68,9 @@ class Projection:
         try:
             crs = CRS.from_user_input(self.text)
         except (CRSError, UnicodeError) as error:
-            problem = f"names an unknown coordinate system ({' '.join(str(error).split())[:100]})"
-            raise InputError(problem, where=self.where, remedy=_REMEDY) from None
+            raise InputError(
+                f"names an unknown coordinate system ({' '.join(str(error).split())[:100]})", where=self.where, remedy=_REMEDY
+            ) from None
         self._check(crs)
         return crs.sub_crs_list[0] if crs.is_compound else crs
 

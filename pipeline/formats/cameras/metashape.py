@@ -187,10 +187,12 @@ def _check_parameters(calibration: ElementTree.Element, where: str) -> None:
     for child in calibration:
         unknown = child.tag not in _TAGS and _PARAMETER.fullmatch(child.tag) is not None
         if unknown and any(value != 0 for value in _numbers_of([child.text or ""])):
-            problem = f"has the lens parameter {child.tag} = {(child.text or '').strip()[:20]}, which is not supported"
             allowed = ", ".join(_TAGS)
             raise InputError(
-                problem, where=where, allowed=allowed, remedy=f"fix {child.tag} at 0 in Metashape and optimise again"
+                f"has the lens parameter {child.tag} = {(child.text or '').strip()[:20]}, which is not supported",
+                where=where,
+                allowed=allowed,
+                remedy=f"fix {child.tag} at 0 in Metashape and optimise again",
             )
 
 

@@ -52,8 +52,11 @@ def project_files(path: Path) -> list[Path]:
     number = None if listed is None else listed.get("active_id")
     chosen = [chunk for chunk in chunks if chunk.get("id") == number] or chunks
     if len(chosen) != 1:
-        remedy = "open the chunk in Metashape and save the project"
-        raise InputError(f"has {len(chunks)} chunks, of which none is active", where=str(project), remedy=remedy)
+        raise InputError(
+            f"has {len(chunks)} chunks, of which none is active",
+            where=str(project),
+            remedy="open the chunk in Metashape and save the project",
+        )
     return [path, project, inside(project.parent, chosen[0].get("path"), project)]
 
 
@@ -74,9 +77,14 @@ def _unpacked(archive: Path) -> bytes:
             size = file.getinfo(_DOCUMENT).file_size
             text = file.read(_DOCUMENT) if size <= MOST_TEXT_BYTES else b""
     except _DAMAGED as error:
-        problem = f"is not an archive of a Metashape project ({' '.join(str(error).split())[:200]})"
-        raise InputError(problem, where=str(archive), remedy=_EXPORT) from None
+        raise InputError(
+            f"is not an archive of a Metashape project ({' '.join(str(error).split())[:200]})", where=str(archive), remedy=_EXPORT
+        ) from None
     if size > MOST_TEXT_BYTES:
-        allowed = f"{MOST_TEXT_BYTES / 1e6:,.0f} MB"
-        raise InputError(f"its {_DOCUMENT} has {size / 1e6:,.0f} MB", where=str(archive), allowed=allowed, remedy=_EXPORT)
+        raise InputError(
+            f"its {_DOCUMENT} has {size / 1e6:,.0f} MB",
+            where=str(archive),
+            allowed=f"{MOST_TEXT_BYTES / 1e6:,.0f} MB",
+            remedy=_EXPORT,
+        )
     return text

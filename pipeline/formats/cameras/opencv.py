@@ -65,9 +65,11 @@ class OpencvInterior:
         """Convert the interior orientation of `camera`; raise InputError if OpenCV's model lacks one of its parameters."""
         for name, meaning in (("b2", "skew"), ("k4", "radial distortion, r^8")):
             if getattr(camera, name) != 0:
-                what = f"{name} = {getattr(camera, name):g} ({meaning}) has no counterpart in OpenCV's camera model"
                 raise InputError(
-                    what, where=where, allowed=f"{name} = 0", remedy="write Metashape's XML, or calibrate without it"
+                    f"{name} = {getattr(camera, name):g} ({meaning}) has no counterpart in OpenCV's camera model",
+                    where=where,
+                    allowed=f"{name} = 0",
+                    remedy="write Metashape's XML, or calibrate without it",
                 )
         principal = camera.width / 2 + camera.cx_px, camera.height / 2 + camera.cy_px
         radial = camera.k1, camera.k2
@@ -91,8 +93,12 @@ def shared_distortion(values: dict[str, float], where: str) -> dict[str, float]:
     """Return the distortion coefficients that our model has too; raise InputError if another one is not zero."""
     for name, value in values.items():
         if name not in _SHARED and value != 0:
-            what = f"{name} = {value:g} has no counterpart in Metashape's camera model"
-            raise InputError(what, where=where, allowed=f"{name} = 0", remedy="calibrate with k1, k2, k3, p1, p2 only")
+            raise InputError(
+                f"{name} = {value:g} has no counterpart in Metashape's camera model",
+                where=where,
+                allowed=f"{name} = 0",
+                remedy="calibrate with k1, k2, k3, p1, p2 only",
+            )
     return {name: value for name, value in values.items() if name in _SHARED}
 
 

@@ -14,7 +14,7 @@ def inside(folder: Path, name: Any, where: Path | str) -> Path:
     Raises InputError for a name that leads out of the folder: an absolute path, one with `..`, or a link to elsewhere.
     """
     if not isinstance(name, str) or not name.strip() or not name.isprintable():
-        raise InputError(f"names a file {name!r:.80}", where=str(where), allowed="a file name")
+        raise InputError(f"contains {name!r:.80} where the name of a file is expected", where=str(where), allowed="a file name")
     pure, path = PurePosixPath(name), folder / name
     try:
         leads_out = pure.is_absolute() or ".." in pure.parts or not path.resolve().is_relative_to(folder.resolve())

@@ -138,8 +138,12 @@ def check_frame(here: PointFit, other: PointFit | None, frame: str, where: str) 
         raise InputError(problem, where=where, remedy=f"write `frame: {fits}`")
     if here.hits < _FEWEST_HITS:
         problem = f"only {100 * here.hits:.2g} % of the points lie in directions in which the sensor sees the reference"
-        remedy = "check `frame`, the sensor's position and rotation, and the coordinate system of points and reference (m)"
-        raise InputError(problem, where=where, allowed=f"{100 * _FEWEST_HITS:g} % or more", remedy=remedy)
+        raise InputError(
+            problem,
+            where=where,
+            allowed=f"{100 * _FEWEST_HITS:g} % or more",
+            remedy="check `frame`, the sensor's position and rotation, and the coordinate system of points and reference (m)",
+        )
 
 
 def check_seen(pair: CameraPair, points: FloatArray, where: str) -> float:
@@ -210,8 +214,7 @@ def check_different(clouds: Mapping[str, PointCloud]) -> None:
     for name, cloud in clouds.items():
         digest = hashlib.sha256(cloud.points.tobytes()).digest()
         if digest in known:
-            problem = f"has the same points as {known[digest]}"
-            raise InputError(problem, where=name, remedy="give one file for each epoch")
+            raise InputError(f"has the same points as {known[digest]}", where=name, remedy="give one file for each epoch")
         known[digest] = name
 
 
@@ -219,12 +222,12 @@ def check_near_rays(here: PointFit, where: str) -> None:
     """Raise InputError if most points are far from the reference along their rays."""
     if here.good:
         return
-    problem = (
-        f"the points are {abs(here.off_m):.3g} m {'behind' if here.off_m > 0 else 'before'} the reference (median along rays)"
+    raise InputError(
+        f"the points are {abs(here.off_m):.3g} m {'behind' if here.off_m > 0 else 'before'} the reference (median along rays)",
+        where=where,
+        allowed=f"a quarter of them within {_NEAR_M:g} m or {100 * here.reach:g} % of the range",
+        remedy="check the sensor's position, the unit (m) and that points and reference are of one wall",
     )
-    allowed = f"a quarter of them within {_NEAR_M:g} m or {100 * here.reach:g} % of the range"
-    remedy = "check the sensor's position, the unit (m) and that points and reference are of one wall"
-    raise InputError(problem, where=where, allowed=allowed, remedy=remedy)
 
 
 def check_pulses(azimuth: Sweep, zenith: Sweep, points: int, epochs: int, where: str) -> None:
@@ -262,5 +265,9 @@ def check_noise(of: str, sigma: FloatArray) -> None:
     """Raise InputError if the model predicts almost no noise (n,), so that standardised residuals would be meaningless."""
     least, unit, key = _LEAST_SIGMA[of]
     if sigma.min(initial=np.inf) < least:
-        problem = f"the model predicts a standard deviation of {sigma.min():.2g} {unit}"
-        raise InputError(problem, where="model.yaml: noise", allowed=f"{least:g} {unit} or more", remedy=f"set `{key}`")
+        raise InputError(
+            f"the model predicts a standard deviation of {sigma.min():.2g} {unit}",
+            where="model.yaml: noise",
+            allowed=f"{least:g} {unit} or more",
+            remedy=f"set `{key}`",
+        )

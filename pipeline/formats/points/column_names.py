@@ -90,9 +90,11 @@ def named_columns(layout: TextLayout, where: str) -> NamedColumns:
             return NamedColumns(_checked(columns, words, line, layout, where))
         if len(words) == layout.form.columns and (not line.comment or len(axes) == 2):
             named = ", ".join(f"'{word}'" for word in words)
-            problem = f"names its columns {named:.200}, which do not include x, y and z"
             raise InputError(
-                problem, where=f"{where}, line {line.number:,}", allowed="x y z, easting northing height", remedy=_HOW
+                f"names its columns {named:.200}, which do not include x, y and z",
+                where=f"{where}, line {line.number:,}",
+                allowed="x y z, easting northing height",
+                remedy=_HOW,
             )
     passed = [f"line {line.number} is ignored: '{line.text:.60}'" for line, _ in header if not line.comment]
     return NamedColumns((), tuple(passed))
@@ -220,8 +222,12 @@ def _coordinate(axis: str, unit: str, word: str, where: str) -> Column:
         return Column(axis, unit, metres)
     if unit in _ANGLES:
         raise InputError(f"names a column '{word}': coordinates in degrees", where=where, allowed="metres", remedy=_PROJECT)
-    problem = f"names a column '{word}' with an unknown unit '{unit}'"
-    raise InputError(problem, where=where, allowed="m, cm, mm, km, ft, us-ft", remedy="correct the name, or remove the unit")
+    raise InputError(
+        f"names a column '{word}' with an unknown unit '{unit}'",
+        where=where,
+        allowed="m, cm, mm, km, ft, us-ft",
+        remedy="correct the name, or remove the unit",
+    )
 
 
 def _further(name: str, unit: str, word: str) -> Column:

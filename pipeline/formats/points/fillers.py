@@ -40,8 +40,11 @@ def without_fillers(cloud: PointCloud, where: str, *, grid: bool = False) -> Poi
     at_zero: NDArray[np.bool_] = np.asarray(~points.any(axis=1))
     count = int(at_zero.sum())
     if count and count == len(points):
-        problem = f"all {count:,} records are 0 0 0, which stands for no return"
-        raise InputError(problem, where=where, remedy="export the scan again, with its points")
+        raise InputError(
+            f"all {count:,} records are 0 0 0, which stands for no return",
+            where=where,
+            remedy="export the scan again, with its points",
+        )
     if count and (grid or count > 1 or _outside(points[~at_zero])):
         return without_fillers(_left_out(cloud, at_zero, "0 0 0"), where)
     place = _shared_place(points)

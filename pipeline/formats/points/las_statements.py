@@ -69,8 +69,12 @@ def _by_keys(header: laspy.LasHeader, where: str) -> AxisUnits | None:
     known = {name: code for name, code in codes.items() if 0 < code < _USER_DEFINED}
     if keys.get(_MODEL) in (_IN_DEGREES, _GEOCENTRIC) or (keys.get(_GEOGRAPHIC) and not codes[_PROJECTED] and _MODEL not in keys):
         what = "from the Earth's centre" if keys.get(_MODEL) == _GEOCENTRIC else "in degrees"
-        problem = f"has coordinates {what}, by its GeoTIFF keys (geographic system {keys.get(_GEOGRAPHIC, 'not named')})"
-        raise InputError(problem, where=where, allowed="projected coordinates", remedy=_PROJECT)
+        raise InputError(
+            f"has coordinates {what}, by its GeoTIFF keys (geographic system {keys.get(_GEOGRAPHIC, 'not named')})",
+            where=where,
+            allowed="projected coordinates",
+            remedy=_PROJECT,
+        )
     plane, height = (_of_code(known.get(name), where) for name in (_PROJECTED, _VERTICAL))
     across = _agreed(plane, keys.get(_LINEAR_UNIT), "coordinates", where)
     up = _agreed(height, keys.get(_VERTICAL_UNIT), "heights", where)
@@ -96,8 +100,11 @@ def _agreed(by_system: float | None, unit_code: int | None, what: str, where: st
     by_unit = None if not unit_code or unit_code >= _USER_DEFINED else metres_of_epsg_unit(unit_code)
     if by_system is not None and by_unit is not None and not np.isclose(by_system, by_unit, rtol=1e-8, atol=0):
         units = f"{by_system:.10g} m by the coordinate system, {by_unit:.10g} m by the unit"
-        problem = f"states two units of its {what} in its GeoTIFF keys: {units}"
-        raise InputError(problem, where=where, remedy="export it with one coordinate system")
+        raise InputError(
+            f"states two units of its {what} in its GeoTIFF keys: {units}",
+            where=where,
+            remedy="export it with one coordinate system",
+        )
     return by_system if by_unit is None else by_unit
 
 
@@ -133,8 +140,11 @@ def check_counts(header: laspy.LasHeader, path: Path) -> None:
     with path.open("rb") as file:
         (older,) = struct.unpack_from("<I", file.read(_OLDER_COUNT_AT + 4), _OLDER_COUNT_AT)
     if older and older != header.point_count:
-        problem = f"states {header.point_count:,} points and, in the field of older versions, {older:,}"
-        raise InputError(problem, where=str(path), remedy="copy or export it again")
+        raise InputError(
+            f"states {header.point_count:,} points and, in the field of older versions, {older:,}",
+            where=str(path),
+            remedy="copy or export it again",
+        )
     if header.are_points_compressed or header.global_encoding.waveform_data_packets_internal:
         return
     start = header.offset_to_point_data

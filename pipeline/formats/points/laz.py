@@ -157,8 +157,9 @@ def read_laz(path: Path) -> PointCloud:
     except (laspy.LaspyException, LazrsError, ValueError, struct.error, MemoryError, OverflowError) as error:
         raise _damaged(path, error) from None
     if len(las.points) < las.header.point_count:
-        problem = f"has {len(las.points):,} of the {las.header.point_count:,} points that it states"
-        raise InputError(problem, where=where, remedy=_COPY)
+        raise InputError(
+            f"has {len(las.points):,} of the {las.header.point_count:,} points that it states", where=where, remedy=_COPY
+        )
     _check_quantisation(las.header, path)
     units, notes = stated_units(las.header, where)
     extra = {name: np.array(las[name]) for name in las.point_format.extra_dimension_names} | _standard_channels(las)
@@ -194,8 +195,12 @@ def _check_quantisation(header: laspy.LasHeader, path: Path) -> None:
     """Raise InputError for scales and offsets that cannot give coordinates."""
     scales, offsets = np.asarray(header.scales), np.asarray(header.offsets)
     if not (np.isfinite(scales).all() and (scales > 0).all() and np.isfinite(offsets).all()):
-        problem = f"has scale factors {scales.tolist()} and offsets {offsets.tolist()}"
-        raise InputError(problem, where=str(path), allowed="finite ones, scales above 0", remedy="export it again")
+        raise InputError(
+            f"has scale factors {scales.tolist()} and offsets {offsets.tolist()}",
+            where=str(path),
+            allowed="finite ones, scales above 0",
+            remedy="export it again",
+        )
 
 
 def _standard_channels(las: Any) -> dict[str, NDArray[Any]]:

@@ -89,8 +89,11 @@ def orthonormal(rotation: FloatArray, where: str) -> tuple[FloatArray, tuple[str
     """
     off = float(np.abs(rotation @ rotation.T - np.eye(3)).max()) if np.abs(rotation).max() < 2 else np.inf
     if off > 0.02 or np.linalg.det(rotation) < 0:
-        remedy = "rows must be orthonormal, determinant +1; give more digits"
-        raise InputError("the rotation is not a rotation matrix", where=where, remedy=remedy)
+        raise InputError(
+            "the rotation is not a rotation matrix",
+            where=where,
+            remedy="rows must be orthonormal, determinant +1; give more digits",
+        )
     left, _, right = np.linalg.svd(rotation)
     words = (f"the rotation deviated from orthonormal by {off:.1g} and was corrected",) if off > 1e-6 else ()
     return np.asarray(left @ right), words
@@ -103,8 +106,7 @@ def _scans(lines: _Lines) -> Iterator[PtxScan]:
         count += 1
         columns, rows = _grid_size(first, lines, count), _grid_size(lines.next(), lines, count)
         if columns < 1 or rows < 1:
-            problem = f"has a grid of {columns} x {rows}"
-            raise InputError(problem, where=lines.here, allowed="1 x 1 or more", remedy=_EXPORT)
+            raise InputError(f"has a grid of {columns} x {rows}", where=lines.here, allowed="1 x 1 or more", remedy=_EXPORT)
         stated = np.array([_row(lines, 3) for _ in range(4)])
         matrix = np.array([_row(lines, 4) for _ in range(4)])
         _check_pose(stated, matrix, f"{lines.where}, scan {count}")
@@ -141,10 +143,12 @@ def _check_pose(stated: FloatArray, matrix: FloatArray, where: str) -> None:
     place, axes = np.abs(stated[0] - other[0]).max(), np.abs(stated[1:] - other[1:]).max()
     if place > _ALIKE_M or axes > _ALIKE:
         there, here = (" ".join(f"{value:.6g}" for value in each[0]) for each in (stated, other))
-        problem = (
-            f"states two poses of the scanner: its position is {there} in lines 3 to 6 of the header but {here} in the matrix"
+        raise InputError(
+            f"states two poses of the scanner: its position is {there} in lines 3 to 6 of the header but {here} in the matrix",
+            where=where,
+            allowed="the same pose in both",
+            remedy="export it again, registered",
         )
-        raise InputError(problem, where=where, allowed="the same pose in both", remedy="export it again, registered")
 
 
 def _table(lines: _Lines, columns: int, rows: int, count: int) -> FloatArray:
@@ -168,8 +172,12 @@ def _table(lines: _Lines, columns: int, rows: int, count: int) -> FloatArray:
             remedy="the file was cut off, or its numbers of columns and rows are wrong: copy or export it again",
         )  # fmt: skip
     if table.shape[1] < 4:
-        problem = f"the cells of scan {count} have {table.shape[1]} values"
-        raise InputError(problem, where=lines.where, allowed="x y z intensity, and r g b", remedy=_EXPORT)
+        raise InputError(
+            f"the cells of scan {count} have {table.shape[1]} values",
+            where=lines.where,
+            allowed="x y z intensity, and r g b",
+            remedy=_EXPORT,
+        )
     return np.asarray(table, dtype=np.float64)
 
 
@@ -178,8 +186,11 @@ def _cells(lines: _Lines, cells: int, count: int) -> Iterator[str]:
     for number, line in enumerate(bounded_lines(lines.file, cells)):
         words = split_row(line, None)
         if len(words) == 1 and words[0].isdecimal():
-            problem = f"scan {count} states {cells:,} cells but has {number:,} lines before the next scan begins"
-            raise InputError(problem, where=lines.where, remedy=_EXPORT)
+            raise InputError(
+                f"scan {count} states {cells:,} cells but has {number:,} lines before the next scan begins",
+                where=lines.where,
+                remedy=_EXPORT,
+            )
         yield line
 
 

@@ -225,5 +225,9 @@ def _no_rows(lines: Sequence[str], where: str) -> InputError:
     if not any(line.strip() for line in lines):
         return InputError("has no points and no line of numbers", where=where, allowed=_ROWS, remedy="export it again")
     first = next(line.strip() for line in lines if line.strip())
-    problem = f"has no line of numbers, at least x y z, among its first {_HEADER_LINES} lines (it begins with '{first:.60}')"
-    return InputError(problem, where=where, allowed=_ROWS, remedy="use a file of points, or remove the lines before them")
+    return InputError(
+        f"has no line of numbers, at least x y z, among its first {_HEADER_LINES} lines (it begins with '{first:.60}')",
+        where=where,
+        allowed=_ROWS,
+        remedy="use a file of points, or remove the lines before them",
+    )

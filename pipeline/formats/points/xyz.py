@@ -179,8 +179,11 @@ def _check_present(values: FloatArray, columns: Sequence[Column], where: str) ->
     """Raise InputError if a coordinate is missing in every row while others exist."""
     empty = [index for index, column in enumerate(columns) if column.name in _AXES and np.isnan(values[:, index]).all()]
     if 0 < len(empty) < 3:
-        problem = f"column {empty[0] + 1}, read as {columns[empty[0]].name}, is empty in all {len(values):,} rows"
-        raise InputError(problem, where=where, remedy="export it again, or name the columns with --columns as they are")
+        raise InputError(
+            f"column {empty[0] + 1}, read as {columns[empty[0]].name}, is empty in all {len(values):,} rows",
+            where=where,
+            remedy="export it again, or name the columns with --columns as they are",
+        )
 
 
 def _cloud(values: FloatArray, columns: Sequence[Column], notes: tuple[str, ...]) -> PointCloud:

@@ -74,13 +74,21 @@ def georeference(tags: dict[int, Any], shape: tuple[int, int], path: Path) -> Ge
     if corner is None:
         return Georeference(None, False, linear, vertical)
     if keys.get(MODEL_TYPE) == _GEOGRAPHIC:
-        remedy = "reproject it to the projected coordinates of the points, in metres"
-        raise InputError("is in geographic coordinates, degrees", where=str(path), allowed="metres or feet", remedy=remedy)
+        raise InputError(
+            "is in geographic coordinates, degrees",
+            where=str(path),
+            allowed="metres or feet",
+            remedy="reproject it to the projected coordinates of the points, in metres",
+        )
     gsd, step_y, x, y = (value * (linear or 1.0) for value in corner)
     if not (_SIDES_M[0] <= gsd <= _SIDES_M[1] and max(abs(x), abs(y)) <= _FARTHEST_M):
         place = f"a pixel of {gsd:g} m with its first corner at {x:g}, {y:g}"
-        allowed = f"sides of {_SIDES_M[0]:g} to {_SIDES_M[1]:g} m, coordinates of up to {_FARTHEST_M:g} m"
-        raise InputError(f"has {place}", where=str(path), allowed=allowed, remedy="export it again, in metres")
+        raise InputError(
+            f"has {place}",
+            where=str(path),
+            allowed=f"sides of {_SIDES_M[0]:g} to {_SIDES_M[1]:g} m, coordinates of up to {_FARTHEST_M:g} m",
+            remedy="export it again, in metres",
+        )
     if keys.get(RASTER_TYPE) == _PIXEL_IS_POINT:
         x, y = x - gsd / 2, y - step_y / 2
     flipped = step_y > 0
@@ -110,8 +118,12 @@ def _affine(tags: dict[int, Any], path: Path) -> tuple[float, float, float, floa
         problem = (
             "its pixels are rotated relative to the axes" if turned else f"its pixels are {step_x:g} x {abs(step_y):g} units"
         )
-        remedy = "resample it to square pixels along the axes (gdalwarp)"
-        raise InputError(problem, where=str(path), allowed="square pixels, columns towards larger x", remedy=remedy)
+        raise InputError(
+            problem,
+            where=str(path),
+            allowed="square pixels, columns towards larger x",
+            remedy="resample it to square pixels along the axes (gdalwarp)",
+        )
     return step_x, step_y, x, y
 
 
@@ -139,8 +151,11 @@ def _geo_keys(tags: dict[int, Any], path: Path) -> dict[int, int]:
         return {}
     rows = list(zip(*(tuple(values)[4 + part :: 4] for part in range(4)), strict=False))
     if len(values) < 4 or len(rows) < values[3]:
-        problem = f"states {values[3] if len(values) > 3 else 0} GeoTIFF keys but has {len(rows)}"
-        raise InputError(problem, where=str(path), remedy="export it again")
+        raise InputError(
+            f"states {values[3] if len(values) > 3 else 0} GeoTIFF keys but has {len(rows)}",
+            where=str(path),
+            remedy="export it again",
+        )
     return {int(key): int(value) for key, location, _, value in rows if location == 0}
 
 
@@ -151,8 +166,12 @@ def _unit(keys: dict[int, int], key: int, path: Path) -> float | None:
         return None
     metres = metres_of_epsg_unit(code)
     if metres is None:
-        problem = f"states the unit EPSG {code}, which is not a length"
-        raise InputError(problem, where=str(path), allowed="a unit of length", remedy="export it in metres")
+        raise InputError(
+            f"states the unit EPSG {code}, which is not a length",
+            where=str(path),
+            allowed="a unit of length",
+            remedy="export it in metres",
+        )
     return metres
 
 

@@ -214,8 +214,12 @@ def _read(path: Path) -> tuple[NDArray[np.float32], dict[int, Any], NDArray[np.b
     except (*_DAMAGE, tifffile.TiffFileError, zlib.error, lzma.LZMAError, struct.error) as error:
         raise _unreadable(path, " ".join(str(error).split())) from None
     if raster.ndim != 2 or raster.dtype.kind not in "fiub":
-        problem = f"has the shape {raster.shape} and values of type {raster.dtype}"
-        raise InputError(problem, where=str(path), allowed="one band of numbers", remedy="export it as float32")
+        raise InputError(
+            f"has the shape {raster.shape} and values of type {raster.dtype}",
+            where=str(path),
+            allowed="one band of numbers",
+            remedy="export it as float32",
+        )
     with np.errstate(over="ignore"):  # becomes infinite, which is checked later
         values = raster.astype(np.float32, copy=False)
     masked = masks[0] == 0 if masks else np.zeros(values.shape, dtype=bool)
@@ -230,9 +234,12 @@ def _is_mask(page: Any, image: Any) -> bool:
 def _unreadable(path: Path, problem: str) -> InputError:
     """Return the error for a file that tifffile cannot read; an unknown compression is not damage."""
     if "imagecodecs" in problem or "not supported" in problem or "not a known COMPRESSION" in problem:
-        allowed = "no compression, deflate, LZW, PackBits, LZMA, Zstandard, LERC, JPEG"
-        remedy = "save it with deflate or without compression"
-        return InputError(f"uses a compression that cannot be read ({problem})", where=str(path), allowed=allowed, remedy=remedy)
+        return InputError(
+            f"uses a compression that cannot be read ({problem})",
+            where=str(path),
+            allowed="no compression, deflate, LZW, PackBits, LZMA, Zstandard, LERC, JPEG",
+            remedy="save it with deflate or without compression",
+        )
     return InputError(f"is not a complete TIFF file ({problem})", where=str(path), remedy="export it again")
 
 
@@ -267,9 +274,12 @@ def _check_values(raster: NDArray[np.float32], path: Path) -> None:
     """Raise InputError for infinite and huge values, by which some programs mark missing data."""
     known = np.isnan(raster) | (np.abs(raster) <= _LARGEST)
     if not known.all():
-        problem = f"has {int((~known).sum()):,} pixels of infinite or huge values, such as {raster[~known][0]:g}"
-        remedy = "write NaN for missing data, or state the value in the tag GDAL_NODATA"
-        raise InputError(problem, where=str(path), allowed=f"up to {_LARGEST:g}", remedy=remedy)
+        raise InputError(
+            f"has {int((~known).sum()):,} pixels of infinite or huge values, such as {raster[~known][0]:g}",
+            where=str(path),
+            allowed=f"up to {_LARGEST:g}",
+            remedy="write NaN for missing data, or state the value in the tag GDAL_NODATA",
+        )
 
 
 def most_pixels() -> int:

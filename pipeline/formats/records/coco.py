@@ -153,8 +153,11 @@ def read_detections(path: Path, truth: Coco, *, masks: bool = True) -> list[Entr
     found = list(_parsed(_Detection, entries, "detection", path))
     strange = {entry["image_id"] for entry, _ in found} - set(ids)
     if strange:
-        problem = f"has detections in {len(strange)} images that the truth does not have, such as id {min(strange)}"
-        raise InputError(problem, where=str(path), remedy="compare with the annotations of the same maps")
+        raise InputError(
+            f"has detections in {len(strange)} images that the truth does not have, such as id {min(strange)}",
+            where=str(path),
+            remedy="compare with the annotations of the same maps",
+        )
     reader = _Masks({image["id"]: image for image in truth.images}, {each["id"] for each in truth.categories}, masks)
     return [reader.complete({**entry, "image_id": ids[entry["image_id"]]}, where) for entry, where in found]
 
@@ -176,9 +179,13 @@ class _Masks:
                 f"refers to image {entry['image_id']}, which does not exist", where=where, allowed=allowed, remedy="leave it out"
             )
         if entry["category_id"] not in self.categories:
-            problem = f"its category {entry['category_id']} is not listed"
             allowed = ", ".join(map(str, sorted(self.categories)[:20])) or "none, as the list is empty"
-            raise InputError(problem, where=where, allowed=allowed, remedy="list it, or use the right category")
+            raise InputError(
+                f"its category {entry['category_id']} is not listed",
+                where=where,
+                allowed=allowed,
+                remedy="list it, or use the right category",
+            )
         height, width = image["height"], image["width"]
         box, segmentation = entry.get("bbox"), entry.get("segmentation")
         if box is not None:
@@ -195,8 +202,12 @@ class _Masks:
 
 def _no_coco(path: Path, problem: str) -> InputError:
     """Return the error for a file that is not COCO."""
-    allowed = "lists of images, annotations and categories"
-    return InputError(f"is not a COCO annotation file ({problem})", where=str(path), allowed=allowed, remedy="make it again")
+    return InputError(
+        f"is not a COCO annotation file ({problem})",
+        where=str(path),
+        allowed="lists of images, annotations and categories",
+        remedy="make it again",
+    )
 
 
 def _parsed(model: type[EntryT], entries: Sequence[Any], kind: str, path: Path) -> Iterable[tuple[Entry, str]]:
@@ -209,8 +220,12 @@ def _parsed(model: type[EntryT], entries: Sequence[Any], kind: str, path: Path) 
         own = entry.get("id") if isinstance(entry, Mapping) else None
         where = f"{path}: {kind} {own}" if isinstance(own, int) and own < 2**63 else f"{path}: {kind} {number} of the list"
         if not isinstance(entry, Mapping):
-            allowed = f"a mapping with {', '.join(name for name, field in model.model_fields.items() if field.is_required())}"
-            raise InputError(f"is of the type {type(entry).__name__}", where=where, allowed=allowed, remedy="make the file again")
+            raise InputError(
+                f"is of the type {type(entry).__name__}",
+                where=where,
+                allowed=f"a mapping with {', '.join(name for name, field in model.model_fields.items() if field.is_required())}",
+                remedy="make the file again",
+            )
         try:
             parse(model, entry, where)
         except InputError as error:
@@ -238,8 +253,9 @@ def _unique(entries: Sequence[Entry], key: str, kind: str, path: Path) -> None:
     seen: set[Any] = set()
     for entry in entries:
         if entry[key] in seen:
-            where = f"{path}: {kind} {entry['id']}"
-            raise InputError(f"its {key} '{entry[key]}' occurs twice", where=where, remedy="leave out one of the two")
+            raise InputError(
+                f"its {key} '{entry[key]}' occurs twice", where=f"{path}: {kind} {entry['id']}", remedy="leave out one of the two"
+            )
         seen.add(entry[key])
 
 
@@ -247,9 +263,12 @@ def _check_pixels(image: Entry, path: Path) -> None:
     """Raise InputError for an image that is too large."""
     height, width = image["height"], image["width"]
     if height * width > (most := most_pixels()):
-        allowed = f"at most {most:,} px"
-        where = f"{path}: image {image['id']}"
-        raise InputError(f"has {height} x {width} px", where=where, allowed=allowed, remedy="cut it into tiles")
+        raise InputError(
+            f"has {height} x {width} px",
+            where=f"{path}: image {image['id']}",
+            allowed=f"at most {most:,} px",
+            remedy="cut it into tiles",
+        )
 
 
 def _check_box(box: Sequence[float], height: int, width: int, where: str) -> None:
@@ -257,5 +276,9 @@ def _check_box(box: Sequence[float], height: int, width: int, where: str) -> Non
     x, y, across, down = box
     inside = min(x, y) >= -BEYOND_PX and x + across <= width + BEYOND_PX and y + down <= height + BEYOND_PX
     if min(across, down) < 0 or not inside:
-        allowed = f"x, y, width, height inside the image of {width} x {height} px"
-        raise InputError(f"its bbox is {list(box)}", where=where, allowed=allowed, remedy="write the corner, then the lengths")
+        raise InputError(
+            f"its bbox is {list(box)}",
+            where=where,
+            allowed=f"x, y, width, height inside the image of {width} x {height} px",
+            remedy="write the corner, then the lengths",
+        )

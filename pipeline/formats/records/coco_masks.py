@@ -55,8 +55,9 @@ def _of_polygons(polygons: Sequence[Any], height: int, width: int, where: str) -
         beyond = points.reshape(-1, 2) - (width, height)
         if points.min() < -BEYOND_PX or beyond.max() > BEYOND_PX:
             allowed = f"x from 0 to {width}, y from 0 to {height}"
-            problem = f"polygon {number} of its segmentation goes beyond the image"
-            raise InputError(problem, where=where, allowed=allowed, remedy=remedy)
+            raise InputError(
+                f"polygon {number} of its segmentation goes beyond the image", where=where, allowed=allowed, remedy=remedy
+            )
     merged = coco_mask.merge(coco_mask.frPyObjects([list(map(float, polygon)) for polygon in polygons], height, width))
     return {"size": [height, width], "counts": merged["counts"].decode("ascii")}
 
@@ -66,8 +67,12 @@ def _checked(segmentation: Mapping[str, Any], height: int, width: int, where: st
     size, counts = segmentation.get("size"), segmentation.get("counts")
     if size != [height, width]:
         allowed = f"[{height}, {width}], the image's height and width"
-        remedy = "use masks and images of the same data set"
-        raise InputError(f"the size of its run lengths is {_kind(size)}", where=where, allowed=allowed, remedy=remedy)
+        raise InputError(
+            f"the size of its run lengths is {_kind(size)}",
+            where=where,
+            allowed=allowed,
+            remedy="use masks and images of the same data set",
+        )
     lengths = _decompressed(counts) if isinstance(counts, str) else _plain(counts)
     if lengths is None or (lengths < 0).any() or lengths.sum() != height * width:
         allowed = f"run lengths, plain or as pycocotools compresses them, of {height * width} pixels in all"

@@ -1,8 +1,9 @@
-"""The normal equations of all candidates at every covariance of the cell means, so that any set of them can be compared at once.
+"""Hold the normal equations of all candidates under every covariance of the cells' means, to compare any sets of candidates
+quickly.
 
-Columns are of two kinds: fixed ones, whose products with each other are all known, and searched sines, of each of which only the
-products with itself and with those fixed columns are that something stands beside (`holding`). A sine that is to stand beside
-others becomes fixed first (`extended`).
+There are two kinds of columns. Products of fixed columns with each other are all known. Of each searched sine only the products
+with itself and with the held columns are known: those of the effects that others are fitted beside (`with_sine_products`). A sine
+that is itself to be held becomes a fixed column first (`extend`).
 """
 
 from __future__ import annotations
@@ -14,23 +15,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.gap.mean.candidates import SineGrid
-from pipeline.gap.mean.mean_model import Covariance, MeanModel, Projected
+from pipeline.gap.mean.mean_model import CellCovariance, MeanModel, ProjectedColumns
 from scene.common.keyed_random import KeyedRandom
 from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 
 _SMALLEST = 1e-9
-"""Share of a column that others have to leave of it, in variance, for its gain to be told from rounding."""
+"""Share of a column's variance that others must leave for its log-likelihood ratio not to be rounding error."""
 _RIDGE = 1e-12
+"""Relative ridge that keeps matrices regular."""
 _AT_ONCE = 8
-"""Covariances together, whatever the number of threads: fewer would cost more in calls than a second core gains."""
+"""Covariances processed together, whatever the number of threads: fewer would cost more in calls than a second core gains."""
 
 
 @dataclass(frozen=True)
-class Waves:
-    """Products of w sines (2 w columns) on the deviations within cells, by the inverse covariance of their noise. fixed: (2 w, k)
-    with the first k of the fixed columns; own: (w, 2, 2); right: (2 w, v) with the values; noise: (2 w, d) with draws of noise;
-    between: (m, 2 w) the cells' means in each basis."""
+class SineProducts:
+    """Products of w sines (2 w columns) with other columns: within cells weighted by the inverse covariance, between cells as
+    means.
+
+    Attributes
+    ----------
+    fixed : (2 w, k) products with the first k of the fixed columns.
+    own : (w, 2, 2) products of each sine with itself.
+    right : (2 w, v) products with v columns of values.
+    noise : (2 w, d) products with d draws of noise.
+    between : (m, 2 w) cell means in each basis.
+    """
 
     fixed: FloatArray
     own: FloatArray
@@ -39,29 +49,53 @@ class Waves:
     between: list[FloatArray]
 
     @classmethod
-    def of(cls, model: MeanModel, grids: list[SineGrid], fixed: FloatArray, value: Projected, noise: NoiseDraws) -> Waves:
-        """Of all sines of some grids. fixed: (n, k) columns, weighed."""
-        beside = np.concatenate([fixed, value.weighed], axis=1)
+    def of(
+        cls, model: MeanModel, grids: list[SineGrid], fixed: FloatArray, value: ProjectedColumns, noise: NoiseDraws
+    ) -> SineProducts:
+        """Compute the products of all sines of some grids.
+
+        Parameters
+        ----------
+        model : The mean model.
+        grids : The sines.
+        fixed : (n, k) weighted deviations of fixed columns.
+        value : Columns of values.
+        noise : Draws of the noise within cells.
+        """
+        beside = np.concatenate([fixed, value.within_weighted], axis=1)
 
         def some(grid: SineGrid) -> tuple[FloatArray, ...]:
-            columns = grid.columns(model.root)
-            planes = model.planes(columns)
+            columns = grid.columns(model.inverse_sigma)
+            planes = model.plane_coefficients(columns)
             means = planes[: model.cells]
-            on_nodes = model.noise.on_nodes(columns, means)
-            own = (_squares(columns) - _squares(planes) - _squares(model.noise.halved(on_nodes))) / model.noise.white
-            drawn = noise.products(model.within(columns, planes, noise.rows), on_nodes)
+            on_nodes = model.within_noise.to_nodes(columns, means)
+            own = (
+                _squares(columns) - _squares(planes) - _squares(model.within_noise.whiten(on_nodes))
+            ) / model.within_noise.white
+            drawn = noise.products(model.deviations(columns, planes, noise.rows), on_nodes)
             return columns.T @ beside, own, drawn, means.T
 
         parts = map_in_threads(some, [part for grid in grids for part in grid.chunks])
         count = fixed.shape[1]
         if not parts:
             empty = np.zeros((0, count)), np.zeros((0, 2, 2)), np.zeros((0, value.within.shape[1]))
-            return cls(*empty, np.zeros((0, noise.white.shape[1])), model.between(np.zeros((model.cells, 0))))
+            return cls(*empty, np.zeros((0, noise.white.shape[1])), model.in_bases(np.zeros((model.cells, 0))))
         products, own, drawn, means = (np.concatenate([part[k] for part in parts]) for k in range(4))
-        return cls(products[:, :count], own, products[:, count:], drawn, model.between(means.T))
+        return cls(products[:, :count], own, products[:, count:], drawn, model.in_bases(means.T))
 
-    def at(self, covariances: list[Covariance], within: FloatArray, between: list[FloatArray]) -> FloatArray:
-        """(C, 2 w, a) products with some columns at each covariance. within: (2 w, a); between: (m, a) in each basis."""
+    def at(self, covariances: list[CellCovariance], within: FloatArray, between: list[FloatArray]) -> FloatArray:
+        """Return the products with some columns under each covariance.
+
+        Parameters
+        ----------
+        covariances : C covariances.
+        within : (2 w, a) products within cells.
+        between : (m, a) cell means of the columns in each basis.
+
+        Returns
+        -------
+        (C, 2 w, a) products.
+        """
         found = np.empty((len(covariances), *within.shape))
         for basis, rows in _by_basis(covariances).items():
             weighted = [between[basis] * covariances[row].weight[:, None] for row in rows]
@@ -69,8 +103,8 @@ class Waves:
             found[rows] = within + products.reshape(len(within), len(rows), within.shape[1]).transpose(1, 0, 2)
         return found
 
-    def own_at(self, covariances: list[Covariance]) -> FloatArray:
-        """(C, w, 2, 2) products of each sine with itself at each covariance."""
+    def own_at(self, covariances: list[CellCovariance]) -> FloatArray:
+        """Return the (C, w, 2, 2) products of each sine with itself under each covariance."""
         found = np.empty((len(covariances), *self.own.shape))
         for basis, rows in _by_basis(covariances).items():
             weights = np.stack([covariances[row].weight for row in rows])
@@ -80,18 +114,24 @@ class Waves:
         return found
 
 
-def _by_basis(covariances: list[Covariance]) -> dict[int, list[int]]:
-    """Of each basis in use the numbers of its covariances."""
+def _by_basis(covariances: list[CellCovariance]) -> dict[int, list[int]]:
+    """For each basis in use the numbers of its covariances."""
     found: dict[int, list[int]] = {}
     for row, each in enumerate(covariances):
-        found.setdefault(each.length, []).append(row)
+        found.setdefault(each.basis, []).append(row)
     return found
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseDraws:
-    """Draws of the noise within cells. rows: some n' of the points; white: (n', d) on them, in single precision, which draws do
-    not need more of; on_nodes: (q, d) by `WithinNoise`."""
+    """Draws of the noise within cells, which represents its effect on any column.
+
+    Attributes
+    ----------
+    rows : The n' points on which white noise is drawn.
+    white : (n', d) white noise, in single precision, which is enough for draws.
+    on_nodes : (q, d) part of the grid-correlated noise (see `WithinCellNoise.draw`).
+    """
 
     rows: slice
     white: NDArray[np.float32]
@@ -99,15 +139,33 @@ class NoiseDraws:
 
     @classmethod
     def of(cls, model: MeanModel, count: int, most_rows: int, random: KeyedRandom) -> NoiseDraws:
-        """`count` draws; white noise on some of the rows stands for that on all."""
+        """Draw the noise.
+
+        White noise on a subsample of the points, scaled up, represents that on all.
+
+        Parameters
+        ----------
+        model : The mean model.
+        count : Number d of draws.
+        most_rows : Most points n'.
+        random : Source of the random numbers.
+        """
         rows = slice(None, None, max(len(model) // most_rows, 1))
-        few = len(model.root[rows])
-        white = random.generator().standard_normal((few, count)) * np.sqrt(len(model) / few)
-        on_nodes = model.noise.drawn(white, rows, model.planes(white, rows)[: model.cells], random.child("nodes"))
-        return cls(rows, (white / np.sqrt(model.noise.white)).astype(np.float32), on_nodes)
+        subsample_size = len(model.inverse_sigma[rows])
+        white = random.generator().standard_normal((subsample_size, count)) * np.sqrt(len(model) / subsample_size)
+        on_nodes = model.within_noise.draw(
+            white, rows, model.plane_coefficients(white, rows)[: model.cells], random.child("nodes")
+        )
+        return cls(rows, (white / np.sqrt(model.within_noise.white)).astype(np.float32), on_nodes)
 
     def products(self, within: FloatArray, on_nodes: FloatArray) -> FloatArray:
-        """(k, d) of columns with the draws, by the inverse covariance. within: (n', k); on_nodes: (q, k)."""
+        """Return the (k, d) products of columns with the draws, weighted by the inverse covariance.
+
+        Parameters
+        ----------
+        within : (n', k) deviations of the columns within cells, on `rows`.
+        on_nodes : (q, k) their products with the nodes.
+        """
         return np.asarray(within.astype(np.float32).T @ self.white + on_nodes.T @ self.on_nodes)
 
 
@@ -117,89 +175,132 @@ def _squares(columns: FloatArray) -> FloatArray:
     return np.asarray(pairs @ pairs.transpose(0, 2, 1))
 
 
-def wave_products(grids: list[SineGrid], weighed: FloatArray, root: FloatArray) -> FloatArray:
-    """(2 w, k) of all sines with further columns (n, k), which are within cells and weighed."""
+def sine_products(grids: list[SineGrid], weighed: FloatArray, root: FloatArray) -> FloatArray:
+    """Compute the products of all sines with further columns.
+
+    Parameters
+    ----------
+    grids : w sines in all.
+    weighed : (n, k) weighted deviations of the columns within cells.
+    root : (n,) inverse standard deviations.
+
+    Returns
+    -------
+    (2 w, k) products.
+    """
     found = map_in_threads(lambda part: part.columns(root).T @ weighed, [part for grid in grids for part in grid.chunks])
     return np.concatenate(found) if found else np.zeros((0, weighed.shape[1]))
 
 
 @dataclass(frozen=True)
-class Equations:
-    """For each of C covariances. fixed: (C, k, k); right: (C, k, v); constant: (C, v) log-likelihood without any column;
-    wave_fixed: (C, 2 w, h) with the columns that are held; wave_own: (C, w, 2, 2); wave_right: (C, 2 w, v); at: the covariances;
-    held: numbers of those h of the fixed columns."""
+class NormalEquations:
+    """Normal equations of all candidates under each of C covariances.
 
-    at: list[Covariance]
+    Attributes
+    ----------
+    covariances : The covariances.
+    fixed : (C, k, k) products of the fixed columns.
+    right : (C, k, v) products of these with v columns of values.
+    constant : (C, v) log-likelihood without any column.
+    wave_fixed : (C, 2 w, h) products of the sines with the h held columns.
+    wave_own : (C, w, 2, 2) products of each sine with itself.
+    wave_right : (C, 2 w, v) products of the sines with the values.
+    held_columns : Numbers of the h held ones among the fixed columns.
+    """
+
+    covariances: list[CellCovariance]
     fixed: FloatArray
     right: FloatArray
     constant: FloatArray
     wave_fixed: FloatArray
     wave_own: FloatArray
     wave_right: FloatArray
-    held: tuple[int, ...] = ()
+    held_columns: tuple[int, ...] = ()
 
-    def with_precision(self, precision: FloatArray) -> Equations:
-        """The same where the fixed columns' coefficients are known to lie about 0. precision: (k,) inverse variances."""
+    def with_precision(self, precision: FloatArray) -> NormalEquations:
+        """Add prior inverse variances (k,) of the fixed columns' coefficients, around 0."""
         return replace(self, fixed=self.fixed + np.diag(precision))
 
-    def of_values(self, right: FloatArray, constant: FloatArray, wave_right: FloatArray) -> Equations:
-        """The same columns with other values."""
+    def with_values(self, right: FloatArray, constant: FloatArray, wave_right: FloatArray) -> NormalEquations:
+        """Replace the values whose log-likelihoods are computed.
+
+        Parameters
+        ----------
+        right : (C, k, v) products of the new values with the fixed columns.
+        constant : (C, v) their log-likelihood without any column.
+        wave_right : (C, 2 w, v) their products with the sines.
+        """
         return replace(self, right=right, constant=constant, wave_right=wave_right)
 
-    def holding(self, columns: list[int], products: FloatArray) -> Equations:
-        """With the products (C, 2 w, a) of the sines with some more of the fixed columns."""
-        return replace(self, wave_fixed=np.concatenate([self.wave_fixed, products], axis=2), held=(*self.held, *columns))
+    def with_sine_products(self, columns: list[int], products: FloatArray) -> NormalEquations:
+        """Hold some more of the fixed columns, given their products (C, 2 w, a) with the sines."""
+        return replace(
+            self, wave_fixed=np.concatenate([self.wave_fixed, products], axis=2), held_columns=(*self.held_columns, *columns)
+        )
 
-    def some(self, chosen: list[int]) -> Equations:
-        """At some of the covariances."""
-        return self._of([self.at[index] for index in chosen], chosen)
+    def at_covariances(self, chosen: list[int]) -> NormalEquations:
+        """Keep only some of the covariances."""
+        return self._of([self.covariances[index] for index in chosen], chosen)
 
-    def _part(self, rows: slice) -> Equations:
-        return self._of(self.at[rows], rows)
+    def _part(self, rows: slice) -> NormalEquations:
+        """The equations of consecutive covariances."""
+        return self._of(self.covariances[rows], rows)
 
-    def _of(self, at: list[Covariance], rows: Any) -> Equations:
+    def _of(self, at: list[CellCovariance], rows: Any) -> NormalEquations:
+        """The equations of some rows, whose covariances are `at`."""
         names = ("fixed", "right", "constant", "wave_fixed", "wave_own", "wave_right")
-        return replace(self, at=at, **{name: getattr(self, name)[rows] for name in names})
+        return replace(self, covariances=at, **{name: getattr(self, name)[rows] for name in names})
 
     def log_likelihood(self, base: list[int]) -> FloatArray:
-        """(C, v) with the fixed columns `base`."""
+        """Return the (C, v) log-likelihoods with the fixed columns `base`."""
         right = self.right[:, base]
         return np.asarray(self.constant + 0.5 * np.einsum("ckv,ckv->cv", right, self._solved(base, right)))
 
     def _solved(self, base: list[int], right: FloatArray) -> FloatArray:
+        """Coefficients of the columns `base` for some right sides."""
         matrix = self.fixed[:, base][:, :, base]
         scale = 1 / np.sqrt(np.maximum(np.einsum("ckk->ck", matrix), 1e-300))
         regular = matrix * scale[:, :, None] * scale[:, None, :] + _RIDGE * np.eye(len(base))
         return np.asarray(np.linalg.solve(regular, right * scale[:, :, None]) * scale[:, :, None])
 
-    def profile(self, base: list[int], fixed: list[list[int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Largest log-likelihoods over the covariances: (v,) of `base`, all of which are held, (f, v) with each list of columns
-        added, (w, v) with each sine added."""
-        parts = [self._part(slice(start, start + _AT_ONCE)) for start in range(0, len(self.at), _AT_ONCE)]
-        found = map_in_threads(lambda part: part._profile(base, fixed), parts)
-        plain, gains, waves = (np.max([each[kind] for each in found], axis=0) for kind in range(3))
-        return plain, gains, waves
+    def profile_log_likelihood(self, base: list[int], fixed: list[list[int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Maximise the log-likelihoods over the covariances.
 
-    def _profile(self, base: list[int], fixed: list[list[int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        Parameters
+        ----------
+        base : Columns that are always fitted; all of them are held.
+        fixed : Lists of columns, each of which is added in turn.
+
+        Returns
+        -------
+        (v,) log-likelihood of the base, (f, v) with each list added, and (w, v) with each sine added.
+        """
+        parts = [self._part(slice(start, start + _AT_ONCE)) for start in range(0, len(self.covariances), _AT_ONCE)]
+        found = map_in_threads(lambda part: part._profile_chunk(base, fixed), parts)
+        plain, added, waves = (np.max([each[kind] for each in found], axis=0) for kind in range(3))
+        return plain, added, waves
+
+    def _profile_chunk(self, base: list[int], fixed: list[list[int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The same for a few covariances."""
         count, whole = self.right.shape[2], self.fixed.shape[2]
-        waves = self.wave_fixed[:, :, [self.held.index(column) for column in base]]
+        waves = self.wave_fixed[:, :, [self.held_columns.index(column) for column in base]]
         beside = self.fixed[:, base]
         solved = self._solved(base, np.concatenate([self.right[:, base], beside, waves.transpose(0, 2, 1)], axis=2))
         value, others, sines = np.split(solved, [count, count + whole], axis=2)
         plain = self.constant + 0.5 * np.einsum("ckv,ckv->cv", self.right[:, base], value)
         left = self.right - beside.transpose(0, 2, 1) @ value
-        gains = np.zeros((len(fixed), count))
+        heights = np.zeros((len(fixed), count))
         for size in {len(columns) for columns in fixed}:
             rows = [row for row, columns in enumerate(fixed) if len(columns) == size]
             columns = np.array([fixed[row] for row in rows])
             own = self.fixed[:, columns[:, :, None], columns[:, None, :]]
             rest = own - beside[:, :, columns].transpose(0, 2, 3, 1) @ others[:, :, columns].transpose(0, 2, 1, 3)
-            gains[rows] = (plain[:, None] + _gain(rest, own, left[:, columns])).max(axis=0)
-        return plain.max(axis=0), gains, self._wave_profile(plain, self.wave_right - waves @ value, sines, waves)
+            heights[rows] = (plain[:, None] + _explained(rest, own, left[:, columns])).max(axis=0)
+        return plain.max(axis=0), heights, self._wave_profile(plain, self.wave_right - waves @ value, sines, waves)
 
     def _wave_profile(self, plain: FloatArray, right: FloatArray, solved: FloatArray, crossed: FloatArray) -> FloatArray:
-        """Two columns at a time: the explained square by the inverse of a 2 x 2 matrix."""
-        shape = len(self.at), self.wave_own.shape[1], 2, crossed.shape[2]
+        """The part for sines: the explained sum of squares of two columns follows from the inverse of a 2 x 2 matrix."""
+        shape = len(self.covariances), self.wave_own.shape[1], 2, crossed.shape[2]
         crossed, mine = crossed.reshape(shape), solved.transpose(0, 2, 1).reshape(shape)
         matrix = self.wave_own - crossed @ mine.transpose(0, 1, 3, 2)
         a, b, d = (matrix[:, :, i, j][..., None] for i, j in ((0, 0), (0, 1), (1, 1)))
@@ -207,13 +308,16 @@ class Equations:
         determinant = a * d - b * b
         whole = (self.wave_own[:, :, 0, 0] * self.wave_own[:, :, 1, 1])[..., None]
         explained = np.where(determinant > _SMALLEST * whole, 0.5 * (r * r * d - 2 * r * s * b + s * s * a), 0.0)
-        gains = explained / np.where(determinant > _SMALLEST * whole, determinant, 1.0)
-        return np.asarray((plain[:, None] + np.maximum(gains, 0.0)).max(axis=0))
+        ratios = explained / np.where(determinant > _SMALLEST * whole, determinant, 1.0)
+        return np.asarray((plain[:, None] + np.maximum(ratios, 0.0)).max(axis=0))
 
 
-def _gain(rest: FloatArray, own: FloatArray, left: FloatArray) -> FloatArray:
-    """(C, f, v) explained by sets of n columns of what the base leaves: `rest` (C, f, n, n) of their products `own`, `left`
-    (C, f, n, v) of the right side."""
+def _explained(rest: FloatArray, own: FloatArray, left: FloatArray) -> FloatArray:
+    """(C, f, v) half the sums of squares that sets of n columns explain beside the base.
+
+    `rest`: (C, f, n, n) products of the columns after the base is projected out, and `own` before; `left`: (C, f, n, v) right
+    sides.
+    """
     scale = np.sqrt(np.maximum(np.einsum("cfkk->cfk", own), 1e-300))
     values, vectors = np.linalg.eigh(rest / scale[..., :, None] / scale[..., None, :])
     turned = vectors.swapaxes(2, 3) @ (left / scale[..., None])
@@ -221,30 +325,51 @@ def _gain(rest: FloatArray, own: FloatArray, left: FloatArray) -> FloatArray:
     return np.asarray(0.5 * np.einsum("cfk,cfkv->cfv", share, turned**2))
 
 
-def assembled(model: MeanModel, at: list[Covariance], fixed: Projected, value: Projected, waves: Waves) -> Equations:
-    """The equations at the covariances `at`, in which no column is held yet."""
-    gram, right = fixed.within.T @ fixed.weighed, fixed.within.T @ value.weighed
-    square = np.einsum("nv,nv->v", value.within, value.weighed)
+def assemble(
+    model: MeanModel, at: list[CellCovariance], fixed: ProjectedColumns, value: ProjectedColumns, waves: SineProducts
+) -> NormalEquations:
+    """Assemble the normal equations, without held columns.
 
-    def at_one(each: Covariance) -> tuple[FloatArray, ...]:
+    Parameters
+    ----------
+    model : The mean model.
+    at : Covariances of the cells' means.
+    fixed : Fixed columns.
+    value : Columns of values.
+    waves : Products of the sines.
+    """
+    gram, right = fixed.within.T @ fixed.within_weighted, fixed.within.T @ value.within_weighted
+    square = np.einsum("nv,nv->v", value.within, value.within_weighted)
+
+    def at_one(each: CellCovariance) -> tuple[FloatArray, ...]:
         root = np.sqrt(each.weight)[:, None]
-        basis, y = fixed.between[each.length] * root, value.between[each.length] * root
+        basis, y = fixed.between[each.basis] * root, value.between[each.basis] * root
         constant = 0.5 * (np.log(each.weight).sum() - np.sum(y**2, axis=0) - square)
         return gram + basis.T @ basis, right + basis.T @ y, constant
 
     products, sides, constant = (np.stack(part) for part in zip(*map_in_threads(at_one, at), strict=True))
     nothing = np.empty((len(at), len(waves.right), 0))
-    return Equations(at, products, sides, constant, nothing, waves.own_at(at), waves.at(at, waves.right, value.between))
+    return NormalEquations(at, products, sides, constant, nothing, waves.own_at(at), waves.at(at, waves.right, value.between))
 
 
-def extended(equations: Equations, had: list[Projected], value: Projected, added: Projected) -> Equations:
-    """With further fixed columns. had: the fixed columns so far."""
-    cross, own = np.concatenate([each.within.T @ added.weighed for each in had]), added.within.T @ added.weighed
-    right = added.within.T @ value.weighed
+def extend(
+    equations: NormalEquations, had: list[ProjectedColumns], value: ProjectedColumns, added: ProjectedColumns
+) -> NormalEquations:
+    """Append fixed columns to the equations.
+
+    Parameters
+    ----------
+    equations : The equations.
+    had : The fixed columns so far, in parts.
+    value : Columns of values.
+    added : Columns to append.
+    """
+    cross, own = np.concatenate([each.within.T @ added.within_weighted for each in had]), added.within.T @ added.within_weighted
+    right = added.within.T @ value.within_weighted
     fixed, sides = [], []
-    for row, each in enumerate(equations.at):
-        weighted = added.between[each.length] * each.weight[:, None]
-        beside = cross + np.concatenate([part.between[each.length].T @ weighted for part in had])
-        fixed.append(np.block([[equations.fixed[row], beside], [beside.T, own + added.between[each.length].T @ weighted]]))
-        sides.append(np.concatenate([equations.right[row], right + weighted.T @ value.between[each.length]]))
+    for row, each in enumerate(equations.covariances):
+        weighted = added.between[each.basis] * each.weight[:, None]
+        beside = cross + np.concatenate([part.between[each.basis].T @ weighted for part in had])
+        fixed.append(np.block([[equations.fixed[row], beside], [beside.T, own + added.between[each.basis].T @ weighted]]))
+        sides.append(np.concatenate([equations.right[row], right + weighted.T @ value.between[each.basis]]))
     return replace(equations, fixed=np.stack(fixed), right=np.stack(sides))

@@ -1,4 +1,4 @@
-"""The search for effects on the mean: what every explanation gains beside others, over one design."""
+"""Score the candidates of the mean model on one set of points, beside any effects that are already selected."""
 
 from __future__ import annotations
 
@@ -7,26 +7,38 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.gap.mean.candidates import FOLDED, OVERTONES, PLACE, REPEATED, Candidate, Explanation, SineGrid, harmonics
+from pipeline.gap.mean.candidates import (
+    HARMONIC_ORDERS,
+    HARMONIC_SERIES,
+    LINE_PATTERN,
+    SPATIAL_NULL,
+    Candidate,
+    ExplanationKey,
+    SineGrid,
+    harmonics,
+)
 from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.mean_model import MeanFit
-from pipeline.gap.mean.null_gains import NullGains
-from pipeline.gap.mean.selection import Choice, Chosen, Members, Tried
+from pipeline.gap.mean.null_distribution import NullDistribution
+from pipeline.gap.mean.selection import EffectSet, FamilyScore, ForwardSelection, SelectedEffect
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 
 _MOST_LEADING = 8
-"""Effects that are taken exactly."""
+"""Most effects that are refitted without linearising."""
 _ALIKE = 100.0
-"""Condition of a form's columns beyond which one of them is others: an overtone that the points' raster shows as a lower one."""
+"""Condition number of a wave's columns above which an overtone is an alias of another one on the points' raster."""
 
 
 class MeanSearch:
-    """All explanations on one set of points, as `Choice` asks for them.
+    """Scores of all candidates on one set of points, as `ForwardSelection` needs them.
 
-    gains_alone: what each gains by itself, given where the residuals' pose holds effects too.
+    Attributes
+    ----------
+    design : The candidates' columns and normal equations.
+    single_effect_ratios : Log-likelihood ratio of each explanation alone.
     """
 
     def __init__(
@@ -35,177 +47,216 @@ class MeanSearch:
         families: list[Candidate | SineGrid],
         random: KeyedRandom,
         pose_precision: FloatArray | None = None,
-        gains_alone: Mapping[Explanation, float] | None = None,
+        single_effect_ratios: Mapping[ExplanationKey, float] | None = None,
     ) -> None:
-        """pose_precision: (p,) inverse variance of the coefficients of `residuals.pose` before there are data, 0 by default."""
-        self.design = Design.of(residuals, families, random, pose_precision)
-        self._null = NullGains.of(self.design, random)
-        self._holding: dict[tuple[Candidate, ...], Design] = {(): self.design}
-        self._profiles: dict[tuple[Candidate, ...], tuple[FloatArray, ...]] = {}
-        alone = sorted(self._tried((), {}), key=lambda each: each.gain) if gains_alone is None else []
-        self.gains_alone = gains_alone or {(each.name, each.empirical): each.gain for each in alone}
+        """Set up the design and simulate its null distribution.
 
-    def select(self) -> tuple[list[Chosen], tuple[Tried, ...]]:
-        """Explanations, and what was tried beside all of them."""
-        found = Choice(self).select()
-        self._holding = {(): self.design}  # a design with a sine is as large as the search itself
+        Parameters
+        ----------
+        residuals : Residuals of the points.
+        families : Candidates and sine grids.
+        random : Source of the random numbers.
+        pose_precision : (p,) prior inverse variances of the coefficients of `residuals.pose_jacobian`; 0 by default.
+        single_effect_ratios : Log-likelihood ratio of each explanation alone, to be given if the pose Jacobian has columns of
+            effects too.
+        """
+        self.design = Design.of(residuals, families, random, pose_precision)
+        self._null = NullDistribution.of(self.design, random)
+        self._designs: dict[tuple[Candidate, ...], Design] = {(): self.design}
+        self._profiles: dict[tuple[Candidate, ...], tuple[FloatArray, ...]] = {}
+        alone = (
+            sorted(self._score_families((), {}), key=lambda each: each.log_likelihood_ratio)
+            if single_effect_ratios is None
+            else []
+        )
+        self.single_effect_ratios = single_effect_ratios or {
+            (each.name, each.empirical): each.log_likelihood_ratio for each in alone
+        }
+
+    def select(self) -> tuple[list[SelectedEffect], tuple[FamilyScore, ...]]:
+        """Select the explanations; return them and the scores of all families beside them."""
+        found = ForwardSelection(self).select()
+        self._designs = {(): self.design}  # frees memory: each conditioned design is as large as the search itself
         return found
 
-    def tried(self, members: Members) -> tuple[Tried, ...]:
-        """Every family's best variant beside some effects, best score first."""
-        return self._tried(members, self.gains_alone)
+    def score_families(self, members: EffectSet) -> tuple[FamilyScore, ...]:
+        """Return every family's best variant beside some effects, best score first."""
+        return self._score_families(members, self.single_effect_ratios)
 
-    def _tried(self, members: Members, alone: Mapping[Explanation, float]) -> tuple[Tried, ...]:
+    def _score_families(self, members: EffectSet, alone: Mapping[ExplanationKey, float]) -> tuple[FamilyScore, ...]:
+        """The same, with given log-likelihood ratios of each explanation alone."""
         plain, fixed, searched = self._profile(tuple(member.candidate for member in members))
         families, found = self.design.families, []
-        for name, (rows, sines) in families.members.items():
-            gains = np.concatenate([fixed[rows, 0], searched[sines, 0]]) - plain[0]
-            best = int(np.argmax(gains))
+        for name, (rows, sines) in families.by_name.items():
+            ratios = np.concatenate([fixed[rows, 0], searched[sines, 0]]) - plain[0]
+            best = int(np.argmax(ratios))
             candidate = families.plain[rows[best]] if best < len(rows) else families.sine(sines[best - len(rows)])
-            gain = float(gains[best])
-            slight = gain < thresholds().mean.least_relative_gain * alone.get((candidate.name, candidate.empirical), 0.0)
-            found.append(Tried(candidate.name, candidate.empirical, gain - self._null.penalty(name), gain, candidate, slight))
+            ratio = float(ratios[best])
+            negligible = ratio < thresholds().mean.least_relative_gain * alone.get((candidate.name, candidate.empirical), 0.0)
+            found.append(
+                FamilyScore(candidate.name, candidate.empirical, ratio - self._null.penalty(name), ratio, candidate, negligible)
+            )
         return tuple(sorted(found, key=lambda item: -item.score))
 
     def _profile(self, candidates: tuple[Candidate, ...]) -> tuple[FloatArray, ...]:
-        """As `Equations.profile`, beside some candidates; kept, since the same sets are asked for again and again."""
+        """Profile log-likelihoods beside some candidates, as `NormalEquations.profile_log_likelihood` returns them; cached."""
         if candidates not in self._profiles:
-            design = self._with(candidates)
-            self._profiles[candidates] = design.equations.profile(design.columns(candidates), design.plain_columns)
+            design = self._conditioned_on(candidates)
+            self._profiles[candidates] = design.equations.profile_log_likelihood(design.columns(candidates), design.plain_columns)
         return self._profiles[candidates]
 
-    def _with(self, candidates: tuple[Candidate, ...]) -> Design:
-        """The design that holds all of them."""
-        if candidates not in self._holding:
-            self._holding[candidates] = self._with(candidates[:-1]).holding(candidates[-1])
-        return self._holding[candidates]
+    def _conditioned_on(self, candidates: tuple[Candidate, ...]) -> Design:
+        """The design conditioned on some candidates; cached."""
+        if candidates not in self._designs:
+            self._designs[candidates] = self._conditioned_on(candidates[:-1]).conditioned_on(candidates[-1])
+        return self._designs[candidates]
 
     def p_value(self, score: float) -> float:
-        """Of the largest score over all families where there is nothing."""
+        """Return the p-value of a score under the null distribution of the largest score over all families."""
         return self._null.p_value(score)
 
-    def p_of_rest(self, tried: Sequence[Tried]) -> float | None:
-        """p-value of what is left beside some effects, by all that was tried there but mere places; None where nothing was.
+    def goodness_of_fit_p_value(self, family_scores: Sequence[FamilyScore]) -> float | None:
+        """Return the p-value of the best remaining score beside the selected effects, without spatial null candidates.
 
-        Null draws are wrong by a Gaussian process; a reference that is wrong by a few waves has larger single ones. How much
-        larger is seen slantwise across the wall, where no sensor has an axis, and so much more may all sines gain where there is
-        nothing (as in genomic control, Devlin & Roeder 1999).
+        The null draws have a Gaussian process as the reference's error. A reference with errors of a few waves has larger
+        single waves. How much larger is measured along oblique directions on the wall, where no sensor has an axis. All sines
+        are discounted by that factor, as in genomic control (Devlin & Roeder 1999).
+
+        Parameters
+        ----------
+        family_scores : Scores of all families beside the selected effects.
+
+        Returns
+        -------
+        The p-value; None if nothing remains to be tested.
         """
-        scores = [item.score for item in tried if not item.name.startswith(PLACE)]
+        scores = [item.score for item in family_scores if not item.name.startswith(SPATIAL_NULL)]
         if not scores:
             return None
-        slanting = [item for item in tried if item.name.startswith(PLACE) and item.candidate.wave is not None]
-        usual = sum(float(self._null.gains[item.candidate.family].mean()) for item in slanting)
-        larger = max(sum(item.gain for item in slanting) / usual, 1.0) if usual else 1.0
-        members = self.design.families.members
-        allowed = {name: larger if members[name][1] else 1.0 for name in members if not name.startswith(f"free {PLACE}")}
+        oblique_waves = [item for item in family_scores if item.name.startswith(SPATIAL_NULL) and item.candidate.wave is not None]
+        expected = sum(float(self._null.log_likelihood_ratios[item.candidate.family].mean()) for item in oblique_waves)
+        inflation = max(sum(item.log_likelihood_ratio for item in oblique_waves) / expected, 1.0) if expected else 1.0
+        members = self.design.families.by_name
+        allowed = {
+            name: inflation if members[name][1] else 1.0 for name in members if not name.startswith(f"free {SPATIAL_NULL}")
+        }
         return self._null.p_value(max(scores), allowed)
 
-    def p_of_places(self, tried: Sequence[Tried]) -> float | None:
-        """The same of mere places."""
-        scores = [item.score for item in tried if item.name.startswith(PLACE)]
-        places = [name for name in self.design.families.members if name.startswith(f"free {PLACE}")]
+    def spatial_null_p_value(self, family_scores: Sequence[FamilyScore]) -> float | None:
+        """Return the p-value of the best remaining score among the spatial null candidates; None without any."""
+        scores = [item.score for item in family_scores if item.name.startswith(SPATIAL_NULL)]
+        places = [name for name in self.design.families.by_name if name.startswith(f"free {SPATIAL_NULL}")]
         return self._null.p_value(max(scores), dict.fromkeys(places, 1.0)) if scores else None
 
-    def score(self, members: Members) -> float:
-        """Of effects together, their periods at the top of the likelihood: the steps of the search cost a strong sine some."""
+    def joint_score(self, members: EffectSet) -> float:
+        """Return the score of effects together, with their periods refined: on the grid alone a strong sine would lose some."""
         candidates = tuple(member.candidate for member in members)
-        design = self._with(candidates)
-        both = (design.equations.log_likelihood(base)[:, 0].max() for base in (design.columns(candidates), design.base))
+        design = self._conditioned_on(candidates)
+        both = (design.equations.log_likelihood(base)[:, 0].max() for base in (design.columns(candidates), design.pose_columns))
         with_them, without = both
-        return float(with_them - without - sum(member.gain - member.score for member in members))
+        return float(with_them - without - sum(member.log_likelihood_ratio - member.score for member in members))
 
-    def kin(self, form: Tried) -> set[str]:
-        """Covariates that change as that of a free form does."""
+    def correlated_covariates(self, form: FamilyScore) -> set[str]:
+        """Return the covariates that vary together with that of a non-parametric term, by their correlation."""
         found = self.design.residuals.covariates
         covariates = {name: values for name, values in found.items() if np.ptp(values) > 0}
         parts = form.name.split(" and ")
-        alike = np.abs(np.corrcoef([*covariates.values(), *(covariates[part] for part in parts)])[:, -len(parts) :])
-        return {name for name, row in zip(covariates, alike, strict=False) if row.max() > thresholds().mean.same_covariate}
+        correlation = np.abs(np.corrcoef([*covariates.values(), *(covariates[part] for part in parts)])[:, -len(parts) :])
+        return {name for name, row in zip(covariates, correlation, strict=False) if row.max() > thresholds().mean.same_covariate}
 
-    def folded(self, members: Members, form: Tried) -> Tried:
-        """What is periodic in its plainest form beside some effects.
+    def with_harmonics(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
+        """Return the simplest form of a periodic term beside some effects.
 
-        A wave has its overtones where the data ask for those, as what is periodic need not be a sine; of what repeats every few
-        lines it is the form of the fewest, as twice as many say it too.
+        A wave gets overtones if the data require them, because a periodic error need not be a sine. A spline becomes a wave if
+        that fits as well. Of patterns that repeat every few lines the one with the fewest lines is taken, because its
+        multiples fit as well.
         """
-        if form.candidate.form.startswith(REPEATED):
+        if form.candidate.form.startswith(LINE_PATTERN):
             return self._of_fewest_lines(members, form)
-        if form.candidate.form == "smooth":
-            form = self._as_wave(members, form)
+        if form.candidate.form == "spline":
+            form = self._wave_instead(members, form)
         return self._with_overtones(members, form) if form.candidate.form == "wave" else form
 
-    def _of_fewest_lines(self, members: Members, form: Tried) -> Tried:
-        alike = [each for each in self.tried(members) if each.candidate.form.startswith(REPEATED) and each.name == form.name]
-        good = [each for each in alike if each.score > form.score - thresholds().mean.nonparametric_margin]
+    def _of_fewest_lines(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
+        """Of the line patterns that score nearly as well, the one with the fewest lines."""
+        patterns = [
+            each
+            for each in self.score_families(members)
+            if each.candidate.form.startswith(LINE_PATTERN) and each.name == form.name
+        ]
+        good = [each for each in patterns if each.score > form.score - thresholds().mean.nonparametric_margin]
         return min(good, key=lambda each: each.candidate.period)
 
-    def _as_wave(self, members: Members, form: Tried) -> Tried:
-        """The wave of the same covariate where that, at the top of its period, says it as well as a curve does."""
-        alike = [each for each in self.tried(members) if each.candidate.form == "wave" and _of_one_kind(each, form)]
-        if not alike:
+    def _wave_instead(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
+        """A wave of the same covariate, with its period refined, if it scores better than a spline; else the spline."""
+        waves = [each for each in self.score_families(members) if each.candidate.form == "wave" and _same_covariate(each, form)]
+        if not waves:
             return form
-        wave, others = alike[0], [member.candidate for member in members]
-        (sine, *_), fit = self.design.refined([wave.candidate, *others])
-        gain = wave.gain + fit.log_likelihood - self.design.fit([wave.candidate, *others]).log_likelihood
-        score = gain - (wave.gain - wave.score)
-        return replace(wave, candidate=sine, gain=gain, score=score) if score > form.score else form
+        wave, others = waves[0], [member.candidate for member in members]
+        (sine, *_), fit = self.design.fit_refined([wave.candidate, *others])
+        ratio = wave.log_likelihood_ratio + fit.log_likelihood - self.design.fit([wave.candidate, *others]).log_likelihood
+        score = ratio - (wave.log_likelihood_ratio - wave.score)
+        return replace(wave, candidate=sine, log_likelihood_ratio=ratio, score=score) if score > form.score else form
 
-    def _with_overtones(self, members: Members, form: Tried) -> Tried:
-        (sine, *others), fit = self.design.refined([form.candidate, *(member.candidate for member in members)])
+    def _with_overtones(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
+        """A wave with its overtones if these improve the score clearly; else the wave itself."""
+        (sine, *others), fit = self.design.fit_refined([form.candidate, *(member.candidate for member in members)])
         unit = float(self.design.residuals.covariates[form.name].std()) or 1.0
 
-        def with_overtones(last: int) -> Tried:
+        def with_overtones(last: int) -> FamilyScore:
             overtones = harmonics(form.name, sine, last)
             columns = np.concatenate([sine.columns, overtones.columns], axis=1)
             if np.linalg.cond(columns.T @ columns) > _ALIKE:
                 return form
-            both = replace(overtones, matrix=columns, form=FOLDED, period=unit * sine.period)
-            gain = self.design.fit([both, *others]).log_likelihood - fit.log_likelihood
-            score = gain - overtones.columns.shape[1]
-            return replace(form, candidate=both, gain=form.gain + gain, score=form.score + score)
+            both = replace(overtones, matrix=columns, form=HARMONIC_SERIES, period=unit * sine.period)
+            ratio = self.design.fit([both, *others]).log_likelihood - fit.log_likelihood
+            score = ratio - overtones.columns.shape[1]
+            return replace(form, candidate=both, log_likelihood_ratio=form.log_likelihood_ratio + ratio, score=form.score + score)
 
-        best = max(map(with_overtones, OVERTONES), key=lambda each: each.score)
+        best = max(map(with_overtones, HARMONIC_ORDERS), key=lambda each: each.score)
         return best if best.score >= form.score + thresholds().mean.nonparametric_margin else form
 
-    def may_be_the_reference(self, members: Members, form: Tried) -> bool:
-        """Whether a wave is no larger than the reference's error beside it, which may hold just such a wave.
+    def may_be_reference_error(self, members: EffectSet, form: FamilyScore) -> bool:
+        """Tell whether a wave is no larger than the reference's error, which may contain just such a wave.
 
-        More than a reference may be wrong by is not its error: it is what the wave leaves of whatever is not quite a wave.
+        The reference's error is limited to `nodes.reference_error`. More than that would be the inexact part of the wave itself.
         """
         if form.candidate.form != "wave":
             return False
-        size, fit = self._said(form, members)
+        size, fit = self._fitted_std_and_fit(form, members)
         most = thresholds().grid_noise.reference_error / float(np.median(self.design.residuals.unit_m))
-        error = min(float(np.sqrt(fit.at.ratio)) * self.design.model.typical_sigma, most)
+        error = min(float(np.sqrt(fit.cell_covariance.variance_ratio)) * self.design.model.typical_sigma, most)
         return size < thresholds().mean.least_wave_sigmas * error
 
-    def size(self, item: Tried) -> float:
-        """Standard deviation of what an explanation by itself says, in the observable's unit."""
-        return self._said(item, ())[0]
+    def fitted_std(self, item: FamilyScore) -> float:
+        """Return the standard deviation of what an explanation alone describes, in the unit of the observable."""
+        return self._fitted_std_and_fit(item, ())[0]
 
-    def _said(self, form: Tried, members: Members) -> tuple[float, MeanFit]:
-        """The same beside some effects, and the fit of all."""
-        candidates, fit = self.design.refined([form.candidate, *(member.candidate for member in members)])
+    def _fitted_std_and_fit(self, form: FamilyScore, members: EffectSet) -> tuple[float, MeanFit]:
+        """The same beside some effects, and the joint fit."""
+        candidates, fit = self.design.fit_refined([form.candidate, *(member.candidate for member in members)])
         columns = candidates[0].columns
-        values = self.design.split(fit.coefficients, candidates)[0][: columns.shape[1]]
+        values = self.design.split_coefficients(fit.coefficients, candidates)[0][: columns.shape[1]]
         return float(np.std(columns @ values)), fit
 
-    def leading(self) -> list[Candidate]:
-        """Effects of the catalogue that are large and explain much by themselves, each variant for itself, best first."""
+    def leading_effects(self) -> list[Candidate]:
+        """List the effects of the catalogue that explain much alone, with their variants, best first. They are refitted
+        without linearising.
+        """
         plain, fixed, _ = self._profile(())
-        gains = fixed[:, 0] - plain[0]
-        found = [(gain, each) for gain, each in zip(gains, self.design.families.plain, strict=True) if not each.empirical]
+        ratios = fixed[:, 0] - plain[0]
+        found = [(ratio, each) for ratio, each in zip(ratios, self.design.families.plain, strict=True) if not each.empirical]
         ranked = sorted(found, key=lambda item: -item[0])
         least = max(thresholds().mean.refit_share * ranked[0][0], thresholds().mean.refit_gain) if ranked else 0.0
-        return [each for gain, each in ranked if gain >= least][:_MOST_LEADING]
+        return [each for ratio, each in ranked if ratio >= least][:_MOST_LEADING]
 
-    def alone(self, candidate: Candidate) -> Chosen:
-        """A candidate by itself."""
-        best = next(item for item in self.tried(()) if item.name == candidate.name and not item.empirical)
+    def selected_alone(self, candidate: Candidate) -> SelectedEffect:
+        """Return a candidate as if it had been selected alone, with its equivalence class."""
+        best = next(item for item in self.score_families(()) if item.name == candidate.name and not item.empirical)
         item = replace(best, candidate=candidate)
-        return Choice(self).chosen((item,), item, {})
+        return ForwardSelection(self).with_equivalents((item,), item, {})
 
 
-def _of_one_kind(one: Tried, other: Tried) -> bool:
+def _same_covariate(one: FamilyScore, other: FamilyScore) -> bool:
+    """Whether two terms have the same covariate and the same angle."""
     return one.name == other.name and one.candidate.angle == other.candidate.angle

@@ -1,8 +1,9 @@
-"""Which effects explain the mean: sets of up to three, the null distribution of the largest gain, classes, a check by free forms.
+"""Select the systematic effects: forward selection of sets of up to three, tested against a simulated null distribution.
 
-The score of a candidate is its gain in log-likelihood less twice what it gains on average where there is nothing (for k free
-columns k, as Akaike's criterion; more where a period is searched): the expected gain on new data. Sets are grown from the few
-best of each size, so that two effects are found too where neither, or a third that looks like their sum, is best alone.
+The score of a candidate is its penalised log-likelihood ratio: the log-likelihood ratio minus twice its mean under the null. It
+estimates the ratio on new data; for k linear columns the penalty is k, as in AIC, and it is larger if a period is searched. Sets
+are grown from the five best of each size. Two effects are therefore also found if neither is the best one alone, for example
+because a third effect resembles their sum.
 """
 
 from __future__ import annotations
@@ -11,201 +12,263 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
-from pipeline.gap.mean.candidates import PLACE, SURFACE, Candidate
+from pipeline.gap.mean.candidates import POLYNOMIAL, SPATIAL_NULL, Candidate
 from pipeline.gap.thresholds import thresholds
 from sensors.effects.range_offset import RangeOffset
 
-_WIDTH = 5
-"""Sets of one size that are grown further."""
-_NOT_PLACES = ("intensity", "disparity_fraction")
-"""Covariates that do not change along the wall."""
+_BEAM_WIDTH = 5
+"""Number of the best sets of one size that are grown further (beam width)."""
+_NOT_SPATIAL = ("intensity", "disparity_fraction")
+"""Covariates that do not vary along the wall, so that the reference's error cannot imitate their effects."""
 
 
 @dataclass(frozen=True)
-class Tried:
-    """What a family of candidates gained beside the effects of a set. candidate: its best variant; slight: whether the gain only
-    makes up for what those are not exact in."""
+class FamilyScore:
+    """How well the best variant of a family of candidates explains the residuals beside a given set of effects.
+
+    Attributes
+    ----------
+    name, empirical : As in `Candidate`.
+    score : Penalised log-likelihood ratio: the expected ratio on new data.
+    log_likelihood_ratio : Of the models with and without the candidate.
+    candidate : The best variant.
+    negligible : Whether the ratio is so small a share of what the candidate explains alone that it may only absorb inexact
+        signatures.
+    """
 
     name: str
     empirical: bool
     score: float
-    gain: float
+    log_likelihood_ratio: float
     candidate: Candidate
-    slight: bool = False
+    negligible: bool = False
 
 
-Members = tuple[Tried, ...]
-"""Effects that stand together."""
-Scores = dict[frozenset[str], float]
-"""Of sets of effects, by their names."""
+EffectSet = tuple[FamilyScore, ...]
+"""Candidates that are fitted together."""
+SetScores = dict[frozenset[str], float]
+"""Scores of sets of effects, by the effects' names."""
 
 
 @dataclass(frozen=True)
-class Chosen:
-    """One explanation that was accepted. alike: others that score as well; tried: all that stood beside it."""
+class SelectedEffect:
+    """An explanation that was selected.
+
+    Attributes
+    ----------
+    candidate : The best variant.
+    indistinguishable : Names of the other effects in its equivalence class: they would score as well in its place.
+    p_value : Of the score, corrected for multiple testing over all families.
+    log_likelihood_ratio : Of the models with and without it, beside the other selected effects.
+    score : Penalised log-likelihood ratio.
+    family_scores : Scores of all families beside the other selected effects.
+    """
 
     candidate: Candidate
-    alike: tuple[str, ...]
+    indistinguishable: tuple[str, ...]
     p_value: float
-    gain: float
+    log_likelihood_ratio: float
     score: float
-    tried: tuple[Tried, ...]
+    family_scores: tuple[FamilyScore, ...]
 
 
 @dataclass(frozen=True)
 class _Set:
-    """Some effects of the catalogue together, and what was tried beside them. score: of all together."""
+    """A set of effects of the catalogue, and the scores of all families beside it.
 
-    members: Members
+    Attributes
+    ----------
+    members : The effects.
+    score : Joint score of all of them.
+    family_scores : Scores of further candidates, best first.
+    """
+
+    members: EffectSet
     score: float
-    tried: tuple[Tried, ...]
+    family_scores: tuple[FamilyScore, ...]
 
     @property
     def names(self) -> frozenset[str]:
+        """Names of the effects."""
         return frozenset(member.name for member in self.members)
 
     @property
-    def catalogue(self) -> list[Tried]:
-        """Of what was tried, the effects of the catalogue that are not in the set yet, best first."""
-        return [item for item in self.tried if not (item.empirical or item.slight) and item.name not in self.names]
+    def catalogue(self) -> list[FamilyScore]:
+        """Effects of the catalogue that may be added, best first."""
+        return [item for item in self.family_scores if not (item.empirical or item.negligible) and item.name not in self.names]
 
     @property
-    def decoy(self) -> float:
-        """Score of mere places."""
-        return max([0.0, *(item.score for item in self.tried if item.name.startswith(PLACE))])
+    def spatial_null_score(self) -> float:
+        """Best score of a spatial null candidate, at least 0."""
+        return max([0.0, *(item.score for item in self.family_scores if item.name.startswith(SPATIAL_NULL))])
 
     @property
-    def free(self) -> Tried | None:
-        """The best free form; of a covariate that changes along the wall only where it does better than mere places do."""
-        decoy = self.decoy
-        free = [item for item in self.tried if item.empirical and not (item.slight or item.name.startswith(PLACE))]
-        found = [item for item in free if _stands_out(item, decoy)]
-        plain = next((item for item in found if item.candidate.form != SURFACE), None)
+    def nonparametric(self) -> FamilyScore | None:
+        """The best non-parametric term, or None. It must clearly beat the spatial null candidates if its covariate varies
+        along the wall.
+        """
+        null_score = self.spatial_null_score
+        terms = [
+            item for item in self.family_scores if item.empirical and not (item.negligible or item.name.startswith(SPATIAL_NULL))
+        ]
+        found = [item for item in terms if _beats_spatial_null(item, null_score)]
+        one_covariate = next((item for item in found if item.candidate.form != POLYNOMIAL), None)
         by = thresholds().mean
-        if plain is None or found[0].score > max(plain.score + by.nonparametric_margin, by.surface_ratio * plain.score):
+        if one_covariate is None or found[0].score > max(
+            one_covariate.score + by.nonparametric_margin, by.surface_ratio * one_covariate.score
+        ):
             return found[0] if found else None
-        return plain
+        return one_covariate
 
 
-def class_margin(gain: float) -> float:
-    """Within which of a score, of so large a gain, others belong to its class: signatures are exact to a share of the gain."""
-    return max(thresholds().mean.class_margin, thresholds().mean.class_share * gain)
+def equivalence_margin(log_likelihood_ratio: float) -> float:
+    """Return the difference of scores within which two effects are indistinguishable.
+
+    It is at least `mean.class_margin` and grows with the log-likelihood ratio, because signatures are only exact to a share of
+    it.
+    """
+    return max(thresholds().mean.class_margin, thresholds().mean.class_share * log_likelihood_ratio)
 
 
-def _in_its_place(names: frozenset[str], name: str, margin: float, scores: Scores) -> list[str]:
-    """Names in the place of which a set would score as well, best first."""
+def _replacements(names: frozenset[str], name: str, margin: float, scores: SetScores) -> list[str]:
+    """Names of effects that could replace `name` in the set `names` at nearly the same joint score, best first."""
     others, least = names - {name}, scores.get(names, math.inf) - margin
     as_good = [each for each, score in scores.items() if others < each and len(each) == len(names) and score > least]
     return [other for each in sorted(as_good, key=lambda each: -scores[each]) for other in each - others if other != name]
 
 
-def _weak(form: Tried | None) -> float:
-    """Score of a free form that is too weak to be said, and that a weak effect of the catalogue has to do better than; else 0."""
+def _unreported_score(form: FamilyScore | None) -> float:
+    """Score of a non-parametric term that is too weak to be reported, which a weak effect must still beat; else 0."""
     return form.score if form is not None and form.score < thresholds().mean.least_nonparametric_score else 0.0
 
 
-def _stands_out(item: Tried, decoy: float) -> bool:
-    """Whether a free form does better than mere places, of which the best scores `decoy`."""
+def _beats_spatial_null(item: FamilyScore, null_score: float) -> bool:
+    """Tell whether a non-parametric term clearly beats the best spatial null candidate, whose score is `null_score`."""
     by = thresholds().mean
-    if item.candidate.form == SURFACE:
-        return item.score > max(decoy + by.nonparametric_margin, by.least_surface_score)
-    least = (by.null_wave_ratio if item.candidate.form == "wave" else 1.0) * decoy + by.nonparametric_margin
-    return item.name in _NOT_PLACES or item.score > least
+    if item.candidate.form == POLYNOMIAL:
+        return item.score > max(null_score + by.nonparametric_margin, by.least_surface_score)
+    least = (by.null_wave_ratio if item.candidate.form == "wave" else 1.0) * null_score + by.nonparametric_margin
+    return item.name in _NOT_SPATIAL or item.score > least
 
 
-class Searched(Protocol):
-    """What a choice rests on."""
+class CandidateScorer(Protocol):
+    """Scores that a forward selection needs; `MeanSearch` computes them."""
 
-    def tried(self, members: Members) -> tuple[Tried, ...]:
-        """Every family's best variant beside some effects, best score first."""
+    def score_families(self, members: EffectSet) -> tuple[FamilyScore, ...]:
+        """Return every family's best variant beside some effects, best score first."""
 
     def p_value(self, score: float) -> float:
-        """Of the largest score over all families where there is nothing."""
+        """Return the p-value of a score under the null distribution of the largest score over all families."""
 
-    def score(self, members: Members) -> float:
-        """Of effects together, their periods at the top of the likelihood."""
+    def joint_score(self, members: EffectSet) -> float:
+        """Return the score of effects together, with their periods refined."""
 
-    def kin(self, form: Tried) -> set[str]:
-        """Covariates that change as that of a free form does."""
+    def correlated_covariates(self, form: FamilyScore) -> set[str]:
+        """Return the covariates that vary together with that of a non-parametric term."""
 
-    def folded(self, members: Members, form: Tried) -> Tried:
-        """A wave with its overtones where the data ask for those."""
+    def with_harmonics(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
+        """Return a wave with its overtones or as a line pattern if that explains the residuals better; else the term itself."""
 
-    def may_be_the_reference(self, members: Members, form: Tried) -> bool:
-        """Whether a form beside some effects is no larger than the reference's error, which may hold just such a form."""
+    def may_be_reference_error(self, members: EffectSet, form: FamilyScore) -> bool:
+        """Tell whether a wave is no larger than the reference's error, which may contain just such a wave."""
 
 
 @dataclass(frozen=True)
-class Choice:
-    """Sets of effects, grown from the few best of each size."""
+class ForwardSelection:
+    """Forward selection of effects, with several sets of each size.
 
-    search: Searched
+    Attributes
+    ----------
+    search : Scores of the candidates.
+    """
 
-    def select(self) -> tuple[list[Chosen], tuple[Tried, ...]]:
-        """Explanations, and what was tried beside all of them."""
-        empty = _Set((), 0.0, self.search.tried(()))
-        levels, scores = [[empty]], Scores()
+    search: CandidateScorer
+
+    def select(self) -> tuple[list[SelectedEffect], tuple[FamilyScore, ...]]:
+        """Select the explanations of the residuals.
+
+        Returns
+        -------
+        The selected effects, with at most one non-parametric term, and the scores of all families beside them.
+        """
+        empty = _Set((), 0.0, self.search.score_families(()))
+        levels, scores = [[empty]], SetScores()
         while len(levels) <= thresholds().mean.most_effects:
-            grown, of_sets = self._grown(levels[-1])
+            grown, of_sets = self._grow(levels[-1])
             if not grown or not self._significant(grown[0].score - levels[-1][0].score):
                 break
             levels.append(grown)
             scores |= of_sets
         best = levels[-1][0]
-        members, form = self._free(levels) or ((), None)
-        form = None if form is None else self.search.folded(members, form)
-        if form is not None and not self.search.may_be_the_reference(members, form):
-            chosen = [self.chosen(members, item, scores) for item in members]
-            chosen.append(Chosen(form.candidate, (), self.search.p_value(form.score), form.gain, form.score, empty.tried))
-            return chosen, self.search.tried((*members, form))
-        best, chosen = self._beyond_places(best, scores)
-        nearly = (1 - thresholds().mean.least_relative_gain) * empty.decoy
-        if best.score <= max(nearly, _weak(empty.free)):  # no effect of the catalogue says it as well
-            return [], empty.tried
-        return chosen, best.tried
+        members, form = self._nonparametric_term(levels) or ((), None)
+        form = None if form is None else self.search.with_harmonics(members, form)
+        if form is not None and not self.search.may_be_reference_error(members, form):
+            chosen = [self.with_equivalents(members, item, scores) for item in members]
+            chosen.append(
+                SelectedEffect(
+                    form.candidate,
+                    (),
+                    self.search.p_value(form.score),
+                    form.log_likelihood_ratio,
+                    form.score,
+                    empty.family_scores,
+                )
+            )
+            return chosen, self.search.score_families((*members, form))
+        best, chosen = self._drop_below_spatial_null(best, scores)
+        nearly = (1 - thresholds().mean.least_relative_gain) * empty.spatial_null_score
+        if best.score <= max(nearly, _unreported_score(empty.nonparametric)):  # no effect of the catalogue explains it as well
+            return [], empty.family_scores
+        return chosen, best.family_scores
 
-    def _beyond_places(self, found: _Set, scores: Scores) -> tuple[_Set, list[Chosen]]:
-        """A set without effects that, beside its others, say no more than mere places do beside all of them."""
-        chosen = [self.chosen(found.members, item, scores) for item in found.members]
+    def _drop_below_spatial_null(self, found: _Set, scores: SetScores) -> tuple[_Set, list[SelectedEffect]]:
+        """Drop effects that score no better beside the others than a spatial null candidate does beside all of them."""
+        chosen = [self.with_equivalents(found.members, item, scores) for item in found.members]
         least = min(chosen, key=lambda each: each.score, default=None)
-        if least is None or least.score > found.decoy:
+        if least is None or least.score > found.spatial_null_score:
             return found, chosen
         members = tuple(item for item, each in zip(found.members, chosen, strict=True) if each is not least)
-        return self._beyond_places(_Set(members, found.score - least.score, self.search.tried(members)), scores)
+        return self._drop_below_spatial_null(
+            _Set(members, found.score - least.score, self.search.score_families(members)), scores
+        )
 
-    def _grown(self, level: list[_Set]) -> tuple[list[_Set], Scores]:
-        """The best sets of one effect more, best first, and what each set that was looked at scores."""
-        found: dict[frozenset[str], Members] = {}
-        scores = Scores()
+    def _grow(self, level: list[_Set]) -> tuple[list[_Set], SetScores]:
+        """The best sets with one more effect, best first, and the score of each set that was considered."""
+        found: dict[frozenset[str], EffectSet] = {}
+        scores = SetScores()
         for each in level:
-            for item in each.catalogue[:_WIDTH]:
+            for item in each.catalogue[:_BEAM_WIDTH]:
                 names, score = each.names | {item.name}, each.score + item.score
                 if score > scores.get(names, -math.inf):
                     scores[names], found[names] = score, (*each.members, item)
-        ranked = sorted(scores, key=lambda names: -scores[names])[:_WIDTH]
-        return [_Set(found[names], scores[names], self.search.tried(found[names])) for names in ranked], scores
+        ranked = sorted(scores, key=lambda names: -scores[names])[:_BEAM_WIDTH]
+        return [_Set(found[names], scores[names], self.search.score_families(found[names])) for names in ranked], scores
 
-    def _free(self, levels: list[list[_Set]]) -> tuple[Members, Tried] | None:
-        """A free form that the data ask for beside or in place of effects of the catalogue, and the effects it stands beside."""
+    def _nonparametric_term(self, levels: list[list[_Set]]) -> tuple[EffectSet, FamilyScore] | None:
+        """A non-parametric term that the data require, beside or instead of effects, and those effects; None if they require
+        none.
+        """
         best, empty = levels[-1][0], levels[0][0]
         if (
-            best.free is not None
-            and best.free.score >= thresholds().mean.least_nonparametric_score
-            and self._significant(best.free.score)
+            best.nonparametric is not None
+            and best.nonparametric.score >= thresholds().mean.least_nonparametric_score
+            and self._significant(best.nonparametric.score)
         ):
-            found: tuple[_Set, Tried] | None = None
+            found: tuple[_Set, FamilyScore] | None = None
             for state in (level[0] for level in levels):
-                form = state.free
+                form = state.nonparametric
                 if form is None:
                     continue
-                if found is None or self._adds(state, state.score + form.score - found[0].score - found[1].score, found[1]):
+                if found is None or self._effects_required(
+                    state, state.score + form.score - found[0].score - found[1].score, found[1]
+                ):
                     found = state, form
             if found is not None:
                 return found[0].members, found[1]
-        alone = empty.free
+        alone = empty.nonparametric
         if not best.members or alone is None:
             return None
-        score = max(best.score, self.search.score(best.members))
+        score = max(best.score, self.search.joint_score(best.members))
         margin = (
             max(thresholds().mean.nonparametric_margin, thresholds().mean.least_relative_gain * score)
             if len(best.members) < 2
@@ -215,32 +278,46 @@ class Choice:
             return (), alone
         return None
 
-    def _adds(self, state: _Set, score: float, form: Tried) -> bool:
-        """Whether the data ask for effects of the catalogue beside a free form: no form is exact, nor has it a constant, and so
-        each effect has to add more than a second form of the same covariate, one of two covariates, or a constant, does."""
+    def _effects_required(self, state: _Set, score: float, form: FamilyScore) -> bool:
+        """Tell whether the data require the effects of a set beside a non-parametric term.
+
+        Such a term is inexact and has no constant. Each effect must therefore add more than a second term of a correlated
+        covariate, a polynomial of two covariates, or a constant would.
+        """
         if not self._significant(score):
             return False
-        kin = self.search.kin(form)
+        correlated = self.search.correlated_covariates(form)
         second = [
             item.score
-            for item in self.search.tried((form,))
-            if item.name == RangeOffset.tag() or item.candidate.form == SURFACE or (item.empirical and item.name in kin)
+            for item in self.search.score_families((form,))
+            if item.name == RangeOffset.tag() or item.candidate.form == POLYNOMIAL or (item.empirical and item.name in correlated)
         ]
         return score > len(state.members) * max([0.0, *second])
 
-    def chosen(self, among: Members, item: Tried, scores: Scores) -> Chosen:
-        """An effect with those that would do as well in its place beside the others.
+    def with_equivalents(self, among: EffectSet, item: FamilyScore, scores: SetScores) -> SelectedEffect:
+        """Describe a selected effect, with the effects that cannot be distinguished from it.
 
-        scores: of sets with other variants of the others, as of another camera, beside which they may do as well.
+        Parameters
+        ----------
+        among : The selected set.
+        item : One of its effects.
+        scores : Scores of other sets, which may contain other variants of the other effects, such as another camera.
         """
         others = tuple(member for member in among if member is not item)
-        beside = [each for each in self.search.tried(others) if not each.empirical and each.name not in {o.name for o in others}]
+        beside = [
+            each
+            for each in self.search.score_families(others)
+            if not each.empirical and each.name not in {o.name for o in others}
+        ]
         mine = next(each for each in beside if each.name == item.name)
-        margin, p_value = class_margin(mine.gain), self.search.p_value(mine.score)
-        alike = [each.name for each in beside if each is not mine and each.score > mine.score - margin]
-        alike += _in_its_place(frozenset(member.name for member in among), item.name, margin, scores)
-        tried = self.search.tried(others)
-        return Chosen(item.candidate, tuple(dict.fromkeys(alike)), p_value, mine.gain, mine.score, tried)
+        margin, p_value = equivalence_margin(mine.log_likelihood_ratio), self.search.p_value(mine.score)
+        indistinguishable = [each.name for each in beside if each is not mine and each.score > mine.score - margin]
+        indistinguishable += _replacements(frozenset(member.name for member in among), item.name, margin, scores)
+        tried = self.search.score_families(others)
+        return SelectedEffect(
+            item.candidate, tuple(dict.fromkeys(indistinguishable)), p_value, mine.log_likelihood_ratio, mine.score, tried
+        )
 
     def _significant(self, score: float) -> bool:
+        """Tell whether a score is large enough and significant."""
         return score >= thresholds().mean.least_score and self.search.p_value(score) <= thresholds().mean.significance

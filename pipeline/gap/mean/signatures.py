@@ -1,6 +1,6 @@
-"""How each effect of the catalogue on the mean would show in the residuals: columns that are linear in amplitudes.
+"""Compute the signatures of the catalogue's systematic effects: how each would change the residuals, per unit of its parameters.
 
-The equations are the effects' own (`Effect.mean`); those of the cameras follow from projecting through the changed pair.
+The equations are those of the effects (`Effect.mean`); effects of the cameras follow by projection through the changed pair.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from pipeline.gap.mean.candidates import (
     Candidate,
     SineGrid,
     Wave,
-    along_disparity,
     amplitude_and_phase,
-    frequencies,
-    variants,
+    disparity_frequencies,
+    expand_grids,
+    frequency_grid,
 )
-from pipeline.gap.residuals.disparity_raster import spacing, through
-from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, real_pair, seen_disparities
+from pipeline.gap.residuals.disparity_raster import apply_smoothing, raster_spacing_px
+from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, predict_disparities, real_pair
 from pipeline.gap.residuals.residuals import Geometry, Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from scene.geometry.mesh import FloatArray
@@ -31,21 +31,36 @@ from sensors.effects.camera_effect import CameraEffect
 from sensors.effects.pixel_locking import PixelLocking
 
 _SIDES = ("left", "right", "both")
+"""Cameras that an effect may belong to."""
 _STEP = 0.1
-"""Of a parameter's typical size, in finite differences."""
+"""Step of the finite differences, in typical sizes of the parameter."""
 _PHASE = "phase_rad"
+"""Name of the parameter that holds a phase."""
 _MOST_PERIODS = 2000
-"""Of one effect; for a wobble over 8,000 scan lines, one of them is then at most half a cycle off over all lines."""
+"""Most periods of one effect. A wobble over 8,000 scan lines then has a period at most half a cycle off over all lines."""
 _REDUCTIONS = (1.0, 2.0, 4.0, 8.0)
+"""Reductions of the images in which a matcher may have worked: pixel locking has their pixels as its period."""
 
 
-def mean_candidates(residuals: Residuals, measurement: Measurement) -> list[Candidate]:
-    """Every effect of the catalogue on the mean that the recorded fields allow, cameras and searched parameters as variants."""
-    return variants(mean_families(residuals, measurement))
+def systematic_candidates(residuals: Residuals, measurement: Measurement) -> list[Candidate]:
+    """List every systematic effect that the recorded fields allow, with cameras and searched periods as variants.
+
+    Parameters
+    ----------
+    residuals : Residuals with their geometry.
+    measurement : The measurement.
+    """
+    return expand_grids(systematic_families(residuals, measurement))
 
 
-def mean_families(residuals: Residuals, measurement: Measurement) -> list[Candidate | SineGrid]:
-    """The same with each searched sine as one grid."""
+def systematic_families(residuals: Residuals, measurement: Measurement) -> list[Candidate | SineGrid]:
+    """List the systematic effects that the recorded fields allow, with each searched sine as one grid of periods.
+
+    Parameters
+    ----------
+    residuals : Residuals with their geometry.
+    measurement : The measurement.
+    """
     geometry = residuals.geometry
     shown = [effect for effect in residuals.candidates if effect.shows_in == ShowsIn.MEAN and effect.known(geometry)]
     cameras: list[type[CameraEffect]] = [effect for effect in shown if issubclass(effect, CameraEffect)]
@@ -60,7 +75,7 @@ def mean_families(residuals: Residuals, measurement: Measurement) -> list[Candid
 
 
 def _families(effect: type[Effect], geometry: Geometry, fixed: dict[str, Any]) -> Iterator[Candidate | SineGrid]:
-    """What one effect allows, by its own equation at typical sizes."""
+    """The candidates of one effect, from its own equation at typical sizes."""
     if effect.searched is not None:
         yield from _searched(effect, effect.searched, geometry, fixed)
     elif _PHASE in effect.model_fields:
@@ -80,14 +95,14 @@ def _families(effect: type[Effect], geometry: Geometry, fixed: dict[str, Any]) -
 
 
 def _sine_and_cosine(effect: type[Effect], geometry: Geometry, fixed: dict[str, Any]) -> FloatArray:
-    """(n, 2) a sin(x + phase) = (a cos phase) sin x + (a sin phase) cos x, of amplitude 1."""
+    """(n, 2) columns at amplitude 1: a sin(x + phase) = (a cos phase) sin x + (a sin phase) cos x."""
     ((amplitude, size),) = effect.typical_sizes().items()
     values = (effect(**fixed, **{amplitude: size, _PHASE: phase}).mean(geometry) / size for phase in (0.0, np.pi / 2))
     return np.stack([*values], axis=1)
 
 
 def _searched(effect: type[Effect], search: Search, geometry: Geometry, fixed: dict[str, Any]) -> Iterator[SineGrid]:
-    """A grid of periods as fine as the reach of what the sine runs along can tell apart."""
+    """A grid of periods with the resolution that the extent of the sine's argument gives."""
     (amplitude,) = effect.typical_sizes()
     x = np.asarray(effect(**fixed).argument(geometry), dtype=np.float64)
     reach = max(float(np.ptp(np.quantile(x, [0.01, 0.99]))), search.shortest)
@@ -97,22 +112,22 @@ def _searched(effect: type[Effect], search: Search, geometry: Geometry, fixed: d
     angle = 2 * np.pi * x / search.shortest
     columns = _sine_and_cosine(effect, geometry, {**fixed, search.period: search.shortest})
     factor = columns[:, 0] * np.sin(angle) + columns[:, 1] * np.cos(angle)
-    tried = frequencies(low, high, 0.3 / reach, _MOST_PERIODS)
+    tried = frequency_grid(low, high, 0.3 / reach, _MOST_PERIODS)
     yield SineGrid(effect.tag(), amplitude, Wave(search.period, factor, x, low), tried, fixed)
 
 
 def _shortest(search: Search, geometry: Geometry) -> float:
-    """Of the periods: pixels that lie farther apart than half of one would show it as a longer one."""
+    """Shortest period to try: pixels farther apart than half a period would show it as a longer one (aliasing)."""
     if not isinstance(geometry, PixelGeometry):
         return search.shortest
-    step = spacing({"image_x": geometry.u, "image_y": geometry.v}[search.along])
+    step = raster_spacing_px({"image_x": geometry.u, "image_y": geometry.v}[search.along])
     return search.shortest if step is None else max(search.shortest, 2 * step)
 
 
 def _of_cameras(
     effects: list[type[CameraEffect]], geometry: PixelGeometry, measurement: StereoMeasurement
 ) -> list[Candidate | SineGrid]:
-    """By finite differences: the changed pair sees other disparities."""
+    """The candidates of camera effects, by finite differences: the disparities that the changed pair measures."""
     nominal = NominalPair.of(measurement)
     sets = {effect: effect.sets or (tuple(effect.nulls()),) for effect in effects}
     varied = [
@@ -122,9 +137,9 @@ def _of_cameras(
         for key in sorted({key for keys in sets[effect] for key in keys})
     ]
     changed = (real_pair(nominal, (effect(camera=side, **{key: step}),), measurement) for effect, side, key, step in varied)
-    base, *seen = seen_disparities(nominal, [nominal.pair, *changed], geometry)
+    base, *seen = predict_disparities(nominal, [nominal.pair, *changed], geometry)
     changes = np.stack([(each - base) / step for (*_, step), each in zip(varied, seen, strict=True)], axis=1)
-    passed = through(measurement.model.effects, geometry, changes)
+    passed = apply_smoothing(measurement.model.effects, geometry, changes)
     columns = {(effect, side, key): column for (effect, side, key, _), column in zip(varied, passed.T, strict=True)}
     return [
         Candidate(
@@ -141,18 +156,19 @@ def _of_cameras(
 
 
 def _by_name(names: tuple[str, ...], values: FloatArray) -> dict[str, float]:
+    """The parameters of coefficients, by name."""
     return dict(zip(names, map(float, values), strict=True))
 
 
 def _locking(geometry: PixelGeometry) -> list[SineGrid]:
-    """A sine of the disparity with the pixels of the matched image, full or reduced, at any phase.
+    """Pixel locking: a sine of the disparity with the pixels of the matched image, full or reduced, at any phase.
 
-    The rectification in which the disparities were found is not part of a measurement: its principal distance (the period) is
-    known to some percent, its offset (the phase) not at all. Locking that acts on the noise too leaves little of its mean.
+    The rectification in which the disparities were computed is not known: its principal distance (the period) is uncertain by
+    some percent, its offset (the phase) entirely. If the matcher's noise is locked too, little of the mean error is left.
     """
     reach = float(np.ptp(np.quantile(geometry.disparity, [0.01, 0.99])))
     one = np.ones_like(geometry.disparity)
     return [
         SineGrid(PixelLocking.tag(), "amplitude_px", Wave("period_px", one, geometry.disparity, float(tried[0])), tried)
-        for tried in (along_disparity(1 / reduction, reach) for reduction in _REDUCTIONS)
+        for tried in (disparity_frequencies(1 / reduction, reach) for reduction in _REDUCTIONS)
     ]

@@ -13,16 +13,16 @@ from pipeline.gap.mean.candidates import (
     MOST_CYCLES_OF_A_SENSOR,
     Candidate,
     SineGrid,
-    angle_forms,
-    free_forms,
-    places,
-    reach_of,
-    repeated,
-    surface_form,
-    twice_a_pixel,
+    angle_error_terms,
+    half_pixel_sine,
+    line_pattern_terms,
+    nonparametric_terms,
+    polynomial_term,
+    robust_extent,
+    spatial_null_candidates,
 )
-from pipeline.gap.mean.signatures import mean_families
-from pipeline.gap.residuals.disparity_raster import spacing
+from pipeline.gap.mean.signatures import systematic_families
+from pipeline.gap.residuals.disparity_raster import raster_spacing_px
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from pipeline.gap.thresholds import thresholds
@@ -45,7 +45,7 @@ def model_has(measurement: Measurement, name: str) -> bool:
 
 def catalogue_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
     """Return the effects of the catalogue that the recorded fields allow, with a Gaussian prior of their size."""
-    return [_with_prior(each) for each in mean_families(part, measurement)]
+    return [_with_prior(each) for each in systematic_families(part, measurement)]
 
 
 def candidate_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
@@ -57,22 +57,22 @@ def candidate_families(measurement: Measurement, part: Residuals) -> list[Candid
         form
         for name, values in part.covariates.items()
         if name not in _NO_NONPARAMETRIC_TERM and np.ptp(values) > 0
-        for form in free_forms(name, values, lowest.get(name, np.inf), _most_cycles(name, values))
+        for form in nonparametric_terms(name, values, lowest.get(name, np.inf), _most_cycles(name, values))
     ]
     if isinstance(part, TlsResiduals):
         angles = _angle_terms(part)
         named, free = _without_described_by_curves(named, angles, measurement, part), [*free, *angles]
-    first, second = part.planes
-    both = surface_form(first, second, part.covariates[first], part.covariates[second])
-    return [*named, *free, *_half_pixel_sines(part), both, *_repeating_terms(part), *places(part.at)]
+    first, second = part.position_covariates
+    both = polynomial_term(first, second, part.covariates[first], part.covariates[second])
+    return [*named, *free, *_half_pixel_sines(part), both, *_repeating_terms(part), *spatial_null_candidates(part.wall_xy)]
 
 
 def _most_cycles(name: str, values: FloatArray) -> float:
     """Highest number of cycles of a wave along a covariate; along an image's axes as many as the raster can show."""
     if name not in _IMAGE:
         return MOST_CYCLES
-    step = spacing(values)
-    return MOST_CYCLES_OF_A_SENSOR if step is None else min(MOST_CYCLES_OF_A_SENSOR, reach_of(values) / (2 * step))
+    step = raster_spacing_px(values)
+    return MOST_CYCLES_OF_A_SENSOR if step is None else min(MOST_CYCLES_OF_A_SENSOR, robust_extent(values) / (2 * step))
 
 
 def _angle_terms(part: TlsResiduals) -> list[Candidate | SineGrid]:
@@ -80,7 +80,7 @@ def _angle_terms(part: TlsResiduals) -> list[Candidate | SineGrid]:
     angles = {"azimuth": part.geometry.azimuth, "zenith": part.geometry.zenith}
     levers = {"azimuth": -part.geometry.by_azimuth, "zenith": -part.geometry.by_zenith}
     along = [(angle, name, values) for angle in levers for name, values in angles.items() if np.ptp(values) > 0]
-    return [form for angle, name, values in along for form in angle_forms(angle, name, values, levers[angle])]
+    return [form for angle, name, values in along for form in angle_error_terms(angle, name, values, levers[angle])]
 
 
 def _without_described_by_curves(
@@ -92,7 +92,7 @@ def _without_described_by_curves(
     if not held:
         return named
     rows = slice(None, None, max(len(part) // _MOST_POINTS, 1))
-    basis = np.linalg.qr(np.concatenate([part.pose[rows], *(columns[rows] for columns in held)], axis=1))[0]
+    basis = np.linalg.qr(np.concatenate([part.pose_jacobian[rows], *(columns[rows] for columns in held)], axis=1))[0]
 
     def left(columns: FloatArray) -> float:
         """Share of a signature's sum of squares that pose and curves leave."""
@@ -107,17 +107,19 @@ def _repeating_terms(part: Residuals) -> list[Candidate]:
     found = part.covariates
     if "line" in found and np.ptp(found["line"]) > 0:
         turn = float(np.polyfit(found["line"], found["azimuth"], 1)[0])
-        return repeated("azimuth", found["line"], turn)
-    steps = {name: step for name in _IMAGE if name in found and (step := spacing(found[name])) is not None}
-    return [form for name, step in steps.items() for form in repeated(name, (found[name] - found[name].min()) / step, step)]
+        return line_pattern_terms("azimuth", found["line"], turn)
+    steps = {name: step for name in _IMAGE if name in found and (step := raster_spacing_px(found[name])) is not None}
+    return [
+        form for name, step in steps.items() for form in line_pattern_terms(name, (found[name] - found[name].min()) / step, step)
+    ]
 
 
 def _half_pixel_sines(part: Residuals) -> list[SineGrid]:
     """Sines of twice the pixel frequency, if the disparities span enough pixels for locking."""
     disparity = part.covariates.get("disparity")
-    if disparity is None or reach_of(disparity) < thresholds().locking.fewest_cycles:
+    if disparity is None or robust_extent(disparity) < thresholds().locking.fewest_cycles:
         return []
-    return twice_a_pixel("disparity", disparity)
+    return half_pixel_sine("disparity", disparity)
 
 
 def _with_prior(candidate: Candidate | SineGrid) -> Candidate | SineGrid:
@@ -131,4 +133,4 @@ def _with_prior(candidate: Candidate | SineGrid) -> Candidate | SineGrid:
         typical.get(key, first) / max(abs(candidate.parameters(unit)[key]), 1e-300) if not key.startswith("phase") else first
         for key, unit in zip(candidate.names, units, strict=True)
     ]
-    return replace(candidate, precision=1 / (thresholds().mean.prior_size * np.array(sizes)) ** 2)
+    return replace(candidate, prior_precision=1 / (thresholds().mean.prior_size * np.array(sizes)) ** 2)

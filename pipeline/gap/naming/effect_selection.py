@@ -10,9 +10,9 @@ import numpy as np
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement
-from pipeline.gap.mean.candidates import PLACE, REPEATED
+from pipeline.gap.mean.candidates import LINE_PATTERN, SPATIAL_NULL
 from pipeline.gap.mean.search import MeanSearch
-from pipeline.gap.mean.selection import Chosen, Tried
+from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
 from pipeline.gap.naming.candidate_families import candidate_families, model_has
 from pipeline.gap.naming.named_effects import (
     Estimate,
@@ -39,11 +39,11 @@ from pipeline.gap.noise_and_edges.grid_noise import find_grid_noise, separate_wh
 from pipeline.gap.noise_and_edges.pixel_locking import NoiseBounds, find_locking
 from pipeline.gap.noise_and_edges.rounded_ranges import find_range_step
 from pipeline.gap.noise_and_edges.variance_model import NoiseRatio, VarianceScore, VarianceTerm, fit_variance_model
-from pipeline.gap.residuals.cells import Cells
-from pipeline.gap.residuals.registration import registered
+from pipeline.gap.residuals.alignment import fit_pose_robustly
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.residuals.wall_blocks import WallCells
 from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -75,7 +75,7 @@ class SelectionResult:
     noise_ratio : standard deviation of the residuals beside the systematic effects, over the predicted one.
     """
 
-    tried: tuple[Tried, ...]
+    tried: tuple[FamilyScore, ...]
     variance_tried: tuple[VarianceScore, ...]
     systematic: frozenset[str]
     p_value: float | None
@@ -131,7 +131,7 @@ def select_effects(
         range_step = find_range_step(part.geometry.measured_m)
     if isinstance(part, StereoResiduals) and not model_has(measurement, PixelLocking.tag()):
         at = part.geometry
-        allowed = NoiseBounds(float(np.median(part.sigma)), nmad(registered(part)[0]))
+        allowed = NoiseBounds(float(np.median(part.sigma)), nmad(fit_pose_robustly(part)[0]))
         locking = find_locking(at.found, at.disparity, at.tangent, at.infinity, allowed)
     if range_step is not None:
         named.append(effect_from_range_step(range_step, part))
@@ -146,7 +146,7 @@ def select_effects(
     possible = (each for each in candidate_families(measurement, part) if (each.name, each.empirical) not in out)
     families = [each for each in possible if not (each.empirical and NONPARAMETRIC_TERMS in out)]
     noise_terms, variance_tried, note = _fit_variance(
-        measurement, part, Cells.over(part.at), registered(part)[0], random, excluded
+        measurement, part, WallCells.over(part.wall_xy), fit_pose_robustly(part)[0], random, excluded
     )
     if wrong := _implausible_variance(measurement, noise_terms):
         return select_effects(measurement, all_residuals, initial_noise_ratio, random, excluded | wrong)
@@ -154,7 +154,7 @@ def select_effects(
         noise_terms = [grid_noise]
 
     def variance_at(at: Residuals) -> list[VarianceTerm]:
-        fitted = _fit_variance(measurement, at, Cells.over(at.at), registered(at)[0], random, excluded)[0]
+        fitted = _fit_variance(measurement, at, WallCells.over(at.wall_xy), fit_pose_robustly(at)[0], random, excluded)[0]
         if fitted or grid_noise is None:
             return fitted
         return [replace(grid_noise, variance=grid_noise.variance[np.isin(part.index, at.index)])]
@@ -169,7 +169,7 @@ def select_effects(
     if implausible and not _explains_everything(found):
         wrong |= implausible
     design = found.search.design
-    left = design.without([each.candidate for each in found.beside])
+    left = design.residuals_after([each.candidate for each in found.beside])
     if found.chosen and not wrong:
         noise_terms, variance_tried, note = _fit_variance(measurement, found.residuals, design.cells, left, random, excluded)
     if noise_terms in ([], [grid_noise]) and (_GRID_NOISE, False) not in excluded:
@@ -178,7 +178,7 @@ def select_effects(
                 noise_left, shared = find_grid_noise(found.residuals, left, model, random)
                 described = any(each.candidate.empirical for each in found.estimates)
                 if noise_left is not None and grid_noise is None:
-                    noise_in_all = find_grid_noise(part, registered(part)[0], model, random)[0] if described else None
+                    noise_in_all = find_grid_noise(part, fit_pose_robustly(part)[0], model, random)[0] if described else None
                     refound = noise_in_all or noise_left.with_constant_variance(len(part))
                     return select_effects(measurement, all_residuals, initial_noise_ratio, random, excluded, refound)
                 kept = noise_left or (None if described else grid_noise)
@@ -194,13 +194,13 @@ def select_effects(
     unexplained_noise = NoiseRatio(1.0, False) if noise_terms else NoiseRatio.of(found.residuals, design.cells, left, random)
     said = (*_note_repetition(found.estimates), *_note_oblique_waves(found), *_note_most_similar(found, part))
     notes = (*part.notes, *_note_left_out(excluded), *filter(None, [note]), *said)
-    p_value = found.search.p_of_rest(found.tried)
-    alone = first.tried(()) if systematic else ()
-    p_without_effects = first.p_of_rest(alone) if alone else p_value
+    p_value = found.search.goodness_of_fit_p_value(found.tried)
+    alone = first.score_families(()) if systematic else ()
+    p_without_effects = first.goodness_of_fit_p_value(alone) if alone else p_value
     systematic_names = frozenset(each.name for each in systematic)
     table = {"names": [f"{part.sensor}.{name}" for name in names], "cosines": cosines.tolist(), "survival": survival.tolist()}
-    tried = found.chosen[0].tried if found.chosen else found.tried
-    without_nulls = tuple(item for item in tried if not item.name.startswith(PLACE))
+    tried = found.chosen[0].family_scores if found.chosen else found.tried
+    without_nulls = tuple(item for item in tried if not item.name.startswith(SPATIAL_NULL))
     sigma = design.reference_sigma([each.candidate for each in found.beside])
     noise_ratio_left = nmad(left / found.residuals.sigma, 0.0)
     result = SelectionResult(
@@ -223,13 +223,13 @@ def select_effects(
 
 def _explains_everything(found: SearchOutcome) -> bool:
     """Whether only effects of the catalogue were found, and no misfit is left beside them."""
-    p_value = found.search.p_of_rest(found.tried)
+    p_value = found.search.goodness_of_fit_p_value(found.tried)
     physical = not any(each.candidate.empirical for each in found.estimates)
     return physical and p_value is not None and p_value > thresholds().verdict.rejection_p
 
 
 def keep_implausible_in_class(
-    named: list[NamedEffect], chosen: list[Chosen], before: frozenset[str], excluded: frozenset[tuple[str, bool]]
+    named: list[NamedEffect], chosen: list[SelectedEffect], before: frozenset[str], excluded: frozenset[tuple[str, bool]]
 ) -> list[NamedEffect]:
     """Add effects that were selected first, but are implausibly large, to the class of the effects named instead.
 
@@ -248,7 +248,7 @@ def keep_implausible_in_class(
     for item in named:
         sensor, name = item.name.split(".", 1)
         instead = item.kind == "physical" and item.effect.shows_in == ShowsIn.MEAN and name not in before
-        alike = {f"{sensor}.{each.candidate.name}" for each in implausible if instead or name in each.alike}
+        alike = {f"{sensor}.{each.candidate.name}" for each in implausible if instead or name in each.indistinguishable}
         found.append(replace(item, alike=(*item.alike, *sorted(alike - {item.name, *item.alike}))))
     return found
 
@@ -267,7 +267,7 @@ def _select_beside_angle_terms(
     """
     aligned, found, _ = aligned_with(measurement, angles, all_residuals.index)
     at = at_points_of(found, all_residuals)
-    named, result = select_effects(aligned, at, registered(at)[2], random.child("angles"), excluded)
+    named, result = select_effects(aligned, at, fit_pose_robustly(at)[2], random.child("angles"), excluded)
     joined, others = merge_angle_curves(angles, [item for item in named if item.effect is AngleEmpirical], all_residuals)
     rest = [item for item in named if item.effect is not AngleEmpirical]
     systematic = result.systematic | {item.name for item in angles}
@@ -283,7 +283,7 @@ def _select_beside_angle_terms(
 
 def _note_repetition(estimates: list[Estimate]) -> list[str]:
     """Notes on terms that repeat after a few scan lines."""
-    lines = [each.candidate.fixed["lines"] for each in estimates if each.candidate.form.startswith(REPEATED)]
+    lines = [each.candidate.fixed["lines"] for each in estimates if each.candidate.form.startswith(LINE_PATTERN)]
     return [
         f"the empirical term repeats after exactly {each} lines: think of the facets of a mirror, or of a read-out in blocks"
         for each in lines
@@ -292,12 +292,12 @@ def _note_repetition(estimates: list[Estimate]) -> list[str]:
 
 def _note_most_similar(found: SearchOutcome, part: Residuals) -> list[str]:
     """Note on the best candidate where a misfit is left and nothing was accepted."""
-    p_value = found.search.p_of_rest(found.tried)
+    p_value = found.search.goodness_of_fit_p_value(found.tried)
     if found.estimates or p_value is None or p_value > thresholds().verdict.rejection_p:
         return []
-    best = max((item for item in found.tried if not item.name.startswith(PLACE)), key=lambda item: item.score)
+    best = max((item for item in found.tried if not item.name.startswith(SPATIAL_NULL)), key=lambda item: item.score)
     what = f"a change with {best.name} ({best.candidate.form})" if best.empirical else best.name
-    size = 1e3 * found.search.size(best) * float(np.median(part.unit_m))
+    size = 1e3 * found.search.fitted_std(best) * float(np.median(part.unit_m))
     return [
         f"the remaining misfit is most similar to {what}, {size:.2g} mm (standard deviation). A reference that errs along whole "
         "lines or columns, as in strips, looks the same; a scan from another station would separate the two"
@@ -306,7 +306,7 @@ def _note_most_similar(found: SearchOutcome, part: Residuals) -> list[str]:
 
 def _note_oblique_waves(found: SearchOutcome) -> list[str]:
     """Note on oblique waves on the wall that the error model of the reference does not explain."""
-    p_value = found.search.p_of_places(found.tried)
+    p_value = found.search.spatial_null_p_value(found.tried)
     if p_value is None or p_value > thresholds().verdict.rejection_p:
         return []
     return [
@@ -318,7 +318,7 @@ def _note_oblique_waves(found: SearchOutcome) -> list[str]:
 def _fit_variance(
     measurement: Measurement,
     part: Residuals,
-    cells: Cells,
+    cells: WallCells,
     value: FloatArray,
     random: KeyedRandom,
     excluded: frozenset[tuple[str, bool]],

@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
-from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.disparity_simulation import simulate_disparities
-from pipeline.gap.residuals.residuals import BoolArray, Missing, Residuals
-from pipeline.gap.residuals.several_scans import simulate_departures
+from pipeline.gap.residuals.residuals import BoolArray, ExpectedPulses, Residuals
+from pipeline.gap.residuals.several_scans import simulate_range_errors
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
-from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, simulated_distances
+from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, simulate_distances
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.residuals.wall_blocks import wall_blocks_by_points
 from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -143,11 +143,11 @@ def simulate_errors(
     """
     match measurement, model, residuals:
         case TlsMeasurement(), TlsModel(), TlsResiduals():
-            return np.stack([simulate_departures(measurement, model, residuals, random) for random in randoms])
+            return np.stack([simulate_range_errors(measurement, model, residuals, random) for random in randoms])
         case StereoMeasurement(), StereoModel(), StereoResiduals():
             return simulate_disparities(measurement, model, residuals, randoms)
         case SurfaceMeasurement(), StereoModel(), SurfaceResiduals():
-            return np.stack([simulated_distances(model, residuals, random) for random in randoms])
+            return np.stack([simulate_distances(model, residuals, random) for random in randoms])
     raise TypeError("measurement, model and residuals are of different sensors")
 
 
@@ -175,9 +175,9 @@ def measure_gap(
     -------
     Gap or None : the scores; None where too few points remain.
     """
-    patch = patches(residuals.at, _POINTS_PER_PATCH)
+    patch = wall_blocks_by_points(residuals.wall_xy, _POINTS_PER_PATCH)
     versions = [_draw_ensemble(measurement, version, residuals, random.child("ensemble")) for version in (before, after)]
-    truth, measured = _draw_ensemble(measurement, after, residuals, random.child("floor")), residuals.observed
+    truth, measured = _draw_ensemble(measurement, after, residuals, random.child("floor")), residuals.total_departure
     usable = np.isfinite(np.concatenate([*versions, truth])).all(axis=0)
     medians, sigma = [np.median(draws, axis=0) for draws in versions], residuals.sigma
     off = np.min([np.abs(measured - median) for median in medians], axis=0)
@@ -212,7 +212,7 @@ def measure_gap(
     )
 
 
-def measure_losses(missing: Missing, chance: FloatArray, held_out: BoolArray) -> Gap | None:
+def measure_losses(missing: ExpectedPulses, chance: FloatArray, held_out: BoolArray) -> Gap | None:
     """Score the predicted probability (m,) of losing pulses on validation pulses; before, it is the share lost of all others.
 
     The floor is the expected score if pulses are lost with exactly that probability. held_out: (m,) validation pulses. Returns
@@ -221,7 +221,7 @@ def measure_losses(missing: Missing, chance: FloatArray, held_out: BoolArray) ->
     if held_out.sum() < 100:
         return None
     lost, p = missing.lost[held_out].astype(np.float64), chance[held_out]
-    patch = patches(missing.at[held_out], _POINTS_PER_PATCH)
+    patch = wall_blocks_by_points(missing.wall_xy[held_out], _POINTS_PER_PATCH)
     count = np.bincount(patch)
     share = float(missing.lost[~held_out].mean())
     old, new, floor = (np.bincount(patch, each) / count for each in ((lost - share) ** 2, (lost - p) ** 2, p * (1 - p)))
@@ -244,9 +244,11 @@ def _draw_ensemble(measurement: Measurement, version: RegisteredModel, residuals
     registered = measurement.moved(version.pose)
     draws = simulate_errors(registered, version.model, residuals, [random.child(number) for number in range(_ENSEMBLE_SIZE)])
     if isinstance(residuals, TlsResiduals):
-        return draws - np.stack([residuals.drawn_reference(random.child("vertices", number)) for number in range(_ENSEMBLE_SIZE)])
+        return draws - np.stack(
+            [residuals.draw_reference_error(random.child("vertices", number)) for number in range(_ENSEMBLE_SIZE)]
+        )
     # a cloud without cameras cannot be simulated at another pose: its datum enters by the Jacobian
-    return draws + residuals.pose @ version.pose if isinstance(residuals, SurfaceResiduals) else draws
+    return draws + residuals.pose_jacobian @ version.pose if isinstance(residuals, SurfaceResiduals) else draws
 
 
 def _patch_statistics(draws: FloatArray, patch: NDArray[np.int64], error: FloatArray | None = None) -> FloatArray:

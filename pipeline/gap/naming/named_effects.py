@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import Measurement
-from pipeline.gap.mean.candidates import SURFACE, Candidate
-from pipeline.gap.mean.selection import Chosen
+from pipeline.gap.mean.candidates import POLYNOMIAL, Candidate
+from pipeline.gap.mean.selection import SelectedEffect
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
 from pipeline.gap.noise_and_edges.missing_returns import LossExplanation
 from pipeline.gap.noise_and_edges.pixel_locking import Locking
 from pipeline.gap.noise_and_edges.rounded_ranges import RangeStep
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
-from pipeline.gap.residuals.registration import Settled, settled
+from pipeline.gap.residuals.alignment import AlignedMeasurement, align
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from pipeline.gap.thresholds import thresholds
@@ -117,7 +117,7 @@ def aligned_with(
     effects: Iterable[NamedEffect],
     registration_rows: NDArray[np.int64] | None = None,
     noise: dict[str, float] | None = None,
-) -> Settled:
+) -> AlignedMeasurement:
     """Put effects into the model of a measurement, compute its residuals and estimate the pose again.
 
     Parameters
@@ -132,7 +132,7 @@ def aligned_with(
     Settled : the measurement at the estimated pose, its residuals and the pose.
     """
     model = with_effects(measurement.model, [item.entry for item in effects], noise)
-    return settled(measurement.changed(model=model), registration_rows)
+    return align(measurement.changed(model=model), registration_rows)
 
 
 def within_bounds(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
@@ -205,7 +205,7 @@ def effect_from_tails(part: Residuals, sigma: float, gain: float) -> NamedEffect
 
     sigma: standard deviation of that noise, in the observable's unit.
     """
-    noise, key = part.noise
+    noise, key = part.white_noise
     return NamedEffect(f"{part.sensor}.{noise.tag()}", "empirical", {"name": noise.tag(), key: sigma}, {}, (), None, gain)
 
 
@@ -228,7 +228,7 @@ class Estimate:
     chosen: the selected explanation; candidate: its columns; values: (k,) coefficients; covariance: (k, k) of the coefficients.
     """
 
-    chosen: Chosen
+    chosen: SelectedEffect
     candidate: Candidate
     values: FloatArray
     covariance: FloatArray
@@ -242,13 +242,15 @@ def effect_from_estimate(found: Estimate, part: Residuals) -> NamedEffect:
 
 
 def _physical_effect(
-    candidate: Candidate, values: FloatArray, covariance: FloatArray, item: Chosen, part: Residuals
+    candidate: Candidate, values: FloatArray, covariance: FloatArray, item: SelectedEffect, part: Residuals
 ) -> NamedEffect:
     """Name an effect of the catalogue by its parameters."""
     entry = {"name": candidate.name, **candidate.fixed, **candidate.parameters(values)}
     std = _standard_deviations(candidate, values, covariance)
-    alike = tuple(f"{part.sensor}.{name}" for name in item.alike)
-    return NamedEffect(f"{part.sensor}.{candidate.name}", "physical", _plain_numbers(entry), std, alike, item.p_value, item.gain)
+    alike = tuple(f"{part.sensor}.{name}" for name in item.indistinguishable)
+    return NamedEffect(
+        f"{part.sensor}.{candidate.name}", "physical", _plain_numbers(entry), std, alike, item.p_value, item.log_likelihood_ratio
+    )
 
 
 def _standard_deviations(candidate: Candidate, values: FloatArray, covariance: FloatArray) -> dict[str, float]:
@@ -265,19 +267,19 @@ def _standard_deviations(candidate: Candidate, values: FloatArray, covariance: F
     return std
 
 
-def _empirical_effect(candidate: Candidate, values: FloatArray, item: Chosen, part: Residuals) -> NamedEffect:
+def _empirical_effect(candidate: Candidate, values: FloatArray, item: SelectedEffect, part: Residuals) -> NamedEffect:
     """Describe a non-parametric term by its values at nodes: over one cycle if periodic, else over the range of its covariate."""
     error = candidate.columns @ values[: candidate.columns.shape[1]]
     if candidate.angle and isinstance(part, TlsResiduals):
         return _angle_term(candidate, error, item, part)
-    term, key = part.described_by
-    found = _surface_nodes(candidate, error, part) if candidate.form == SURFACE else _curve_nodes(candidate, error, part)
+    term, key = part.empirical_term
+    found = _surface_nodes(candidate, error, part) if candidate.form == POLYNOMIAL else _curve_nodes(candidate, error, part)
     rows = _rounded_rows(found.pop("values"))
     entry = {"name": term.tag(), **found, key: rows}
-    return NamedEffect(f"{part.sensor}.{term.tag()}", "empirical", entry, {}, (), item.p_value, item.gain)
+    return NamedEffect(f"{part.sensor}.{term.tag()}", "empirical", entry, {}, (), item.p_value, item.log_likelihood_ratio)
 
 
-def _angle_term(candidate: Candidate, error: FloatArray, item: Chosen, part: TlsResiduals) -> NamedEffect:
+def _angle_term(candidate: Candidate, error: FloatArray, item: SelectedEffect, part: TlsResiduals) -> NamedEffect:
     """Describe an error of an angle by a curve, recovered from the ranges where the surface slants more than at half of the
     points."""
     levers = {"azimuth": part.geometry.by_azimuth, "zenith": part.geometry.by_zenith}
@@ -286,7 +288,9 @@ def _angle_term(candidate: Candidate, error: FloatArray, item: Chosen, part: Tls
     found = _curve_nodes(candidate, np.divide(error, lever, out=np.zeros_like(error), where=steep), part, steep)
     rows = _rounded_rows(found.pop("values"))
     entry = {"name": AngleEmpirical.tag(), "angle": candidate.angle, **found, "values_rad": rows}
-    return NamedEffect(f"{part.sensor}.{AngleEmpirical.tag()}", "empirical", entry, {}, (), item.p_value, item.gain)
+    return NamedEffect(
+        f"{part.sensor}.{AngleEmpirical.tag()}", "empirical", entry, {}, (), item.p_value, item.log_likelihood_ratio
+    )
 
 
 def merge_angle_curves(
@@ -341,7 +345,7 @@ def _curve_nodes(candidate: Candidate, error: FloatArray, part: Residuals, rows:
 
 def _surface_nodes(candidate: Candidate, error: FloatArray, part: Residuals) -> dict[str, Any]:
     """Fit the polynomial of two covariates to its values at the points and evaluate it on a grid of nodes."""
-    first, second = part.planes
+    first, second = part.position_covariates
     x, y = part.covariates[first], part.covariates[second]
     axes = [np.linspace(values.min(), values.max(), _SURFACE_NODES) for values in (x, y)]
     nodes = np.meshgrid(*axes)

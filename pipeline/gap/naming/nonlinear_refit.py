@@ -8,13 +8,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.formats.measurements.measurement import Measurement
-from pipeline.gap.mean.candidates import HARMONICS, OVERTONES, Candidate, Explanation, SineGrid, harmonics, precision_of
+from pipeline.gap.mean.candidates import (
+    HARMONIC_ORDERS,
+    HARMONICS,
+    Candidate,
+    ExplanationKey,
+    SineGrid,
+    harmonics,
+    prior_precision,
+)
 from pipeline.gap.mean.search import MeanSearch
-from pipeline.gap.mean.selection import Chosen, Tried, class_margin
+from pipeline.gap.mean.selection import FamilyScore, SelectedEffect, equivalence_margin
 from pipeline.gap.naming.candidate_families import PERIODIC, candidate_families, catalogue_families
 from pipeline.gap.naming.named_effects import Estimate, aligned_with, effect_from_estimate, is_plausible, relative_size
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
-from pipeline.gap.residuals.registration import Settled, registered
+from pipeline.gap.residuals.alignment import AlignedMeasurement, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
@@ -66,12 +74,12 @@ class SearchOutcome:
     tried : candidates that the last search tried.
     """
 
-    chosen: list[Chosen]
+    chosen: list[SelectedEffect]
     estimates: list[Estimate]
     search: MeanSearch
     residuals: Residuals
-    beside: list[Chosen]
-    tried: tuple[Tried, ...]
+    beside: list[SelectedEffect]
+    tried: tuple[FamilyScore, ...]
 
     @property
     def complexity(self) -> tuple[int, int]:
@@ -99,7 +107,7 @@ class _SingleFit:
     @property
     def score(self) -> float:
         """Penalised log-likelihood."""
-        return self.log_likelihood - (self.estimate.chosen.gain - self.estimate.chosen.score)
+        return self.log_likelihood - (self.estimate.chosen.log_likelihood_ratio - self.estimate.chosen.score)
 
     @classmethod
     def of(cls, given: SearchInput, first: MeanSearch, estimate: Estimate) -> _SingleFit | None:
@@ -108,19 +116,19 @@ class _SingleFit:
             return None
         measurement, found, _ = _aligned_with_estimates(given, [estimate])
         found = found.part(np.isin(found.index, given.part.index))
-        registered_residuals, _, noise_ratio = registered(found)
+        registered_residuals, _, noise_ratio = fit_pose_robustly(found)
         largest = thresholds().points.outlier_sigmas * noise_ratio * found.sigma
         value, kept = np.zeros(len(given.part)), _still_present(found, given.part)
         if kept.mean() < thresholds().points.least_share_on_reference:
             return None
-        value[kept] = np.where(found.smooth, np.clip(registered_residuals, -largest, largest), 0.0)
+        value[kept] = np.where(found.usable, np.clip(registered_residuals, -largest, largest), 0.0)
         return cls(estimate, at_points_of(found, given.part), measurement, first.design.log_likelihood(value, estimate.candidate))
 
     def improved(self, given: SearchInput, first: MeanSearch) -> _SingleFit | None:
         """Return the fit after one Gauss-Newton step from the present values."""
         candidate = _recomputed(self.estimate.candidate, candidate_families(self.measurement, self.residuals))
         width = candidate.columns.shape[1]
-        step = _gauss_newton_step(self.residuals, candidate.columns, precision_of(candidate, width), np.zeros(width))
+        step = _gauss_newton_step(self.residuals, candidate.columns, prior_precision(candidate, width), np.zeros(width))
         return _SingleFit.of(given, first, replace(self.estimate, values=self.estimate.values + step))
 
 
@@ -197,7 +205,7 @@ def fit_jointly(given: SearchInput, candidates: list[Candidate]) -> tuple[Measur
         if after > (1 - _CONVERGED_DECREASE) * before:
             break
         before = after
-        precision = np.concatenate([precision_of(each, width) for each, width in zip(candidates, widths, strict=True)])
+        precision = np.concatenate([prior_precision(each, width) for each, width in zip(candidates, widths, strict=True)])
         values = values + _gauss_newton_step(at, _all_columns(candidates), precision, values)
         parts = np.split(values, np.cumsum(widths)[:-1])
         estimates = [_estimate_of_size(each, part) for each, part in zip(candidates, parts, strict=True)]
@@ -226,29 +234,29 @@ def _all_columns(candidates: list[Candidate]) -> FloatArray:
 
 def _estimate_of_size(candidate: Candidate, values: FloatArray) -> Estimate:
     """An estimate with given coefficients and no evidence yet."""
-    nothing = Chosen(candidate, (), 1.0, 0.0, 0.0, ())
+    nothing = SelectedEffect(candidate, (), 1.0, 0.0, 0.0, ())
     return Estimate(nothing, candidate, values, np.zeros((len(values), len(values))))
 
 
 def _gauss_newton_step(at: Residuals, columns: FloatArray, precision: FloatArray, values: FloatArray) -> FloatArray:
     """(k,) change of the coefficients: weighted least squares with the Jacobian (n, k), free pose and a Gaussian prior around
     0."""
-    design = np.concatenate([at.pose, columns], axis=1) / at.sigma[:, None]
+    design = np.concatenate([at.pose_jacobian, columns], axis=1) / at.sigma[:, None]
     known, pull = np.zeros(design.shape[1]), np.zeros(design.shape[1])
-    start = at.pose.shape[1]
+    start = at.pose_jacobian.shape[1]
     known[start:], pull[start:] = precision, precision * values
     found = np.linalg.solve(design.T @ design + np.diag(known), design.T @ (at.value / at.sigma) - pull)
     return np.asarray(found[start:])
 
 
-def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list[Chosen]) -> list[_SingleFit]:
+def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list[SelectedEffect]) -> list[_SingleFit]:
     """The effects that alone explain most, refitted without linearising, best first.
 
     Empty where the linearised model is good enough: its error is smaller than the gain of any selected effect.
     """
     found: list[_SingleFit] = []
-    tolerance = min([thresholds().mean.linearisation_error, *(_ABSORBED_SHARE * each.gain for each in together)])
-    for candidate in first.leading():
+    tolerance = min([thresholds().mean.linearisation_error, *(_ABSORBED_SHARE * each.log_likelihood_ratio for each in together)])
+    for candidate in first.leading_effects():
         alone = _single_fit(given, first, candidate)
         if alone is None:
             continue
@@ -259,7 +267,7 @@ def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list
     if not found:
         return []
     likeliest = _best_variants(given, first, found)
-    return _with_alternatives(given, first, likeliest, set(likeliest[0].estimate.chosen.alike))
+    return _with_alternatives(given, first, likeliest, set(likeliest[0].estimate.chosen.indistinguishable))
 
 
 def _with_alternatives(given: SearchInput, first: MeanSearch, alone: list[_SingleFit], names: set[str]) -> list[_SingleFit]:
@@ -267,7 +275,7 @@ def _with_alternatives(given: SearchInput, first: MeanSearch, alone: list[_Singl
 
     Of each effect the variant with the parameters that the linearised search prefers is used, in every camera.
     """
-    others = {item.name: item.candidate.names for item in first.tried(()) if not item.empirical and item.name in names}
+    others = {item.name: item.candidate.names for item in first.score_families(()) if not item.empirical and item.name in names}
     for each in alone:
         others.pop(each.name, None)
     plain = (each for each in first.design.families.plain if not each.empirical)
@@ -276,12 +284,12 @@ def _with_alternatives(given: SearchInput, first: MeanSearch, alone: list[_Singl
     if not more:
         return alone
     ranked = sorted([*alone, *_best_variants(given, first, more)], key=lambda each: -each.score)
-    return _with_alternatives(given, first, ranked, set(ranked[0].estimate.chosen.alike))
+    return _with_alternatives(given, first, ranked, set(ranked[0].estimate.chosen.indistinguishable))
 
 
 def _single_fit(given: SearchInput, first: MeanSearch, candidate: Candidate) -> _SingleFit | None:
     """One effect in the model, at the coefficients of the linearised fit."""
-    (estimate,) = _estimates_of(first, [first.alone(candidate)])
+    (estimate,) = _estimates_of(first, [first.selected_alone(candidate)])
     return _SingleFit.of(given, first, estimate)
 
 
@@ -309,10 +317,12 @@ def _with_equivalence_class(converged: list[_SingleFit]) -> _SingleFit:
     """The best single fit with its equivalence class; the linearised search decides for effects that were not refitted."""
     best, *others = converged
     chosen = best.estimate.chosen
-    least = best.score - class_margin(chosen.gain)
+    least = best.score - equivalence_margin(chosen.log_likelihood_ratio)
     near = {each.name for each in others if each.score > least}
-    linearised = set(chosen.alike) - {each.name for each in others}
-    return replace(best, estimate=replace(best.estimate, chosen=replace(chosen, alike=tuple(sorted(near | linearised)))))
+    linearised = set(chosen.indistinguishable) - {each.name for each in others}
+    return replace(
+        best, estimate=replace(best.estimate, chosen=replace(chosen, indistinguishable=tuple(sorted(near | linearised))))
+    )
 
 
 def _converged(given: SearchInput, first: MeanSearch, alone: _SingleFit) -> _SingleFit:
@@ -330,7 +340,7 @@ def _search_beside(given: SearchInput, chosen: SearchOutcome) -> SearchOutcome |
     physical = [each for each in chosen.estimates if not each.candidate.empirical]
     if not physical or out_of_bounds(given.measurement, chosen.estimates, chosen.residuals):
         return None
-    again = _repeat_search(given, physical, chosen.search.gains_alone)
+    again = _repeat_search(given, physical, chosen.search.single_effect_ratios)
     if again is None:
         return None
     search, at, estimates, beside, tried = again
@@ -366,19 +376,19 @@ def with_fitted_variance(part: Residuals, noise_terms: list[VarianceTerm], noise
 
     noise_terms: fitted noise terms; where there are none, the predicted standard deviations are multiplied by `noise_ratio`.
     """
-    part = part.averaged
+    part = part.with_sigma_of_means
     if not noise_terms:
         return replace(part, sigma=part.sigma * noise_ratio)
     made = (effect_of(each.effect)(**each.parameters) for each in noise_terms if each.parameters)
     shared = [effect for effect in made if isinstance(effect, MatchingNoise)]
     sigma = np.sqrt(part.sigma**2 + sum(each.variance for each in noise_terms))
-    return replace(part, sigma=sigma, shared_noise=part.shared_noise.beside(shared))
+    return replace(part, sigma=sigma, correlated_noise=part.correlated_noise.with_effects(shared))
 
 
-def _estimates_of(search: MeanSearch, chosen: list[Chosen]) -> list[Estimate]:
+def _estimates_of(search: MeanSearch, chosen: list[SelectedEffect]) -> list[Estimate]:
     """Refine the selected explanations jointly and return their coefficients with covariance."""
-    candidates, fit = search.design.refined([item.candidate for item in chosen])
-    places = search.design.split(np.arange(len(fit.coefficients)), candidates)
+    candidates, fit = search.design.fit_refined([item.candidate for item in chosen])
+    places = search.design.split_coefficients(np.arange(len(fit.coefficients)), candidates)
     return [
         Estimate(item, candidate, fit.coefficients[place], fit.covariance[np.ix_(place, place)])
         for item, candidate, place in zip(chosen, candidates, places, strict=True)
@@ -386,8 +396,8 @@ def _estimates_of(search: MeanSearch, chosen: list[Chosen]) -> list[Estimate]:
 
 
 def _repeat_search(
-    given: SearchInput, known_effects: list[Estimate], alone: Mapping[Explanation, float]
-) -> tuple[MeanSearch, Residuals, list[Estimate], list[Chosen], tuple[Tried, ...]] | None:
+    given: SearchInput, known_effects: list[Estimate], alone: Mapping[ExplanationKey, float]
+) -> tuple[MeanSearch, Residuals, list[Estimate], list[SelectedEffect], tuple[FamilyScore, ...]] | None:
     """Repeat the search with some effects in the model, whose coefficients stay free like the pose.
 
     Parameters
@@ -413,19 +423,19 @@ def _repeat_search(
     known = [replace(each, candidate=_recomputed(each.candidate, renewed)) for each in known_effects]
     columns = [_free_columns(each) for each in known]
     periodic = [(PERIODIC[name], each.candidate) for each in known if (name := each.candidate.name) in PERIODIC]
-    others += [harmonics(covariate, sine, last) for covariate, sine in periodic for last in OVERTONES]
+    others += [harmonics(covariate, sine, last) for covariate, sine in periodic for last in HARMONIC_ORDERS]
     weighted = _with_variance_refitted(given, at)
-    precision = [precision_of(each.candidate, matrix.shape[1]) for each, matrix in zip(known, columns, strict=True)]
+    precision = [prior_precision(each.candidate, matrix.shape[1]) for each, matrix in zip(known, columns, strict=True)]
     search = MeanSearch(
-        replace(weighted, pose=np.concatenate([at.pose, *columns], axis=1)),
+        replace(weighted, pose_jacobian=np.concatenate([at.pose_jacobian, *columns], axis=1)),
         others,
         given.random.child("again"),
-        np.concatenate([np.zeros(at.pose.shape[1]), *precision]),
+        np.concatenate([np.zeros(at.pose_jacobian.shape[1]), *precision]),
         alone,
     )
     chosen, tried = search.select()
-    fit = search.design.refined([item.candidate for item in chosen])[1]
-    kept, start = [], at.pose.shape[1]
+    fit = search.design.fit_refined([item.candidate for item in chosen])[1]
+    kept, start = [], at.pose_jacobian.shape[1]
     for each, matrix in zip(known, columns, strict=True):
         place = slice(start, start := start + matrix.shape[1])
         kept.append(replace(each, values=each.values + fit.coefficients[place], covariance=fit.covariance[place, place]))
@@ -434,10 +444,10 @@ def _repeat_search(
 
 def _with_variance_refitted(given: SearchInput, at: Residuals) -> Residuals:
     """Residuals with the noise fitted beside the effects in the model. Without these, their signatures would look like noise."""
-    return with_fitted_variance(at, given.variance_at(at), registered(at)[2])
+    return with_fitted_variance(at, given.variance_at(at), fit_pose_robustly(at)[2])
 
 
-def _aligned_with_estimates(given: SearchInput, effects: list[Estimate]) -> Settled:
+def _aligned_with_estimates(given: SearchInput, effects: list[Estimate]) -> AlignedMeasurement:
     """Put some effects into the model of the measurement and estimate the pose again."""
     return aligned_with(given.measurement, [effect_from_estimate(each, given.part) for each in effects], given.part.index)
 
@@ -457,8 +467,8 @@ def _merge_sines_with_overtones(estimates: list[Estimate]) -> list[Estimate]:
 
 def at_points_of(found: Residuals, part: Residuals) -> Residuals:
     """Restrict residuals to the points of `part` that are smooth there too and no outliers."""
-    registered_residuals, _, noise_ratio = registered(found)
-    good = found.smooth & (np.abs(registered_residuals) < thresholds().points.outlier_sigmas * noise_ratio * found.sigma)
+    registered_residuals, _, noise_ratio = fit_pose_robustly(found)
+    good = found.usable & (np.abs(registered_residuals) < thresholds().points.outlier_sigmas * noise_ratio * found.sigma)
     place = np.full(int(max(found.index.max(initial=-1), part.index.max())) + 1, -1)
     place[found.index[good]] = np.flatnonzero(good)
     rows = place[part.index]
@@ -477,7 +487,7 @@ def _recomputed(candidate: Candidate, families: list[Candidate | SineGrid]) -> C
     for family in families:
         if family.name == candidate.name and not family.empirical and dict(family.fixed) == chosen:
             if isinstance(family, SineGrid):
-                return family.at(candidate.period)
+                return family.at_period(candidate.period)
             if family.names == candidate.names:
                 return family
     raise KeyError(candidate.name)
@@ -486,4 +496,4 @@ def _recomputed(candidate: Candidate, families: list[Candidate | SineGrid]) -> C
 def _free_columns(found: Estimate) -> FloatArray:
     """(n, k) columns of an effect's coefficients; a sine also has that of its frequency."""
     wave = found.candidate.wave
-    return found.candidate.columns if wave is None else wave.with_slope(found.candidate.period, found.values[:2])
+    return found.candidate.columns if wave is None else wave.with_frequency_derivative(found.candidate.period, found.values[:2])

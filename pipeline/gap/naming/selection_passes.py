@@ -15,13 +15,13 @@ from pipeline.gap.naming.named_effects import NamedEffect, aligned_with, effect_
 from pipeline.gap.noise_and_edges.beam_footprint import find_footprint
 from pipeline.gap.noise_and_edges.disparity_edges import find_disparity_edge_effects
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
-from pipeline.gap.residuals.cells import Cells
-from pipeline.gap.residuals.changes import SceneChange, find_changes, once_each
-from pipeline.gap.residuals.registration import registered, residuals_of, settled
+from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
-from pipeline.gap.residuals.sight import Sight
+from pipeline.gap.residuals.scene_changes import SceneChange, drop_duplicates, find_scene_changes
+from pipeline.gap.residuals.sensor_view import SensorView
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
+from pipeline.gap.residuals.wall_blocks import WallCells
 from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -63,7 +63,7 @@ class PassInput:
     changed: BoolArray
     registered_residuals: FloatArray
     noise_ratio: float
-    cells: Cells
+    cells: WallCells
     held_out: BoolArray
     training_rows: NDArray[np.int64]
 
@@ -89,16 +89,18 @@ class PassInput:
         touched = np.any([np.zeros(len(plain), dtype=bool), *(each.touched[plain.index] for each in edge_effects)], axis=0)
         registration_rows = plain.index[~(touched | held_out_points[plain.index])] if realigned else None
         modelled, residuals = _with_edge_effects(aligned, plain, edge_effects, touched, registration_rows)
-        registered_residuals, _, noise_ratio = registered(residuals)
-        sight = Sight.of(aligned, residuals)
-        changes, changed = find_changes(replace(residuals, value=registered_residuals), sight, residuals.even & ~touched)
+        registered_residuals, _, noise_ratio = fit_pose_robustly(residuals)
+        sight = SensorView.of(aligned, residuals)
+        changes, changed = find_scene_changes(
+            replace(residuals, value=registered_residuals), sight, residuals.on_smooth_surface & ~touched
+        )
         if isinstance(aligned, TlsMeasurement) and aligned.scans:
-            changes = once_each(changes)
-        registered_residuals, _, noise_ratio = registered(replace(residuals, smooth=residuals.smooth & ~changed))
-        cells = Cells.over(residuals.at)
+            changes = drop_duplicates(changes)
+        registered_residuals, _, noise_ratio = fit_pose_robustly(replace(residuals, usable=residuals.usable & ~changed))
+        cells = WallCells.over(residuals.wall_xy)
         held_out = held_out_points[residuals.index]
         usable = (
-            residuals.smooth
+            residuals.usable
             & ~changed
             & (np.abs(registered_residuals) < thresholds().points.outlier_sigmas * noise_ratio * residuals.sigma)
         )
@@ -120,12 +122,12 @@ class PassInput:
     @property
     def stable(self) -> BoolArray:
         """(n,) points on smooth surface that did not change."""
-        return np.asarray(self.residuals.smooth & ~self.changed)
+        return np.asarray(self.residuals.usable & ~self.changed)
 
     @property
     def measurable(self) -> BoolArray:
         """(n,) points on which the gap may be measured: on smooth surface, or moved by an edge effect, and unchanged."""
-        return np.asarray((self.residuals.smooth | self.touched) & ~self.changed)
+        return np.asarray((self.residuals.usable | self.touched) & ~self.changed)
 
     @property
     def training_part(self) -> tuple[Measurement, Residuals]:
@@ -260,7 +262,7 @@ def _find_edge_effects(measurement: Measurement, residuals: Residuals, held_out_
 
     held_out_points: (N,) points of the measurement that must not be used.
     """
-    registered_residuals, _, noise_ratio = registered(residuals)
+    registered_residuals, _, noise_ratio = fit_pose_robustly(residuals)
     found: list[EdgeEffect] = []
     held_out = held_out_points[residuals.index]
     match measurement, residuals:
@@ -291,18 +293,18 @@ def _with_edge_effects(
     entries = [effect_from_edges(shape).entry for shape in edge_effects]
     modelled = measurement.changed(model=with_effects(measurement.model, entries))
     if registration_rows is None:
-        found = residuals_of(modelled)
+        found = compute_residuals(modelled)
     else:
-        modelled, found, _ = settled(modelled, registration_rows)
+        modelled, found, _ = align(modelled, registration_rows)
     place = np.full(len(measurement.cloud.points), -1)
     place[found.index] = np.arange(len(found))
     rows = place[residuals.index]
     known = rows >= 0
-    matched = residuals.with_rows(known, found.part(rows[known]))
-    return modelled, replace(matched, smooth=residuals.smooth & ~touched & known)
+    matched = residuals.with_rows_from(known, found.part(rows[known]))
+    return modelled, replace(matched, usable=residuals.usable & ~touched & known)
 
 
 def subsample(measurement: Measurement, residuals: Residuals, rows: NDArray[np.int64]) -> tuple[Measurement, Residuals]:
     """Restrict a measurement and its residuals to some rows of the residuals."""
     part = residuals.part(rows)
-    return measurement.part(part.index), replace(part, index=np.arange(len(rows)), missing=None)
+    return measurement.part(part.index), replace(part, index=np.arange(len(rows)), expected_pulses=None)

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.naming.named_effects import NamedEffect
-from pipeline.gap.survey.identifiability import ALIKE, Identifiability, identifiability
-from pipeline.gap.survey.planned import measured_survey
+from pipeline.gap.survey.identifiability import SIMILAR_COSINE, Identifiability, identifiability
+from pipeline.gap.survey.survey_views import measured_survey
 from sensors.effects import effect_of
 
 _POINTS = 4000
@@ -44,6 +44,6 @@ def _separating_measurement(found: Identifiability, item: NamedEffect) -> str:
     own = found.names.index(item.name)
     cosine = {each.name: max(float(each.cosines[own, other]) for other in known) for each in found.extensions}
     best = min(cosine, key=lambda name: cosine[name])
-    if cosine[best] < ALIKE:
-        return " or ".join(name for name in sorted(cosine, key=lambda name: cosine[name]) if cosine[name] < ALIKE)
+    if cosine[best] < SIMILAR_COSINE:
+        return " or ".join(name for name in sorted(cosine, key=lambda name: cosine[name]) if cosine[name] < SIMILAR_COSINE)
     return f"no single further measurement; the best is {best} (signatures still alike: cosine {cosine[best]:.2f})"

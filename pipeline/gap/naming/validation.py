@@ -11,7 +11,7 @@ from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.naming.gap_score import LOSS_MEASURE, Gap, RegisteredModel, measure_gap, measure_losses, subsampling
 from pipeline.gap.naming.named_effects import NamedEffect, aligned_with, with_effects
 from pipeline.gap.noise_and_edges.missing_returns import LossExplanation
-from pipeline.gap.residuals.registration import pose_of
+from pipeline.gap.residuals.alignment import fit_pose
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
@@ -94,7 +94,7 @@ class Validation:
     @property
     def pose(self) -> FloatArray:
         """(6,) pose that registers the model without effects."""
-        return pose_of(self.residuals, self.registration_rows)
+        return fit_pose(self.residuals, self.registration_rows)
 
     def validate(self, named: list[NamedEffect]) -> tuple[ValidationResult, list[str]]:
         """Measure the gap on validation points, and drop effects that make the predictions worse.
@@ -146,15 +146,15 @@ class Validation:
         """(n,) registered residuals of the same points with some effects, NaN where their rays miss the reference, and the pose
         (6,)."""
         if not (named or self.reduced_noise):
-            return self.residuals.value - self.residuals.pose @ self.pose, self.pose
+            return self.residuals.value - self.residuals.pose_jacobian @ self.pose, self.pose
         registered_points = self.residuals.index[self.registration_rows]
         _, found, pose = aligned_with(self.measurement, named, registered_points, self.reduced_noise)
-        rest = pose_of(found, found.smooth & np.isin(found.index, registered_points))
-        return found.of_points(found.value - found.pose @ rest, self.residuals.index), pose + rest
+        rest = fit_pose(found, found.usable & np.isin(found.index, registered_points))
+        return found.values_at(found.value - found.pose_jacobian @ rest, self.residuals.index), pose + rest
 
     def _gap(self, named: list[NamedEffect], versions: tuple[RegisteredModel, RegisteredModel], rows: BoolArray) -> Gap | None:
         """Score two models on some points (n,), or on pulses if the first effect explains missing returns."""
-        missing = self.residuals.missing
+        missing = self.residuals.expected_pulses
         if self.losses is not None and missing is not None and named and named[0].name == f"tls.{self.losses[0].name}":
             found, held_out = self.losses
             share = np.full(len(held_out), float(missing.lost.mean()))

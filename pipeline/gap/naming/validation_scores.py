@@ -11,12 +11,12 @@ from scipy.sparse import csr_array
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement
-from pipeline.gap.mean.within_noise import inverse_of
+from pipeline.gap.mean.within_cell_noise import inverse_from_cholesky
 from pipeline.gap.naming.named_effects import NamedEffect, aligned_with
-from pipeline.gap.residuals.cells import patches
-from pipeline.gap.residuals.registration import pose_of
+from pipeline.gap.residuals.alignment import fit_pose
+from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
-from pipeline.gap.residuals.shared_noise import SharedNoise
+from pipeline.gap.residuals.wall_blocks import wall_blocks_by_points
 from pipeline.gap.thresholds import thresholds
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import ShowsIn
@@ -63,7 +63,7 @@ def validate_effects(
     if not scorable or (~training).sum() < 100:
         return ValidatedEffects(named, [], [])
     with_all = _registered_residuals(measurement, named, residuals, training)
-    shared = float(np.mean(residuals.averaged.sigma**2 - residuals.sigma**2)) / _POINTS_PER_PATCH
+    shared = float(np.mean(residuals.with_sigma_of_means.sigma**2 - residuals.sigma**2)) / _POINTS_PER_PATCH
     patch_sigma = float(np.sqrt(reference_sigma**2 + shared))
 
     def gains(out: list[NamedEffect]) -> tuple[float, float]:
@@ -71,7 +71,7 @@ def validate_effects(
         without = _registered_residuals(measurement, [each for each in named if each not in out], residuals, training)
         known = np.isfinite(with_all.value) & np.isfinite(without.value)
         tested, learned = (
-            _log_score_gain(with_all, without, known & rows, residuals.at, patch_sigma) for rows in (~training, training)
+            _log_score_gain(with_all, without, known & rows, residuals.wall_xy, patch_sigma) for rows in (~training, training)
         )
         return tested, learned * float(np.sum(known & ~training)) / max(float(np.sum(known & training)), 1.0)
 
@@ -129,7 +129,7 @@ class _RegisteredResiduals:
 
     value: FloatArray
     sigma: FloatArray
-    shared: SharedNoise
+    shared: GridCorrelatedNoise
 
     def log_score(self, rows: NDArray[np.int64], patch: NDArray[np.int64], reference_sigma: float) -> float:
         """Return the Gaussian log score of some rows, without its constant.
@@ -144,7 +144,7 @@ class _RegisteredResiduals:
         reference_sigma : standard deviation of the reference error of a patch, in the observable's unit.
         """
         value, sigma = self.value[rows], self.sigma[rows]
-        field = self.shared.part(rows).field(len(rows))
+        field = self.shared.part(rows).node_field(len(rows))
         nodes, own = field.weights, np.maximum(sigma**2 - field.variance, _LEAST_WHITE_SHARE * sigma**2)
         total = np.bincount(patch, 1 / own)
         mean = np.bincount(patch, value / own) / total
@@ -159,7 +159,7 @@ class _RegisteredResiduals:
         if nodes.shape[1]:
             matrix = (nodes.T @ nodes.multiply(1 / own[:, None]) - node_sums.T @ node_sums.multiply(shrinkage[:, None])).toarray()
             prior = cholesky(field.covariance, lower=True)
-            root = cholesky(matrix + inverse_of(prior), lower=True)
+            root = cholesky(matrix + inverse_from_cholesky(prior), lower=True)
             right = nodes.T @ weighed - node_sums.T @ (shrinkage * sums)
             square -= np.sum(solve_triangular(root, right, lower=True) ** 2)
             size += 2 * np.sum(np.log(np.diag(root)) + np.log(np.diag(prior)))
@@ -174,7 +174,7 @@ def _log_score_gain(
     at: (n, 2) places on the wall, m; sigma: standard deviation of the reference error.
     """
     chosen = np.flatnonzero(rows & (_inliers(with_all) | _inliers(without)))
-    patch = patches(at[chosen], _POINTS_PER_PATCH)
+    patch = wall_blocks_by_points(at[chosen], _POINTS_PER_PATCH)
     return with_all.log_score(chosen, patch, sigma) - without.log_score(chosen, patch, sigma)
 
 
@@ -204,10 +204,10 @@ def _registered_residuals(
     found = aligned_with(measurement, named, residuals.index[training]).residuals
     count = len(measurement.cloud.points)
     place = np.full(count, -1)
-    place[found.index[found.smooth]] = np.flatnonzero(found.smooth)  # points at edges under this model are not used
+    place[found.index[found.usable]] = np.flatnonzero(found.usable)  # points at edges under this model are not used
     rows = place[residuals.index]
     known = rows >= 0
     value, sigma = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
-    pose = pose_of(found, rows[training & known])
-    value[known], sigma[known] = (found.value - found.pose @ pose)[rows[known]], found.sigma[rows[known]]
-    return _RegisteredResiduals(value, sigma, found.shared_noise.part(rows))
+    pose = fit_pose(found, rows[training & known])
+    value[known], sigma[known] = (found.value - found.pose_jacobian @ pose)[rows[known]], found.sigma[rows[known]]
+    return _RegisteredResiduals(value, sigma, found.correlated_noise.part(rows))

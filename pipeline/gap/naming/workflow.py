@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from pipeline.formats.measurements.checks import check_noise
 from pipeline.formats.measurements.measurement import FILE, Measurement, StereoMeasurement, TlsMeasurement
-from pipeline.gap.mean.selection import Tried
+from pipeline.gap.mean.selection import FamilyScore
 from pipeline.gap.naming.candidate_families import model_has
 from pipeline.gap.naming.effect_selection import NONPARAMETRIC_TERMS, SelectionResult
 from pipeline.gap.naming.gap_score import Gap
@@ -44,15 +44,15 @@ from pipeline.gap.noise_and_edges.missing_returns import (
     explain_missing_returns,
 )
 from pipeline.gap.noise_and_edges.variance_model import HeavyTails, VarianceScore, find_heavy_tails
-from pipeline.gap.residuals.cells import Cells, block_numbers, held_out_blocks
-from pipeline.gap.residuals.changes import SceneChange, moved_share
-from pipeline.gap.residuals.registration import registered, residuals_of, settled
+from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
-from pipeline.gap.residuals.sight import Sight
+from pipeline.gap.residuals.scene_changes import SceneChange, moved_share
+from pipeline.gap.residuals.sensor_view import SensorView
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals, with_surroundings
+from pipeline.gap.residuals.subsampling import subsample_measurement
 from pipeline.gap.residuals.surface_residuals import SurfaceResiduals
-from pipeline.gap.residuals.thinning import thinned
-from pipeline.gap.residuals.tls_residuals import TlsResiduals, missing_returns, with_order
+from pipeline.gap.residuals.tls_residuals import TlsResiduals, find_expected_pulses, with_scan_order
+from pipeline.gap.residuals.wall_blocks import WallCells, in_validation_blocks, wall_block_numbers
 from pipeline.gap.thresholds import Thresholds, thresholds, use_thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -98,7 +98,7 @@ class GapDiagnosis:
     pose: FloatArray
     model_after: TlsModel | StereoModel
     gap: Gap | None
-    tried: tuple[Tried, ...]
+    tried: tuple[FamilyScore, ...]
     variance_tried: tuple[VarianceScore, ...]
     remaining: dict[str, Any]
     identifiability: dict[str, Any]
@@ -140,8 +140,8 @@ def diagnose(
     clock, random = _Clock(progress), KeyedRandom(seed, ("gap",))
     # one BLAS thread: results do not depend on the number of threads, and no threads wait for each other
     with use_thresholds(thresholds), threadpool_limits(1, "blas"):
-        ordered = with_order(measurement) if isinstance(measurement, TlsMeasurement) else measurement
-        part, rows = thinned(ordered, random.child("thinned"))
+        ordered = with_scan_order(measurement) if isinstance(measurement, TlsMeasurement) else measurement
+        part, rows = subsample_measurement(ordered, random.child("thinned"))
         found = _diagnose(part, clock, random)
     return replace(found, residuals=replace(found.residuals, index=rows[found.residuals.index]))
 
@@ -149,18 +149,18 @@ def diagnose(
 def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> GapDiagnosis:
     """Run the steps of the workflow on the subsampled measurement."""
     measurement.check_near(FILE)
-    initial = residuals_of(measurement)
+    initial = compute_residuals(measurement)
     check_noise("surface" if isinstance(initial, SurfaceResiduals) else initial.sensor, initial.sigma)
     held_out_points = np.zeros(len(measurement.cloud.points), dtype=bool)
-    held_out_points[initial.index] = held_out_blocks(initial.at, Cells.over(initial.at).side_m)
+    held_out_points[initial.index] = in_validation_blocks(initial.wall_xy, WallCells.over(initial.wall_xy).side_m)
     held_out_points |= _in_validation_epoch(measurement.epochs)
-    aligned, plain, surveyed = settled(measurement, initial.index[~held_out_points[initial.index]], initial)
+    aligned, plain, surveyed = align(measurement, initial.index[~held_out_points[initial.index]], initial)
     if isinstance(aligned, StereoMeasurement) and isinstance(plain, StereoResiduals):
         aligned = with_surroundings(aligned, plain)
     if isinstance(aligned, TlsMeasurement) and isinstance(plain, TlsResiduals):
-        plain = replace(plain, missing=missing_returns(aligned, plain))
+        plain = replace(plain, expected_pulses=find_expected_pulses(aligned, plain))
     clock.lap("residuals")
-    if plain.smooth.sum() < thresholds().points.fewest:
+    if plain.usable.sum() < thresholds().points.fewest:
         return _insufficient_data(measurement, plain, clock)
     validated = _select_and_validate(PassInputs(aligned, plain, held_out_points), random)
     given, selection = validated.given, validated.selection
@@ -192,13 +192,13 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     if evidence.much_moved:
         result, _ = replace(validation, reduced_noise={}).validate([])
         notes = [*note_moved_wall(evidence, bool(aligned.stable_areas)), *selection.notes]
-    value = plain.value - plain.pose @ validation.pose
+    value = plain.value - plain.pose_jacobian @ validation.pose
     clock.lap("validation")
     return GapDiagnosis(
         verdict=verdict_of(result.named, evidence),
         effects=tuple(result.named),
         changes=tuple(given.changes),
-        residuals=replace(plain, smooth=given.residuals.smooth),
+        residuals=replace(plain, usable=given.residuals.usable),
         held_out=given.held_out,
         before=value,
         after=np.where(np.isfinite(result.value), result.value, value),
@@ -234,11 +234,11 @@ def _with_moved_share(evidence: Evidence, aligned: Measurement, given: PassInput
     if not (noisy or still_unexplained):
         return evidence
     after = replace(given.residuals, value=result.value)
-    sight = Sight.of(aligned, after)
+    sight = SensorView.of(aligned, after)
     moved = moved_share(after, sight, given.stable)
     if noisy and not still_unexplained and moved >= thresholds().changes.moved_share:
-        found = residuals_of(aligned.changed(model=result.model))
-        sigma = found.of_points(found.sigma, after.index)
+        found = compute_residuals(aligned.changed(model=result.model))
+        sigma = found.values_at(found.sigma, after.index)
         beside = moved_share(replace(after, sigma=np.where(np.isfinite(sigma), sigma, after.sigma)), sight, given.stable)
         moved = moved if beside >= thresholds().changes.moved_share_beside_noise else 0.0
     return replace(evidence, moved=moved)
@@ -325,7 +325,7 @@ def _with_heavy_tails(
     if any(item.effect is OcclusionFill or item.entry.get("early_share") for item in named):
         return named, None
     part, value, scale = _smooth_residuals_with(measurement, named)
-    tails = find_heavy_tails(value / part.sigma / scale, block_numbers(part.at, side_m))
+    tails = find_heavy_tails(value / part.sigma / scale, wall_block_numbers(part.wall_xy, side_m))
     if tails is None or not tails.uniform or not tails.sigma:
         return named, tails
     rows_of_tails = [item for item in named if not item.adds_variance]
@@ -341,8 +341,8 @@ def _smooth_residuals_with(measurement: Measurement, named: list[NamedEffect]) -
     """Residuals on smooth rock with some effects in the model, the registered ones (n,), and their noise over the predicted
     one."""
     found = aligned_with(measurement, named).residuals
-    part = found.part(np.flatnonzero(found.smooth))
-    value, _, scale = registered(part)
+    part = found.part(np.flatnonzero(found.usable))
+    value, _, scale = fit_pose_robustly(part)
     return part, value, scale
 
 
@@ -388,10 +388,10 @@ def _findings_first(notes: list[str], about_data: Sequence[str]) -> list[str]:
 
 def _insufficient_data(measurement: Measurement, residuals: Residuals, clock: _Clock) -> GapDiagnosis:
     """Return the diagnosis of a measurement with too few points."""
-    count, least = int(residuals.smooth.sum()), thresholds().points.fewest
+    count, least = int(residuals.usable.sum()), thresholds().points.fewest
     note = f"{count} points on smooth parts of the reference and stable ground, but {least} are needed"
     empty = np.zeros(len(residuals))
-    pose = np.zeros(residuals.pose.shape[1] if isinstance(residuals, SurfaceResiduals) else 6)
+    pose = np.zeros(residuals.pose_jacobian.shape[1] if isinstance(residuals, SurfaceResiduals) else 6)
     return GapDiagnosis(
         "insufficient_data", (), (), residuals, empty > 1, residuals.value, residuals.value, pose, measurement.model,
         None, (), (), _remaining_entry(Evidence(None, None), [note], {}), {"names": [], "cosines": [], "survival": []},
@@ -402,18 +402,18 @@ def _insufficient_data(measurement: Measurement, residuals: Residuals, clock: _C
 def _explain_losses(measurement: Measurement, given: PassInput) -> tuple[LossExplanation, BoolArray] | None:
     """Explain the missing returns, with the pulses that the explanation was not fitted to."""
     residuals = given.residuals
-    missing = residuals.missing
+    missing = residuals.expected_pulses
     if missing is None or any(model_has(measurement, name) for name in LOSS_EFFECTS):
         return None
-    held_out = held_out_blocks(missing.at, given.cells.side_m)
+    held_out = in_validation_blocks(missing.wall_xy, given.cells.side_m)
     early = (
-        residuals.smooth
+        residuals.usable
         & ~given.changed
         & (
             given.registered_residuals
             < -np.maximum(thresholds().missing_returns.early_sigmas * residuals.sigma, thresholds().missing_returns.early_m)
         )
     )
-    drops = count_isolated_returns(residuals.at, early)
+    drops = count_isolated_returns(residuals.wall_xy, early)
     found = explain_missing_returns(missing, ~held_out, drops, len(residuals), measurement.cloud.intensity)
     return None if found is None else (found, held_out)

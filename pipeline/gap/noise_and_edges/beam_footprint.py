@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.formats.measurements.measurement import TlsMeasurement
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect, WallBlocks, log_density, maximise_gain
 from pipeline.gap.residuals.residuals import BoolArray
-from pipeline.gap.residuals.scan_simulation import mean_model, simulate_modes, simulate_ranges
+from pipeline.gap.residuals.scan_simulation import simulate_ranges, simulate_ranges_by_mode, systematic_part
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
@@ -60,7 +60,7 @@ def find_footprint(
     rows = rows[np.abs(widest_shift) > sigma[rows]]
     if len(rows) < thresholds().edges.footprint_fewest:
         return []
-    blocks = WallBlocks(WallBlocks.over(residuals.at).number[rows])
+    blocks = WallBlocks(WallBlocks.over(residuals.wall_xy).number[rows])
     jittered = footprint.shift(rows, ("mean",), _equivalent_divergence(measurement.model))["mean"]
     without = [log_density(registered_residuals[rows], moved, sigma[rows]) for moved in (np.zeros_like(jittered), jittered)]
     null = np.logaddexp(*without) - np.log(2)  # the first holds at a step, the second on a curved slope
@@ -102,11 +102,11 @@ class _FootprintSimulation:
     @cached_property
     def _axis(self) -> FloatArray:
         """(n,) ranges along the beams' axes, m."""
-        return simulate_ranges(self.measurement, mean_model(self.measurement.model), self.residuals.geometry, _RANDOM)
+        return simulate_ranges(self.measurement, systematic_part(self.measurement.model), self.residuals.geometry, _RANDOM)
 
     def shift(self, rows: NDArray[np.int64], modes: tuple[Mode, ...], angle: float) -> dict[Mode, FloatArray]:
         """(m,) range of a beam of divergence `angle` minus that of its axis, m, for each mode; 0 where either does not return."""
-        plain = mean_model(self.measurement.model)
+        plain = systematic_part(self.measurement.model)
         beam = plain.model_copy(update={"effects": (*plain.effects, BeamDivergence(divergence_rad=angle))})
-        whole = simulate_modes(self.measurement, beam, modes, self.residuals.geometry.part(rows), _RANDOM)
+        whole = simulate_ranges_by_mode(self.measurement, beam, modes, self.residuals.geometry.part(rows), _RANDOM)
         return {mode: np.asarray(np.nan_to_num(whole[mode] - self._axis[rows])) for mode in modes}

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import StereoMeasurement
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect, WallBlocks, log_density, maximise_gain
+from pipeline.gap.residuals.alignment import fit_pose_robustly
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
-from pipeline.gap.residuals.registration import registered
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.thresholds import thresholds
@@ -82,14 +82,16 @@ class _EdgeData:
 
     def shift(self, effects: list[Effect]) -> FloatArray:
         """(n,) change of the disparities by the known effects and further ones, px."""
-        return self.raster.moved([*self.beside, *effects], self.disparity)
+        return self.raster.added_by([*self.beside, *effects], self.disparity)
 
     def gains(self, effect: Effect) -> FloatArray:
         """(n,) log-likelihood ratio of an effect beside the known ones."""
         shift = self.shift([effect])
         counts = (shift != self.shift_without) & ~self.held_out
         if isinstance(effect, EdgeFattening):
-            clear = np.maximum(thresholds().edges.clear_sigmas * self.sigma, thresholds().edges.clear_step * self.raster.jump_px)
+            clear = np.maximum(
+                thresholds().edges.clear_sigmas * self.sigma, thresholds().edges.clear_step * self.raster.depth_step_px
+            )
             counts &= np.abs(shift - self.shift_without) > clear
         rows = np.flatnonzero(counts)
         gains = np.zeros(len(shift))
@@ -108,7 +110,7 @@ class _EdgeData:
     def registered_with(self, effect: Effect) -> _EdgeData:
         """Repeat the registration and the noise estimate with an effect beside the known ones."""
         shift = np.nan_to_num(self.shift([effect]))
-        value, _, scale = registered(replace(self.residuals, value=self.residuals.value - shift))
+        value, _, scale = fit_pose_robustly(replace(self.residuals, value=self.residuals.value - shift))
         return replace(self, registered_residuals=value + shift, sigma=scale * self.residuals.sigma)
 
     def likelier(self, found: list[EdgeEffect]) -> EdgeEffect:
@@ -146,11 +148,11 @@ def find_disparity_edge_effects(
     raster = DisparityRaster.of(measurement, residuals.geometry)
     if raster is None:
         return []
-    scale = nmad((registered_residuals / residuals.sigma)[residuals.smooth], 0.0)
+    scale = nmad((registered_residuals / residuals.sigma)[residuals.usable], 0.0)
     known_effects: list[Effect] = [effect for effect in measurement.model.effects if isinstance(effect, RasterEffect)]
     disparity = residuals.geometry.disparity
-    known_shift = raster.moved(known_effects, disparity)
-    search_raster, points = raster.searched()
+    known_shift = raster.added_by(known_effects, disparity)
+    search_raster, points = raster.search_part()
     part = residuals.part(points)
     data = _EdgeData(
         replace(part, value=part.value + known_shift[points]),
@@ -158,7 +160,7 @@ def find_disparity_edge_effects(
         part.geometry.disparity,
         (registered_residuals + known_shift)[points],
         scale * part.sigma,
-        WallBlocks.over(part.at),
+        WallBlocks.over(part.wall_xy),
         held_out[points],
         known_effects,
     )
@@ -209,10 +211,12 @@ def _unpredictable_points(effect: Effect, beside: list[Effect], raster: Disparit
     match effect:
         case EdgeFattening():
             wider = effect.model_copy(update={"radius_px": effect.radius_px + _EDGE_MARGIN_CELLS * raster.step})
-            return np.asarray(raster.moved([wider], at.disparity) != 0)
+            return np.asarray(raster.added_by([wider], at.disparity) != 0)
         case Smoothing():
-            return raster.beside_border(effect.sigma_px)
-    return raster.filled(beside) | raster.copies(at.found, _COPY_TOLERANCE * float(np.median(residuals.sigma)))
+            return raster.near_border(effect.sigma_px)
+    return raster.in_filled_occlusions(beside) | raster.copied_from_neighbour(
+        at.found, _COPY_TOLERANCE * float(np.median(residuals.sigma))
+    )
 
 
 def _find_fattening(data: _EdgeData) -> EdgeEffect | None:
@@ -250,7 +254,9 @@ def _find_fattening(data: _EdgeData) -> EdgeEffect | None:
 def _fattening_of(radius: int, height: float, raster: DisparityRaster) -> EdgeFattening:
     """The effect of a radius in cells and a depth step in units of the smallest one that counts."""
     reach = (radius + 0.5) * raster.step
-    return EdgeFattening(radius_px=reach) if height == 1 else EdgeFattening(radius_px=reach, step_px=height * raster.jump_px)
+    return (
+        EdgeFattening(radius_px=reach) if height == 1 else EdgeFattening(radius_px=reach, step_px=height * raster.depth_step_px)
+    )
 
 
 def _find_smoothing(data: _EdgeData) -> EdgeEffect | None:
@@ -279,11 +285,11 @@ def _find_filling(data: _EdgeData) -> EdgeEffect | None:
     Without the effect few of those cells hold a point, at most a fifth, where edges are not exactly where the reference has them.
     """
     raster = data.raster
-    points = raster.filled(data.beside)
+    points = raster.in_filled_occlusions(data.beside)
     gain = float(data.gains(OcclusionFill(reach_px=1e5))[points].sum())
     if points.sum() < thresholds().edges.fewest_filled or gain < thresholds().edges.least_filled_gain:
         return None
-    widths, held = _occluded_strips(raster.after(data.beside), raster)
+    widths, held = _occluded_strips(raster.apply(data.beside), raster)
     reach, std = _estimate_reach(widths, held, raster.step)
     narrow = held[widths <= reach / raster.step]
     if narrow.mean() < thresholds().edges.least_filled_share:

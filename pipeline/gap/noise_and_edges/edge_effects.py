@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.gap.residuals.cells import patches
 from pipeline.gap.residuals.residuals import BoolArray
+from pipeline.gap.residuals.wall_blocks import wall_blocks_by_points
 from pipeline.gap.thresholds import thresholds
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect
@@ -49,7 +49,7 @@ class WallBlocks:
     @classmethod
     def over(cls, at: FloatArray) -> WallBlocks:
         """Divide the wall into blocks. at: (n, 2) places on the wall, m."""
-        return cls(patches(at, _POINTS_PER_BLOCK))
+        return cls(wall_blocks_by_points(at, _POINTS_PER_BLOCK))
 
     def sums(self, gains: FloatArray) -> FloatArray:
         """Sum gains (n,) by block."""

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
-from pipeline.gap.residuals.cells import patches
-from pipeline.gap.residuals.disparity_raster import spacing
+from pipeline.gap.residuals.disparity_raster import raster_spacing_px
 from pipeline.gap.residuals.residuals import BoolArray
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.residuals.wall_blocks import wall_blocks_by_points
 from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -271,7 +271,7 @@ def _variogram(part: StereoResiduals, value: FloatArray, model: StereoModel) -> 
     """Compute the semivariogram along rows and columns, with its covariance from wall blocks; None where the pixels are on no
     raster."""
     g = part.geometry
-    steps = [step for step in (spacing(g.v), spacing(g.u)) if step is not None]
+    steps = [step for step in (raster_spacing_px(g.v), raster_spacing_px(g.u)) if step is not None]
     if len(steps) < 2:
         return None
     row, column = (np.rint((x - x.min()) / step).astype(np.int64) for x, step in zip((g.v, g.u), steps, strict=True))
@@ -279,7 +279,7 @@ def _variogram(part: StereoResiduals, value: FloatArray, model: StereoModel) -> 
     raster = np.full((int(row.max()) + 1, int(column.max()) + 1), np.nan)
     raster[row, column] = np.where(np.abs(value) < bound, value, np.nan)
     block = np.zeros(raster.shape, dtype=np.int64)
-    block[row, column] = patches(part.at, _POINTS_PER_BLOCK)
+    block[row, column] = wall_blocks_by_points(part.wall_xy, _POINTS_PER_BLOCK)
     count = int(block.max()) + 1
     lags = [(axis, lag) for axis in (0, 1) for lag in _LAGS if lag * steps[axis] <= _LONGEST_LAG_PX[0]]
     pairs, sums = np.stack([_pairs_by_block(raster, block, lag, axis, count) for axis, lag in lags], axis=1)
@@ -308,7 +308,7 @@ def _variogram(part: StereoResiduals, value: FloatArray, model: StereoModel) -> 
 def _wall_per_px(part: StereoResiduals) -> float:
     """Metres on the wall per px of the image, mean of rows and columns."""
     g = part.geometry
-    return float(np.sqrt(np.prod(np.std(part.at, axis=0)) / (np.std(g.u) * np.std(g.v))))
+    return float(np.sqrt(np.prod(np.std(part.wall_xy, axis=0)) / (np.std(g.u) * np.std(g.v))))
 
 
 def _usable_lags(pairs: FloatArray, length: FloatArray) -> BoolArray:

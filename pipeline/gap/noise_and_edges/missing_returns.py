@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit, logit, ndtr
 
-from pipeline.gap.residuals.cells import patches
-from pipeline.gap.residuals.residuals import BoolArray, Missing
+from pipeline.gap.residuals.residuals import BoolArray, ExpectedPulses
+from pipeline.gap.residuals.wall_blocks import wall_blocks_by_points
 from pipeline.gap.thresholds import thresholds
 from scene.geometry.mesh import FloatArray
 from sensors.effects import catalogue
@@ -112,7 +112,7 @@ class _LossFit:
 
 
 def explain_missing_returns(
-    missing: Missing, fit: BoolArray, early: int, points: int, intensity: FloatArray | None
+    missing: ExpectedPulses, fit: BoolArray, early: int, points: int, intensity: FloatArray | None
 ) -> LossExplanation | None:
     """Find the effect that explains the missing returns; None if none gains enough.
 
@@ -140,7 +140,7 @@ def explain_missing_returns(
         missing, best, free, fit
     ):
         best = free
-    confidence = 1 / _overdispersion(lost[fit], best.probability[fit], missing.at[fit])
+    confidence = 1 / _overdispersion(lost[fit], best.probability[fit], missing.wall_xy[fit])
     best = replace(best, gain=best.gain * confidence, score=best.score * confidence)
     if best.score < thresholds().missing_returns.least_gain:
         return None
@@ -156,7 +156,7 @@ def count_isolated_returns(at: FloatArray, early: BoolArray) -> int:
 
     An object before the wall, or its edge, returns many pulses side by side.
     """
-    patch, count = patches(at, _PULSES_PER_PATCH), int(early.sum())
+    patch, count = wall_blocks_by_points(at, _PULSES_PER_PATCH), int(early.sum())
     number = int(patch.max()) + 1
     anywhere = number * (1 - (1 - 1 / number) ** count)
     return count if len(np.unique(patch[early])) >= thresholds().missing_returns.least_isolated_share * anywhere else 0
@@ -164,13 +164,13 @@ def count_isolated_returns(at: FloatArray, early: BoolArray) -> int:
 
 def _overdispersion(lost: BoolArray, probability: FloatArray, at: FloatArray) -> float:
     """Variance of the patches' losses over that of independent ones, at least 1."""
-    patch = patches(at, _PULSES_PER_PATCH)
+    patch = wall_blocks_by_points(at, _PULSES_PER_PATCH)
     left = np.bincount(patch, lost - probability)
     expected = np.bincount(patch, probability * (1 - probability))
     return float(max(np.sum(left**2) / np.sum(expected), 1.0))
 
 
-def _strips_agree(missing: Missing, known: LossExplanation, free: LossExplanation, fit: BoolArray) -> bool:
+def _strips_agree(missing: ExpectedPulses, known: LossExplanation, free: LossExplanation, fit: BoolArray) -> bool:
     """Whether losses by one angle occur in all strips of the other angle. Each strip is predicted from the losses of the others.
 
     A shrub before the wall takes pulses in a few strips only, and so do lines that the scanner dropped.

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pipeline.change.robust import nmad
-from pipeline.gap.residuals.cells import Cells, block_numbers
 from pipeline.gap.residuals.residuals import BoolArray, Geometry, Residuals
+from pipeline.gap.residuals.wall_blocks import WallCells, wall_block_numbers
 from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -108,7 +108,7 @@ class VarianceScore:
     empirical: bool = False
 
 
-def standardised_deviations(residuals: Residuals, cells: Cells, value: FloatArray) -> FloatArray:
+def standardised_deviations(residuals: Residuals, cells: WallCells, value: FloatArray) -> FloatArray:
     """Return deviations from the cells' planes over the predicted standard deviation, (n,), NaN outside of cells.
 
     They have unit variance if the model is right. The plane in each cell removes the reference error, which is correlated over
@@ -122,7 +122,7 @@ def standardised_deviations(residuals: Residuals, cells: Cells, value: FloatArra
     """
     inside = cells.cell >= 0
     cell = cells.cell[inside]
-    offset = (residuals.at[inside] - cells.centre[cell]) / cells.side_m
+    offset = (residuals.wall_xy[inside] - cells.centre[cell]) / cells.side_m
     weight = 1 / residuals.sigma[inside]
     basis = np.stack([np.ones(len(cell)), offset[:, 0], offset[:, 1]], axis=1) * weight[:, None]
     y = value[inside] * weight
@@ -165,7 +165,7 @@ def _candidate(effect: type[Effect], geometry: Geometry, fixed: dict[str, float]
 
 
 def fit_variance_model(
-    residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom, excluded: frozenset[str] = frozenset()
+    residuals: Residuals, cells: WallCells, value: FloatArray, random: KeyedRandom, excluded: frozenset[str] = frozenset()
 ) -> tuple[list[VarianceTerm], list[VarianceScore], str]:
     """Find the noise terms that explain the squared deviations, at most two.
 
@@ -198,7 +198,7 @@ def fit_variance_model(
             added = candidates[best.members[0]].variance @ best.theta[0]
             weighted = replace(residuals, sigma=np.sqrt(residuals.sigma**2 + added))
     excess = float(np.mean(best.added(shapes)))
-    block = block_numbers(residuals.at[used], cells.side_m)
+    block = wall_block_numbers(residuals.wall_xy[used], cells.side_m)
     p_value = null_p_value(squares, [shape.sum(axis=1) for shape in shapes], block, random)
     tried = [VarianceScore(c.name, fit.gain, fit.score) for c, fit in zip(candidates, singles, strict=True)]
     tried = sorted(_best_variants(tried), key=lambda item: -item.score)
@@ -272,8 +272,8 @@ def _unshared_share(residuals: Residuals, value: FloatArray, used: BoolArray, ad
     variance."""
     part = residuals.part(used)
     value, predicted = value[used], part.sigma**2
-    other = cKDTree(part.at).query(part.at, k=2)[1][:, 1]
-    variance = predicted + predicted[other] - 2 * part.shared_with(other)
+    other = cKDTree(part.wall_xy).query(part.wall_xy, k=2)[1][:, 1]
+    variance = predicted + predicted[other] - 2 * part.reference_covariance_with(other)
     total = (added * predicted + (added * predicted)[other]) / variance
     weight = total / (1 + total) ** 2
     return float(np.sum(weight * ((value - value[other]) ** 2 / variance - 1)) / np.sum(weight * total))
@@ -290,12 +290,14 @@ class NoiseRatio:
     clearly_below: bool
 
     @classmethod
-    def of(cls, residuals: Residuals, cells: Cells, value: FloatArray, random: KeyedRandom) -> NoiseRatio:
+    def of(cls, residuals: Residuals, cells: WallCells, value: FloatArray, random: KeyedRandom) -> NoiseRatio:
         """Compute it from residuals (n,) after the systematic effects; outliers are clipped."""
         z = standardised_deviations(residuals, cells, value)
         used = np.isfinite(z)
         squares = np.minimum(z[used] ** 2, _CLIP_SIGMAS**2) / _expected_mean_square(residuals, cells, random)
-        means = np.bincount(np.unique(block_numbers(residuals.at[used], cells.side_m), return_inverse=True)[1], squares - 1)
+        means = np.bincount(
+            np.unique(wall_block_numbers(residuals.wall_xy[used], cells.side_m), return_inverse=True)[1], squares - 1
+        )
         below = float(means.sum()) < -thresholds().variance.block_sigmas * float(np.linalg.norm(means))
         return cls(float(np.sqrt(squares.mean())), below)
 
@@ -305,10 +307,10 @@ class NoiseRatio:
         return self.value if self.clearly_below and self.value < thresholds().variance.excess_noise_ratio else 1.0
 
 
-def _expected_mean_square(residuals: Residuals, cells: Cells, random: KeyedRandom) -> float:
+def _expected_mean_square(residuals: Residuals, cells: WallCells, random: KeyedRandom) -> float:
     """Mean square of standardised deviations if the model is right, by simulation: planes absorb more correlated than white
     noise."""
-    field = residuals.shared_noise.field(len(residuals))
+    field = residuals.correlated_noise.node_field(len(residuals))
     if not field.weights.shape[1]:
         return 1.0
     own = np.sqrt(np.maximum(residuals.sigma**2 - field.variance, _LEAST_WHITE_SHARE * residuals.sigma**2))

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from pipeline.formats.measurements.measurement import Measurement, TlsMeasurement
 from pipeline.gap.naming.named_effects import aligned_with
 from pipeline.gap.naming.workflow import GapDiagnosis
-from pipeline.gap.residuals.registration import pose_of
-from pipeline.gap.residuals.tls_residuals import with_order
+from pipeline.gap.residuals.alignment import fit_pose
+from pipeline.gap.residuals.tls_residuals import with_scan_order
 from scene.geometry.mesh import FloatArray
 
 
@@ -30,8 +30,8 @@ def contributions(found: GapDiagnosis, measurement: Measurement) -> FloatArray:
     """
     if len(found.effects) < 2:
         return np.array([found.before - found.after for _ in found.effects]).reshape(-1, len(found.before))
-    there = with_order(measurement) if isinstance(measurement, TlsMeasurement) else measurement
-    there, registration_rows = there.part(found.residuals.index), np.flatnonzero(found.residuals.smooth & ~found.held_out)
+    there = with_scan_order(measurement) if isinstance(measurement, TlsMeasurement) else measurement
+    there, registration_rows = there.part(found.residuals.index), np.flatnonzero(found.residuals.usable & ~found.held_out)
     return np.stack(
         [found.before - _residuals_with_one(found, there, number, registration_rows) for number in range(len(found.effects))]
     )
@@ -42,6 +42,6 @@ def _residuals_with_one(
 ) -> FloatArray:
     """(n,) residuals with one effect in the model, or those before where a ray misses. measurement: of these points alone."""
     _, residuals, _ = aligned_with(measurement, [found.effects[number]], registration_rows)
-    rest = pose_of(residuals, residuals.smooth & np.isin(residuals.index, registration_rows))
-    value = residuals.of_points(residuals.value - residuals.pose @ rest, np.arange(len(found.before)))
+    rest = fit_pose(residuals, residuals.usable & np.isin(residuals.index, registration_rows))
+    value = residuals.values_at(residuals.value - residuals.pose_jacobian @ rest, np.arange(len(found.before)))
     return np.where(np.isfinite(value), value, found.before)

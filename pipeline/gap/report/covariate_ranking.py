@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.gap.naming.workflow import GapDiagnosis
-from pipeline.gap.residuals.cells import patches
-from pipeline.gap.residuals.residuals import Missing, Residuals
+from pipeline.gap.residuals.residuals import ExpectedPulses, Residuals
+from pipeline.gap.residuals.wall_blocks import wall_blocks_by_points
 from scene.geometry.mesh import FloatArray
 
 _BINS = 12
@@ -35,9 +35,13 @@ def rank_disagreements(found: GapDiagnosis) -> list[dict[str, Any]]:
     """
     residuals = found.residuals
     rows = [row for name, x, z in standardised_by_covariate(found) for row in _rank_statistics(name, x, z, residuals)]
-    if residuals.missing is not None and residuals.missing.lost.any():
-        patch = patches(residuals.missing.at, max(len(residuals.missing.lost) / _PATCHES, _LEAST_PULSES))
-        rows += [_rank_losses(name, x, residuals.missing, patch) for name, x in residuals.missing.covariates.items()]
+    if residuals.expected_pulses is not None and residuals.expected_pulses.lost.any():
+        patch = wall_blocks_by_points(
+            residuals.expected_pulses.wall_xy, max(len(residuals.expected_pulses.lost) / _PATCHES, _LEAST_PULSES)
+        )
+        rows += [
+            _rank_losses(name, x, residuals.expected_pulses, patch) for name, x in residuals.expected_pulses.covariates.items()
+        ]
     return sorted(rows, key=lambda row: (row["p_value"], -abs(row["size_m"])))[:_MOST_ROWS]
 
 
@@ -53,10 +57,10 @@ def standardised_by_covariate(found: GapDiagnosis) -> list[tuple[str, FloatArray
 def inliers(found: GapDiagnosis) -> Any:
     """(n,) points on smooth parts of the surface, outside of scene changes, whose residual before is no outlier."""
     residuals = found.residuals
-    used = residuals.smooth & (np.abs(found.before) < _OUTLIER_SIGMAS * residuals.sigma)
+    used = residuals.usable & (np.abs(found.before) < _OUTLIER_SIGMAS * residuals.sigma)
     for change in found.changes:
         low, high = change.bounds[:, :2] + np.array([[-_MARGIN_M], [_MARGIN_M]])
-        used = used & ~((residuals.at >= low) & (residuals.at <= high)).all(axis=1)
+        used = used & ~((residuals.wall_xy >= low) & (residuals.wall_xy <= high)).all(axis=1)
     return used
 
 
@@ -91,7 +95,7 @@ def _rank_statistics(name: str, x: FloatArray, z: FloatArray, residuals: Residua
     return found
 
 
-def _rank_losses(name: str, x: FloatArray, missing: Missing, patch: NDArray[np.int64]) -> dict[str, Any]:
+def _rank_losses(name: str, x: FloatArray, missing: ExpectedPulses, patch: NDArray[np.int64]) -> dict[str, Any]:
     """Entry of the bin whose share of lost pulses differs most.
 
     Losses are clustered, for example behind a shrub. The variance of a bin's share is therefore the larger of two estimates: that

@@ -44,7 +44,7 @@ def estimate_scale(found: GapDiagnosis) -> DatumScale | None:
     residuals = found.residuals
     if not isinstance(residuals, SurfaceResiduals) or not residuals.datum[6].any():
         return None
-    rows = residuals.smooth & ~found.held_out & (abs(found.after) < found.thresholds.points.outlier_sigmas * residuals.sigma)
+    rows = residuals.usable & ~found.held_out & (abs(found.after) < found.thresholds.points.outlier_sigmas * residuals.sigma)
     if rows.sum() < _FEWEST_POINTS:
         return None
     stretch, variance = residuals.datum[6] @ found.pose, datum_covariance(residuals, found.after, rows)[6, 6]

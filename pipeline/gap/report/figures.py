@@ -17,7 +17,7 @@ from pipeline.gap.naming.gap_score import Gap
 from pipeline.gap.naming.workflow import GapDiagnosis
 from pipeline.gap.report.covariate_ranking import inliers, quantile_bins, standardised_by_covariate
 from pipeline.gap.report.wording import covariate_with_unit
-from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, sigma_of
+from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, predicted_sigma
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
 from pipeline.report.figures import COLOURS, label_map_axes
 from pipeline.report.pictures import png
@@ -91,7 +91,7 @@ def sigma_after(found: GapDiagnosis) -> FloatArray:
         case TlsModel() as model, TlsResiduals(geometry=rays) as ranges:
             return np.asarray(np.sqrt(model.variance(rays) + ranges.reference_variance))
         case StereoModel() as model, SurfaceResiduals() as surface:
-            return sigma_of(model, surface)
+            return predicted_sigma(model, surface)
         case StereoModel() as model, residuals:
             return np.asarray(np.sqrt(np.broadcast_to(model.variance, len(residuals))))
     raise TypeError("model and residuals are of different sensors")
@@ -204,8 +204,8 @@ class _PixelGrid:
 
     def __init__(self, found: GapDiagnosis) -> None:
         residuals = found.residuals
-        self._kept = residuals.smooth if residuals.smooth.any() else ~residuals.smooth
-        at = residuals.at[self._kept]
+        self._kept = residuals.usable if residuals.usable.any() else ~residuals.usable
+        at = residuals.wall_xy[self._kept]
         low, extent = at.min(axis=0), np.ptp(at, axis=0)
         side = max(float(np.sqrt(np.prod(extent) * _POINTS_PER_PIXEL / len(at))), float(extent.max()) / _MOST_PIXELS) or 1.0
         columns, rows = (int(size / side) + 1 for size in extent)

@@ -13,8 +13,8 @@ import numpy as np
 from pipeline.formats.files.atomic import write_json, write_text, writing
 from pipeline.gap.report.figures import matrix_figure
 from pipeline.gap.report.wording import format_number, join_words
-from pipeline.gap.survey.identifiability import ALIKE, NAMED_AT, Identifiability
-from pipeline.gap.survey.survey_design import REFERENCE_LENGTH_M, SIGNAL_TO_NOISE
+from pipeline.gap.survey.identifiability import NAMING_SNR, SIMILAR_COSINE, Identifiability
+from pipeline.gap.survey.survey_design import DETECTION_SNR, REFERENCE_LENGTH_M
 from pipeline.report.page import template
 from pipeline.report.provenance import versions
 
@@ -47,9 +47,9 @@ def write_identifiability(out: Path, found: Sequence[Identifiability]) -> Path:
             temporary.write_bytes(picture)
     page = template("gap/report/identifiability.html.jinja").render(
         parts=[_part(each, pictures[each.sensor]) for each in found],
-        alike=ALIKE,
-        seen_at=SIGNAL_TO_NOISE,
-        named_at=NAMED_AT,
+        alike=SIMILAR_COSINE,
+        seen_at=DETECTION_SNR,
+        named_at=NAMING_SNR,
         length_m=REFERENCE_LENGTH_M,
     )
     write_text(out / "report.html", page)
@@ -66,10 +66,10 @@ def summarise(found: Identifiability) -> str:
     if pairs:
         a, b = pairs[0]
         parts.append(
-            f"{len(pairs)} pairs of effects look alike (cosine of at least {ALIKE:g}), most of all {found.names[a]} and"
+            f"{len(pairs)} pairs of effects look alike (cosine of at least {SIMILAR_COSINE:g}), most of all {found.names[a]} and"
             f" {found.names[b]} ({found.cosines[a, b]:.3f}): this survey alone cannot tell the two apart."
         )
-        counts = {e.name: sum(bool(e.cosines[pair] < ALIKE) for pair in pairs) for e in found.extensions}
+        counts = {e.name: sum(bool(e.cosines[pair] < SIMILAR_COSINE) for pair in pairs) for e in found.extensions}
         best = max(counts, key=lambda name: counts[name])
         verb = f"would separate {counts[best]} of the {len(pairs)}" if counts[best] else "would separate any of them"
         parts.append(f"{'None of the further measurements' if not counts[best] else best.capitalize()} {verb}.")

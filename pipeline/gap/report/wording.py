@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from pipeline.gap.mean.selection import Tried
+from pipeline.gap.mean.selection import FamilyScore
 from pipeline.gap.naming.named_effects import NamedEffect
 from pipeline.gap.naming.verdict import VERDICTS, describe_closing, describe_misfit, verdict_sentence
 from pipeline.gap.naming.workflow import GapDiagnosis
@@ -87,7 +87,7 @@ def verdict_in_words(found: GapDiagnosis) -> str:
 
 def _findings(found: GapDiagnosis, rows: list[dict[str, Any]]) -> list[str]:
     """Sentences on what was compared and what was found."""
-    parts = [f"{len(found.residuals):,} {found.residuals.called} were compared with what the model predicts."]
+    parts = [f"{len(found.residuals):,} {found.residuals.label} were compared with what the model predicts."]
     parts.append(verdict_in_words(found))
     scale = estimate_scale(found)
     parts += [] if scale is None else [scale.words]
@@ -137,7 +137,7 @@ def _largest_disagreement(found: GapDiagnosis, rows: list[dict[str, Any]]) -> st
     return f"Before any effect was named, the disagreement was largest in the {statistic} against {join_words(seen)}."
 
 
-def outcome(found: GapDiagnosis, tried: Sequence[Tried], item: Tried) -> str:
+def outcome(found: GapDiagnosis, tried: Sequence[FamilyScore], item: FamilyScore) -> str:
     """Return what became of an explanation of the mean: named, of the class of a named one, added as empirical, or rejected.
 
     tried: all explanations, best first; item: one of these.

@@ -1,5 +1,5 @@
-"""Compute the residuals: the measurement minus what the current model predicts along the same rays or at the same pixels.
+"""Compute the residuals of a measurement: what was measured minus what the current model predicts along the same rays.
 
-Everything that explains them is in the folders beside this one.
-Start with `residuals.py`.
+`residuals.py` has the common class; `tls_residuals.py`, `stereo_residuals.py` and `surface_residuals.py` compute it for each
+sensor; `alignment.py` aligns the sensor with the reference first; `scene_changes.py` sets regions that moved aside.
 """

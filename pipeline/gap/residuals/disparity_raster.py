@@ -1,4 +1,4 @@
-"""The reference as the cells of a depth map see it, so that effects that look at neighbouring cells can be predicted."""
+"""Represent the reference as a disparity raster, so that effects that use neighbouring pixels can be predicted."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import StereoMeasurement
-from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, is_hidden, project, rays, real_pair
+from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, is_hidden, pixel_rays, project, real_pair
 from pipeline.gap.residuals.residuals import BoolArray
 from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
@@ -20,22 +20,32 @@ from sensors.effects.raster_effect import RasterEffect
 from sensors.effects.smoothing import LowPass, Smoothing
 
 MOST_CELLS, _AT_ONCE = 40_000_000, 2_000_000
-"""Of a raster: the largest cameras' pixels; and of those that are cast at once."""
+"""Most cells of a raster (as many as the largest cameras have pixels), and how many of them are traced at once."""
 _SEARCHED, _BANDS, _LEAST_ROWS = 1_000_000, 4, 64
-"""Cells among which a search looks, in so many bands of rows, each of so many rows at the least."""
+"""Most cells among which edge effects are searched; a larger raster is searched in this many bands of at least so many rows."""
 _MARGIN = 32
-"""Cells beside the outermost points: three standard deviations of the widest low-pass that is looked for."""
+"""Cells beyond the outermost points: three standard deviations of the widest low-pass filter that is searched for."""
 _BEYOND = 0.01
-"""Share of a low-pass that may lie beyond what both cameras see: reached 2.3 standard deviations from a straight border."""
+"""Share of a low-pass filter's weight that may lie outside the area that both cameras see. It is reached 2.3 standard deviations
+from a straight border.
+"""
 _STEPS, _ON_RASTER = range(2, 33), 0.5
+"""Spacings of a raster that are tried, px, and how coherent the pixels' phases must be for one to count."""
 _STEEP = 0.3
-"""Disparity per pixel along the image beyond which neighbouring cells lie on both sides of a depth step."""
+"""Change of disparity per pixel above which neighbouring cells lie on both sides of a depth step."""
 
 
 @dataclass(frozen=True)
 class DisparityRaster:
-    """step: px per cell; disparity: (rows, columns) of the reference, px, NaN where no match can be; hidden: (rows, columns)
-    where the left camera sees the reference and the right one does not; row, column: (n,) cell of each point."""
+    """Disparities of the reference on the raster of the matcher.
+
+    Attributes
+    ----------
+    step : Spacing of the cells, px.
+    disparity : (rows, columns) disparity of the reference, px; NaN where nothing can be matched.
+    hidden : (rows, columns) whether the left camera sees the reference and the right one does not.
+    row, column : (n,) cell of each point.
+    """
 
     step: float
     disparity: FloatArray
@@ -45,41 +55,53 @@ class DisparityRaster:
 
     @classmethod
     def of(cls, measurement: StereoMeasurement, geometry: PixelGeometry) -> DisparityRaster | None:
-        """None where the pixels are on no raster, or on one of more than 40 million cells."""
-        step = cell_px(geometry.u, geometry.v)
-        if step is None or cells_over(geometry.u, geometry.v, step) > MOST_CELLS:
+        """Compute the raster of a measurement.
+
+        Parameters
+        ----------
+        measurement : The pair with its reference and model.
+        geometry : The pixels of its points.
+
+        Returns
+        -------
+        The raster; None if the pixels lie on no raster, if it has more than 40 million cells, or if the cameras miss the
+        reference.
+        """
+        step = raster_cell_px(geometry.u, geometry.v)
+        if step is None or raster_cell_count(geometry.u, geometry.v, step) > MOST_CELLS:
             return None
         nominal = NominalPair.of(measurement)
         real = real_pair(nominal, measurement.model.effects, measurement)
         left, right = real.left, real.right
         (columns, column), (rows, row) = (
-            _axis(x, step, size) for x, size in ((geometry.u, left.width), (geometry.v, left.height))
+            _raster_axis(x, step, size) for x, size in ((geometry.u, left.width), (geometry.v, left.height))
         )
         disparity = np.full((len(rows), len(columns)), np.nan)
         only_left = np.zeros(disparity.shape, dtype=bool)
         for part in np.array_split(np.arange(len(rows)), -(-disparity.size // _AT_ONCE)):
             u, v = (x.ravel() for x in np.meshgrid(columns, rows[part]))
-            ray = rays(left, u, v)
+            ray = pixel_rays(left, u, v)
             point = left.position + measurement.scene.cast(left.position, ray)[0][:, None] * ray
             seen, hidden = np.isfinite(point).all(axis=1), is_hidden(measurement.scene, right.position, point)
-            matched = seen & ~hidden & _pictured(right, point)
+            matched = seen & ~hidden & _in_image(right, point)
             found = np.full(len(u), np.nan)
             if matched.any():
                 found[matched] = nominal.disparity((u[matched], v[matched]), project(right, point[matched]))
             disparity[part], only_left[part] = (x.reshape(len(part), -1) for x in (found, seen & hidden))
-        if np.isnan(disparity).all():  # the cameras look past the reference
+        if np.isnan(disparity).all():  # the cameras miss the reference
             return None
         return cls(step, disparity, only_left, row, column)
 
     @property
-    def jump_px(self) -> float:
-        """Difference of neighbouring cells beyond which they lie on both sides of a depth step."""
+    def depth_step_px(self) -> float:
+        """Difference of neighbouring cells, px, above which they lie on both sides of a depth step."""
         return max(_STEEP * self.step, 1.0)
 
-    def searched(self) -> tuple[DisparityRaster, NDArray[np.int64]]:
-        """The part among which a search looks, and the points in it: all, or of a large raster some bands of rows over all of it.
+    def search_part(self) -> tuple[DisparityRaster, NDArray[np.int64]]:
+        """Return the part of the raster in which edge effects are searched, and the numbers of its points.
 
-        Bands lie apart by as many empty rows as they reach beyond their points; `hidden` holds for the rows of points alone.
+        This is the whole raster, or some bands of rows if it is large. Bands are separated by as many empty rows as they
+        extend beyond their points; `hidden` is only valid in the rows of points.
         """
         from scipy.ndimage import maximum_filter1d
 
@@ -98,49 +120,88 @@ class DisparityRaster:
         return replace(self, disparity=disparity, hidden=hidden, row=place[self.row[points]], column=self.column[points]), points
 
     def at_points(self, raster: NDArray[Any]) -> NDArray[Any]:
-        """(n,) what a raster holds at the points."""
+        """Return the (n,) values of a raster at the points."""
         return np.asarray(raster[self.row, self.column])
 
-    def beside_border(self, sigma_px: float) -> BoolArray:
-        """(n,) points for which a low-pass sees beyond what both cameras see of the reference, by more than a hundredth."""
+    def near_border(self, sigma_px: float) -> BoolArray:
+        """Tell for which points a low-pass filter reaches beyond the area that both cameras see, by over 1 % of its weight.
+
+        Parameters
+        ----------
+        sigma_px : Standard deviation of the filter, px.
+
+        Returns
+        -------
+        (n,) true near the border.
+        """
         from scipy.ndimage import gaussian_filter
 
         inside = (~np.isnan(self.disparity) | self.hidden).astype(np.float64)
         return self.at_points(gaussian_filter(inside, sigma_px / self.step, mode="constant") < 1 - _BEYOND)
 
-    def filled(self, effects: Iterable[Effect]) -> BoolArray:
-        """(n,) points in cells that the left camera alone sees, where no effect that looks at neighbours gives any."""
-        return np.asarray(np.isnan(self.at_points(self.after(effects))) & self.at_points(self.hidden))
+    def in_filled_occlusions(self, effects: Iterable[Effect]) -> BoolArray:
+        """Return (n,) whether a point lies where only the left camera sees the reference and no effect gives a disparity."""
+        return np.asarray(np.isnan(self.at_points(self.apply(effects))) & self.at_points(self.hidden))
 
-    def copies(self, found: FloatArray, tolerance: float) -> BoolArray:
-        """(n,) points whose measured disparity (n,), px, is that of the cell beside them in the row, as fillings leave it."""
+    def copied_from_neighbour(self, found: FloatArray, tolerance: float) -> BoolArray:
+        """Tell which measured disparities equal that of a neighbouring cell in the row, as filled occlusions do.
+
+        Parameters
+        ----------
+        found : (n,) measured disparities, px.
+        tolerance : Largest difference that counts as equal, px.
+
+        Returns
+        -------
+        (n,) true for copied disparities.
+        """
         cells = np.full(self.disparity.shape, np.nan)
         cells[self.row, self.column] = found
         same = np.abs(np.diff(cells, axis=1)) < tolerance
         return self.at_points(np.pad(same, ((0, 0), (1, 0))) | np.pad(same, ((0, 0), (0, 1))))
 
-    def after(self, effects: Iterable[Effect]) -> FloatArray:
-        """(rows, columns) disparities after those of the effects that look at neighbours, px, NaN where there is no match."""
+    def apply(self, effects: Iterable[Effect]) -> FloatArray:
+        """Apply the effects that use neighbouring pixels; return (rows, columns) disparities, px, NaN without a match."""
         found = self.disparity
         filters = (effect for effect in effects if isinstance(effect, RasterEffect))
         for effect in sorted(filters, key=lambda effect: (effect.stage, effect.order)):
-            found = effect.filtered(found, self.step, self.jump_px)
+            found = effect.filtered(found, self.step, self.depth_step_px)
         return found
 
-    def moved(self, effects: Iterable[Effect], disparity: FloatArray) -> FloatArray:
-        """(n,) what the effects add to the disparities (n,) that the reference has at the points, px; 0 where they say none."""
+    def added_by(self, effects: Iterable[Effect], disparity: FloatArray) -> FloatArray:
+        """Return what effects that use neighbouring pixels add to the disparities at the points.
+
+        Parameters
+        ----------
+        effects : The effects; others are ignored.
+        disparity : (n,) disparity of the reference at the points, px, used where the raster has none.
+
+        Returns
+        -------
+        (n,) added disparity, px; 0 where the effects give none.
+        """
         plain = self.at_points(self.disparity)
-        return np.nan_to_num(self.at_points(self.after(effects)) - np.where(np.isnan(plain), disparity, plain))
+        return np.nan_to_num(self.at_points(self.apply(effects)) - np.where(np.isnan(plain), disparity, plain))
 
 
-def through(effects: Iterable[Effect], geometry: PixelGeometry, columns: FloatArray) -> FloatArray:
-    """(n, k) what small changes of the disparities (n, k) at the points are after the low-passes among the effects.
+def apply_smoothing(effects: Iterable[Effect], geometry: PixelGeometry, columns: FloatArray) -> FloatArray:
+    """Apply the smoothing among the effects to small changes of the disparities, such as columns of a Jacobian.
 
-    They take the rock's relief off them, by which a move of the cameras changes each disparity. What moves outlines leaves them.
-    Of thinned points the low-pass is that over their own cells.
+    A move of the cameras changes disparities in proportion to the rock's relief, which smoothing removes. Edge fattening does not
+    change such columns. Of subsampled points, only their own cells are averaged.
+
+    Parameters
+    ----------
+    effects : Effects of the model; only smoothing is used.
+    geometry : The pixels.
+    columns : (n, k) changes of the disparity at the points, px per unit.
+
+    Returns
+    -------
+    (n, k) smoothed changes; unchanged without smoothing or without a raster.
     """
-    filters, step = [effect for effect in effects if isinstance(effect, Smoothing)], cell_px(geometry.u, geometry.v)
-    if not filters or step is None or cells_over(geometry.u, geometry.v, step) > MOST_CELLS:
+    filters, step = [effect for effect in effects if isinstance(effect, Smoothing)], raster_cell_px(geometry.u, geometry.v)
+    if not filters or step is None or raster_cell_count(geometry.u, geometry.v, step) > MOST_CELLS:
         return columns
     row, column = _cell(geometry.v, step), _cell(geometry.u, step)
     matched = np.zeros((int(row.max()) + 1, int(column.max()) + 1), dtype=bool)
@@ -157,22 +218,29 @@ def through(effects: Iterable[Effect], geometry: PixelGeometry, columns: FloatAr
     return np.stack(map_in_threads(passed, columns.T), axis=1)
 
 
-def cells_over(u: FloatArray, v: FloatArray, step: float) -> int:
-    """Of a raster of `step` px, from the first to the last row and column of pixels (n,)."""
+def raster_cell_count(u: FloatArray, v: FloatArray, step: float) -> int:
+    """Return the number of cells of a raster that covers pixels.
+
+    Parameters
+    ----------
+    u, v : (n,) columns and rows, px.
+    step : Spacing of the cells, px.
+    """
     return int(np.prod([np.rint(np.ptp(x) / step) + 1 for x in (u, v)]))
 
 
-def _pictured(camera: Camera, point: FloatArray) -> BoolArray:
-    """(n,) whether points (n, 3) lie within a camera's picture: nothing else can be matched."""
+def _in_image(camera: Camera, point: FloatArray) -> BoolArray:
+    """(n,) whether points (n, 3) lie within a camera's image: others cannot be matched."""
     u, v = project(camera, point)
     with np.errstate(invalid="ignore"):
         return np.asarray((u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height))
 
 
-def _axis(x: FloatArray, step: float, size: int) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Pixels of the rows or columns of the matcher's raster, and of each point (n,) which it is of. size: of the image, px.
+def _raster_axis(x: FloatArray, step: float, size: int) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Positions of the rows or columns of the matcher's raster, px, and the number of that of each point (n,).
 
-    Beyond the outermost points as far as the image goes and a low-pass sees: clouds are cut, and matched before.
+    The raster extends beyond the outermost points, as far as the image (of `size` px) and a low-pass filter reach, because
+    clouds are cropped after matching.
     """
     before, after = (int(np.clip(room // step, 0, _MARGIN)) for room in (x.min(), size - x.max()))
     cell = _cell(x, step)
@@ -180,18 +248,28 @@ def _axis(x: FloatArray, step: float, size: int) -> tuple[FloatArray, NDArray[np
 
 
 def _cell(x: FloatArray, step: float) -> NDArray[np.int64]:
-    """(n,) number of the row or column of each point, `step` px each, from the first."""
+    """(n,) number of the row or column of each point, counted from the first, with `step` px each."""
     return np.rint((x - x.min()) / step).astype(np.int64)
 
 
-def cell_px(u: FloatArray, v: FloatArray) -> float | None:
-    """Side of the cells of a raster of pixels (n,), px: the less of the distances of neighbouring columns and rows."""
-    steps = [step for step in (spacing(u), spacing(v)) if step is not None]
+def raster_cell_px(u: FloatArray, v: FloatArray) -> float | None:
+    """Return the spacing of a raster of pixels, px: the smaller one of its rows and columns; None if they lie on no raster."""
+    steps = [step for step in (raster_spacing_px(u), raster_spacing_px(v)) if step is not None]
     return min(steps, default=None)
 
 
-def spacing(u: FloatArray) -> float | None:
-    """Distance of neighbouring columns of a raster of pixels, px; also where a registration has moved them a little."""
+def raster_spacing_px(u: FloatArray) -> float | None:
+    """Return the spacing of neighbouring columns in a raster of pixels, px, even if a registration has shifted the pixels a
+    little.
+
+    Parameters
+    ----------
+    u : (n,) columns (or rows) of the pixels, px.
+
+    Returns
+    -------
+    The spacing; None if the pixels lie on no raster.
+    """
     gaps = np.diff(np.unique(np.round(u, 3)))
     step = float(np.median(gaps)) if len(gaps) > 10 else 0.0
     steps = gaps / max(step, 1e-9)

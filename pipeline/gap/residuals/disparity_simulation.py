@@ -1,4 +1,4 @@
-"""A stereo pair asked for the depth map's cells that hold given pixels, so that a measurement can be simulated pixel by pixel."""
+"""Simulate the disparities of a stereo pair pixel by pixel: the sensor simulation is evaluated at the pixels of a measurement."""
 
 from __future__ import annotations
 
@@ -21,18 +21,28 @@ from sensors.stereo.stereo_pair import REDUCTION, StereoPair
 from sensors.subset import effects_needing_neighbours, restrict_to
 
 _SAME_STEP = 0.5
-"""px by which two rasters' steps may differ: registrations move pixels a little."""
+"""Difference of two raster spacings, px, that still counts as equal: registrations shift pixels a little."""
 
 
 def simulate_disparities(
     measurement: StereoMeasurement, model: StereoModel, residuals: StereoResiduals, randoms: Sequence[KeyedRandom]
 ) -> FloatArray:
-    """(d, n) of the depth map's cell that holds each pixel, for each source of random numbers; the finest depth map of whose grid
-    the pixels are, or come nearest to.
+    """Simulate the disparity of each measured pixel, with the depth map whose raster fits the pixels best.
 
-    measurement: with its cameras where they stood, against which `residuals` may be those of another place. Cells are two pixels
-    wide at least; by how much the reference's disparity differs between the middle of a cell and the pixel is taken off. What a
-    matcher does to neighbours is done among the pixels of the measurement's own raster, if that is not the depth map's.
+    The cells of a depth map are at least two pixels wide. The difference of the reference's disparity between the centre of a
+    cell and the pixel is corrected. Effects of the matcher on neighbouring pixels are applied on the measurement's own raster
+    if its spacing differs from that of the depth map.
+
+    Parameters
+    ----------
+    measurement : The pair, with the cameras at their aligned pose.
+    model : The sensor model to simulate.
+    residuals : Residuals with the pixels; they may belong to another pose of the cameras.
+    randoms : d sources of random numbers, one for each simulation.
+
+    Returns
+    -------
+    (d, n) disparities, px.
     """
     nominal, g = NominalPair.of(measurement), residuals.geometry
     quality = min(REDUCTION, key=lambda name: float(np.mean(np.abs(np.mod(g.u, REDUCTION[name]) - REDUCTION[name] / 2))))
@@ -40,8 +50,8 @@ def simulate_disparities(
     height, width = pair.shape
     rows = np.clip((g.v / step).astype(int), 0, height - 1)
     columns = np.clip((g.u / step).astype(int), 0, width - 1)
-    middle = nominal.of_surface(measurement.scene, (columns + 0.5) * step, (rows + 0.5) * step)
-    beside = g.disparity + (middle - nominal.of_surface(measurement.scene, g.u, g.v))
+    middle = nominal.surface_disparity(measurement.scene, (columns + 0.5) * step, (rows + 0.5) * step)
+    beside = g.disparity + (middle - nominal.surface_disparity(measurement.scene, g.u, g.v))
     pair, shaped = _on_own_raster(pair, measurement, g, step)
     drawn = []
     for seen in _points(pair, measurement, rows * width + columns, randoms):
@@ -53,9 +63,10 @@ def simulate_disparities(
 def _on_own_raster(
     pair: StereoPair, measurement: StereoMeasurement, geometry: PixelGeometry, step: int
 ) -> tuple[StereoPair, FloatArray]:
-    """The pair without the effects that are done among the measurement's pixels, and what those add (n,), px.
+    """Remove the effects that are applied on the measurement's own raster, and return what they add (n,), px, beside the other
+    pair.
 
-    Outlines grow by whole cells, from steps between cells: on finer ones they grow otherwise.
+    Edge fattening grows by whole cells, so that it depends on their size.
     """
     shapes = [effect for effect in pair.model.effects if isinstance(effect, RasterEffect) and effect.stage == Stage.MATCH]
     raster = DisparityRaster.of(measurement.changed(model=pair.model), geometry) if shapes else None
@@ -63,14 +74,16 @@ def _on_own_raster(
         return pair, np.zeros(len(geometry))
     others = tuple(effect for effect in pair.model.effects if effect not in shapes)
     without = replace(pair, model=pair.model.model_copy(update={"effects": others}))
-    return without, raster.moved(shapes, geometry.disparity)
+    return without, raster.added_by(shapes, geometry.disparity)
 
 
 def _points(
     pair: StereoPair, measurement: StereoMeasurement, cells: NDArray[np.int64], randoms: Sequence[KeyedRandom]
 ) -> list[FloatArray]:
-    """(n, 3) of each source of random numbers: what is recorded in these cells (n,), of which those alone are traced where no
-    effect looks at others."""
+    """For each source of random numbers the (n, 3) points recorded in depth map cells (n,).
+
+    Only those cells are traced, unless an effect uses neighbouring ones.
+    """
     if effects_needing_neighbours(pair.model):
         return [pair.observe(measurement.scene, random).points.reshape(-1, 3)[cells] for random in randoms]
     chosen, place = np.unique(cells, return_inverse=True)

@@ -1,4 +1,7 @@
-"""The nominal pair of cameras in the wall frame: pixels to rays and back, disparities in its rectification, and the real pair."""
+"""Project points and pixels with the nominal stereo pair: rays of pixels, disparities in its rectification, and the real pair.
+
+The nominal pair has the calibration that the measurement states; the real pair has the camera effects of the model too.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.formats.measurements.measurement import StereoMeasurement
-from pipeline.gap.residuals.residuals import BoolArray, Rows, part_of
+from pipeline.gap.residuals.residuals import BoolArray, Rows, select_rows
 from scene.common.backend import dr, mi
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -21,15 +24,25 @@ from sensors.numerics.device import rotated, vector
 from sensors.stereo.stereo_pair import rectified_pixel, rectified_tangents, row_tangent
 
 _HIDDEN_SHARE = 2e-4
-"""A point is hidden where another surface stands before it by this share of its distance."""
+"""A point is hidden if another surface lies in front of it by more than this share of its distance."""
 
 
 @dataclass(frozen=True)
 class PixelGeometry:
-    """Per point: left pixel (u, v) and row in the right image (px), disparity of the reference and as found (px), point and unit
-    normal of the reference (n, 3), wall frame, m, distances to the middles of both images (px), tangent of the angle between the
-    rectified row and axis, disparity of a point at infinity, and what effects that look at neighbouring pixels add to that of the
-    reference (px)."""
+    """Geometry of n matched pixels as the equations of the effects use it.
+
+    Attributes
+    ----------
+    u, v : (n,) column and row in the left image, px.
+    v_right : (n,) row in the right image, px.
+    disparity : (n,) disparity of the reference, px.
+    found : (n,) measured disparity, px.
+    point, normal : (n, 3) point and unit normal of the reference, wall frame, m.
+    radius, radius_right : (n,) distance from the centre of the left and of the right image, px.
+    tangent : (n,) tangent of the angle between the rectified row and the rectified axis.
+    infinity : (n,) disparity of a point at infinity, px.
+    shaped : (n,) what effects that use neighbouring pixels (edge fattening, smoothing) add to the reference's disparity, px.
+    """
 
     u: FloatArray
     v: FloatArray
@@ -48,113 +61,167 @@ class PixelGeometry:
         return len(self.u)
 
     def part(self, rows: Rows) -> PixelGeometry:
-        """The same of some of the points."""
-        return part_of(self, rows)
+        """Return the geometry of some of the points."""
+        return select_rows(self, rows)
 
     @property
-    def plane(self) -> FloatArray:
+    def sensor_coordinates(self) -> FloatArray:
         """(n, 2) column and row in the left image, px."""
         return np.stack([self.u, self.v], axis=1)
 
     @property
     def departure(self) -> FloatArray:
-        """(n,) found disparity less that of the reference, px."""
+        """(n,) measured disparity minus that of the reference, px."""
         return np.asarray(self.found - self.disparity)
 
 
 @dataclass(frozen=True)
 class NominalPair:
-    """The nominal pair in the wall frame, with its rectification."""
+    """The nominal stereo pair in the wall frame.
+
+    Attributes
+    ----------
+    pair : The cameras.
+    geometry : Their rectification.
+    """
 
     pair: CameraPair
     geometry: Rectification
 
     @classmethod
     def of(cls, measurement: StereoMeasurement) -> NominalPair:
+        """Take the nominal pair of a measurement."""
         pair = measurement.cameras.in_wall_frame(measurement.frame)
         return cls(pair, rectify(pair))
 
     def disparity(self, left: tuple[FloatArray, FloatArray], right: tuple[FloatArray, FloatArray]) -> FloatArray:
-        """(n,) disparity of pixels of the left and of the right image, px."""
+        """Return the (n,) disparities, px, of matched pixels (column, row) of the left and of the right image."""
         first, second = ([on_device(mi.Float64, each) for each in pixel] for pixel in (left, right))
         return _on_host(self.left_column(*first) - self.right_column(*second))[0]
 
-    def of_surface(self, scene: RayCaster, u: FloatArray, v: FloatArray) -> FloatArray:
-        """(n,) disparity of what pixels of the left image see, px; NaN where they see nothing."""
+    def surface_disparity(self, scene: RayCaster, u: FloatArray, v: FloatArray) -> FloatArray:
+        """Return the disparity of the surface that pixels of the left image see.
+
+        Parameters
+        ----------
+        scene : The surface.
+        u, v : (n,) columns and rows, px.
+
+        Returns
+        -------
+        (n,) disparities, px; NaN for pixels that see nothing.
+        """
         left = self.pair.left
-        ray = rays(left, u, v)
+        ray = pixel_rays(left, u, v)
         point = left.position + scene.cast(left.position, ray)[0][:, None] * ray
         return self.disparity((u, v), project(self.pair.right, point))
 
     def left_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
-        """(n,) rectified column of pixels of the left image."""
+        """Return the (n,) rectified columns of pixels of the left image, px."""
         rect = self.geometry
         return rectified_pixel(self.pair.left, rect.left, u, v, rect.f, rect.u_left, rect.v)[0]
 
     def tangent(self, u: FloatArray, v: FloatArray) -> FloatArray:
-        """(n,) tangent of the angle between the rectified rows of pixels of the left image and the rectified axis."""
+        """Return the (n,) tangent of the angle between the rectified rows of pixels of the left image and the rectified axis."""
         rect = self.geometry
         pixel = on_device(mi.Float64, u), on_device(mi.Float64, v)
         row = rectified_pixel(self.pair.left, rect.left, *pixel, rect.f, rect.u_left, rect.v)[1]
         return _on_host(row_tangent(rect, row))[0]
 
     def right_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
-        """(n,) rectified column of pixels of the right image."""
+        """Return the (n,) rectified columns of pixels of the right image, px."""
         rect = self.geometry
         return rectified_pixel(self.pair.right, rect.right, u, v, rect.f, rect.u_right, rect.v)[0]
 
     def right_column_of(self, real: Camera, point: mi.Array3f64) -> mi.Float64:
-        """(n,) rectified column of the pixels at which the right camera, as it really is, sees points."""
+        """Return the (n,) nominally rectified columns of the pixels at which a real right camera sees points, px."""
         x, y = _seen_tangents(real, point)
-        if _interior(real) != _interior(self.pair.right):  # else the pixel's tangents are these
+        if _interior(real) != _interior(self.pair.right):  # else both cameras have the same tangents
             x, y = self.pair.right.on_device().tangents(*real.on_device().pixel(x, y))
         rect = self.geometry
         return rectified_tangents(x, y, rect.right, rect.f, rect.u_right, rect.v)[0]
 
 
 def project(camera: Camera, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pixels (u, v) of points (n, 3)."""
+    """Project points (n, 3), m, into a camera; return columns and rows (n,), px."""
     u, v = _on_host(*_pixel(camera, vectors_on_device(points)))
     return u, v
 
 
-def rays(camera: Camera, u: FloatArray, v: FloatArray) -> FloatArray:
-    """(n, 3) directions of pixels with unit component along the camera's axis."""
+def pixel_rays(camera: Camera, u: FloatArray, v: FloatArray) -> FloatArray:
+    """Return the rays of pixels.
+
+    Parameters
+    ----------
+    camera : The camera.
+    u, v : (n,) columns and rows, px.
+
+    Returns
+    -------
+    (n, 3) directions in the frame in which the camera's pose is given, with a component of 1 along its axis.
+    """
     return np.stack(_on_host(*_ray(camera, on_device(mi.Float64, u), on_device(mi.Float64, v))), axis=1)
 
 
 def _pixel(camera: Camera, point: mi.Array3f64) -> tuple[mi.Float64, mi.Float64]:
+    """Column and row at which a camera sees points, on the device."""
     u, v = camera.on_device().pixel(*_seen_tangents(camera, point))
     return u, v
 
 
 def _seen_tangents(camera: Camera, point: mi.Array3f64) -> tuple[mi.Float64, mi.Float64]:
+    """Tangents x / z and y / z of points in a camera, on the device."""
     local = rotated(camera.rotation.T, point - vector(camera.position))
     return local.x / local.z, local.y / local.z
 
 
 def _interior(camera: Camera) -> tuple[float, ...]:
+    """Parameters of the interior orientation, to compare two cameras."""
     return tuple(float(getattr(camera, name)) for name in INTERIOR)
 
 
 def _ray(camera: Camera, u: mi.Float64, v: mi.Float64) -> mi.Array3f64:
+    """Directions of pixels, on the device."""
     return rotated(camera.rotation, mi.Array3f64(*camera.on_device().tangents(u, v), 1.0))
 
 
 def _on_host(*columns: mi.Float64) -> list[FloatArray]:
+    """Copy arrays from the device."""
     dr.eval(*columns)
     return [np.array(column) for column in columns]
 
 
 def is_hidden(scene: RayCaster, position: FloatArray, points: FloatArray) -> BoolArray:
-    """(n,) whether another surface stands before points (n, 3) of the scene, seen from a position; a point that is NaN is not."""
+    """Tell which points are hidden behind another surface.
+
+    Parameters
+    ----------
+    scene : The surface.
+    position : (3,) position of the camera, m.
+    points : (n, 3) points on the surface, m; NaN counts as not hidden.
+
+    Returns
+    -------
+    (n,) whether another surface lies in front of each point.
+    """
     back = np.nan_to_num(points, nan=1e9) - position
     length = np.linalg.norm(back, axis=1)
     return np.asarray(scene.cast(position, back / length[:, None])[0] < length * (1 - _HIDDEN_SHARE))
 
 
-def seen_disparities(nominal: NominalPair, real: Iterable[CameraPair], geometry: PixelGeometry) -> list[FloatArray]:
-    """(n,) of each real pair: the disparity that it gives on each point's tangent plane, in the nominal rectified pair."""
+def predict_disparities(nominal: NominalPair, real: Iterable[CameraPair], geometry: PixelGeometry) -> list[FloatArray]:
+    """Predict the disparities that real pairs of cameras measure, linearising the surface by its tangent planes.
+
+    Parameters
+    ----------
+    nominal : The nominal pair, in whose rectification disparities are given.
+    real : The real pairs.
+    geometry : Pixels with their points on the reference and its normals.
+
+    Returns
+    -------
+    For each pair the (n,) disparities, px.
+    """
     u, v = on_device(mi.Float64, geometry.u), on_device(mi.Float64, geometry.v)
     point, normal = vectors_on_device(geometry.point), vectors_on_device(geometry.normal)
     column = nominal.left_column(u, v)
@@ -163,7 +230,7 @@ def seen_disparities(nominal: NominalPair, real: Iterable[CameraPair], geometry:
 
     def tangents(camera: Camera) -> tuple[mi.Float64, mi.Float64]:
         interior = _interior(camera)
-        if interior not in known:  # most pairs differ in where they stand alone
+        if interior not in known:  # most pairs differ only in their pose
             known[interior] = camera.on_device().tangents(u, v)
             dr.eval(*known[interior])
         return known[interior]
@@ -173,14 +240,26 @@ def seen_disparities(nominal: NominalPair, real: Iterable[CameraPair], geometry:
         ray = rotated(pair.left.rotation, mi.Array3f64(*tangents(pair.left), 1.0))
         met = origin + dr.dot(point - origin, normal) / dr.dot(ray, normal) * ray
         disparity = column - nominal.right_column_of(pair.right, met)
-        dr.eval(disparity)  # one kernel for all pairs, and no waiting for it
+        dr.eval(disparity)  # launches the same kernel for each pair, without waiting
         return disparity
 
     return _on_host(*[seen(pair) for pair in real])
 
 
 def moved_pair(pair: CameraPair, centre: FloatArray, vector: FloatArray, *, turned: bool) -> CameraPair:
-    """The pair shifted by `vector` (m) or turned by it (rad, small) about `centre`, in the frame that it is given in."""
+    """Move both cameras of a pair as one rigid body.
+
+    Parameters
+    ----------
+    pair : The cameras.
+    centre : (3,) fixed point of a rotation, m.
+    vector : (3,) shift, m, or small rotation vector, rad.
+    turned : Whether `vector` is a rotation.
+
+    Returns
+    -------
+    The moved pair, in the frame of the given one.
+    """
     if not turned:
         return pair.shifted("both", vector)
     x, y, z = vector
@@ -193,7 +272,14 @@ def moved_pair(pair: CameraPair, centre: FloatArray, vector: FloatArray, *, turn
 
 
 def real_pair(nominal: NominalPair, effects: tuple[Effect, ...], measurement: StereoMeasurement) -> CameraPair:
-    """The nominal pair with camera effects, wall frame."""
+    """Return the pair with camera effects applied, in the wall frame.
+
+    Parameters
+    ----------
+    nominal : The nominal pair.
+    effects : Effects of the model; those that do not change cameras are ignored.
+    measurement : The measurement with its cameras and frame.
+    """
     pair = measurement.cameras
     for effect in effects:
         pair = effect.apply(pair, KeyedRandom(0)) if effect.stage == Stage.CAMERA else pair

@@ -1,4 +1,4 @@
-"""The disagreement at the level of the raw observable, common to both sensors."""
+"""Hold the residuals (measured minus predicted observable) of one measurement, in the form that both sensors share."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.gap.residuals.shared_noise import NOT_SHARED, SharedNoise
+from pipeline.gap.residuals.correlated_noise import NO_CORRELATED_NOISE, GridCorrelatedNoise
 from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 from sensors.effects import Effects, catalogue
@@ -21,21 +21,21 @@ if TYPE_CHECKING:
 
 BoolArray = NDArray[np.bool_]
 Rows = BoolArray | NDArray[np.int64] | slice
-"""Some of n points: a mask or indices."""
+"""Which of n points are meant: a mask, row numbers or a slice."""
 _Columns = TypeVar("_Columns", bound="DataclassInstance")
 
 
 class Geometry(Protocol):
-    """What the equations of either sensor's effects look at, at n points."""
+    """Geometry of n measured points as the equations of the effects use it; either sensor has a class of its own."""
 
     def __len__(self) -> int: ...
 
     def part(self, rows: Rows) -> Self:
-        """The same of some of the points."""
+        """Return the geometry of some of the points."""
 
     @property
-    def plane(self) -> FloatArray:
-        """(n, 2) direction as the sensor counts it: azimuth and zenith, rad, or column and row, px."""
+    def sensor_coordinates(self) -> FloatArray:
+        """(n, 2) direction of each point in sensor coordinates: azimuth and zenith, rad, or image column and row, px."""
 
     @property
     def departure(self) -> FloatArray:
@@ -43,51 +43,71 @@ class Geometry(Protocol):
 
 
 def _order(values: FloatArray) -> NDArray[np.int32]:
+    """Row numbers that sort the values, ascending; equal values keep their order."""
     return np.argsort(values, kind="stable").astype(np.int32)
 
 
-def part_of(columns: _Columns, rows: Rows) -> _Columns:
-    """Some rows of a dataclass of (n, ...) arrays, some of which may be None."""
+def select_rows(columns: _Columns, rows: Rows) -> _Columns:
+    """Return the same dataclass with only some rows of its (n, ...) arrays; fields that are None stay None."""
     values: dict[str, Any] = {column.name: getattr(columns, column.name) for column in fields(columns)}
     return replace(columns, **{name: value[rows] for name, value in values.items() if value is not None})
 
 
 @dataclass(frozen=True)
 class Residuals(ABC):
-    """Measured minus predicted observable of n points, with what it may depend on; what ranges and disparities have in common.
+    """Residuals of n points: measured minus predicted observable, with all that later steps need to explain them.
 
-    value, sigma: (n,), m of range (TLS) or px of disparity (stereo), sigma being what the model predicts; unit_m: (n,) metres of
-    range or depth per unit of the observable, without the sign that `depth_m` has; smooth: (n,) where the surface around the
-    point is smooth enough for a mean to make sense, and of stable ground; even: the same of any ground; pose: (n, 6) derivatives
-    by translation (m) and rotation (rad) of the sensor in the wall frame; at: (n, 2) wall frame x, y of the reference's point,
-    which unlike the measured one does not move with the noise, m; covariates: named (n,) arrays; index: (n,) rows of the
-    measurement's points; away: (n,) what was taken off `value` because epochs were taken from places of their own, None where
-    they were not; missing: of the pulses that were sent and should have met the wall, None where the pattern is not known;
-    shared_noise: predicted noise that neighbours share.
+    The observable is a range (m) for a laser scan, a disparity (px) for a stereo pair, or a distance along the normal (m)
+    for a surface without cameras.
 
-    What stands on the class: planes, the two covariates that an error may depend on together; described_by, noise: the empirical
-    term and the white noise in the observable's unit, each with the name of its values; called: what they are in words.
+    Attributes
+    ----------
+    value : (n,) residuals, in the unit of the observable.
+    sigma : (n,) standard deviation that the model predicts, same unit.
+    unit_m : (n,) metres of range or depth per unit of the observable, always positive (`depth_m` has the sign).
+    usable : (n,) whether a point is used for fitting: the surface around it is smooth, and it lies on stable ground.
+    on_smooth_surface : (n,) whether the surface around a point is smooth, on stable ground or not.
+    pose_jacobian : (n, 6 k) derivatives of the observable by the poses of k set-ups: shift (m) and small rotation (rad) of
+        each in the wall frame. A surface without cameras has up to seven columns (with a scale).
+    wall_xy : (n, 2) x and y of the reference's point in the wall frame, m. It does not move with the noise of the
+        measured point.
+    covariates : (n,) arrays by name, on which an error may depend.
+    index : (n,) rows of the points in the measurement.
+    geometry : The rays or pixels behind the points.
+    epoch_offset : (n,) what was subtracted from `value` because each epoch had its own pose; None for a single epoch.
+    notes : Remarks for the user.
+    expected_pulses : Pulses that should have hit the wall; None if the scan pattern is not known.
+    correlated_noise : The part of the predicted noise that neighbouring points share.
+
+    Class attributes
+    ----------------
+    sensor : Sensor whose catalogue of effects applies.
+    position_covariates : Names of the two covariates of the point's position in the sensor's field of view, along which an
+        error may vary jointly.
+    empirical_term, white_noise : The effect class of an empirical term and of white noise for this observable, each with
+        the name of the field that holds its values.
+    label : What the points are, in words for the report.
     """
 
     sensor: ClassVar[Sensor]
-    planes: ClassVar[tuple[str, str]]
-    described_by: ClassVar[tuple[type[Effect], str]]
-    noise: ClassVar[tuple[type[Effect], str]]
-    called: ClassVar[str]
+    position_covariates: ClassVar[tuple[str, str]]
+    empirical_term: ClassVar[tuple[type[Effect], str]]
+    white_noise: ClassVar[tuple[type[Effect], str]]
+    label: ClassVar[str]
     value: FloatArray
     sigma: FloatArray
     unit_m: FloatArray
-    smooth: BoolArray
-    even: BoolArray
-    pose: FloatArray
-    at: FloatArray
+    usable: BoolArray
+    on_smooth_surface: BoolArray
+    pose_jacobian: FloatArray
+    wall_xy: FloatArray
     covariates: dict[str, FloatArray]
     index: NDArray[np.int64]
     geometry: Geometry
-    away: FloatArray | None = None
+    epoch_offset: FloatArray | None = None
     notes: tuple[str, ...] = ()
-    missing: Missing | None = None
-    shared_noise: SharedNoise = NOT_SHARED
+    expected_pulses: ExpectedPulses | None = None
+    correlated_noise: GridCorrelatedNoise = NO_CORRELATED_NOISE
 
     def __len__(self) -> int:
         return len(self.value)
@@ -95,59 +115,83 @@ class Residuals(ABC):
     @property
     @abstractmethod
     def depth_m(self) -> FloatArray:
-        """(n,) metres by which the surface lies deeper per unit of the observable: positive where rock is missing."""
+        """(n,) change of depth per unit of the observable, m: positive if a larger value means missing rock."""
 
     @property
-    def averaged(self) -> Self:
-        """With the spread that counts for means of many neighbours: root n times that of a mean of n."""
+    def with_sigma_of_means(self) -> Self:
+        """Return the residuals with the sigma that counts for means of many neighbours: √n times the sigma of a mean of n.
+
+        Noise that neighbours share makes it larger than the sigma of single points.
+        """
         return self
 
-    def shared_with(self, other: NDArray[np.int64]) -> FloatArray:
-        """(n,) covariance of each point's predicted noise with that of another, the row `other` (n,), by the reference's."""
+    def reference_covariance_with(self, other: NDArray[np.int64]) -> FloatArray:
+        """Return the covariance of each point's error with that of another point, as far as the reference's errors cause it.
+
+        Parameters
+        ----------
+        other : (n,) row of the other point.
+        """
         return np.zeros(len(other))
 
     @property
     def candidates(self) -> Effects:
-        """The effects that may be named."""
+        """Classes of the effects that may be named for this kind of measurement."""
         return catalogue(self.sensor)
 
     @property
-    def observed(self) -> FloatArray:
-        """(n,) measured minus geometric observable, without any effect of the model, as if all epochs had one place."""
-        return self.geometry.departure if self.away is None else self.geometry.departure - self.away
+    def total_departure(self) -> FloatArray:
+        """(n,) measured minus geometric observable without any effect of the model, as if all epochs had one pose."""
+        return self.geometry.departure if self.epoch_offset is None else self.geometry.departure - self.epoch_offset
 
     @cached_property
-    def orders(self) -> dict[str, NDArray[np.int32]]:
-        """(n,) rows by the value of each covariate, rising, and where that is the same as they are."""
+    def sort_orders(self) -> dict[str, NDArray[np.int32]]:
+        """(n,) row numbers that sort each covariate, ascending, by its name; equal values keep their order."""
         return dict(zip(self.covariates, map_in_threads(_order, self.covariates.values()), strict=True))
 
-    def of_points(self, values: FloatArray, index: NDArray[np.int64]) -> FloatArray:
-        """(m,) values (n,) of these residuals at the measurement's points `index` (m,); NaN where there is no residual."""
+    def values_at(self, values: FloatArray, index: NDArray[np.int64]) -> FloatArray:
+        """Look values up by the numbers of the measurement's points.
+
+        Parameters
+        ----------
+        values : (n,) one value for each residual.
+        index : (m,) rows of points in the measurement.
+
+        Returns
+        -------
+        (m,) values; NaN for points without a residual.
+        """
         found = np.full(int(max(self.index.max(initial=-1), index.max(initial=-1))) + 1, np.nan)
         found[self.index] = values
         return np.asarray(found[index])
 
     def part(self, rows: Rows) -> Self:
-        """The residuals of some of the points."""
+        """Return the residuals of some of the points."""
         return replace(
             self,
             value=self.value[rows],
             sigma=self.sigma[rows],
             unit_m=self.unit_m[rows],
-            smooth=self.smooth[rows],
-            even=self.even[rows],
-            pose=self.pose[rows],
-            at=self.at[rows],
+            usable=self.usable[rows],
+            on_smooth_surface=self.on_smooth_surface[rows],
+            pose_jacobian=self.pose_jacobian[rows],
+            wall_xy=self.wall_xy[rows],
             covariates={name: values[rows] for name, values in self.covariates.items()},
             index=self.index[rows],
             geometry=self.geometry.part(rows),
-            away=None if self.away is None else self.away[rows],
-            shared_noise=self.shared_noise.part(rows),
+            epoch_offset=None if self.epoch_offset is None else self.epoch_offset[rows],
+            correlated_noise=self.correlated_noise.part(rows),
         )
 
-    def with_rows(self, known: BoolArray, other: Self) -> Self:
-        """With what `other` has of the points `known` (n,), in their order, but for which of them are smooth or even."""
-        names = ("value", "sigma", "unit_m", "pose", "at")
+    def with_rows_from(self, known: BoolArray, other: Self) -> Self:
+        """Replace some rows by those of other residuals, except `usable` and `on_smooth_surface`, which stay.
+
+        Parameters
+        ----------
+        known : (n,) rows to replace.
+        other : Residuals of just those points, in the same order.
+        """
+        names = ("value", "sigma", "unit_m", "pose_jacobian", "wall_xy")
         columns: dict[str, Any] = {name: _merged(getattr(self, name), getattr(other, name), known) for name in names}
         columns["covariates"] = {name: _merged(values, other.covariates[name], known) for name, values in self.covariates.items()}
         mine, theirs = vars(self.geometry), vars(other.geometry)
@@ -157,24 +201,42 @@ class Residuals(ABC):
 
 
 def _merged(mine: NDArray[Any], theirs: NDArray[Any], known: BoolArray) -> NDArray[Any]:
-    """(n, ...) values with others in the rows `known`."""
+    """Return (n, ...) values in which the rows `known` are replaced by `theirs`."""
     found = mine.copy()
     found[known] = theirs
     return found
 
 
 @dataclass(frozen=True)
-class Missing:
-    """Pulses of the pattern that should have met the wall. lost: (m,) whether no point stands in that direction."""
+class ExpectedPulses:
+    """Pulses of the scan pattern that should have hit the wall, and whether each returned.
+
+    Attributes
+    ----------
+    lost : (m,) whether no point was recorded in the pulse's direction.
+    covariates : (m,) arrays by name, on which a loss may depend.
+    wall_xy : (m, 2) x and y of the place on the wall that the pulse should have hit, wall frame, m.
+    """
 
     lost: BoolArray
     covariates: dict[str, FloatArray] = field(default_factory=dict)
-    at: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    wall_xy: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
 
 
-def plane_slopes(normal: FloatArray, direction: FloatArray, moved: FloatArray, distance: FloatArray) -> FloatArray:
-    """(n,) change of the distance to a plane along a ray whose unit direction changes by `moved`, m per unit.
+def range_derivative(normal: FloatArray, direction: FloatArray, moved: FloatArray, distance: FloatArray) -> FloatArray:
+    """Return how the distance to a plane along a ray changes as the ray turns.
 
-    From t = (p - o).n / (u.n): dt = -t (du.n) / (u.n).
+    With t = (p - o)·n / (u·n), the derivative is dt = -t (du·n) / (u·n).
+
+    Parameters
+    ----------
+    normal : (n, 3) normals of the planes.
+    direction : (n, 3) unit directions u of the rays.
+    moved : (n, 3) derivative du of the direction, per unit of the turning angle.
+    distance : (n,) distances t, m.
+
+    Returns
+    -------
+    (n,) derivative of the distance, m per unit of the turning angle.
     """
     return -distance * np.einsum("ni,ni->n", moved, normal) / np.einsum("ni,ni->n", direction, normal)

@@ -1,4 +1,4 @@
-"""The laser scanner sent in given directions instead of a pattern, so that a measurement can be simulated ray by ray."""
+"""Simulate a laser scan ray by ray: the scanner simulation sends its pulses in given directions instead of a pattern."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.formats.measurements.measurement import TlsMeasurement
-from pipeline.gap.residuals.rays import RayGeometry
+from pipeline.gap.residuals.ray_hits import RayGeometry
 from scene.common.backend import dr, mi
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -25,10 +25,13 @@ _NO_NOISE = TlsNoise(range_sigma_m=0.0, range_ppm=0.0, angle_sigma_rad=0.0)
 
 @dataclass(frozen=True)
 class DirectedScanner(LaserScanner):
-    """A scanner whose pulses leave in the directions of `geometry`, one after another.
+    """A scanner whose pulses leave in given directions, one after another.
 
-    Recorded powers, where there are any, take the place of those that the albedo of the reference would give; inclined: so do
-    the geometry's angles of incidence of those to the triangles; between: what of a reference made of points its triangles lack.
+    Attributes
+    ----------
+    geometry : Directions of the pulses. Recorded powers, if there are any, replace those that the reference's albedo would give.
+    inclined : Whether the geometry's incidence angles replace those to the reference's triangles.
+    between : Correction of the ranges for a reference made of points, and the planes along which deflected pulses are followed.
     """
 
     geometry: PulseGeometry = field(kw_only=True)
@@ -36,6 +39,7 @@ class DirectedScanner(LaserScanner):
     between: RayGeometry | None = None
 
     def emit(self) -> Pulses:
+        """Return one pulse for each direction."""
         angles, count = self.geometry, len(self.geometry.azimuth)
         index = dr.arange(mi.UInt32, count)
         zero = np.zeros(count)
@@ -55,12 +59,25 @@ class DirectedScanner(LaserScanner):
         )
 
     def ranges(self, scene: RayCaster, random: KeyedRandom) -> FloatArray:
-        """(n,) recorded ranges, m; NaN without a return."""
+        """Simulate the recorded ranges, (n,), m; NaN without a return. `scene` is the surface, `random` the source of random
+        numbers.
+        """
         pulses, beam = self.emitted(self.emit(), random)
-        return self._recorded_ranges(pulses, self.echo(scene, self._straight(pulses), beam, beam.combine_echoes), random)
+        return self._recorded_ranges(pulses, self.echo(scene, self._traced_pulses(pulses), beam, beam.combine_echoes), random)
 
     def ranges_by_mode(self, scene: RayCaster, random: KeyedRandom, modes: Sequence[Mode]) -> dict[Mode, FloatArray]:
-        """(n,) ranges as recorded by the beam in each of the modes, m; its sub-rays are traced once."""
+        """Simulate the recorded ranges for several modes of the beam; its sub-rays are traced only once.
+
+        Parameters
+        ----------
+        scene : The surface.
+        random : Source of the random numbers.
+        modes : Modes in which echoes of a footprint are combined.
+
+        Returns
+        -------
+        For each mode the (n,) ranges, m; NaN without a return.
+        """
         pulses, beam = self.emitted(self.emit(), random)
         parts: dict[Mode, list[Echo]] = {mode: [] for mode in modes}
 
@@ -71,35 +88,37 @@ class DirectedScanner(LaserScanner):
                 parts[mode].append(echo)
             return echo
 
-        self.echo(scene, self._straight(pulses), beam, merge)
+        self.echo(scene, self._traced_pulses(pulses), beam, merge)
         return {mode: self._recorded_ranges(pulses, Echo.joined(parts[mode]), random) for mode in modes}
 
-    def _straight(self, pulses: Pulses) -> Pulses:
-        """The pulses as they are traced: towards where they are recorded, if what turns them goes along planes."""
+    def _traced_pulses(self, pulses: Pulses) -> Pulses:
+        """The pulses in their recorded directions if deflections are followed along planes; else unchanged."""
         return pulses if self._planes is None else replace(pulses, aim_azimuth=pulses.azimuth, aim_zenith=pulses.zenith)
 
     def _recorded_ranges(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> FloatArray:
+        """(n,) ranges of echoes after the effects on measured values, m; NaN without a return."""
         pulses = self.measured(pulses, echo, random)
         return np.array(dr.select(pulses.returned, pulses.range_m, np.nan))
 
     def measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
+        """Apply the effects on measured values, with the recorded powers, the given incidence angles and the corrected ranges."""
         known = {"power": self.geometry.power, "cos_incidence": self.geometry.cos_incidence if self.inclined else None}
         known = {name: on_device(mi.Float32, np.maximum(each, 1e-9)) for name, each in known.items() if each is not None}
         echo = replace(echo, **known)
         if self.between is not None and self.between.bulge_m is not None:
             echo = replace(echo, range_m=echo.range_m - on_device(mi.Float64, np.nan_to_num(self.between.bulge_m)))
         if self._planes is not None:
-            echo = replace(echo, range_m=echo.range_m * _turned(pulses, self._planes))
+            echo = replace(echo, range_m=echo.range_m * _deflection_ratio(pulses, self._planes))
         return super().measured(pulses, echo, random)
 
     @property
     def _planes(self) -> FloatArray | None:
-        """(n, 3) normals of the planes along which pulses that turn go, None where they go along the reference's triangles."""
+        """(n, 3) normals of the planes along which deflected pulses are followed; None: along the reference's triangles."""
         return None if self.between is None else self.between.plane_normal
 
 
-def _turned(pulses: Pulses, normal: FloatArray) -> mi.Float64:
-    """(n,) distance along planes with normals (n, 3) in the direction in which a pulse leaves, over that in the nominal one."""
+def _deflection_ratio(pulses: Pulses, normal: FloatArray) -> mi.Float64:
+    """(n,) distance to planes with normals (n, 3) in the direction of each pulse, relative to that in its nominal direction."""
     across = mi.Vector3d(*(on_device(mi.Float64, np.ascontiguousarray(each)) for each in normal.T))
     nominal, real = direction(pulses.azimuth, pulses.zenith), direction(pulses.aim_azimuth, pulses.aim_zenith)
     return dr.dot(across, nominal) / dr.dot(across, real)
@@ -108,6 +127,7 @@ def _turned(pulses: Pulses, normal: FloatArray) -> mi.Float64:
 def _scanner(
     measurement: TlsMeasurement, model: TlsModel, geometry: PulseGeometry, between: RayGeometry | None = None
 ) -> DirectedScanner:
+    """The scanner of a measurement with another model."""
     position, rotation = measurement.station
     pattern = Pattern(0.0, 1.0, len(geometry.azimuth), 0.0, 1.0, 1)
     config = ScannerConfig(minimum_range_m=0.01, maximum_range_m=1e5)
@@ -116,30 +136,62 @@ def _scanner(
 
 
 def simulate_ranges(measurement: TlsMeasurement, model: TlsModel, geometry: RayGeometry, random: KeyedRandom) -> FloatArray:
-    """(n,) ranges that the sensor's own code records with `model` in the directions of `geometry`, m; NaN without a return."""
+    """Simulate the ranges that a model gives along the measured rays, with the scanner simulation.
+
+    Parameters
+    ----------
+    measurement : The scan, with its station and reference.
+    model : The sensor model.
+    geometry : The rays.
+    random : Source of the random numbers.
+
+    Returns
+    -------
+    (n,) ranges, m; NaN without a return.
+    """
     return _scanner(measurement, model, geometry, geometry).ranges(measurement.scene, random)
 
 
-def simulate_modes(
+def simulate_ranges_by_mode(
     measurement: TlsMeasurement, model: TlsModel, modes: Sequence[Mode], geometry: RayGeometry, random: KeyedRandom
 ) -> dict[Mode, FloatArray]:
-    """The same for a model whose beam has a footprint, for each of the modes in which its returns may be recorded."""
+    """Simulate the ranges of a model whose beam has a footprint, for several modes in which its echoes are combined.
+
+    Parameters
+    ----------
+    measurement, model, geometry, random : As in `simulate_ranges`.
+    modes : The modes.
+
+    Returns
+    -------
+    For each mode the (n,) ranges, m; NaN without a return.
+    """
     return _scanner(measurement, model, geometry, geometry).ranges_by_mode(measurement.scene, random, modes)
 
 
-def mean_model(model: TlsModel) -> TlsModel:
-    """The model's effects on the mean alone, without noise."""
+def systematic_part(model: TlsModel) -> TlsModel:
+    """Return the model with its systematic and edge effects only: without noise and without lost returns."""
     kept = tuple(effect for effect in model.effects if effect.shows_in in (ShowsIn.MEAN, ShowsIn.EDGES))
     return model.model_copy(update={"noise": _NO_NOISE, "effects": kept})
 
 
-def aimed(measurement: TlsMeasurement, geometry: PulseGeometry) -> tuple[FloatArray, FloatArray]:
-    """(n,) azimuth and zenith in which the pulses leave on average, by the measurement's model, scanner frame, rad."""
-    scanner = _scanner(measurement, mean_model(measurement.model), geometry)
+def mean_beam_directions(measurement: TlsMeasurement, geometry: PulseGeometry) -> tuple[FloatArray, FloatArray]:
+    """Predict the directions in which the pulses leave on average, under the measurement's model.
+
+    Parameters
+    ----------
+    measurement : The scan.
+    geometry : The recorded directions.
+
+    Returns
+    -------
+    (n,) azimuth and zenith angle, rad, scanner frame.
+    """
+    scanner = _scanner(measurement, systematic_part(measurement.model), geometry)
     pulses = scanner.emitted(scanner.emit(), KeyedRandom(0, ("gap", "mean")))[0]
     return np.array(pulses.aim_azimuth), np.array(pulses.aim_zenith)
 
 
-def simulated_ranges(measurement: TlsMeasurement, geometry: RayGeometry) -> FloatArray:
-    """(n,) mean range that the measurement's model predicts, m: the effects on the mean through the sensor's code, no noise."""
-    return simulate_ranges(measurement, mean_model(measurement.model), geometry, KeyedRandom(0, ("gap", "mean")))
+def predict_ranges(measurement: TlsMeasurement, geometry: RayGeometry) -> FloatArray:
+    """Predict the (n,) mean ranges along the rays, m, under the measurement's model: the simulation without noise."""
+    return simulate_ranges(measurement, systematic_part(measurement.model), geometry, KeyedRandom(0, ("gap", "mean")))

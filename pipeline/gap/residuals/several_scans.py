@@ -1,4 +1,4 @@
-"""Several scans with one instrument as one set of residuals: one set of effects, and a pose for each set-up."""
+"""Combine several scans with one instrument: all share one set of effects, and each set-up has its own pose."""
 
 from __future__ import annotations
 
@@ -16,22 +16,25 @@ from scene.geometry.mesh import FloatArray
 from sensors.models.sensor_model import TlsModel
 
 
-def scans_residuals(measurement: TlsMeasurement) -> TlsResiduals:
-    """Residuals of all scans, in the order of the measurement's points. pose: (n, 6 k), six columns for each of k set-ups."""
+def residuals_of_scans(measurement: TlsMeasurement) -> TlsResiduals:
+    """Compute the residuals of all scans of a measurement, in the order of its points.
+
+    The pose Jacobian is (n, 6 k), with six columns for each of k set-ups.
+    """
     count = 1 + max((scan.set_up for scan in measurement.scans), default=0)
     parts = []
     for scan, rows, one in measurement.each_scan():
         found = tls_residuals(one)
         pose = np.zeros((len(found), 6 * count))
-        pose[:, 6 * scan.set_up : 6 * scan.set_up + 6] = found.pose
-        parts.append(replace(found, pose=pose, index=rows[found.index]))
-    whole = _joined(parts)
+        pose[:, 6 * scan.set_up : 6 * scan.set_up + 6] = found.pose_jacobian
+        parts.append(replace(found, pose_jacobian=pose, index=rows[found.index]))
+    whole = _concatenated(parts)
     return whole.part(np.argsort(whole.index, kind="stable"))
 
 
-def _joined(parts: Sequence[TlsResiduals]) -> TlsResiduals:
-    """One set of them, with the covariates that all have."""
-    arrays = ("value", "sigma", "unit_m", "smooth", "even", "pose", "at", "index")
+def _concatenated(parts: Sequence[TlsResiduals]) -> TlsResiduals:
+    """Concatenate residuals, with the covariates that all of them have."""
+    arrays = ("value", "sigma", "unit_m", "usable", "on_smooth_surface", "pose_jacobian", "wall_xy", "index")
     columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}
     shared = [name for name in parts[0].covariates if all(name in part.covariates for part in parts)]
     columns["covariates"] = {name: np.concatenate([part.covariates[name] for part in parts]) for name in shared}
@@ -44,8 +47,22 @@ def _joined(parts: Sequence[TlsResiduals]) -> TlsResiduals:
     return replace(parts[0], **columns, geometry=replace(geometries[0], **pulses), notes=notes)
 
 
-def simulate_departures(measurement: TlsMeasurement, model: TlsModel, residuals: TlsResiduals, random: KeyedRandom) -> FloatArray:
-    """(n,) simulated minus geometric range of the residuals' points, of one scan or several, NaN without a return."""
+def simulate_range_errors(
+    measurement: TlsMeasurement, model: TlsModel, residuals: TlsResiduals, random: KeyedRandom
+) -> FloatArray:
+    """Simulate the range errors that a model gives at the residuals' points.
+
+    Parameters
+    ----------
+    measurement : One scan or several.
+    model : The sensor model.
+    residuals : Residuals with the rays to simulate.
+    random : Source of the random numbers.
+
+    Returns
+    -------
+    (n,) simulated minus geometric range, m; NaN without a return.
+    """
     rays = residuals.geometry
     if not measurement.scans:
         return simulate_ranges(measurement, model, rays, random) - np.asarray(rays.range_m)

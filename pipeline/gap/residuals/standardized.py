@@ -1,4 +1,7 @@
-"""Residuals against their surroundings, in units of how much residuals spread where and how they were measured."""
+"""Standardise residuals locally: subtract the median of their surroundings and divide by their actual scatter.
+
+The search for scene changes uses this, so that neither a slowly varying error nor noisier parts of the wall look like a change.
+"""
 
 from __future__ import annotations
 
@@ -14,44 +17,69 @@ from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 
 _CELLS, _WINDOW = 36, 9
-"""Cells along the longer side of the view, and how many of them make up the surroundings: a quarter of the side."""
+"""Cells along the longer side of the field of view, and cells along the side of the window that counts as surroundings: a
+quarter of the view.
+"""
 _FEWEST = 5
+"""Fewest points in a cell for its median to be used."""
 _BIN_POINTS, _MOST_BINS = 400, 24
+"""Smallest number of points in a bin of a covariate, and largest number of bins."""
 _ENOUGH = 5_000
-"""Points of which a bin's NMAD is known to 1.6 %."""
+"""Points of a bin from which its NMAD is computed: enough for a precision of 1.6 %."""
 
 
-def standardized(residuals: Residuals, plane: FloatArray, quiet: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
-    """(n,) residuals less their surroundings' median, in the observable's unit and in units of their spread.
+def standardize(residuals: Residuals, view_xy: FloatArray, unchanged: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+    """Subtract the local median from residuals and divide by their local scatter.
 
-    plane: (n, 2) as the sensor sees the points; quiet: (n,) points of which surroundings and spread are learned. The spread is
-    the predicted one times the largest NMAD that standardised residuals have among points of like covariates, at least 1: noise
-    that the model lacks, and rays that are off where the surface is steep, raise it there and not elsewhere.
+    The scatter is the predicted sigma times the largest NMAD of the standardised residuals among points with a similar value
+    of one covariate, but at least the predicted sigma. Noise that the model lacks, and misdirected rays on steep surfaces,
+    therefore raise it only where they occur.
+
+    Parameters
+    ----------
+    residuals : Residuals of n points.
+    view_xy : (n, 2) positions in the sensor's field of view, equally scaled on both axes.
+    unchanged : (n,) points without changes, from which median and scatter are estimated.
+
+    Returns
+    -------
+    (n,) residuals minus the local median in the unit of the observable, and the same divided by the scatter.
     """
-    departure = residuals.value - _surroundings(plane, residuals.value, quiet)
+    departure = residuals.value - _local_median(view_xy, residuals.value, unchanged)
     z = departure / residuals.sigma
-    return departure, z / np.maximum(spread(residuals, z, quiet), 1.0)
+    return departure, z / np.maximum(nmad_along_covariates(residuals, z, unchanged), 1.0)
 
 
-def spread(residuals: Residuals, z: FloatArray, quiet: NDArray[np.bool_]) -> FloatArray:
-    """(n,) largest NMAD that z has, of quiet points, among those of about the same value of one of the covariates."""
+def nmad_along_covariates(residuals: Residuals, z: FloatArray, unchanged: NDArray[np.bool_]) -> FloatArray:
+    """Return how much the points scatter, as the largest NMAD along any covariate.
+
+    Parameters
+    ----------
+    residuals : Residuals with their covariates.
+    z : (n,) standardised residuals.
+    unchanged : (n,) points without changes, from which the NMADs are computed.
+
+    Returns
+    -------
+    (n,) for each point the largest of the NMADs of z in its bins of the covariates and over all points.
+    """
 
     def along(name: str) -> FloatArray:
-        order = residuals.orders[name]
-        return _spread_along(residuals.covariates[name], z, order[quiet[order]])
+        order = residuals.sort_orders[name]
+        return _nmad_along(residuals.covariates[name], z, order[unchanged[order]])
 
-    whole = np.full(len(z), nmad(z[quiet], 0.0))
-    return reduce(np.maximum, map_in_threads(along, residuals.orders), whole)
+    whole = np.full(len(z), nmad(z[unchanged], 0.0))
+    return reduce(np.maximum, map_in_threads(along, residuals.sort_orders), whole)
 
 
-def _surroundings(plane: FloatArray, value: FloatArray, quiet: NDArray[np.bool_]) -> FloatArray:
-    """(n,) median of the cells' medians about each point, linear between cells."""
-    low = plane.min(axis=0)
-    side = float(np.ptp(plane, axis=0).max()) / _CELLS or 1.0
-    shape = tuple(int(extent / side) + 1 for extent in np.ptp(plane, axis=0))
-    place = (plane - low) / side
+def _local_median(view_xy: FloatArray, value: FloatArray, unchanged: NDArray[np.bool_]) -> FloatArray:
+    """(n,) local median: the median of the cells' medians in the window around each point, interpolated between cells."""
+    low = view_xy.min(axis=0)
+    side = float(np.ptp(view_xy, axis=0).max()) / _CELLS or 1.0
+    shape = tuple(int(extent / side) + 1 for extent in np.ptp(view_xy, axis=0))
+    place = (view_xy - low) / side
     cell = np.ravel_multi_index(tuple(np.minimum(place[:, axis].astype(np.int64), shape[axis] - 1) for axis in (0, 1)), shape)
-    middle = medians(value[quiet], cell[quiet], int(np.prod(shape)), _FEWEST).reshape(shape)
+    middle = group_medians(value[unchanged], cell[unchanged], int(np.prod(shape)), _FEWEST).reshape(shape)
     padded = np.pad(middle, _WINDOW // 2, constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (_WINDOW, _WINDOW)).reshape(-1, _WINDOW**2)
     empty = np.isnan(windows).all(axis=1)
@@ -61,8 +89,20 @@ def _surroundings(plane: FloatArray, value: FloatArray, quiet: NDArray[np.bool_]
     return np.asarray(ndimage.map_coordinates(smooth, (place - 0.5).T, order=1, mode="nearest"))
 
 
-def medians(value: FloatArray, cell: NDArray[np.int64], count: int, fewest: int) -> FloatArray:
-    """(count,) median of the values of each cell, NaN where there are too few."""
+def group_medians(value: FloatArray, cell: NDArray[np.int64], count: int, fewest: int) -> FloatArray:
+    """Return the median of each group of values.
+
+    Parameters
+    ----------
+    value : (n,) values.
+    cell : (n,) number of each value's group.
+    count : Number of groups.
+    fewest : Groups with fewer values get NaN.
+
+    Returns
+    -------
+    (count,) medians.
+    """
     order = np.lexsort((value, cell))
     ordered = value[order]
     sizes = np.bincount(cell, minlength=count)
@@ -74,8 +114,8 @@ def medians(value: FloatArray, cell: NDArray[np.int64], count: int, fewest: int)
     return found
 
 
-def _spread_along(values: FloatArray, z: FloatArray, order: NDArray[np.int32]) -> FloatArray:
-    """(n,) NMAD of z among the known points with about the same value of a covariate. order: those points by that, rising."""
+def _nmad_along(values: FloatArray, z: FloatArray, order: NDArray[np.int32]) -> FloatArray:
+    """(n,) NMAD of z among points in the same bin of a covariate. `order`: the points to use, sorted by the covariate."""
     groups = np.array_split(order, int(np.clip(len(order) // _BIN_POINTS, 1, _MOST_BINS)))
     found = np.array([nmad(z[group[:: max(len(group) // _ENOUGH, 1)]], 0.0) for group in groups])
     borders = np.array([values[group[0]] for group in groups[1:]])

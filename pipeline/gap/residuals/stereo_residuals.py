@@ -1,4 +1,4 @@
-"""Disparity residuals of a reconstructed surface: measured and reference disparity of each pixel, nominally rectified."""
+"""Compute the disparity residuals of a stereo pair: measured minus reference disparity, nominally rectified."""
 
 from __future__ import annotations
 
@@ -8,19 +8,25 @@ import numpy as np
 
 from pipeline.formats.measurements.measurement import StereoMeasurement
 from pipeline.formats.measurements.surroundings import Surroundings
-from pipeline.gap.residuals.disparity_raster import MOST_CELLS, DisparityRaster, cell_px, cells_over, through
+from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise
+from pipeline.gap.residuals.disparity_raster import (
+    MOST_CELLS,
+    DisparityRaster,
+    apply_smoothing,
+    raster_cell_count,
+    raster_cell_px,
+)
 from pipeline.gap.residuals.nominal_pair import (
     NominalPair,
     PixelGeometry,
     is_hidden,
     moved_pair,
+    pixel_rays,
+    predict_disparities,
     project,
-    rays,
     real_pair,
-    seen_disparities,
 )
 from pipeline.gap.residuals.residuals import Residuals
-from pipeline.gap.residuals.shared_noise import SharedNoise
 from pipeline.registration.rigid import RigidTransform
 from scene.geometry.mesh import FloatArray
 from scene.ray_casting.raycast import RayCaster
@@ -33,15 +39,19 @@ from sensors.models.sensor_model import StereoModel
 from sensors.numerics.curve import interpolate_on_host
 
 _PROBE_PX = 3.0
+"""Distance to the neighbouring pixels that detect edges, px."""
 _EDGE_PX, _MOST_EDGE_PX = 1.0, 10.0
-"""A surface that departs by more from its tangent plane within some pixels counts as an edge; the most that is told apart."""
+"""Deviation of the surface from its tangent plane, px of disparity, from which a pixel counts as an edge; and the largest
+recorded.
+"""
 _STAYS_PX = 0.5
-"""A pixel that sees a place no farther from another, a sixth of what is probed about it, has that one's surroundings."""
+"""Surroundings are kept if a pixel sees a place at most this far from the earlier one, px: a sixth of the probing distance."""
 _LEAST_VARIANCE = 1e-8
-"""Of a disparity, px2: a model without noise divides by nothing."""
+"""Smallest variance of a disparity, px², so that a model without noise does not cause divisions by 0."""
 _REGISTRATION_STEPS, _NUDGE = 3, 1e-4
+"""Gauss-Newton steps, and step of the finite differences, m and rad."""
 _ON_RAY = 0.1
-"""A registration counts as found where it leaves less than this share of the distance from the points to their rays."""
+"""The registration counts as found if it leaves less than this share of the distances between points and rays."""
 
 
 @dataclass(frozen=True)
@@ -49,46 +59,62 @@ class StereoResiduals(Residuals):
     """Residuals of disparities, px."""
 
     sensor = "stereo"
-    planes = ("image_x", "image_y")
-    described_by = DisparityEmpirical, "values_px"
-    noise = ParallaxNoise, "sigma_px"
-    called = "disparities of a stereo pair"
+    position_covariates = ("image_x", "image_y")
+    empirical_term = DisparityEmpirical, "values_px"
+    white_noise = ParallaxNoise, "sigma_px"
+    label = "disparities of a stereo pair"
     geometry: PixelGeometry
 
     @property
     def depth_m(self) -> FloatArray:
-        """(n,) m per px, below 0: a disparity, f B / Z, falls with the depth."""
+        """(n,) depth per disparity, m/px, negative: a disparity f B / Z falls with the depth."""
         return -self.unit_m
 
 
-def on_their_rays(left: Camera, points: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
-    """Points (n, 3) moved as one rigid body so that they project into the pixels that they were matched at.
+def move_onto_rays(left: Camera, points: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
+    """Move points rigidly so that they project into the pixels at which they were matched.
 
-    A reconstruction lies on the rays of its pixels until it is registered; the registration, which the points show thus to some
-    micrometres, is undone. Gauss-Newton on some thousand points; the points stay where that does not bring them nearer.
+    A reconstruction lies on the rays of its pixels until it is registered. The registration can be recovered from the points
+    to some micrometres, and is undone. It is found by Gauss-Newton with some thousand points; the points stay if that brings
+    them no nearer.
+
+    Parameters
+    ----------
+    left : The left camera.
+    points : (n, 3) reconstructed points, m.
+    u, v : (n,) columns and rows at which they were matched, px.
+
+    Returns
+    -------
+    (n, 3) moved points, m.
     """
     some = slice(None, None, max(len(points) // 4000, 1))
     found, centre = RigidTransform.identity(), points.mean(axis=0)
     for _ in range(_REGISTRATION_STEPS):
         moved = found.apply(points[some])
-        miss = _miss(left, moved, u[some], v[some])
+        miss = _reprojection_error(left, moved, u[some], v[some])
         units = _NUDGE * np.eye(6)
         nudges = [RigidTransform.about(centre, unit[3:], unit[:3]) for unit in units]
-        slopes = np.stack([(_miss(left, nudge.apply(moved), u[some], v[some]) - miss) / _NUDGE for nudge in nudges], axis=1)
-        change = np.asarray(np.linalg.lstsq(slopes, -miss, rcond=None)[0], dtype=np.float64)
+        jacobian = np.stack(
+            [(_reprojection_error(left, nudge.apply(moved), u[some], v[some]) - miss) / _NUDGE for nudge in nudges], axis=1
+        )
+        change = np.asarray(np.linalg.lstsq(jacobian, -miss, rcond=None)[0], dtype=np.float64)
         found = RigidTransform.about(centre, change[3:], change[:3]).after(found)
-    before, after = (np.sqrt(np.mean(_miss(left, each, u, v) ** 2)) for each in (points, found.apply(points)))
+    before, after = (np.sqrt(np.mean(_reprojection_error(left, each, u, v) ** 2)) for each in (points, found.apply(points)))
     return found.apply(points) if after < _ON_RAY * before else points
 
 
-def _miss(left: Camera, points: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
-    """(2 n,) projected minus given pixel, columns first."""
+def _reprojection_error(left: Camera, points: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
+    """(2 n,) projected minus given pixels, columns first, px."""
     found = project(left, points)
     return np.concatenate([found[0] - u, found[1] - v])
 
 
 def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
-    """Disparity residuals with predicted spread and covariates; points whose pixel does not see the surface are left out."""
+    """Compute the disparity residuals of a pair, with predicted sigma, covariates and pose Jacobian.
+
+    Points whose pixel does not see the reference are left out.
+    """
     nominal, model = NominalPair.of(measurement), measurement.model
     u, v, points = _pixels(nominal, measurement)
     measured = nominal.disparity(project(nominal.pair.left, points), project(nominal.pair.right, points))
@@ -97,62 +123,66 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
     about = _surroundings(measurement, nominal, real, geometry, depth)
     geometry = replace(geometry, shaped=_shaped_px(measurement, geometry))
     hit = np.isfinite(geometry.disparity)
-    slope = nominal.geometry.f * nominal.geometry.base_m / depth**2
+    px_per_m = nominal.geometry.f * nominal.geometry.base_m / depth**2
     covariates = _covariates(nominal, geometry, depth, about)
-    mean = _mean_error(model, geometry) + _empirical(model, covariates)
+    mean = _systematic_error(model, geometry) + _empirical_error(model, covariates)
     even = hit & ~about.hidden & (about.edge_px < _EDGE_PX)
     whole = StereoResiduals(
         value=measured - geometry.disparity - mean,
         sigma=np.full(len(u), np.sqrt(max(model.variance, _LEAST_VARIANCE))),
-        unit_m=1 / slope,
-        smooth=even & measurement.stable,
-        even=even,
-        pose=through(model.effects, geometry, _pose(nominal, geometry)),
-        at=geometry.point[:, :2],
+        unit_m=1 / px_per_m,
+        usable=even & measurement.stable,
+        on_smooth_surface=even,
+        pose_jacobian=apply_smoothing(model.effects, geometry, _pose_jacobian(nominal, geometry)),
+        wall_xy=geometry.point[:, :2],
         covariates=covariates,
         index=np.arange(len(u)),
         geometry=geometry,
-        shared_noise=SharedNoise.of(model, np.stack([u, v], axis=1)),
-        notes=(*measurement.notes, *_notes(_recorded(measurement), u, v)),
+        correlated_noise=GridCorrelatedNoise.of(model, np.stack([u, v], axis=1)),
+        notes=(*measurement.notes, *_notes(_has_pixels(measurement), u, v)),
     )
     return whole if hit.all() else whole.part(hit)
 
 
 def with_surroundings(measurement: StereoMeasurement, found: StereoResiduals) -> StereoMeasurement:
-    """With what lies about the places that the pixels see, which is not looked for again where these move little.
+    """Store the surroundings of the places that pixels see, to avoid detecting them again after small moves of the cameras.
 
-    found: its residuals, of which it is taken. What the right camera does not see is taken over too, wherever it stands: a few
-    points beside edges where it moves far.
+    The visibility from the right camera is stored too. After a large move it is wrong at a few points beside edges.
+
+    Parameters
+    ----------
+    measurement : The pair.
+    found : Its residuals, which contain the surroundings.
     """
     edge = found.covariates["edge_step"]
-    about = Surroundings(found.geometry.point, edge, ~found.even & (edge < _EDGE_PX))
+    about = Surroundings(found.geometry.point, edge, ~found.on_smooth_surface & (edge < _EDGE_PX))
     everywhere = Surroundings.nowhere(len(measurement.cloud.points))
     return measurement.changed(surroundings=everywhere.changed(found.index, about))
 
 
-def _recorded(measurement: StereoMeasurement) -> bool:
-    """Whether the points come with their pixels."""
+def _has_pixels(measurement: StereoMeasurement) -> bool:
+    """Tell whether the points come with their pixels."""
     return "pixel_x" in measurement.cloud.extra and "pixel_y" in measurement.cloud.extra
 
 
 def _pixels(nominal: NominalPair, measurement: StereoMeasurement) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Column and row (n,) of each point in the left image, px, and the points (n, 3) on the rays of these."""
+    """Column and row (n,) of each point in the left image, px, and the points (n, 3) on the rays of these pixels."""
     points, left = measurement.cloud.points, nominal.pair.left
-    if not _recorded(measurement):
+    if not _has_pixels(measurement):
         return *project(left, points), points
     u, v = (np.asarray(measurement.cloud.extra[key], dtype=np.float64) for key in ("pixel_x", "pixel_y"))
-    return u, v, on_their_rays(left, points, u, v)
+    return u, v, move_onto_rays(left, points, u, v)
 
 
 def _notes(given: bool, u: FloatArray, v: FloatArray) -> tuple[str, ...]:
-    """What cannot be looked into for want of a field. given: whether the pixels are recorded."""
-    step = cell_px(u, v)
-    large = step is not None and cells_over(u, v, step) > MOST_CELLS
+    """Notes that name the candidates which were left out. `given`: whether the pixels were recorded."""
+    step = raster_cell_px(u, v)
+    large = step is not None and raster_cell_count(u, v, step) > MOST_CELLS
     absent = {
-        "no pixel_x, pixel_y: pixels were found by projecting the points": not given,
-        "pixels on no raster: edge_fattening, smoothing and occlusion_fill were not tried": step is None,
-        f"a raster of more than {MOST_CELLS:,} cells: edge_fattening, smoothing and occlusion_fill were not tried": large,
-        "no images: texture_noise was not tried": True,
+        "no pixel_x, pixel_y: pixels were computed by projecting the points": not given,
+        "pixels on no raster: edge_fattening, smoothing and occlusion_fill were not tested": step is None,
+        f"a raster of more than {MOST_CELLS:,} cells: edge_fattening, smoothing and occlusion_fill were not tested": large,
+        "no images: texture_noise was not tested": True,
     }
     return tuple(note for note, true in absent.items() if true)
 
@@ -160,10 +190,9 @@ def _notes(given: bool, u: FloatArray, v: FloatArray) -> tuple[str, ...]:
 def _reference(
     nominal: NominalPair, real: CameraPair, scene: RayCaster, u: FloatArray, v: FloatArray, measured: FloatArray
 ) -> tuple[PixelGeometry, FloatArray]:
-    """What the pixels of the cameras as the model has them (`real`) see on the reference, its disparity in the nominal pair, and
-    the depth (m)."""
+    """What the pixels of the `real` cameras see: their geometry on the reference, and the depth (n,), m."""
     left, camera = real.left, real.right
-    ray = rays(left, u, v)
+    ray = pixel_rays(left, u, v)
     distance, face = scene.cast(left.position, ray)
     point = left.position + distance[:, None] * ray
     right = project(camera, point)
@@ -187,7 +216,7 @@ def _reference(
 def _surroundings(
     measurement: StereoMeasurement, nominal: NominalPair, real: CameraPair, geometry: PixelGeometry, depth: FloatArray
 ) -> Surroundings:
-    """Those that the measurement knows, and what the pixels that see other places have about them."""
+    """Use the stored surroundings, and detect those of pixels that now see other places."""
     known = measurement.surroundings or Surroundings.nowhere(len(geometry))
     away_px = nominal.geometry.f * np.linalg.norm(geometry.point - known.point, axis=1) / depth
     rows = np.flatnonzero(np.isfinite(depth) & ~(away_px < _STAYS_PX))
@@ -199,10 +228,10 @@ def _surroundings(
 
 
 def _edge_px(nominal: NominalPair, left: Camera, scene: RayCaster, geometry: PixelGeometry) -> FloatArray:
-    """(n,) departure of the reference from its tangent planes beside what the pixels see, px of disparity."""
+    """(n,) largest deviation of the reference from its tangent plane at four neighbouring pixels, px of disparity."""
     edge = np.zeros(len(geometry))
     for du, dv in ((_PROBE_PX, 0.0), (-_PROBE_PX, 0.0), (0.0, _PROBE_PX), (0.0, -_PROBE_PX)):
-        beside = rays(left, geometry.u + du, geometry.v + dv)
+        beside = pixel_rays(left, geometry.u + du, geometry.v + dv)
         seen = scene.cast(left.position, beside)[0]
         flat = np.einsum("ni,ni->n", geometry.point - left.position, geometry.normal)
         flat /= np.einsum("ni,ni->n", beside, geometry.normal)
@@ -211,35 +240,35 @@ def _edge_px(nominal: NominalPair, left: Camera, scene: RayCaster, geometry: Pix
     return np.minimum(edge, _MOST_EDGE_PX)
 
 
-def _pose(nominal: NominalPair, geometry: PixelGeometry) -> FloatArray:
-    """(n, 6) change of the disparity if both cameras stand shifted (m) and turned (rad) about the left one, wall frame."""
+def _pose_jacobian(nominal: NominalPair, geometry: PixelGeometry) -> FloatArray:
+    """(n, 6) derivatives of the disparity by a shift (m) and a rotation (rad) of both cameras about the left one, wall frame."""
     centre, step = nominal.pair.left.position, 1e-4
     units = step * np.eye(3)
     moved = [moved_pair(nominal.pair, centre, unit, turned=turned) for turned in (False, True) for unit in units]
-    base, *columns = seen_disparities(nominal, [nominal.pair, *moved], geometry)
+    base, *columns = predict_disparities(nominal, [nominal.pair, *moved], geometry)
     return np.stack([(column - base) / step for column in columns], axis=1)
 
 
-def _mean_error(model: StereoModel, geometry: PixelGeometry) -> FloatArray:
-    """(n,) what those of the model's effects that are not in the cameras add to the disparity, px."""
+def _systematic_error(model: StereoModel, geometry: PixelGeometry) -> FloatArray:
+    """(n,) systematic disparity error by the effects of the model outside the cameras, px."""
     beside = [effect for effect in model.effects if not effect.empirical and not isinstance(effect, CameraEffect | RasterEffect)]
     found = np.asarray(sum((effect.mean(geometry) for effect in beside), np.zeros(len(geometry))))
     return found + geometry.shaped
 
 
 def _shaped_px(measurement: StereoMeasurement, geometry: PixelGeometry) -> FloatArray:
-    """(n,) what those of the model's effects that look at neighbouring pixels add to the disparity, px."""
+    """(n,) disparity that the model's effects on neighbouring pixels add, px."""
     shapes = [effect for effect in measurement.model.effects if isinstance(effect, RasterEffect)]
     if not shapes:
         return np.zeros(len(geometry))
     if measurement.shaped_px is not None:
         return measurement.shaped_px
     raster = DisparityRaster.of(measurement, geometry)
-    return np.zeros(len(geometry)) if raster is None else raster.moved(shapes, geometry.disparity)
+    return np.zeros(len(geometry)) if raster is None else raster.added_by(shapes, geometry.disparity)
 
 
-def _empirical(model: StereoModel, covariates: dict[str, FloatArray]) -> FloatArray:
-    """(n,) what empirical terms of the model add to the disparity, px (see DisparityEmpirical)."""
+def _empirical_error(model: StereoModel, covariates: dict[str, FloatArray]) -> FloatArray:
+    """(n,) disparity that the empirical terms of the model add, px (see DisparityEmpirical)."""
     total = np.zeros(len(covariates["depth"]))
     for effect in model.effects:
         if isinstance(effect, DisparityEmpirical):
@@ -249,6 +278,7 @@ def _empirical(model: StereoModel, covariates: dict[str, FloatArray]) -> FloatAr
 
 
 def _covariates(nominal: NominalPair, geometry: PixelGeometry, depth: FloatArray, about: Surroundings) -> dict[str, FloatArray]:
+    """The covariates of a disparity, by name."""
     ray = geometry.point - nominal.pair.left.position
     cosine = np.abs(np.einsum("ni,ni->n", ray, geometry.normal)) / np.linalg.norm(ray, axis=1)
     return {

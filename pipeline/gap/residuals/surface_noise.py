@@ -1,12 +1,12 @@
-"""The noise of a cloud, from the cloud itself: how its distances from the reference differ between neighbours.
+"""Estimate the noise of a point cloud without cameras from the semivariogram of its distances to the reference.
 
-Half the mean squared difference of two points h apart (the semivariogram), from the median absolute one so that outliers do not
-count, is
+The semivariogram is half the mean squared difference of two distances whose points are h apart. It is estimated robustly, from
+the median absolute difference, and fitted by
 
-    g(h) = w + r^2 (4/9 - B(hx / s) B(hy / s)) + c h^2
+    g(h) = w + r² (4/9 - B(hx / s) B(hy / s)) + c h²
 
-w the variance of each point's own noise, r and s the standard deviation and the step of nodes whose values neighbours share, B
-the cubic B-spline, and c h^2 what changes slowly over the wall: an error of the reference, a wrong shape of the cloud. The
+with w the variance of each point's own (white) noise, r and s the standard deviation and the node spacing of grid-correlated
+noise, B the cubic B-spline, and c h² slow variation over the wall: an error of the reference, or a wrong shape of the cloud. The
 direction of h is averaged over.
 """
 
@@ -20,8 +20,8 @@ from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 
 from pipeline.formats.measurements.measurement import SurfaceMeasurement
-from pipeline.gap.residuals.registration import registered, settled
-from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, spacing_m
+from pipeline.gap.residuals.alignment import align, fit_pose_robustly
+from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, point_spacing_m
 from pipeline.gap.thresholds import thresholds
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
@@ -29,101 +29,127 @@ from sensors.models.sensor_model import StereoModel, StereoNoise
 from sensors.signal_chain.node_grid import node_semivariogram
 
 _LAGS = np.array([1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0])
-"""Of points, in spacings."""
+"""Lags of the semivariogram, in point spacings."""
 _STEPS = np.geomspace(1.5, 12.0, 13)
-"""Of nodes, in spacings."""
+"""Node spacings that are tried, in point spacings."""
 _SAMPLE, _FEWEST = 20_000, 200
+"""Most points from which pairs start, and fewest pairs or points for an estimate."""
 _NORMAL = 1.4826
+"""Standard deviation over median absolute value, for a normal distribution."""
 _DIRECTIONS = np.linspace(0, np.pi / 2, 8, endpoint=False)
+"""Directions of h over which the semivariogram of the nodes is averaged, rad."""
 
 
 @dataclass(frozen=True)
 class SurfaceNoise:
-    """Standard deviations in metres of each point's own noise, and at nodes `step_m` apart that neighbours share; spacing_m: of
-    the points; share: of the variance that neighbours share."""
+    """Noise of a point cloud's distances to the reference.
+
+    Attributes
+    ----------
+    sigma_m : Standard deviation of each point's own noise, m.
+    node_sigma_m : Standard deviation at the nodes of grid-correlated noise, m; 0 without.
+    step_m : Spacing of these nodes, m.
+    spacing_m : Typical distance between neighbouring points, m.
+    correlated_share : Share of the variance that is grid-correlated.
+    """
 
     sigma_m: float
-    shared_sigma_m: float
+    node_sigma_m: float
     step_m: float
     spacing_m: float
-    share: float
+    correlated_share: float
 
     @property
     def model(self) -> StereoModel:
-        """A model with this noise and nothing else."""
+        """Return a sensor model with this noise and no effects."""
         return StereoModel(
             noise=StereoNoise(
                 parallax_sigma_px=0.0,
                 regularization_sigma_px=0.0,
                 point_sigma_m=_rounded(self.sigma_m),
-                point_shared_sigma_m=_rounded(self.shared_sigma_m),
+                point_shared_sigma_m=_rounded(self.node_sigma_m),
                 point_shared_step_m=_rounded(self.step_m),
             )
         )
 
     @property
-    def words(self) -> str:
-        """Size and correlation, in a line."""
-        how = "estimated from how the cloud's distances from the reference differ between neighbours"
-        own = f"{how}: {1e3 * self.sigma_m:.3g} mm of each point"
-        if not self.shared_sigma_m:
-            return f"{own}, nothing that neighbours share ({1e3 * self.spacing_m:.3g} mm apart)"
+    def summary(self) -> str:
+        """One line with the size and the correlation of the noise."""
+        how = "estimated from the semivariogram of the cloud's distances to the reference"
+        own = f"{how}: {1e3 * self.sigma_m:.3g} mm of white noise"
+        if not self.node_sigma_m:
+            return f"{own}, no grid-correlated noise (points are {1e3 * self.spacing_m:.3g} mm apart)"
         return (
-            f"{own} and {1e3 * self.shared_sigma_m * 2 / 3:.3g} mm that neighbours share over {1e3 * self.step_m:.3g} mm "
-            f"({1e3 * self.spacing_m:.3g} mm apart): {100 * self.share:.0f} % of the variance"
+            f"{own} and {1e3 * self.node_sigma_m * 2 / 3:.3g} mm of grid-correlated noise with nodes {1e3 * self.step_m:.3g} mm "
+            f"apart (points: {1e3 * self.spacing_m:.3g} mm): {100 * self.correlated_share:.0f} % of the variance is correlated"
         )
 
 
-def estimated_noise(measurement: SurfaceMeasurement, where: str) -> SurfaceNoise:
-    """The noise of a cloud's points, registered first; whatever its model says. Raises InputError for too few points."""
-    found = settled(measurement).residuals
-    value = registered(found)[0]
-    rows = np.flatnonzero(found.smooth)
+def estimate_surface_noise(measurement: SurfaceMeasurement, where: str) -> SurfaceNoise:
+    """Estimate the noise of a cloud's points, after aligning the cloud with the reference.
+
+    The noise that the measurement's model states is ignored.
+
+    Parameters
+    ----------
+    measurement : The cloud with its reference.
+    where : Name of the input, for the error message.
+
+    Raises
+    ------
+    InputError
+        With fewer than 200 points on smooth parts of the reference.
+    """
+    found = align(measurement).residuals
+    value = fit_pose_robustly(found)[0]
+    rows = np.flatnonzero(found.usable)
     if len(rows) < _FEWEST or not isinstance(found, SurfaceResiduals):
         raise InputError(
             f"{len(rows)} points on smooth parts of the reference", where=where, allowed=f"{_FEWEST} and more",
-            remedy="give a denser cloud, or a reference that is as wide as it",
+            remedy="use a denser cloud, or a reference that covers it",
         )  # fmt: skip
-    return _fitted(found.geometry.point[rows], value[rows])
+    return _fit_noise(found.geometry.point[rows], value[rows])
 
 
-def _fitted(points: FloatArray, value: FloatArray) -> SurfaceNoise:
-    """Of distances (n,) at points (n, 3), m."""
-    spacing = spacing_m(points)
+def _fit_noise(points: FloatArray, value: FloatArray) -> SurfaceNoise:
+    """Fit the noise to distances (n,) at points (n, 3), m; grid-correlated noise only if chi² and its share of the variance
+    justify it.
+    """
+    spacing = point_spacing_m(points)
     lag, gamma, weight = _semivariogram(points, value, spacing)
-    root = np.sqrt(weight) / gamma  # the error of a variance is in proportion to it
+    root = np.sqrt(weight) / gamma  # the standard error of a variance is proportional to it
     slow = (lag / lag.max()) ** 2
     best = None
-    plain = _solved(np.stack([np.ones(len(lag)), slow], axis=1), gamma, root)
+    without_nodes = _nonnegative_fit(np.stack([np.ones(len(lag)), slow], axis=1), gamma, root)
     for step in _STEPS:
-        form = np.stack([np.ones(len(lag)), _nodes(lag / step), slow], axis=1)
-        found = _solved(form, gamma, root)
+        form = np.stack([np.ones(len(lag)), _node_semivariogram(lag / step), slow], axis=1)
+        found = _nonnegative_fit(form, gamma, root)
         if best is None or found[1] < best[1][1]:
             best = step, found
-    step, (values, square) = best if best is not None else (1.0, plain)
+    step, (values, square) = best if best is not None else (1.0, without_nodes)
     shared = 4 / 9 * values[1]
-    gains = plain[1] - square > thresholds().grid_noise.least_gain
-    if not gains or shared < thresholds().variance.least_excess * values[0]:
-        return SurfaceNoise(float(np.sqrt(plain[0][0])), 0.0, 0.1, spacing, 0.0)
+    improves = without_nodes[1] - square > thresholds().grid_noise.least_gain
+    if not improves or shared < thresholds().variance.least_excess * values[0]:
+        return SurfaceNoise(float(np.sqrt(without_nodes[0][0])), 0.0, 0.1, spacing, 0.0)
     own = max(values[0], 1e-4 * shared)
     return SurfaceNoise(float(np.sqrt(own)), float(np.sqrt(values[1])), step * spacing, spacing, float(shared / (own + shared)))
 
 
-def _solved(form: FloatArray, gamma: FloatArray, root: FloatArray) -> tuple[FloatArray, float]:
-    """Values at least 0, and chi^2."""
+def _nonnegative_fit(form: FloatArray, gamma: FloatArray, root: FloatArray) -> tuple[FloatArray, float]:
+    """Weighted least squares with coefficients of at least 0; returns them and chi²."""
     values, left = nnls(form * root[:, None], gamma * root)
     return values, float(left**2)
 
 
-def _nodes(lag: FloatArray) -> FloatArray:
-    """(k,) semivariogram of nodes of variance 1 at lags in steps, the mean over directions."""
+def _node_semivariogram(lag: FloatArray) -> FloatArray:
+    """(k,) semivariogram of nodes with variance 1, averaged over directions, at lags (k,) in node spacings."""
     return np.mean(
         [node_semivariogram(np.stack([lag * np.cos(angle), lag * np.sin(angle)], axis=1)) for angle in _DIRECTIONS], axis=0
     )
 
 
 def _semivariogram(points: FloatArray, value: FloatArray, spacing: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Lags in spacings, half the mean squared differences, m2, and how many differences count as independent, (k,) each."""
+    """Lags in point spacings, semivariances, m², and effective numbers of independent differences, each (k,)."""
     tree = cKDTree(points)
     start = np.arange(0, len(points), max(len(points) // _SAMPLE, 1), dtype=np.int64)
     found = []
@@ -139,9 +165,9 @@ def _semivariogram(points: FloatArray, value: FloatArray, spacing: float) -> tup
 
 
 def _pairs(tree: cKDTree, points: FloatArray, start: NDArray[np.int64], low: float, high: float) -> NDArray[np.int64]:
-    """(k, 2) numbers of pairs of points between two distances, one for each of `start` that has one."""
-    angle = 2.399963 * np.arange(len(start))  # the golden angle: all directions alike
-    # towards any direction in the tangent plane the nearest point to that place
+    """(k, 2) pairs of points whose distance is between `low` and `high`, m; at most one for each of the points `start`."""
+    angle = 2.399963 * np.arange(len(start))  # the golden angle, so that all directions are equally frequent
+    # the other point of a pair is the one nearest to a place at the wanted distance
     towards = 0.5 * (low + high) * np.stack([np.cos(angle), np.sin(angle), np.zeros(len(start))], axis=1)
     other = tree.query(points[start] + towards, workers=-1)[1]
     away = np.linalg.norm(points[other] - points[start], axis=1)
@@ -150,4 +176,5 @@ def _pairs(tree: cKDTree, points: FloatArray, start: NDArray[np.int64], low: flo
 
 
 def _rounded(value: float) -> float:
+    """Round to three significant digits."""
     return float(f"{value:.3g}")

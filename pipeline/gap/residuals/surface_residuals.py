@@ -1,9 +1,10 @@
-"""Distances of a cloud from the reference, for a cloud out of photographs whose cameras are not known.
+"""Compute the residuals of a photogrammetric cloud without cameras: its distances from the reference.
 
-Each point is compared along the normal of the plane through the 24 vertices around the nearest one, as M3C2 does (Lague et al.
-2013): where that line meets the reference is the point's place. A cloud's datum has a shift, a turn and a scale, so that the
-registration has seven values. With N the normal of the triangle that is met, n the line's direction and p that place less the
-reference's middle, a move d + w x p + s p of the cloud changes its distance by N.(d + w x p + s p) / (N.n).
+Each point is compared along the normal of the plane through the 24 vertices around the nearest one, as in M3C2 (Lague et al.
+2013); the point's place is where that line hits the reference. Such a cloud's datum is unknown up to a shift, a rotation and a
+scale, so its alignment has seven parameters. With N the normal of the triangle that is hit, n the direction of the line and p the
+place relative to the reference's centre, a change d + w x p + s p of the datum changes the distance by N·(d + w x p + s p) /
+(N·n).
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ import numpy as np
 from pipeline.formats.measurements.measurement import SurfaceMeasurement
 from pipeline.formats.measurements.surface_datum import datum_columns
 from pipeline.formats.measurements.surface_fit import near_m
-from pipeline.gap.residuals.cells import block_numbers
+from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise
 from pipeline.gap.residuals.residuals import BoolArray, Residuals, Rows
-from pipeline.gap.residuals.shared_noise import SharedNoise
+from pipeline.gap.residuals.wall_blocks import wall_block_numbers
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects import Effects
@@ -29,34 +30,43 @@ from sensors.models.sensor_model import StereoModel
 from sensors.signal_chain.surface_places import RecordedPoints, SurfacePlaces
 
 NO_CAMERAS = (
-    "no cameras: every effect of the catalogue of stereo pairs needs them, and none was tried; what is left is described over "
-    "the surface, without a name for its cause"
+    "no cameras: the effects of stereo pairs need them and were not tested; the residuals are described over the surface, "
+    "without naming a cause"
 )
-NO_SCALE = "the reference has too little relief to tell the cloud's scale, which is taken as right"
+"""Note that without cameras no effect can be named."""
+NO_SCALE = "the reference has too little relief to determine the cloud's scale, which is assumed to be correct"
+"""Note that the scale is not estimated."""
 _START = 1e-5
-"""Share of the reference's extent by which rays start on the other side of a point, so that none starts on the surface."""
+"""Share of the reference's extent by which a ray starts on the other side of its point, so that it never starts on the surface.
+"""
 _EDGE_SIGMAS, _EDGE_SLOPE = 3.0, 0.5
-"""A reference that bends by more within a spacing of the points counts as an edge: sigmas, or so much of the spacing."""
+"""A reference that bends by more within one point spacing counts as an edge: in sigmas, or as a share of the spacing."""
 _FROM_RIM = 2.0
-"""Spacings of the points from the reference's rim within which it is not smooth."""
+"""Distance from the reference's rim, in point spacings, within which it does not count as smooth."""
 _JACKKNIFE_CELLS = 30.0
+"""Number of wall blocks of the jackknife."""
 _ROUNDING = 1e-6
-"""Share of the reference's extent by which a covariate must differ."""
+"""Smallest variation of a covariate that counts as such, as a share of the reference's extent."""
 
 
 @dataclass(frozen=True)
 class SurfaceGeometry(SurfacePlaces):
-    """Places on the reference, and how far above it the points were found (n,), m."""
+    """Places on the reference with their surroundings, and the distances of the cloud's points from it.
+
+    Attributes
+    ----------
+    departure : (n,) distance of each point from the reference along the normal, m, positive out of the rock.
+    """
 
     departure: FloatArray
 
     @property
-    def plane(self) -> FloatArray:
-        """(n, 2) along the wall and up it, m."""
+    def sensor_coordinates(self) -> FloatArray:
+        """(n, 2) positions along the wall and up the wall, m."""
         return np.asarray(self.point[:, :2])
 
     def part(self, rows: Rows) -> SurfaceGeometry:
-        """The same of some of the points."""
+        """Return the geometry of some of the points."""
         return super().part(rows)
 
 
@@ -64,15 +74,19 @@ class SurfaceGeometry(SurfacePlaces):
 class SurfaceResiduals(Residuals):
     """Distances along the normal, m, positive out of the rock.
 
-    pose: (n, k) by the parts of the datum that the reference tells; datum: (7, k) these in shift (m), turn (rad) and stretch. The
-    places of the reference make the slopes, not the points, whose noise would be in the stretch.
+    The pose Jacobian is evaluated at the places on the reference, because the noise of the points would bias the scale.
+
+    Attributes
+    ----------
+    pose_jacobian : (n, k) derivatives by those k combinations of the datum's parameters that the reference can determine.
+    datum : (7, k) these combinations in terms of shift (m), rotation (rad) and scale.
     """
 
     sensor = "stereo"
-    planes = ("along", "up")
-    described_by = SurfaceEmpirical, "values_m"
-    noise = PointNoise, "sigma_m"
-    called = "points of a surface from photographs"
+    position_covariates = ("along", "up")
+    empirical_term = SurfaceEmpirical, "values_m"
+    white_noise = PointNoise, "sigma_m"
+    label = "points of a surface from photographs"
     geometry: SurfaceGeometry
     datum: FloatArray = field(default_factory=lambda: np.eye(7))
 
@@ -83,15 +97,18 @@ class SurfaceResiduals(Residuals):
 
     @property
     def candidates(self) -> Effects:
-        """No effect of the catalogue: noise in metres alone."""
+        """Noise in metres only: the other effects of the catalogue need cameras."""
         return (PointNoise,)
 
 
 def surface_residuals(measurement: SurfaceMeasurement) -> SurfaceResiduals:
-    """Distances with their predicted spread and covariates; points whose line misses the reference nearby are left out."""
+    """Compute the distances of a cloud from the reference, with predicted sigma, covariates and pose Jacobian.
+
+    Points whose line misses the reference nearby are left out.
+    """
     points, model = measurement.cloud.points, measurement.model
-    spacing = spacing_m(points)
-    geometry, triangle, across = _met(measurement, points)
+    spacing = point_spacing_m(points)
+    geometry, triangle, across = _hits_along_normals(measurement, points)
     sigma = np.sqrt(sum((effect.variance(geometry) for effect in model.of_points()), np.zeros(len(points))))
     mean = sum((effect.mean(geometry) for effect in model.of_points()), np.zeros(len(points)))
     hit = np.isfinite(geometry.departure)
@@ -102,32 +119,32 @@ def surface_residuals(measurement: SurfaceMeasurement) -> SurfaceResiduals:
         value=geometry.departure - mean,
         sigma=sigma,
         unit_m=np.ones(len(points)),
-        smooth=even & measurement.stable,
-        even=even,
-        pose=-datum_columns(geometry.point - measurement.centre, triangle) @ measurement.datum / across[:, None],
-        at=geometry.point[:, :2],
-        covariates=_varying(geometry, hit, measurement),
+        usable=even & measurement.stable,
+        on_smooth_surface=even,
+        pose_jacobian=-datum_columns(geometry.point - measurement.centre, triangle) @ measurement.datum / across[:, None],
+        wall_xy=geometry.point[:, :2],
+        covariates=_varying_covariates(geometry, hit, measurement),
         index=np.arange(len(points)),
         geometry=geometry,
         datum=measurement.datum,
-        shared_noise=_shared(model, geometry.point[:, :2], spacing),
+        correlated_noise=_correlated_noise(model, geometry.point[:, :2], spacing),
         notes=(*measurement.notes, NO_CAMERAS, *(() if measurement.datum[6].any() else (NO_SCALE,))),
     )
     return whole.part(hit)
 
 
-def _varying(geometry: SurfaceGeometry, hit: BoolArray, measurement: SurfaceMeasurement) -> dict[str, FloatArray]:
-    """The covariates that differ by more than rounding does."""
+def _varying_covariates(geometry: SurfaceGeometry, hit: BoolArray, measurement: SurfaceMeasurement) -> dict[str, FloatArray]:
+    """The covariates that vary by more than rounding errors."""
     extent = float(np.linalg.norm(np.ptp(measurement.reference.bounds, axis=0)))
     return {
         name: values
         for name, values in geometry.covariates.items()
-        if name in SurfaceResiduals.planes or (hit.any() and float(np.ptp(values[hit])) > _ROUNDING * extent)
+        if name in SurfaceResiduals.position_covariates or (hit.any() and float(np.ptp(values[hit])) > _ROUNDING * extent)
     }
 
 
-def spacing_m(points: FloatArray) -> float:
-    """Typical distance from a point (n, 3) to the next, m."""
+def point_spacing_m(points: FloatArray) -> float:
+    """Return the median distance from a point to its nearest neighbour, m. `points`: (n, 3), m."""
     from scipy.spatial import cKDTree
 
     if len(points) < 2:
@@ -136,10 +153,11 @@ def spacing_m(points: FloatArray) -> float:
     return float(np.median(cKDTree(points).query(some, 2)[0][:, 1]))
 
 
-def _met(measurement: SurfaceMeasurement, points: FloatArray) -> tuple[SurfaceGeometry, FloatArray, FloatArray]:
-    """Where the points' lines meet the reference, nearest; the triangle's normal there (n, 3), and the cosine (n,) between both.
+def _hits_along_normals(measurement: SurfaceMeasurement, points: FloatArray) -> tuple[SurfaceGeometry, FloatArray, FloatArray]:
+    """Find the nearest place where each point's line hits the reference.
 
-    NaN where a line meets nothing as near as a point of the surface may be.
+    Returns the geometry (NaN where nothing is hit as near as a point of the surface may be), the normals (n, 3) of the
+    triangles, and the cosines (n,) between these normals and the lines.
     """
     shape, scene = measurement.shape, measurement.scene
     vertex = shape.nearest(points)[1]
@@ -164,7 +182,7 @@ def _met(measurement: SurfaceMeasurement, points: FloatArray) -> tuple[SurfaceGe
 def _bend(
     measurement: SurfaceMeasurement, point: FloatArray, triangle: FloatArray, normal: FloatArray, spacing: float
 ) -> FloatArray:
-    """(n,) largest departure of the reference from the plane of the triangle that is met, a spacing beside it, m."""
+    """(n,) largest deviation of the reference from the hit triangle's plane at four places one point spacing away, m."""
     known = np.isfinite(point).all(axis=1)
     bend = np.full(len(point), np.inf)
     at, plane, direction = point[known], triangle[known], normal[known]
@@ -182,7 +200,7 @@ def _bend(
 
 
 def _rim_distance(measurement: SurfaceMeasurement, point: FloatArray) -> FloatArray:
-    """(n,) m from the reference's open border; infinite where it has none."""
+    """(n,) distance from the reference's open border, m; infinite if it has none."""
     from scipy.spatial import cKDTree
 
     rim = measurement.shape.rim
@@ -193,36 +211,56 @@ def _rim_distance(measurement: SurfaceMeasurement, point: FloatArray) -> FloatAr
     return distance
 
 
-def _shared(model: StereoModel, at: FloatArray, spacing: float) -> SharedNoise:
-    """What neighbours share of the model's noise. Places are counted in spacings, as pixels are: values on nodes know no unit."""
+def _correlated_noise(model: StereoModel, at: FloatArray, spacing: float) -> GridCorrelatedNoise:
+    """The grid-correlated noise of the model. Positions and node spacings are given in point spacings instead of pixels."""
     noise = [effect for effect in model.of_points() if isinstance(effect, PointNoise) and effect.shared_sigma_m > 0]
     nodes = tuple(RegularizationNoise(sigma_px=effect.shared_sigma_m, step_px=effect.shared_step_m / spacing) for effect in noise)
-    return SharedNoise(nodes, np.nan_to_num(at / spacing)) if nodes else SharedNoise()
+    return GridCorrelatedNoise(nodes, np.nan_to_num(at / spacing)) if nodes else GridCorrelatedNoise()
 
 
-def simulated_distances(model: StereoModel, residuals: SurfaceResiduals, random: KeyedRandom) -> FloatArray:
-    """(n,) m above the reference that the model says of the residuals' points."""
+def simulate_distances(model: StereoModel, residuals: SurfaceResiduals, random: KeyedRandom) -> FloatArray:
+    """Simulate the distances from the reference that a model gives at the residuals' points.
+
+    Parameters
+    ----------
+    model : The sensor model.
+    residuals : Residuals with the points' places on the reference.
+    random : Source of the random numbers.
+
+    Returns
+    -------
+    (n,) distances along the normal, m.
+    """
     start = RecordedPoints(residuals.geometry, np.zeros(len(residuals)))
     return apply_stage(model.of_points(), Stage.POINT, start, random).above
 
 
-def sigma_of(model: StereoModel, residuals: SurfaceResiduals) -> FloatArray:
-    """(n,) spread that a model predicts, m."""
+def predicted_sigma(model: StereoModel, residuals: SurfaceResiduals) -> FloatArray:
+    """Return the (n,) standard deviation that a model predicts at the residuals' points, m."""
     return np.sqrt(sum((effect.variance(residuals.geometry) for effect in model.of_points()), np.zeros(len(residuals))))
 
 
 def datum_covariance(residuals: SurfaceResiduals, value: FloatArray, rows: BoolArray) -> FloatArray:
-    """(7, 7) covariance of shift, turn and stretch: the jackknife over blocks of the wall, which share their errors.
+    """Estimate the covariance of the datum by a jackknife over wall blocks, because errors are correlated within them.
 
-    value: (n,) residuals with the registration taken off; rows: (n,) those by which it was made. Without a block b the values
-    change by -(A - A_b)^-1 r_b, A and r being the normal equations' matrix and right side.
+    Without block b the datum changes by -(A - A_b)⁻¹ r_b, with A and r the matrix and the right side of the normal equations.
+
+    Parameters
+    ----------
+    residuals : Residuals of the cloud.
+    value : (n,) residuals after the alignment.
+    rows : (n,) points by which the cloud was aligned.
+
+    Returns
+    -------
+    (7, 7) covariance of shift (m), rotation (rad) and scale.
     """
     part, left = residuals.part(rows), value[rows]
-    extent = np.ptp(part.at, axis=0)
-    block = block_numbers(part.at, float(np.sqrt(np.prod(extent) / _JACKKNIFE_CELLS)) / 3)
+    extent = np.ptp(part.wall_xy, axis=0)
+    block = wall_block_numbers(part.wall_xy, float(np.sqrt(np.prod(extent) / _JACKKNIFE_CELLS)) / 3)
     _, number = np.unique(block, return_inverse=True)
-    scale = np.linalg.norm(part.pose / part.sigma[:, None], axis=0)
-    columns = part.pose / part.sigma[:, None] / scale
+    scale = np.linalg.norm(part.pose_jacobian / part.sigma[:, None], axis=0)
+    columns = part.pose_jacobian / part.sigma[:, None] / scale
     whole = columns.T @ columns
     changes = []
     for each in range(int(number.max()) + 1):
@@ -230,5 +268,5 @@ def datum_covariance(residuals: SurfaceResiduals, value: FloatArray, rows: BoolA
         matrix = whole - columns[own].T @ columns[own]
         changes.append(-np.linalg.lstsq(matrix, columns[own].T @ (left[own] / part.sigma[own]), rcond=None)[0] / scale)
     count = len(changes)
-    spread = (np.array(changes) - np.mean(changes, axis=0)) @ residuals.datum.T
-    return np.asarray((count - 1) / count * spread.T @ spread)
+    deviations = (np.array(changes) - np.mean(changes, axis=0)) @ residuals.datum.T
+    return np.asarray((count - 1) / count * deviations.T @ deviations)

@@ -1,4 +1,4 @@
-"""Range residuals of a laser scan: the measured directions are cast on the surface as known."""
+"""Compute the range residuals of a laser scan: each recorded direction is traced to the reference surface."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from pipeline.formats.measurements.config import ScanPattern
 from pipeline.formats.measurements.measurement import TlsMeasurement
-from pipeline.gap.residuals.rays import RayGeometry, met, turned
-from pipeline.gap.residuals.residuals import BoolArray, Missing, Residuals, plane_slopes
-from pipeline.gap.residuals.scan_simulation import aimed, simulated_ranges
+from pipeline.gap.residuals.ray_hits import RayGeometry, cast_rays, redirect_hits
+from pipeline.gap.residuals.residuals import BoolArray, ExpectedPulses, Residuals, range_derivative
+from pipeline.gap.residuals.scan_simulation import mean_beam_directions, predict_ranges
 from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -23,58 +23,65 @@ from sensors.signal_chain.polar import polar, polar_axes
 from sensors.signal_chain.pulses import PulseGeometry
 
 _EDGE_SIGMAS = 3.0
+"""A surface that deviates from its triangle's plane by more sigmas within a beam's width counts as an edge."""
 _LARGEST_SLOPE = 4.0
-"""Metres of range per metre across the ray beyond which a point counts as grazing."""
+"""Change of range per metre across the ray beyond which a point counts as grazing."""
 _SHORTEST_STEP_RAD = 1e-6
+"""Smallest gap between azimuths that separates two scan lines, rad."""
 _LEAST_POWER = 1e-9
-"""That is received, relative: files round small ones to 0, of which there is no logarithm."""
+"""Smallest relative received power: files round small ones to 0, which has no logarithm."""
 
 
 @dataclass(frozen=True)
 class TlsResiduals(Residuals):
-    """Residuals of ranges, m.
+    """Range residuals of a laser scan, m.
 
-    reference_error_m: standard deviation of each vertex of the reference along the rays; of_relief: whether that is for the most
-    part relief between points, which means of neighbours do not share.
+    Attributes
+    ----------
+    reference_error_m : Standard deviation of each vertex of the reference along the rays, m.
+    error_is_relief : Whether that error is mostly relief between the reference's points, which is independent from ray to ray.
     """
 
     sensor = "tls"
-    planes = ("azimuth", "zenith")
-    described_by = RangeEmpirical, "values_m"
-    noise = RangeNoise, "sigma_m"
-    called = "ranges of a laser scan"
+    position_covariates = ("azimuth", "zenith")
+    empirical_term = RangeEmpirical, "values_m"
+    white_noise = RangeNoise, "sigma_m"
+    label = "ranges of a laser scan"
     geometry: RayGeometry
     reference_error_m: float = 0.0
-    of_relief: bool = False
+    error_is_relief: bool = False
 
     @property
     def reference_variance(self) -> FloatArray:
-        """(n,) of the ranges, m2, by the errors of the reference's vertices: their weights squared."""
+        """(n,) variance of the ranges that errors of the reference's vertices cause, m²; it uses the squared weights."""
         return _reference_variance(self.reference_error_m, self.geometry)
 
     @property
-    def averaged(self) -> Self:
-        """Neighbours share the errors of the vertices between them."""
+    def with_sigma_of_means(self) -> Self:
+        """Return the residuals with the sigma that counts for means: neighbouring rays share the errors of the vertices
+        between them.
+        """
         corner, weight = self.geometry.corner, self.geometry.weight
-        if not self.reference_error_m or self.of_relief or corner is None or weight is None:
+        if not self.reference_error_m or self.error_is_relief or corner is None or weight is None:
             return self
         shared = np.sum(weight * np.bincount(corner.ravel(), weight.ravel())[corner], axis=1)
         variance = self.sigma**2 - self.reference_variance + self.reference_error_m**2 * shared
         return replace(self, sigma=np.sqrt(variance))
 
-    def shared_with(self, other: NDArray[np.int64]) -> FloatArray:
+    def reference_covariance_with(self, other: NDArray[np.int64]) -> FloatArray:
+        """Return the covariance of two rays that share vertices of the reference, m². `other`: (n,) row of the other ray."""
         corner, weight = self.geometry.corner, self.geometry.weight
         if not self.reference_error_m or corner is None or weight is None:
-            return super().shared_with(other)
+            return super().reference_covariance_with(other)
         same = corner[:, :, None] == corner[other][:, None]
         return np.asarray(self.reference_error_m**2 * np.einsum("nab,na,nb->n", same, weight, weight[other]))
 
-    def drawn_reference(self, random: KeyedRandom) -> FloatArray:
-        """(n,) a draw of what the errors of the reference's vertices do to ranges that are measured on it, m."""
+    def draw_reference_error(self, random: KeyedRandom) -> FloatArray:
+        """Draw the (n,) range errors, m, that errors of the reference's vertices cause."""
         corner, weight = self.geometry.corner, self.geometry.weight
         if not self.reference_error_m or corner is None or weight is None:
             return np.zeros(len(self))
-        if self.of_relief:
+        if self.error_is_relief:
             return np.asarray(np.sqrt(self.reference_variance) * random.generator().standard_normal(len(self)))
         errors = self.reference_error_m * random.generator().standard_normal(int(corner.max(initial=0)) + 1)
         return np.asarray(np.sum(weight * errors[corner], axis=1))
@@ -86,21 +93,24 @@ class TlsResiduals(Residuals):
 
 
 def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
-    """Range residuals with their predicted spread and covariates; points whose ray misses the surface are left out."""
+    """Compute the range residuals of a scan, with predicted sigma, covariates and pose Jacobian.
+
+    Points whose ray misses the reference are left out.
+    """
     (position, rotation), model = measurement.station, measurement.model
-    azimuth, zenith, measured = recorded(measurement)
-    line, share = measurement.order or _order(measurement, azimuth)
+    azimuth, zenith, measured = recorded_polar(measurement)
+    line, share = measurement.order or _scan_order(measurement, azimuth)
     intensity = measurement.cloud.intensity
     real = azimuth, zenith
     if any(effect.stage == Stage.AIM for effect in model.effects):
-        real = aimed(measurement, PulseGeometry(azimuth, zenith, line=line, share=share, power=intensity))
+        real = mean_beam_directions(measurement, PulseGeometry(azimuth, zenith, line=line, share=share, power=intensity))
     axes = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(*real)]
     along_planes = measurement.planes is not None and measurement.planes.noise_dominates
     if along_planes:
         nominal = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(azimuth, zenith)]
-        seen = turned(met(measurement, nominal), nominal[0], axes[0])
+        seen = redirect_hits(cast_rays(measurement, nominal), nominal[0], axes[0])
     else:
-        seen = met(measurement, axes)
+        seen = cast_rays(measurement, axes)
     distance, normal = seen.distance, seen.normal
     geometry = RayGeometry(
         azimuth=azimuth,
@@ -111,14 +121,14 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
         corner=seen.corner,
         weight=seen.weight,
         plane_normal=normal @ rotation if along_planes else None,
-        by_azimuth=plane_slopes(normal, axes[0], axes[1], distance) * np.sin(zenith),
-        by_zenith=plane_slopes(normal, axes[0], axes[2], distance),
+        by_azimuth=range_derivative(normal, axes[0], axes[1], distance) * np.sin(zenith),
+        by_zenith=range_derivative(normal, axes[0], axes[2], distance),
         cos_incidence=seen.cos_incidence,
         line=line,
         share=share,
         power=None if intensity is None else np.maximum(intensity, _LEAST_POWER),
     )
-    predicted = simulated_ranges(measurement, geometry) if model.effects else distance
+    predicted = predict_ranges(measurement, geometry) if model.effects else distance
     sigma = np.sqrt(model.variance(geometry) + _reference_variance(measurement.reference_error_m, geometry))
     slope = np.hypot(geometry.by_azimuth / np.sin(zenith), geometry.by_zenith) / distance
     hit = np.isfinite(predicted) & np.isfinite(distance)
@@ -129,37 +139,38 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
         value=measured - predicted,
         sigma=sigma,
         unit_m=np.ones_like(measured),
-        smooth=hit & flat & measurement.stable,
-        even=hit & flat,
-        pose=_pose(axes[0], normal, distance),
-        at=(position + distance[:, None] * axes[0])[:, :2],
+        usable=hit & flat & measurement.stable,
+        on_smooth_surface=hit & flat,
+        pose_jacobian=_pose_jacobian(axes[0], normal, distance),
+        wall_xy=(position + distance[:, None] * axes[0])[:, :2],
         covariates=_covariates(geometry, seen.curvature),
         index=np.arange(len(measured)),
         geometry=geometry,
         notes=_notes(measurement),
         reference_error_m=measurement.reference_error_m,
-        of_relief=measurement.planes is not None and not along_planes,
+        error_is_relief=measurement.planes is not None and not along_planes,
     )
     return whole.part(hit)
 
 
 def _reference_variance(error_m: float, geometry: RayGeometry) -> FloatArray:
+    """(n,) variance of the ranges by independent errors of the reference's vertices, m²."""
     if not error_m or geometry.weight is None:
         return np.zeros(len(geometry))
     return np.asarray(error_m**2 * np.sum(geometry.weight**2, axis=1))
 
 
-def with_order(measurement: TlsMeasurement) -> TlsMeasurement:
-    """With scan lines and times of all points, so that a part of them keeps them."""
+def with_scan_order(measurement: TlsMeasurement) -> TlsMeasurement:
+    """Determine scan lines and times of all points, so that a subsample keeps them."""
     if measurement.scans:
-        found = [(rows, with_order(one).order or (None, None)) for _, rows, one in measurement.each_scan() if len(rows)]
-        line, share = (_scattered([(rows, order[which]) for rows, order in found], len(measurement.scan_of)) for which in (0, 1))
+        found = [(rows, with_scan_order(one).order or (None, None)) for _, rows, one in measurement.each_scan() if len(rows)]
+        line, share = (_assembled([(rows, order[which]) for rows, order in found], len(measurement.scan_of)) for which in (0, 1))
         return measurement.changed(order=(line, share))
-    return measurement.changed(order=_order(measurement, recorded(measurement)[0]))
+    return measurement.changed(order=_scan_order(measurement, recorded_polar(measurement)[0]))
 
 
-def _scattered(parts: list[tuple[NDArray[np.int64], FloatArray | None]], count: int) -> FloatArray | None:
-    """(count,) values of some rows each; None where some have none."""
+def _assembled(parts: list[tuple[NDArray[np.int64], FloatArray | None]], count: int) -> FloatArray | None:
+    """(count,) values assembled from (rows, values) of each scan; None if one scan has no values."""
     found = np.zeros(count)
     for rows, values in parts:
         if values is None:
@@ -169,13 +180,18 @@ def _scattered(parts: list[tuple[NDArray[np.int64], FloatArray | None]], count: 
 
 
 def log_over_median(power: FloatArray) -> FloatArray:
-    """(n,) ln of the received power over its median."""
+    """(n,) logarithm of the received power relative to its median."""
     positive = np.maximum(power, 1e-12)
     return np.asarray(np.log(positive / np.median(positive)), dtype=np.float64)
 
 
-def recorded(measurement: TlsMeasurement) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(n,) azimuth, without jumps, and zenith (rad), as the face counts them, and range (m)."""
+def recorded_polar(measurement: TlsMeasurement) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the recorded directions and ranges of a scan.
+
+    Returns
+    -------
+    (n,) azimuth without jumps and zenith angle, rad, as the face of the instrument counts them, and range, m.
+    """
     position, rotation = measurement.station
     local = np.einsum("ji,nj->ni", rotation, measurement.cloud.points - position)
     measured, azimuth, zenith = polar(local)
@@ -184,35 +200,40 @@ def recorded(measurement: TlsMeasurement) -> tuple[FloatArray, FloatArray, Float
     return (around, zenith, measured) if measurement.face == 1 else (around + np.pi, 2 * np.pi - zenith, measured)
 
 
-def _pose(ray: FloatArray, normal: FloatArray, distance: FloatArray) -> FloatArray:
-    """(n, 6) change of measured minus predicted range if the scanner stands shifted (m) and turned (rad) against the survey.
+def _pose_jacobian(ray: FloatArray, normal: FloatArray, distance: FloatArray) -> FloatArray:
+    """(n, 6) pose Jacobian of measured minus predicted range: shift (m) and rotation (rad) of the scanner from the survey.
 
-    The true ray starts at o + t with direction u + w x u: dR = -n.t / (n.u) - R n.(w x u) / (n.u).
+    The true ray starts at o + t with direction u + w x u, so dR = -n·t / (n·u) - R n·(w x u) / (n·u).
     """
     scale = -1 / np.einsum("ni,ni->n", ray, normal)[:, None]
     return np.concatenate([normal * scale, distance[:, None] * np.cross(ray, normal) * scale], axis=1)
 
 
-def _order(measurement: TlsMeasurement, azimuth: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
-    """Scan line (by the pattern, else the points' channel `line`, else gaps of the azimuths) and share of the duration."""
+def _scan_order(measurement: TlsMeasurement, azimuth: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
+    """Scan line and share of the scan's duration of each point, each (n,) or None.
+
+    Lines come from the pattern, else from the channel `line`, else from gaps between azimuths; shares come from times, else
+    lines.
+    """
     stated = measurement.cloud.extra.get("line")
     known = measurement.pattern is None and stated is not None and bool(np.isfinite(stated).all())
-    line = np.asarray(stated, dtype=np.float64) if known else _lines(measurement.pattern, azimuth)
+    line = np.asarray(stated, dtype=np.float64) if known else _scan_lines(measurement.pattern, azimuth)
     time = measurement.cloud.gps_time
     if time is not None and np.ptp(time) > 0:
-        return line, _shares(time, measurement.epochs)
+        return line, _shares_of_duration(time, measurement.epochs)
     return line, None if line is None or np.ptp(line) == 0 else (line - line.min()) / np.ptp(line)
 
 
-def _shares(time: FloatArray, epochs: NDArray[np.int64]) -> FloatArray:
-    """(n,) share of its epoch's duration."""
+def _shares_of_duration(time: FloatArray, epochs: NDArray[np.int64]) -> FloatArray:
+    """(n,) share of its epoch's duration that had passed at each point, from 0 to 1."""
     first, last = np.full(epochs.max() + 1, np.inf), np.full(epochs.max() + 1, -np.inf)
     np.minimum.at(first, epochs, time)
     np.maximum.at(last, epochs, time)
     return np.asarray((time - first[epochs]) / np.maximum(last - first, 1e-300)[epochs])
 
 
-def _lines(pattern: ScanPattern | None, azimuth: FloatArray) -> FloatArray | None:
+def _scan_lines(pattern: ScanPattern | None, azimuth: FloatArray) -> FloatArray | None:
+    """(n,) scan line of each azimuth; None if the azimuths lie on no raster."""
     if pattern is not None:
         start, _, step = pattern.azimuth_rad
         turn = 2 * np.pi * np.round((azimuth.mean() - start - (pattern.azimuth_rad[1] - start) / 2) / (2 * np.pi))
@@ -220,11 +241,12 @@ def _lines(pattern: ScanPattern | None, azimuth: FloatArray) -> FloatArray | Non
     gaps = np.diff(np.sort(azimuth))
     wide = gaps[gaps > _SHORTEST_STEP_RAD]
     if len(wide) < 10 or len(wide) > 0.2 * len(azimuth):
-        return None  # the azimuths are no raster
+        return None  # the azimuths lie on no raster
     return np.asarray(np.rint((azimuth - azimuth.min()) / np.median(wide)), dtype=np.float64)
 
 
 def _covariates(geometry: RayGeometry, curvature: FloatArray) -> dict[str, FloatArray]:
+    """The covariates of a range by name: angles, range, and intensity, line and time where they were recorded."""
     found = {
         "range": geometry.range_m,
         "azimuth": geometry.azimuth,
@@ -241,30 +263,37 @@ def _covariates(geometry: RayGeometry, curvature: FloatArray) -> dict[str, Float
 
 
 def _notes(measurement: TlsMeasurement) -> tuple[str, ...]:
-    """What cannot be looked into for want of a field."""
+    """Notes that name the candidates which were left out because a field was not recorded."""
     cloud = measurement.cloud
     absent = {
-        "no intensity: range_intensity_bias and range_noise_intensity were not tried": cloud.intensity is None,
-        "no gps_time: the share of the scan is taken from the scan lines": cloud.gps_time is None,
-        "no pattern: missing returns (detection_limit, precipitation) could not be counted": measurement.pattern is None,
+        "no intensity: range_intensity_bias and range_noise_intensity were not tested": cloud.intensity is None,
+        "no gps_time: times were estimated from the scan lines": cloud.gps_time is None,
+        "no pattern: missing returns (detection_limit, precipitation) were not tested": measurement.pattern is None,
     }
     return (*measurement.notes, *(note for note, true in absent.items() if true))
 
 
-def missing_returns(measurement: TlsMeasurement, residuals: TlsResiduals) -> Missing | None:
-    """Every pulse of the pattern that should meet the wall, and whether it came back, epoch after epoch; None without a pattern.
+def find_expected_pulses(measurement: TlsMeasurement, residuals: TlsResiduals) -> ExpectedPulses | None:
+    """List every pulse of the pattern that should hit the wall, and whether it returned; epoch after epoch.
 
-    residuals: of all points of the measurement.
+    Parameters
+    ----------
+    measurement : The scan, with its pattern.
+    residuals : Residuals of all its points.
+
+    Returns
+    -------
+    The pulses; None if the pattern is not known.
     """
     pattern = measurement.pattern
     if pattern is None:
         return None
     position, rotation = measurement.station
     sweeps = _sweeps(pattern)
-    sent = np.arange(pulses_of(pattern)) if measurement.pulses is None else np.flatnonzero(measurement.pulses)
+    sent = np.arange(pulse_count(pattern)) if measurement.pulses is None else np.flatnonzero(measurement.pulses)
     azimuth, zenith = (sweep[place] for sweep, place in zip(sweeps, np.divmod(sent, len(sweeps[1])), strict=True))
     axes = [np.einsum("ij,nj->ni", rotation, vectors) for vectors in polar_axes(azimuth, zenith)]
-    seen_by = met(measurement, axes)
+    seen_by = cast_rays(measurement, axes)
     distance = seen_by.distance
     usable = np.isfinite(distance) & (seen_by.curvature < 0.3)
     covariates = {
@@ -276,18 +305,28 @@ def missing_returns(measurement: TlsMeasurement, residuals: TlsResiduals) -> Mis
     }
     at = (position + distance[:, None] * axes[0])[:, :2]
     epochs = measurement.epochs[residuals.index]
-    seen = [_seen(pattern, residuals.geometry.part(epochs == number))[sent[usable]] for number in np.unique(epochs)]
+    seen = [_returned(pattern, residuals.geometry.part(epochs == number))[sent[usable]] for number in np.unique(epochs)]
     chosen = {name: np.tile(values[usable], len(seen)) for name, values in covariates.items()}
-    return Missing(~np.concatenate(seen), chosen, np.tile(at[usable], (len(seen), 1)))
+    return ExpectedPulses(~np.concatenate(seen), chosen, np.tile(at[usable], (len(seen), 1)))
 
 
-def pulses_of(pattern: ScanPattern) -> int:
-    """How many pulses a pattern has."""
+def pulse_count(pattern: ScanPattern) -> int:
+    """Return the number of pulses of a pattern."""
     return int(np.prod([len(sweep) for sweep in _sweeps(pattern)]))
 
 
-def pulse_of(pattern: ScanPattern, azimuth: FloatArray, zenith: FloatArray) -> NDArray[np.int64]:
-    """(n,) number of the pulse that has about a recorded direction, line after line."""
+def pulse_number(pattern: ScanPattern, azimuth: FloatArray, zenith: FloatArray) -> NDArray[np.int64]:
+    """Find the pulse of the pattern with the direction nearest to a recorded one.
+
+    Parameters
+    ----------
+    pattern : The scan pattern.
+    azimuth, zenith : (n,) recorded directions, rad.
+
+    Returns
+    -------
+    (n,) numbers of the pulses, counted line after line.
+    """
     sweeps = _sweeps(pattern)
     turn = 2 * np.pi * np.round((azimuth.mean() - sweeps[0].mean()) / (2 * np.pi))
     columns = (
@@ -298,18 +337,19 @@ def pulse_of(pattern: ScanPattern, azimuth: FloatArray, zenith: FloatArray) -> N
     return np.asarray(line * len(sweeps[1]) + pulse)
 
 
-def _seen(pattern: ScanPattern, geometry: RayGeometry) -> BoolArray:
-    """(m,) pulses of a pattern in whose direction a point stands."""
-    seen = np.zeros(pulses_of(pattern), dtype=bool)
-    seen[pulse_of(pattern, geometry.azimuth, geometry.zenith)] = True
+def _returned(pattern: ScanPattern, geometry: RayGeometry) -> BoolArray:
+    """(m,) whether a point was recorded in the direction of each pulse of the pattern."""
+    seen = np.zeros(pulse_count(pattern), dtype=bool)
+    seen[pulse_number(pattern, geometry.azimuth, geometry.zenith)] = True
     return seen
 
 
 def _sweeps(pattern: ScanPattern) -> list[FloatArray]:
-    """Azimuths of the lines and zenith angles of their pulses, rad."""
+    """Azimuths of the scan lines, and zenith angles of the pulses in a line, rad."""
     return [_sweep(values) for values in (pattern.azimuth_rad, pattern.zenith_rad)]
 
 
 def _sweep(values: tuple[float, float, float]) -> FloatArray:
+    """Values from start to stop, inclusive, of (start, stop, step)."""
     start, stop, step = values
     return np.asarray(start + step * np.arange(int(np.floor((stop - start) / step + 1e-6)) + 1), dtype=np.float64)

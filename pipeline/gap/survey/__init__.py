@@ -1,5 +1,5 @@
-"""Compute, before any data are read, which effects a measurement of this geometry can tell apart.
+"""Compute, before there are data, which effects a planned survey can detect and distinguish.
 
-It also proposes the additional measurement that would separate two effects that look alike here.
-Start with `identifiability.py`, then `surveys.py`.
+It also proposes the additional measurement that would separate two effects with similar signatures.
+`identifiability.py` has the analysis; `load_surveys.py` reads the survey, and `survey_views.py` describes it.
 """

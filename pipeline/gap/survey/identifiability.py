@@ -1,15 +1,17 @@
-"""What a survey could tell apart, before any residual is looked at.
+"""Analyse which effects a survey can detect and distinguish, before any residual is computed.
 
-Each effect's signature S (n, k) is that of the diagnosis; pose columns J, one set per station, are projected out of it in the
-metric of the predicted noise:
+The signature S (n, k) of each effect is the one that `gap` uses. The pose columns J, one set for each station, are projected
+out in the metric of the predicted noise, W = diag(1 / sigma²):
 
-    survival  |S_perp| / |S|, over all phases S_perp = S - J (J^T W J)^-1 J^T W S
-    cosine    largest canonical correlation of two effects' S_perp, over the variants of one of them (which camera)
-    seen from the parameter's value at which S/N = 5: 5 sqrt(C), C the covariance of its estimate beside the pose
-    named from that at which S/N times the sine of the angle to the nearest other signature is 8
+    survival    |S_perp| / |S| with S_perp = S - J (J^T W J)^-1 J^T W S, over all phases
+    cosine      largest canonical correlation of two effects' S_perp, over the variants of one of them (such as the camera)
+    seen_from   detectable size: the parameter value with a signal-to-noise ratio of 5, 5 sqrt(C), where C is the variance of its
+                estimate beside the pose
+    named_from  size from which it can be named: the signal-to-noise ratio times the sine of the angle to the nearest other
+                signature is 8
 
-C counts all points of the survey, and an error of the reference that is correlated over metres (Matern 3/2), which many points do
-not average away. Of effects with an amplitude and a phase the amplitude is that of the phase which shows least.
+C counts all points of the survey, and a reference error that is correlated over metres (Matern 3/2), which many points do not
+average out. The amplitude of an effect with a phase is given for the phase that is hardest to detect.
 """
 
 from __future__ import annotations
@@ -23,21 +25,37 @@ import numpy as np
 
 from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.survey.known_points import KnownPoints, known_points
-from pipeline.gap.survey.planned import Survey, View
-from pipeline.gap.survey.spread_identifiability import OtherEffect, others
-from pipeline.gap.survey.survey_design import REFERENCE_LENGTH_M, SIGNAL_TO_NOISE, SurveyDesign, families_of, label, signatures
+from pipeline.gap.survey.noise_detectability import NoiseOrLossEffect, noise_and_loss_effects
+from pipeline.gap.survey.survey_design import (
+    DETECTION_SNR,
+    REFERENCE_LENGTH_M,
+    SurveyDesign,
+    group_by_effect,
+    parameter_label,
+    view_signatures,
+)
+from pipeline.gap.survey.survey_views import Survey, SurveyView
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 
-NAMED_AT = 8.0
-ALIKE = 0.9
-"""Signatures whose cosine is at least this count as alike."""
+NAMING_SNR = 8.0
+"""Signal-to-noise ratio, times the sine of the angle to the nearest other signature, from which an effect can be named."""
+SIMILAR_COSINE = 0.9
+"""Cosine from which two signatures count as alike."""
 REFERENCE_ERRORS_M = {"tls": 0.001, "stereo": 0.005}
+"""Default standard deviation of the reference's correlated error, m."""
 
 
 @dataclass(frozen=True)
-class Extension:
-    """A survey with one more measurement. cosines: (m, m) of the same effects as those of the survey as planned."""
+class SurveyExtension:
+    """A survey with one additional measurement.
+
+    Attributes
+    ----------
+    name : The additional measurement, in words.
+    cosines : (m, m) cosines between the signatures of the same m effects.
+    seen_from : Detectable size of each effect.
+    """
 
     name: str
     cosines: FloatArray
@@ -45,15 +63,29 @@ class Extension:
 
     @property
     def named_from(self) -> tuple[float, ...]:
-        """(m,) value of each effect's parameter from which it is told from all others."""
+        """(m,) parameter value from which each effect can be named."""
         return _named_from(self.cosines, self.seen_from)
 
 
 @dataclass(frozen=True)
 class Identifiability:
-    """What a survey could tell. names: (m,) with the sensor's prefix; survival: (m,); cosines: (m, m), absolute values;
-    parameters: name of each effect's main one; seen_from: its value at S/N 5 with an error of the reference, seen_from_noise:
-    without; shown: what was searched or chosen for the row (a period, a camera); extensions: surveys with more in them."""
+    """Which of m effects a survey can detect and distinguish.
+
+    Attributes
+    ----------
+    sensor : The sensor.
+    names : Names of the effects, with the sensor as prefix.
+    survival : (m,) share of each signature that the pose fit leaves.
+    cosines : (m, m) absolute cosines between the signatures.
+    parameters : Name of each effect's main parameter.
+    seen_from : Its detectable size (signal-to-noise ratio 5), with the reference error.
+    seen_from_noise : The same without a reference error.
+    shown : Searched or chosen values of the tabulated variant, such as a period or a camera.
+    extensions : The survey with each of some additional measurements.
+    points : Number of points of the survey.
+    reference_error_m : Standard deviation of the reference's correlated error, m.
+    others : Effects on the noise and on missing returns.
+    """
 
     sensor: str
     names: tuple[str, ...]
@@ -63,32 +95,32 @@ class Identifiability:
     seen_from: tuple[float, ...]
     seen_from_noise: tuple[float, ...]
     shown: tuple[str, ...]
-    extensions: tuple[Extension, ...]
+    extensions: tuple[SurveyExtension, ...]
     points: int
     reference_error_m: float
-    others: tuple[OtherEffect, ...] = ()
+    others: tuple[NoiseOrLossEffect, ...] = ()
 
     @property
     def named_from(self) -> tuple[float, ...]:
-        """(m,) value of each effect's parameter from which it is told from all others."""
+        """(m,) parameter value from which each effect can be named."""
         return _named_from(self.cosines, self.seen_from)
 
-    def best_extension(self, row: int) -> Extension:
-        """The further measurement with which an effect is named from the smallest value on."""
+    def best_extension(self, row: int) -> SurveyExtension:
+        """Return the additional measurement with which the effect in a row can be named from the smallest size on."""
         return min(self.extensions, key=lambda extension: extension.named_from[row])
 
     def alike(self, row: int) -> list[int]:
-        """Effects whose signatures are alike that of `row`, the most alike first."""
+        """Return the rows of effects whose signatures are similar to that of `row`, most similar first."""
         order = np.argsort(-self.cosines[row])
-        return [int(other) for other in order if other != row and self.cosines[row, other] >= ALIKE]
+        return [int(other) for other in order if other != row and self.cosines[row, other] >= SIMILAR_COSINE]
 
     def pairs(self) -> list[tuple[int, int]]:
-        """Pairs that are alike as planned, the most alike first."""
-        found = [(a, b) for a in range(len(self.names)) for b in range(a) if self.cosines[a, b] >= ALIKE]
+        """Return the pairs of rows with similar signatures in the survey as planned, most similar first."""
+        found = [(a, b) for a in range(len(self.names)) for b in range(a) if self.cosines[a, b] >= SIMILAR_COSINE]
         return sorted(found, key=lambda pair: -self.cosines[pair])
 
     def to_dict(self) -> dict[str, Any]:
-        """As identifiability.json holds it."""
+        """Return the content of identifiability.json."""
         return {
             "sensor": self.sensor,
             "points": self.points,
@@ -102,7 +134,7 @@ class Identifiability:
                     "names": [self.names[a], self.names[b]],
                     "cosine": float(self.cosines[a, b]),
                     "with": {extension.name: float(extension.cosines[a, b]) for extension in self.extensions},
-                    "split_by": [e.name for e in self.extensions if e.cosines[a, b] < ALIKE],
+                    "split_by": [e.name for e in self.extensions if e.cosines[a, b] < SIMILAR_COSINE],
                 }
                 for a, b in self.pairs()
             ],
@@ -110,6 +142,7 @@ class Identifiability:
         }
 
     def _row(self, row: int) -> dict[str, Any]:
+        """One effect of identifiability.json."""
         return {
             "name": self.names[row],
             "parameter": self.parameters[row],
@@ -122,53 +155,59 @@ class Identifiability:
 
 
 def _shown(candidate: Candidate) -> str:
-    """What was chosen for the row: a camera, a period."""
+    """The searched or chosen values of a variant, in words."""
     values = dict(candidate.fixed) | ({} if candidate.wave is None else {candidate.wave.key: candidate.period})
     return ", ".join(f"{key} {value if isinstance(value, str) else f'{value:.3g}'}" for key, value in values.items())
 
 
 def _finite(value: float) -> float | None:
+    """The value; None if it is infinite, which JSON cannot hold."""
     return value if np.isfinite(value) else None
 
 
 def _named_from(cosines: FloatArray, seen_from: tuple[float, ...]) -> tuple[float, ...]:
+    """Size from which each effect can be named, from its detectable size and the cosine to the nearest other signature."""
     nearest = (cosines - np.eye(len(cosines))).max(axis=1)
     sine = np.sqrt(np.maximum(1 - nearest**2, 1e-300))
-    return tuple(NAMED_AT / SIGNAL_TO_NOISE * value / float(s) for value, s in zip(seen_from, sine, strict=True))
+    return tuple(NAMING_SNR / DETECTION_SNR * value / float(s) for value, s in zip(seen_from, sine, strict=True))
 
 
 def identifiability(survey: Survey, reference_error_m: float | None = None) -> Identifiability:
-    """Analyse a survey, and what one more measurement would add to it.
+    """Analyse a survey, and what each of some additional measurements would add.
 
-    reference_error_m: standard deviation of the reference's correlated error (none: 1 mm for a laser scanner, 5 mm for a pair).
+    Parameters
+    ----------
+    survey : The survey.
+    reference_error_m : Standard deviation of the reference's correlated error, m; by default 1 mm for a laser scanner and 5 mm
+        for a stereo pair.
     """
     error = REFERENCE_ERRORS_M[survey.sensor] if reference_error_m is None else reference_error_m
-    families = families_of(signatures(survey.views[0]))
+    families = group_by_effect(view_signatures(survey.views[0]))
     plain = SurveyDesign.of(survey.views, families)
     seen, noise = (plain.seen_from(sigma) for sigma in (error, 0.0))
     extensions = []
     for name, views, points in _extended(survey):
         design = SurveyDesign.of(views, families, points)
-        extensions.append(Extension(name, design.cosines(), design.seen_from(error)))
+        extensions.append(SurveyExtension(name, design.cosines(), design.seen_from(error)))
     shown = [variants[0] for variants in families.values()]
     return Identifiability(
         sensor=survey.sensor,
         names=tuple(f"{survey.sensor}.{name}" for name in families),
         survival=plain.survival(),
         cosines=plain.cosines(),
-        parameters=tuple(label(candidate) for candidate in shown),
+        parameters=tuple(parameter_label(candidate) for candidate in shown),
         seen_from=seen,
         seen_from_noise=noise,
         shown=tuple(_shown(candidate) for candidate in shown),
         extensions=tuple(extensions),
-        points=sum(view.whole for view in survey.views),
+        points=sum(view.point_count for view in survey.views),
         reference_error_m=error,
-        others=others(survey),
+        others=noise_and_loss_effects(survey),
     )
 
 
-def table(found: Identifiability) -> str:
-    """Name, share that survives the pose fit, value seen, and the signature that is most alike."""
+def format_table(found: Identifiability) -> str:
+    """Format a text table: effect, share that the pose fit leaves, detectable size, and the most similar signature."""
     cosines = found.cosines - np.eye(len(found.names))
     lines = [f"{'effect':<32}{'survives pose':>14}  {'seen from (S/N 5)':<32}most alike (cosine)"]
     for row, (name, share) in enumerate(zip(found.names, found.survival, strict=True)):
@@ -178,16 +217,18 @@ def table(found: Identifiability) -> str:
     return "\n".join(lines)
 
 
-def _extended(survey: Survey) -> list[tuple[str, tuple[View, ...], KnownPoints | None]]:
-    """The survey with one more measurement each: its name, all views, known points. What would see too little of the wall is no
-    measurement to ask for."""
+def _extended(survey: Survey) -> list[tuple[str, tuple[SurveyView, ...], KnownPoints | None]]:
+    """The survey with each additional measurement: its name, all views, and known points if these are added.
+
+    Measurements that would see too little of the wall are left out.
+    """
     number = max(view.station for view in survey.views) + 1
-    wanted: list[Callable[[], tuple[str, View]]] = [
+    wanted: list[Callable[[], tuple[str, SurveyView]]] = [
         lambda: (f"a second {survey.place} at half the range", survey.moved(0.5, 0.0, number)),
         lambda: (f"a second {survey.place} at the same range, 40 degrees aside", survey.moved(1.0, np.radians(40.0), number)),
         lambda: survey.repeated(number),
     ]
-    found: list[tuple[str, tuple[View, ...], KnownPoints | None]] = []
+    found: list[tuple[str, tuple[SurveyView, ...], KnownPoints | None]] = []
     for observed in wanted:
         with suppress(InputError):
             name, view = observed()

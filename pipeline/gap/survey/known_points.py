@@ -1,4 +1,6 @@
-"""Points of known position that a survey could measure besides the wall: what they would say about effects and pose."""
+"""Describe points of known position that a survey could measure in addition to the wall, and what they say about effects and
+pose.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +12,9 @@ import numpy as np
 
 from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.residuals.nominal_pair import NominalPair, moved_pair, project, real_pair
-from pipeline.gap.residuals.rays import RayGeometry
+from pipeline.gap.residuals.ray_hits import RayGeometry
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from pipeline.gap.survey.planned import StereoView, TlsView
+from pipeline.gap.survey.survey_views import StereoView, TlsView
 from scene.geometry.mesh import FloatArray
 from sensors.cameras.camera import CameraPair
 from sensors.effects import effect_of
@@ -20,33 +22,48 @@ from sensors.effects.base import Effect
 from sensors.signal_chain.polar import polar_axes
 
 _TARGETS = 12
+"""Number of targets around a scanner."""
 _TARGET_SIGMA_M = 0.001
+"""Standard deviation of a target's position, m."""
 _CHECK_ROWS, _CHECK_COLUMNS = 4, 6
+"""Rows and columns of check points across the frame of a pair."""
 _CHECK_SIGMA_PX = 0.1
+"""Standard deviation of an image coordinate of a check point, px."""
 _CHECK_DEPTHS = (0.7, 1.0)
-"""Depths of the check points, alternating, over the wall's."""
+"""Depths of the check points relative to that of the wall, alternating."""
 _STEP = 0.01
-"""Step of the finite differences over a parameter's typical value."""
+"""Step of the finite differences, relative to a parameter's typical value."""
 
 
 @dataclass(frozen=True)
 class KnownPoints:
-    """Observations of known points. pose: (n, 6), of the first station; sigma: (n,); columns(wanted): (n, k) by candidates."""
+    """Observations of points with known positions.
+
+    Attributes
+    ----------
+    title : What they are, in words.
+    pose_jacobian : (n, 6) derivatives of the observations by the pose of the first station.
+    sigma : (n,) their standard deviations.
+    columns : Function from candidates to their (n, k) signatures in these observations.
+    """
 
     title: str
-    pose: FloatArray
+    pose_jacobian: FloatArray
     sigma: FloatArray
     columns: Callable[[list[Candidate]], FloatArray]
 
 
 def known_points(view: TlsView | StereoView) -> KnownPoints:
-    """Targets around a scanner, or check points across the frame of a pair."""
+    """Return known points that a survey could add: targets around a scanner, or check points in front of a stereo pair."""
     return _targets(view) if isinstance(view, TlsView) else _check_points(view)
 
 
 def _targets(view: TlsView) -> KnownPoints:
-    """Twelve targets around the station. A point known in three dimensions says as much as three planes at right angles through
-    it, here all inclined alike to the ray, so that the signatures of ranges serve."""
+    """Twelve targets around the station.
+
+    A point that is known in three dimensions gives as much information as three orthogonal planes through it. They are equally
+    inclined to the ray here, so the signatures of ranges can be used.
+    """
     from pipeline.gap.survey.survey_design import signature_columns
 
     g = view.residuals.geometry
@@ -55,7 +72,10 @@ def _targets(view: TlsView) -> KnownPoints:
     distance = float(np.median(g.range_m)) * np.tile([0.25, 0.5, 0.75, 1.0], _TARGETS)[:_TARGETS]
     azimuth, zenith, distance = (np.repeat(each, 3) for each in (azimuth, zenith, distance))
     angle = np.tile(2 * np.pi * np.arange(3) / 3, _TARGETS)
-    across, along = np.sqrt(2.0) * np.cos(angle), np.sqrt(2.0) * np.sin(angle)  # tangents of the planes' normals
+    across, along = (
+        np.sqrt(2.0) * np.cos(angle),
+        np.sqrt(2.0) * np.sin(angle),
+    )  # components of the planes' normals across the ray, relative to that along it
     by_azimuth, by_zenith = -distance * across * np.sin(zenith), -distance * along
     ray, right, down = polar_axes(azimuth, zenith)
     turn = view.measurement.station[1]
@@ -70,32 +90,44 @@ def _targets(view: TlsView) -> KnownPoints:
         by_azimuth=by_azimuth,
         by_zenith=by_zenith,
         cos_incidence=np.ones_like(distance),
-        line=None if g.line is None else np.interp(azimuth, *_ordered(g.azimuth, g.line)),
-        share=None if g.share is None else np.interp(azimuth, *_ordered(g.azimuth, g.share)),
+        line=None if g.line is None else np.interp(azimuth, *_sorted_by_first(g.azimuth, g.line)),
+        share=None if g.share is None else np.interp(azimuth, *_sorted_by_first(g.azimuth, g.share)),
         power=None if g.power is None else np.full_like(distance, float(np.median(g.power))),
     )
     sigma = np.full(len(distance), _TARGET_SIGMA_M * np.sqrt(3.0))
     residuals = _only_geometry(view.residuals, geometry, sigma, pose)
-    there = replace(view, residuals=residuals, whole=len(sigma))
+    there = replace(view, residuals=residuals, point_count=len(sigma))
     title = f"{_TARGETS} targets around the station, known to {1e3 * _TARGET_SIGMA_M:.0f} mm"
     return KnownPoints(title, pose, sigma, lambda wanted: signature_columns(there, wanted))
 
 
-def _ordered(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _sorted_by_first(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Both arrays sorted by the first one."""
     order = np.argsort(x)
     return x[order], y[order]
 
 
 def _only_geometry(like: TlsResiduals, geometry: RayGeometry, sigma: FloatArray, pose: FloatArray) -> TlsResiduals:
+    """Residuals that hold nothing but the geometry of some rays."""
     zero = np.zeros(len(sigma))
     return replace(
-        like, value=zero, sigma=sigma, unit_m=zero + 1, smooth=zero < 1, even=zero < 1, pose=pose, at=np.zeros((len(sigma), 2)),
-        covariates={}, index=np.arange(len(sigma)), geometry=geometry, missing=None,
-    )  # fmt: skip
+        like,
+        value=zero,
+        sigma=sigma,
+        unit_m=zero + 1,
+        usable=zero < 1,
+        on_smooth_surface=zero < 1,
+        pose_jacobian=pose,
+        wall_xy=np.zeros((len(sigma), 2)),
+        covariates={},
+        index=np.arange(len(sigma)),
+        geometry=geometry,
+        expected_pulses=None,
+    )
 
 
 def _check_points(view: StereoView) -> KnownPoints:
-    """A grid of points at two depths in front of the pair; columns and rows of both images are observed."""
+    """A grid of points at two depths in front of the pair, whose columns and rows are measured in both images."""
     nominal = NominalPair.of(view.measurement)
     left, depth = nominal.pair.left, float(np.median(view.residuals.covariates["depth"]))
     share = [(np.arange(count) + 0.5) / count for count in (_CHECK_COLUMNS, _CHECK_ROWS)]
@@ -124,7 +156,9 @@ def _check_points(view: StereoView) -> KnownPoints:
             elif side:
                 found.append(np.stack([column(effect_of(candidate.name), side, key) for key in candidate.names], axis=1))
             else:
-                found.append(np.zeros((len(base), candidate.columns.shape[1])))  # a target is not matched by area
+                found.append(
+                    np.zeros((len(base), candidate.columns.shape[1]))
+                )  # other effects arise in area matching, which is not used for targets
         return np.concatenate(found, axis=1)
 
     pose = []
@@ -137,7 +171,7 @@ def _check_points(view: StereoView) -> KnownPoints:
 
 
 def _jitter(candidate: Candidate, side: str, base: FloatArray) -> FloatArray:
-    """Rows of one image are displaced: columns of that image's points, in the order left u, left v, right u, right v."""
+    """Columns of a row jitter: rows of one image are displaced. The observations are left u, left v, right u and right v."""
     left_u, left_v, _, right_v = np.split(base, 4)
     angle = 2 * np.pi / candidate.period * (left_v if side == "left" else right_v)
     found = np.zeros((4, len(left_u), 2))

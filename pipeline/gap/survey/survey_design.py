@@ -1,4 +1,4 @@
-"""Signatures of a survey's effects as one design, with the pose projected out."""
+"""Combine the signatures of a survey's effects in one design matrix, with the pose of each station projected out."""
 
 from __future__ import annotations
 
@@ -10,24 +10,35 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.distance import cdist
 
 from pipeline.gap.mean.candidates import Candidate
-from pipeline.gap.mean.signatures import mean_candidates
-from pipeline.gap.residuals.cells import Cells
+from pipeline.gap.mean.signatures import systematic_candidates
+from pipeline.gap.residuals.wall_blocks import WallCells
 from pipeline.gap.survey.known_points import KnownPoints
-from pipeline.gap.survey.planned import View
+from pipeline.gap.survey.survey_views import SurveyView
 from scene.geometry.mesh import FloatArray
 
-SIGNAL_TO_NOISE = 5.0
+DETECTION_SNR = 5.0
+"""Signal-to-noise ratio from which an effect counts as detectable."""
 REFERENCE_LENGTH_M = 3.0
+"""Correlation length of the reference's error, m."""
 _NULL = 1e-9
+"""Relative size below which what the pose leaves of a signature counts as nothing."""
 
 
-def signatures(view: View) -> list[Candidate]:
-    """Every effect of the catalogue on the mean, with its variants."""
-    return mean_candidates(view.residuals, view.measurement)
+def view_signatures(view: SurveyView) -> list[Candidate]:
+    """List every systematic effect of the catalogue with its variants, for the measurement of a view."""
+    return systematic_candidates(view.residuals, view.measurement)
 
 
-def families_of(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
-    """By effect: the variant that is shown first, then those that could take its place. Of searched waves the middle one."""
+def group_by_effect(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
+    """Group candidates by effect.
+
+    The first variant of each effect represents it in the table; the others are alternatives to it, such as other cameras. A
+    searched wave is represented by its middle period.
+
+    Returns
+    -------
+    The variants of each effect, by its name.
+    """
     groups: dict[str, list[Candidate]] = {}
     for candidate in candidates:
         groups.setdefault(candidate.name, []).append(candidate)
@@ -47,48 +58,73 @@ def families_of(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
     return families
 
 
-def label(candidate: Candidate) -> str:
-    """The parameter that `seen_from` speaks of; of several of one kind all names."""
+def parameter_label(candidate: Candidate) -> str:
+    """Return the name of the parameter whose detectable size is given; several names, separated by commas, for parameters of
+    one kind.
+    """
     hidden = {"phase_rad", "" if candidate.wave is None else candidate.wave.key}
     return ", ".join(name for name in candidate.names if name not in hidden)
 
 
 def _scales(candidate: Candidate) -> tuple[float, ...]:
-    """The parameter's value per unit of each coefficient."""
+    """Value of the main parameter per unit of each coefficient."""
     units = np.eye(candidate.columns.shape[1])
     return tuple(
-        max(abs(v) for key, v in candidate.parameters(unit).items() if key in label(candidate).split(", ")) for unit in units
+        max(abs(v) for key, v in candidate.parameters(unit).items() if key in parameter_label(candidate).split(", "))
+        for unit in units
     )
 
 
 @dataclass(frozen=True)
 class SurveyDesign:
-    """Whitened columns of all views, without the pose. left, whole: (n, k) after and before the pose fit, white metric; spans:
-    columns of each family's variants; cells of the wall and the weights there; the known points are the last rows."""
+    """Signatures of m effects in all views, divided by sigma.
 
-    left: FloatArray
-    whole: FloatArray
-    pose: FloatArray
+    Attributes
+    ----------
+    projected : (n, k) signatures after the pose is projected out.
+    signatures : (n, k) signatures before.
+    pose_basis : (n, p) orthonormal columns of the pose.
+    spans : For each effect the columns of each of its variants.
+    scales : For each effect the parameter value per unit of each coefficient.
+    cells : Cells of the wall, over which the reference's error is correlated.
+    sigma : (n,) standard deviations; they give a subsample of the points the weight of all.
+    unit_m : Median metres per unit of the observable.
+    wall : Number of rows on the wall; rows of known points follow.
+    """
+
+    projected: FloatArray
+    signatures: FloatArray
+    pose_basis: FloatArray
     spans: list[list[slice]]
     scales: list[tuple[float, ...]]
-    cells: Cells
+    cells: WallCells
     sigma: FloatArray
     unit_m: float
     wall: int
 
     @classmethod
-    def of(cls, views: tuple[View, ...], families: dict[str, list[Candidate]], points: KnownPoints | None = None) -> SurveyDesign:
+    def of(
+        cls, views: tuple[SurveyView, ...], families: dict[str, list[Candidate]], points: KnownPoints | None = None
+    ) -> SurveyDesign:
+        """Set up the design of a survey.
+
+        Parameters
+        ----------
+        views : What each station or pair sees.
+        families : The variants of each effect (`group_by_effect`).
+        points : Observations of known points, if the survey has any.
+        """
         wanted = [variant for variants in families.values() for variant in variants]
         columns = np.concatenate([signature_columns(view, wanted) for view in views])
         sigma = np.concatenate([view.sigma for view in views])
         stations = sorted({view.station for view in views})
         pose = np.concatenate(
-            [np.kron(np.eye(len(stations))[stations.index(view.station)], view.residuals.pose) for view in views]
+            [np.kron(np.eye(len(stations))[stations.index(view.station)], view.residuals.pose_jacobian) for view in views]
         )
         wall = len(columns)
         if points is not None:
             more = np.zeros((len(points.sigma), pose.shape[1]))
-            more[:, :6] = points.pose
+            more[:, :6] = points.pose_jacobian
             columns, pose = np.concatenate([columns, points.columns(wanted)]), np.concatenate([pose, more])
             sigma = np.concatenate([sigma, points.sigma])
         whole, base = columns / sigma[:, None], np.linalg.qr(pose / sigma[:, None])[0]
@@ -101,18 +137,24 @@ class SurveyDesign:
                 stop = start + variant.columns.shape[1]
                 spans[-1].append(slice(start, stop))
                 start = stop
-        at = np.concatenate([view.residuals.at for view in views])
+        at = np.concatenate([view.residuals.wall_xy for view in views])
         unit = float(np.median(np.concatenate([view.residuals.unit_m for view in views])))
         scales = [_scales(variants[0]) for variants in families.values()]
-        return cls(left, whole, base, spans, scales, Cells.over(at), sigma, unit, wall)
+        return cls(left, whole, base, spans, scales, WallCells.over(at), sigma, unit, wall)
 
     def survival(self) -> FloatArray:
-        """(m,) share of each first variant that survives the pose fit, root mean square over its columns."""
-        sizes = [(float(np.linalg.norm(self.left[:, v[0]])), float(np.linalg.norm(self.whole[:, v[0]]))) for v in self.spans]
+        """Return the (m,) share of each signature that the pose fit leaves, as root mean square over its columns."""
+        sizes = [
+            (float(np.linalg.norm(self.projected[:, v[0]])), float(np.linalg.norm(self.signatures[:, v[0]]))) for v in self.spans
+        ]
         return np.array([left / max(whole, 1e-300) for left, whole in sizes])
 
     def cosines(self) -> FloatArray:
-        """(m, m) largest canonical correlation of a family's first variant with any variant of another, made symmetric."""
+        """Return the (m, m) cosines between signatures.
+
+        A cosine is the largest canonical correlation of an effect's first variant with any variant of the other one, made
+        symmetric.
+        """
         bases = [[self._basis(span) for span in variants] for variants in self.spans]
         count = len(bases)
         found = np.eye(count)
@@ -124,18 +166,27 @@ class SurveyDesign:
         return np.maximum(found, found.T)
 
     def _basis(self, span: slice) -> FloatArray:
-        """Orthonormal basis of what the pose fit leaves of some columns; no columns where it leaves nothing."""
-        columns, whole = self.left[:, span], np.linalg.norm(self.whole[:, span], axis=0)
+        """Orthonormal basis of what the pose fit leaves of some columns; one column of zeros if nothing is left."""
+        columns, whole = self.projected[:, span], np.linalg.norm(self.signatures[:, span], axis=0)
         kept = columns[:, np.linalg.norm(columns, axis=0) > _NULL * whole]
         return np.asarray(np.linalg.qr(kept)[0]) if kept.shape[1] else np.zeros((len(columns), 1))
 
     def seen_from(self, reference_error_m: float) -> tuple[float, ...]:
-        """Parameter of each family's first variant at S/N 5; infinity where the pose fit leaves nothing."""
+        """Return the detectable size of each effect: the parameter value at a signal-to-noise ratio of 5.
+
+        Parameters
+        ----------
+        reference_error_m : Standard deviation of the reference's correlated error, m.
+
+        Returns
+        -------
+        The values; infinite if the pose fit leaves nothing of a signature.
+        """
         first = [list(range(variants[0].start, variants[0].stop)) for variants in self.spans]
         chosen = [column for group in first for column in group]
-        design = np.concatenate([self.pose, self.left[:, chosen]], axis=1)
+        design = np.concatenate([self.pose_basis, self.projected[:, chosen]], axis=1)
         information = self._information(design, reference_error_m / self.unit_m)
-        count, places = self.pose.shape[1], {column: number for number, column in enumerate(chosen)}
+        count, places = self.pose_basis.shape[1], {column: number for number, column in enumerate(chosen)}
         nuisance = information[:count, :count]
         found = []
         for group, scales in zip(first, self.scales, strict=True):
@@ -143,12 +194,12 @@ class SurveyDesign:
             cross = information[np.ix_(range(count), rows)]
             own = information[np.ix_(rows, rows)] - cross.T @ np.linalg.solve(nuisance, cross)
             least = float(np.linalg.eigvalsh(own / np.outer(scales, scales))[0])
-            whole = float(np.max(np.sum((self.whole[:, group] / np.array(scales)) ** 2, axis=0)))
-            found.append(SIGNAL_TO_NOISE / np.sqrt(least) if least > _NULL**2 * whole else np.inf)
+            whole = float(np.max(np.sum((self.signatures[:, group] / np.array(scales)) ** 2, axis=0)))
+            found.append(DETECTION_SNR / np.sqrt(least) if least > _NULL**2 * whole else np.inf)
         return tuple(found)
 
     def _information(self, design: FloatArray, error: float) -> FloatArray:
-        """(k, k) of whitened columns where the cells' means share an error of the reference of standard deviation `error`."""
+        """(k, k) information matrix of columns over sigma, if the cells' means share a correlated error of the reference."""
         wall, known = design[: self.wall], design[self.wall :]
         total = wall.T @ wall + known.T @ known
         if error <= 0:
@@ -165,9 +216,21 @@ class SurveyDesign:
         return np.asarray(total - taken + left)
 
 
-def signature_columns(view: View, wanted: list[Candidate]) -> FloatArray:
-    """(n, k) columns of the wanted variants in a view; searched periods are those of the variant, not of the view's own grid."""
-    own = {_key(each): each for each in signatures(view)}
+def signature_columns(view: SurveyView, wanted: list[Candidate]) -> FloatArray:
+    """Return the signatures of given variants in a view.
+
+    Searched periods are those of the variants, not those of the view's own grid.
+
+    Parameters
+    ----------
+    view : The view.
+    wanted : The variants.
+
+    Returns
+    -------
+    (n, k) columns.
+    """
+    own = {_key(each): each for each in view_signatures(view)}
     parts = []
     for variant in wanted:
         found = own[_key(variant)]
@@ -176,5 +239,6 @@ def signature_columns(view: View, wanted: list[Candidate]) -> FloatArray:
 
 
 def _key(candidate: Candidate) -> tuple[Any, ...]:
+    """Key by which the same variant is found in another view."""
     fixed = {key: value for key, value in candidate.fixed.items() if candidate.wave is None or key != candidate.wave.key}
     return candidate.name, candidate.names, tuple(sorted(fixed.items(), key=str))

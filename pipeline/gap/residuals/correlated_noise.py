@@ -1,4 +1,4 @@
-"""Noise of disparities that neighbours share, as random numbers on the nodes of a grid."""
+"""Represent grid-correlated noise of disparities: random values at the nodes of a grid, interpolated bilinearly to the points."""
 
 from __future__ import annotations
 
@@ -16,81 +16,101 @@ from sensors.models.sensor_model import StereoModel
 from sensors.signal_chain.node_grid import MEAN_VARIANCE
 
 _MOST_NODES = 2500
-"""What is finer is represented by nodes farther apart, of the same power at long wavelengths."""
+"""Most nodes. A finer grid is replaced by a coarser one with the same power at long wavelengths."""
 _SAMPLE = 500
+"""Points over which the variance is averaged."""
 _RIDGE = 1e-4
+"""Share of a node's variance that is added to the diagonal of the covariance, to keep it positive definite."""
 _REACH = 2.5
-"""Steps of an effect over which its nodes' noise is followed: disparities two steps apart share none."""
+"""Distance, in node spacings of an effect, up to which its covariance is evaluated: two spacings apart it is zero."""
 
 
 @dataclass(frozen=True, eq=False)
 class NodeField:
-    """Noise as random values on the nodes of a grid, interpolated bilinearly. weights: (n, q); covariance: (q, q), px2."""
+    """Grid-correlated noise in matrix form.
+
+    Attributes
+    ----------
+    weights : (n, q) bilinear weights of n points on q nodes.
+    covariance : (q, q) covariance of the nodes' values, px².
+    """
 
     weights: sparse.csr_array
     covariance: FloatArray
 
     @property
     def variance(self) -> float:
-        """Of a point on average, px2."""
+        """Mean variance of a point, px²."""
         some = self.weights[:: max(self.weights.shape[0] // _SAMPLE, 1)]
         return float(np.mean((some @ self.covariance * some.toarray()).sum(axis=1))) if some.shape[1] else 0.0
 
 
 @dataclass(frozen=True)
-class SharedNoise:
-    """What of the predicted noise neighbours share. effects: what makes it; pixels: (n, 2) columns and rows of the points."""
+class GridCorrelatedNoise:
+    """The part of the predicted noise that neighbouring points share.
+
+    Attributes
+    ----------
+    effects : Effects of the sensor model that make such noise.
+    pixels : (n, 2) columns and rows of the points, px; None without such noise.
+    """
 
     effects: tuple[NodeNoise, ...] = ()
     pixels: FloatArray | None = None
 
     @classmethod
-    def of(cls, model: StereoModel, pixels: FloatArray) -> SharedNoise:
-        """What a model predicts of it."""
-        return cls(_shared(model.matching_noise), pixels)
+    def of(cls, model: StereoModel, pixels: FloatArray) -> GridCorrelatedNoise:
+        """Take the grid-correlated noise of a sensor model at pixels (n, 2), px."""
+        return cls(_grid_correlated(model.matching_noise), pixels)
 
-    def part(self, rows: Any) -> SharedNoise:
-        """Of some of the points."""
+    def part(self, rows: Any) -> GridCorrelatedNoise:
+        """Return the noise of some of the points."""
         return self if self.pixels is None else replace(self, pixels=self.pixels[rows])
 
-    def beside(self, effects: Sequence[MatchingNoise]) -> SharedNoise:
-        """With further noise."""
-        return replace(self, effects=(*self.effects, *_shared(effects)))
+    def with_effects(self, effects: Sequence[MatchingNoise]) -> GridCorrelatedNoise:
+        """Add the grid-correlated ones among further effects."""
+        return replace(self, effects=(*self.effects, *_grid_correlated(effects)))
 
-    def field(self, count: int) -> NodeField:
-        """As values on nodes; of `count` points.
+    def node_field(self, count: int) -> NodeField:
+        """Return the noise as values at nodes, for `count` points.
 
-        What is finer than the points' own spacing is as good as white, and left out.
+        Noise on a finer grid than the points' own spacing acts like white noise and is left out.
         """
         if self.pixels is None or not count:
-            return _none(count)
+            return _empty_field(count)
         area = float(np.prod(np.maximum(np.ptp(self.pixels, axis=0), 1.0)))
         coarse = [effect for effect in self.effects if effect.step_px**2 > area / count]
-        return _on_nodes(coarse, self.pixels, area) if coarse else _none(count)
+        return _on_nodes(coarse, self.pixels, area) if coarse else _empty_field(count)
 
 
-NOT_SHARED = SharedNoise()
+NO_CORRELATED_NOISE = GridCorrelatedNoise()
+"""Nothing that neighbouring points share."""
 
 
-def _none(count: int) -> NodeField:
+def _empty_field(count: int) -> NodeField:
+    """A field without nodes for `count` points."""
     return NodeField(sparse.csr_array((count, 0)), np.zeros((0, 0)))
 
 
 def _on_nodes(effects: list[NodeNoise], pixels: FloatArray, area: float) -> NodeField:
-    """The covariance of all of them together on nodes half as far apart as those of the finest, where they lie not being known.
+    """The joint covariance of all effects on one grid, with half the spacing of the finest effect's grid (whose offset is
+    unknown).
 
-    Nodes so far apart that they miss some of it are given its power at long wavelengths, which is 9/4 of the variance times the
-    square of the step (that of bilinear interpolation).
+    If that would be too many nodes, a coarser grid gets the same power at long wavelengths, which is 9/4 of the variance times
+    the square of the spacing (for bilinear interpolation).
     """
     step = max(min(effect.step_px for effect in effects) / 2, float(np.sqrt(area / _MOST_NODES)))
     weights, nodes = _bilinear(pixels, step)
     place = np.rint(nodes / step).astype(np.int64)
-    matrix = sum((_stationary(place, _table(effect, step)) for effect in effects), np.zeros((len(nodes), len(nodes))))
+    matrix = sum(
+        (_covariance_of_nodes(place, _covariance_by_offset(effect, step)) for effect in effects),
+        np.zeros((len(nodes), len(nodes))),
+    )
     return NodeField(weights, matrix + _RIDGE * matrix[0, 0] * np.eye(len(nodes)))
 
 
-def _table(effect: NodeNoise, step: float) -> FloatArray:
-    """(k, k) covariance of two nodes that are apart by up to (k - 1) / 2 steps along either axis."""
+def _covariance_by_offset(effect: NodeNoise, step: float) -> FloatArray:
+    """(k, k) covariance of two nodes by their offset along both axes, up to (k - 1) / 2 grid steps either way."""
     reach = int(np.ceil(_REACH * effect.step_px / step))
     near = step * np.arange(-reach, reach + 1)
     around = np.stack(np.meshgrid(near, near, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -99,10 +119,10 @@ def _table(effect: NodeNoise, step: float) -> FloatArray:
     return np.asarray(scale * table)
 
 
-def _stationary(place: NDArray[np.int64], table: FloatArray) -> FloatArray:
-    """(q, q) covariance of nodes at `place` ((q, 2), in steps of their grid), which is 0 but for those near each other.
+def _covariance_of_nodes(place: NDArray[np.int64], table: FloatArray) -> FloatArray:
+    """(q, q) covariance of nodes at `place` ((q, 2), in grid steps); nodes beyond the reach of `table` are uncorrelated.
 
-    table: (k, k) of two that are apart by up to (k - 1) / 2 steps along either axis.
+    `table`: (k, k) covariance by the offset along both axes, up to (k - 1) / 2 grid steps either way.
     """
     corner, margin = place.min(axis=0), len(table) // 2
     number = np.full(np.ptp(place, axis=0) + 1 + 2 * margin, -1)
@@ -117,9 +137,9 @@ def _stationary(place: NDArray[np.int64], table: FloatArray) -> FloatArray:
 
 
 def _bilinear(pixels: FloatArray, step_px: float) -> tuple[sparse.csr_array, FloatArray]:
-    """Bilinear weights (n, q) of pixels (n, 2) on the nodes of a grid at multiples of `step_px`, and their places (q, 2), px.
+    """Bilinear weights (n, q) of pixels (n, 2) on a grid at multiples of `step_px`, and the nodes' positions (q, 2), px.
 
-    Only nodes are given that have some weight.
+    Nodes without any weight are left out.
     """
     corner = np.floor(pixels / step_px).astype(np.int64)
     share = pixels / step_px - corner
@@ -135,5 +155,6 @@ def _bilinear(pixels: FloatArray, step_px: float) -> tuple[sparse.csr_array, Flo
     return found, step_px * (np.stack([nodes % width, nodes // width], axis=1) + corner.min(axis=0))
 
 
-def _shared(effects: Sequence[MatchingNoise]) -> tuple[NodeNoise, ...]:
+def _grid_correlated(effects: Sequence[MatchingNoise]) -> tuple[NodeNoise, ...]:
+    """The grid-correlated ones among some effects, without those that are zero."""
     return tuple(effect for effect in effects if isinstance(effect, NodeNoise) and not effect.is_null)

@@ -1,7 +1,7 @@
-"""A survey before there are data: where its rays would meet the wall, for the analysis of what it could tell apart.
+"""Describe a survey before there are data: where the rays of each station or stereo pair would hit the wall.
 
-The sensor's own code observes the wall without noise, on a thinned grid; how many points the whole survey has is kept beside it.
-Further stations, a second face, another pair of exposures and known points are added to a survey in the same way.
+The sensor simulation observes the wall without noise, on a subsample of its raster; the number of points of the whole survey
+is kept with it. Further stations, a second face and further pairs are added in the same way.
 """
 
 from __future__ import annotations
@@ -31,54 +31,77 @@ from sensors.stereo.exchanged import pair_of
 from sensors.stereo.stereo_pair import REDUCTION, Quality, StereoPair
 
 _MOST_PULSES = 30_000
+"""Most pulses or pixels of a view's subsample."""
 _FEWEST_POINTS = 300
+"""Fewest points on smooth parts of the wall."""
 _ALBEDO_SPREAD = 0.3
-"""Standard deviation of ln(albedo) from point to point, where the wall has no albedo of its own."""
+"""Standard deviation of ln(albedo) between points, for a wall without albedo."""
 _QUIET_TLS = TlsModel(noise=TlsNoise(range_sigma_m=0.0, range_ppm=0.0, angle_sigma_rad=0.0))
+"""Sensor models without noise or effects."""
 _QUIET_STEREO = StereoModel(noise={"parallax_sigma_px": 0.0, "regularization_sigma_px": 0.0})
 Pose = tuple[FloatArray, FloatArray]
-"""Position (3,) m and rotation (3, 3) scanner to wall frame."""
+"""Position (3,), m, and rotation (3, 3) from the scanner to the wall frame."""
 
 
 @dataclass(frozen=True)
-class View:
-    """What one station or one pair sees. residuals: of a thinned grid, values without meaning; whole: points of the real grid;
-    station: number of its pose; measurement: with its pose or its cameras."""
+class SurveyView:
+    """What one station or one stereo pair sees of the wall.
+
+    Attributes
+    ----------
+    residuals : Geometry of a subsample of the points; the residual values have no meaning.
+    point_count : Number of points of the full view.
+    station : Number of its pose.
+    measurement : A measurement with its pose or cameras.
+    """
 
     residuals: Residuals
-    whole: int
+    point_count: int
     station: int
     measurement: Measurement
 
     @classmethod
     def of(cls, found: Residuals, whole: int, number: int, measurement: Measurement) -> Self:
-        """On smooth parts of the wall. Raises InputError where there are next to none."""
-        smooth = np.flatnonzero(found.smooth)
+        """Make a view of the points on smooth parts of the wall.
+
+        Parameters
+        ----------
+        found : Geometry of the subsample.
+        whole : Number of points of the full view.
+        number : Number of the pose.
+        measurement : A measurement with that pose.
+
+        Raises
+        ------
+        InputError
+            If fewer than 300 points of the subsample lie on smooth parts of the wall.
+        """
+        smooth = np.flatnonzero(found.usable)
         if len(smooth) < _FEWEST_POINTS:
             raise InputError(
                 f"{len(smooth)} of {len(found)} points lie on smooth parts of the wall, {_FEWEST_POINTS} are needed",
                 where="station" if found.sensor == "tls" else "cameras",
-                remedy="aim at the wall, or scan in finer steps",
+                remedy="aim at the wall, or scan with a finer step",
             )
         return cls(found.part(smooth), int(whole * len(smooth) / len(found)), number, measurement)
 
     @property
     def sigma(self) -> FloatArray:
-        """(n,) predicted spread that gives the thinned points the weight of all."""
-        return self.residuals.sigma * np.sqrt(len(self.residuals) / max(self.whole, 1))
+        """(n,) predicted sigma, reduced so that the subsample has the weight of all points."""
+        return self.residuals.sigma * np.sqrt(len(self.residuals) / max(self.point_count, 1))
 
 
 @dataclass(frozen=True)
-class TlsView(View):
-    """What one station sees."""
+class TlsView(SurveyView):
+    """What one scanner station sees."""
 
     residuals: TlsResiduals
     measurement: TlsMeasurement
 
 
 @dataclass(frozen=True)
-class StereoView(View):
-    """What one pair sees."""
+class StereoView(SurveyView):
+    """What one stereo pair sees."""
 
     residuals: StereoResiduals
     measurement: StereoMeasurement
@@ -86,7 +109,14 @@ class StereoView(View):
 
 @dataclass(frozen=True)
 class TlsSurvey:
-    """Views of one wall by a scanner. centre: (3,) of the wall; observe(measurement, number): a further view of it."""
+    """Views of one wall by a laser scanner.
+
+    Attributes
+    ----------
+    views : One for each station.
+    centre : (3,) centre of the wall, m.
+    observe : Function that makes a further view, from a measurement with its pose and a number.
+    """
 
     views: tuple[TlsView, ...]
     centre: FloatArray
@@ -95,15 +125,34 @@ class TlsSurvey:
     place: ClassVar[str] = "station"
 
     def moved(self, scale: float, turn_rad: float, number: int) -> TlsView:
-        """The first view from a place that is brought nearer to the wall's centre by `scale` and turned about the vertical."""
+        """Move the station of the first view.
+
+        Parameters
+        ----------
+        scale : New distance from the wall's centre, relative to the present one.
+        turn_rad : Rotation about the vertical through the wall's centre, rad.
+        number : Number of the new pose.
+
+        Raises
+        ------
+        InputError
+            If too little of the wall is seen from there.
+        """
         base = self.views[0].measurement
         turn = _about_vertical(base, turn_rad)
         position = self.centre + scale * turn @ (base.station[0] - self.centre)
         return self.observe(base.changed(station=(position, turn @ base.station[1])), number)
 
     def repeated(self, number: int) -> tuple[str, TlsView]:
-        """In words, and as a view: the first station's scan in the other face, azimuth turned by pi, the zenith angle 2 pi less
-        what it was; the pose is that of the first view, whatever `number`."""
+        """Repeat the first scan in the other face of the instrument.
+
+        Azimuths increase by pi, and zenith angles become 2 pi minus themselves. The pose stays that of the first view,
+        whatever `number`.
+
+        Returns
+        -------
+        A description in words, and the view.
+        """
         first = self.views[0]
         g = first.residuals.geometry
         turned = replace(g, azimuth=g.azimuth + np.pi, zenith=2 * np.pi - g.zenith, by_zenith=-g.by_zenith)
@@ -112,7 +161,14 @@ class TlsSurvey:
 
 @dataclass(frozen=True)
 class StereoSurvey:
-    """Views of one wall by a pair of cameras. centre: (3,) of the wall; observe(measurement, number): a further view of it."""
+    """Views of one wall by stereo pairs.
+
+    Attributes
+    ----------
+    views : One for each pair.
+    centre : (3,) centre of the wall, m.
+    observe : Function that makes a further view, from a measurement with its cameras and a number.
+    """
 
     views: tuple[StereoView, ...]
     centre: FloatArray
@@ -121,7 +177,19 @@ class StereoSurvey:
     place: ClassVar[str] = "pair of exposures"
 
     def moved(self, scale: float, turn_rad: float, number: int) -> StereoView:
-        """The first view from a place that is brought nearer to the wall's centre by `scale` and turned about the vertical."""
+        """Move the pair of the first view.
+
+        Parameters
+        ----------
+        scale : New distance from the wall's centre, relative to the present one.
+        turn_rad : Rotation about the vertical through the wall's centre, rad.
+        number : Number of the new pose.
+
+        Raises
+        ------
+        InputError
+            If too little of the wall is seen from there.
+        """
         base = self.views[0].measurement
         turn = _about_vertical(base, turn_rad)
         world, middle = base.frame.rotation.T @ turn @ base.frame.rotation, base.frame.to_world(self.centre[None])[0]
@@ -134,17 +202,35 @@ class StereoSurvey:
         return self.observe(base.changed(cameras=pair), number)
 
     def repeated(self, number: int) -> tuple[str, StereoView]:
-        """In words, and as a view: the first pair with its cameras turned about their axes by 45 degrees, either way."""
+        """Repeat the first pair with its cameras rolled by 45 degrees in opposite directions.
+
+        Returns
+        -------
+        A description in words, and the view.
+        """
         base = self.views[0].measurement
         pair = base.cameras.rotated("left", 2, np.pi / 4).rotated("right", 2, -np.pi / 4)
-        return "the pair repeated, its cameras rolled by 45 degrees either way", self.observe(base.changed(cameras=pair), number)
+        return "the pair repeated with its cameras rolled by 45 degrees in opposite directions", self.observe(
+            base.changed(cameras=pair), number
+        )
 
 
 Survey = TlsSurvey | StereoSurvey
 
 
 def planned_survey(config: SimulationConfig, sensor: SensorName) -> Survey:
-    """The survey that a simulation config describes. Raises InputError where the sensor sees next to nothing of the wall."""
+    """Simulate the survey that a config describes.
+
+    Parameters
+    ----------
+    config : The simulation config.
+    sensor : The sensor.
+
+    Raises
+    ------
+    InputError
+        If the sensor sees too little of the wall.
+    """
     site = prepare_site(config, sensor, KeyedRandom(config.seed))
     nothing, mesh, frame, centre = PointCloud(np.empty((0, 3))), site.mesh, site.frame, site.mesh.bounds.mean(axis=0)
     if not isinstance(site.sensor, LaserScanner):
@@ -160,52 +246,67 @@ def planned_survey(config: SimulationConfig, sensor: SensorName) -> Survey:
 
 
 def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Survey:
-    """The survey of a measurement: its own points, of which only the places count, not what they measured. most: points of the
-    thinned grid."""
+    """Describe the survey of an existing measurement; only the positions of its points count.
+
+    Parameters
+    ----------
+    measurement : The measurement.
+    most : Most points of each view's subsample.
+
+    Raises
+    ------
+    InputError
+        If the measurement has no cameras or station.
+    """
     centre = measurement.reference.bounds.mean(axis=0)
     if isinstance(measurement, StereoMeasurement):
         seen = stereo_residuals(measurement)
-        pair = StereoView(seen.part(_thinned(seen, most)), int(seen.smooth.sum()), 0, measurement)
+        pair = StereoView(seen.part(_subsample_rows(seen, most)), int(seen.usable.sum()), 0, measurement)
         return StereoSurvey((pair,), centre, _pair_observer("medium"))
     if isinstance(measurement, SurfaceMeasurement):
-        raise InputError("has no cameras, so no effect that it could show", where="--identifiability", remedy="name `cameras`")
+        raise InputError(
+            "the measurement has no cameras, so no effect can be analysed", where="--identifiability", remedy="add `cameras`"
+        )
     measurement = measurement.changed(order=None)
-    several = [(scan.set_up, one) for scan, rows, one in measurement.each_scan() if len(rows)]
-    found, *others = [(number, one, tls_residuals(one)) for number, one in several or [(0, measurement)]]
+    set_ups = [(scan.set_up, one) for scan, rows, one in measurement.each_scan() if len(rows)]
+    found, *others = [(number, one, tls_residuals(one)) for number, one in set_ups or [(0, measurement)]]
     views = tuple(
-        TlsView(each.part(_thinned(each, most)), int(each.smooth.sum()), number, one) for number, one, each in (found, *others)
+        TlsView(each.part(_subsample_rows(each, most)), int(each.usable.sum()), number, one)
+        for number, one, each in (found, *others)
     )
     _, measurement, residuals = found
     view = views[0]
-    step = float(np.sqrt(np.prod(np.ptp(measurement.cloud.points[:, :2], axis=0)) / max(view.whole, 1)))
+    step = float(np.sqrt(np.prod(np.ptp(measurement.cloud.points[:, :2], axis=0)) / max(view.point_count, 1)))
     reach = float(np.median(residuals.geometry.range_m))
-    steps = {"azimuth_step_rad": step / reach, "zenith_step_rad": step / reach}  # coarser than a scan where the wall is near
+    steps = {"azimuth_step_rad": step / reach, "zenith_step_rad": step / reach}  # coarser than the scan on near parts
     scanner = ScannerConfig(zenith_limits_rad=(0.05, 3.09)).model_copy(update=steps)
     return TlsSurvey(views, centre, _scan_observer(scanner))
 
 
-def _thinned(found: Residuals, most: int) -> NDArray[np.int64]:
-    """About so many of the rows on smooth parts."""
-    rows = np.flatnonzero(found.smooth)
+def _subsample_rows(found: Residuals, most: int) -> NDArray[np.int64]:
+    """Rows of a subsample on smooth parts of the wall."""
+    rows = np.flatnonzero(found.usable)
     return rows[:: max(len(rows) // most, 1)]
 
 
 def _scan_observer(scanner: ScannerConfig) -> Callable[[TlsMeasurement, int], TlsView]:
-    """Views of a laser scanner with the pose of the measurement, aimed at the whole wall unless the config has a window."""
+    """Return a function that scans the wall from a measurement's pose. The scan covers the whole wall, unless the config has a
+    window.
+    """
 
     def observe(base: TlsMeasurement, number: int) -> TlsView:
         world = base.frame.to_world(base.station[0][None])[0], base.frame.rotation.T @ base.station[1]
         instrument = LaserScanner.aimed(world, base.frame, base.reference.vertices, scanner, _QUIET_TLS)
         pattern = instrument.pattern
         stride = max(int(np.sqrt(pattern.lines * pattern.pulses / _MOST_PULSES)), 1)
-        thinned = replace(
+        subsampled = replace(
             pattern,
             azimuth_step=stride * pattern.azimuth_step,
             zenith_step=stride * pattern.zenith_step,
             lines=max(pattern.lines // stride, 1),
             pulses=max(pattern.pulses // stride, 1),
         )
-        seen = replace(instrument, pattern=thinned).observe(base.scene, KeyedRandom(0, ("gap", "planned")))
+        seen = replace(instrument, pattern=subsampled).observe(base.scene, KeyedRandom(0, ("gap", "planned")))
         valid = seen.valid.ravel()
         power = (
             None
@@ -223,6 +324,7 @@ def _scan_observer(scanner: ScannerConfig) -> Callable[[TlsMeasurement, int], Tl
 
 
 def _with_albedo(power: FloatArray, scene: RayCaster) -> FloatArray:
+    """Powers with a random albedo, if the wall has none of its own."""
     if scene.mesh.vertex_albedo is not None:
         return power
     random = KeyedRandom(0, ("gap", "albedo")).generator()
@@ -230,7 +332,7 @@ def _with_albedo(power: FloatArray, scene: RayCaster) -> FloatArray:
 
 
 def _pair_observer(quality: Quality) -> Callable[[StereoMeasurement, int], StereoView]:
-    """Views of a pair of cameras, on its coarsest depth map."""
+    """Return a function that observes the wall with a measurement's cameras, at the coarsest depth map."""
 
     def observe(base: StereoMeasurement, number: int) -> StereoView:
         pair = StereoPair(base.cameras, base.frame, _QUIET_STEREO, "low")
@@ -250,7 +352,7 @@ def _pair_observer(quality: Quality) -> Callable[[StereoMeasurement, int], Stere
 
 
 def _about_vertical(measurement: Measurement, angle: float) -> FloatArray:
-    """(3, 3) turn about the world's vertical in the wall frame (Rodrigues)."""
+    """(3, 3) rotation about the world's vertical, in the wall frame (Rodrigues)."""
     x, y, z = measurement.frame.rotation[:, 2]
     skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.asarray(np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew)

@@ -1,4 +1,4 @@
-"""Where each point lies as the sensor sees it, which points are neighbours there, and what solid angle each stands for."""
+"""Describe how the sensor saw the points: their directions, their neighbours there, and the solid angle of each."""
 
 from __future__ import annotations
 
@@ -19,30 +19,38 @@ from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray, area_normals
 
 NEIGHBOURS = 8
-"""The ring around a point of a raster."""
+"""Neighbours of a point: the ring around it in a raster."""
 _FARTHEST = 3.0
-"""Spacings beyond which two points are no neighbours, whatever lies between."""
+"""Point spacings above which two points are no neighbours."""
 _SAMPLE, _NEAR, _ROUNDS = 2000, 48, 6
+"""To scale the axes: points and neighbours of each that are sampled, and most rounds."""
 _AT_ONCE = 100_000
-"""Points whose neighbours are looked at together, whatever the number of threads: 7 MB of values."""
+"""Points processed together (7 MB of values), whatever the number of threads."""
 _AROUND = 24
-"""Two rings: the neighbours among which the cells of a few points are found."""
+"""Neighbours from which the solid angle of a point is computed: two rings."""
 _LARGEST_CELL = 4.0
+"""Largest area of a Delaunay triangle, in median ones."""
 _FROM_AFAR, _STEEPEST = 1000.0, 0.2
-"""A surface is looked at along its plane's normal, from so many times as far; cosine of the steepest parts' slope that count."""
+"""A surface without cameras is viewed along its plane's normal from this many times as far; and the smallest cosine of its slope.
+"""
 
 
 @dataclass(frozen=True)
-class Sight:
+class SensorView:
     """How the sensor saw n points.
 
-    plane: (n, 2) direction as the sensor counts it, rad (azimuth, zenith) or px (column, row), in any units; epoch: (n,); origin:
-    (3,) of the rays, or (n, 3) of several scans, which lie apart in `plane`, m; ray: (n, 3) unit vectors, wall frame;
-    reference_m: (n,) range on the reference along them; disparity: (n,) of the reference less that of infinity, px, None where
-    ranges are measured; slant: (n,) range per metre of a residual, of a surface without cameras, which is seen from far away.
+    Attributes
+    ----------
+    coordinates : (n, 2) direction of each point: azimuth and zenith, rad, or column and row, px. Several scans lie side by side.
+    epoch : (n,) number of the point's epoch.
+    origin : (3,) origin of the rays, or (n, 3) for several scans, wall frame, m.
+    ray : (n, 3) unit directions of the rays, wall frame.
+    reference_m : (n,) range to the reference along the rays, m.
+    disparity : (n,) disparity of the reference minus that at infinity, px; None if ranges were measured.
+    slant : (n,) change of range per metre of residual; only for a surface without cameras, which is viewed from far away.
     """
 
-    plane: FloatArray
+    coordinates: FloatArray
     epoch: NDArray[np.int64]
     origin: FloatArray
     ray: FloatArray
@@ -51,8 +59,19 @@ class Sight:
     slant: FloatArray | None = None
 
     @classmethod
-    def of(cls, measurement: Measurement, residuals: Residuals) -> Sight:
-        """Of the points of the residuals. A pair of cameras looks from the left one."""
+    def of(cls, measurement: Measurement, residuals: Residuals) -> SensorView:
+        """Describe the view of a measurement. A stereo pair views the wall from its left camera.
+
+        Parameters
+        ----------
+        measurement : The measurement.
+        residuals : Residuals of the points to describe.
+
+        Raises
+        ------
+        TypeError
+            If both are of different sensors.
+        """
         origin, reference, disparity, slant = measurement.viewpoint, None, None, None
         match measurement, residuals:
             case StereoMeasurement(), StereoResiduals(geometry=pixels):
@@ -67,17 +86,17 @@ class Sight:
             case _:
                 raise TypeError("measurement and residuals are of different sensors")
         length = np.linalg.norm(towards, axis=1)
-        epoch, plane = measurement.epochs[residuals.index], residuals.geometry.plane
+        epoch, plane = measurement.epochs[residuals.index], residuals.geometry.sensor_coordinates
         if isinstance(measurement, TlsMeasurement) and measurement.scans:
-            plane = _apart_by_scan(plane, measurement.scan_of[residuals.index])
+            plane = _side_by_side(plane, measurement.scan_of[residuals.index])
         reference = length if reference is None else reference
         return cls(plane, epoch, origin, towards / length[:, None], reference, disparity, slant)
 
-    def part(self, rows: Rows) -> Sight:
-        """Of some of the points."""
+    def part(self, rows: Rows) -> SensorView:
+        """Return the view of some of the points."""
         return replace(
             self,
-            plane=self.plane[rows],
+            coordinates=self.coordinates[rows],
             epoch=self.epoch[rows],
             ray=self.ray[rows],
             origin=self.origin if self.origin.ndim == 1 else self.origin[rows],
@@ -86,8 +105,18 @@ class Sight:
             slant=None if self.slant is None else self.slant[rows],
         )
 
-    def range_with(self, rows: NDArray[np.int64], residual: FloatArray) -> FloatArray:
-        """(m,) range of some points that depart from the reference by residuals (m,), m of range or px: R d / (d + residual)."""
+    def range_at_residual(self, rows: NDArray[np.int64], residual: FloatArray) -> FloatArray:
+        """Return the range at which a point lies if it has a given residual; for disparities R d / (d + residual).
+
+        Parameters
+        ----------
+        rows : (m,) rows of the points.
+        residual : (m,) residuals, m of range or px of disparity.
+
+        Returns
+        -------
+        (m,) ranges, m.
+        """
         if self.slant is not None:
             return np.asarray(self.reference_m[rows] + residual * self.slant[rows])
         if self.disparity is None:
@@ -95,45 +124,71 @@ class Sight:
         return np.asarray(self.reference_m[rows] * self.disparity[rows] / (self.disparity[rows] + residual))
 
     def points_at(self, rows: NDArray[np.int64], range_m: FloatArray) -> FloatArray:
-        """(m, 3) places on the rays of some points, wall frame, m."""
+        """Return places on the rays.
+
+        Parameters
+        ----------
+        rows : (m,) rows of the points.
+        range_m : (m,) ranges, m.
+
+        Returns
+        -------
+        (m, 3) places, wall frame, m.
+        """
         origin = self.origin if self.origin.ndim == 1 else self.origin[rows]
         return np.asarray(origin + range_m[:, None] * self.ray[rows])
 
     @cached_property
-    def even_plane(self) -> FloatArray:
-        """(n, 2) `plane` with neighbours as far off by the one axis as by the other, 1 from one to the next."""
-        plane = (self.plane - self.plane.min(axis=0)) / np.maximum(np.ptp(self.plane, axis=0), 1e-300)
+    def scaled_coordinates(self) -> FloatArray:
+        """(n, 2) coordinates scaled so that the spacing of neighbouring points is 1 along both axes."""
+        plane = (self.coordinates - self.coordinates.min(axis=0)) / np.maximum(np.ptp(self.coordinates, axis=0), 1e-300)
         rows = np.flatnonzero(self.epoch == self.epoch.min())
-        apart = _apart(plane[rows])
+        apart = _axis_spacings(plane[rows])
         for _ in range(_ROUNDS):
             if abs(np.log(apart[0] / apart[1])) < 0.02:
                 break
             plane = plane / apart
-            apart = _apart(plane[rows])
+            apart = _axis_spacings(plane[rows])
         return np.asarray(plane / apart)
 
     @cached_property
     def _trees(self) -> list[tuple[NDArray[np.int64], cKDTree]]:
-        """Of each epoch: its points and where they lie."""
+        """For each epoch the rows of its points and a search tree of their scaled coordinates."""
         groups = [np.flatnonzero(self.epoch == number) for number in np.unique(self.epoch)]
-        return [(rows, cKDTree(self.even_plane[rows])) for rows in groups]
+        return [(rows, cKDTree(self.scaled_coordinates[rows])) for rows in groups]
 
-    def around(self, rows: NDArray[np.int64], count: int = NEIGHBOURS) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Pairs (k,), (k,) of some points and their nearest of the same epoch; and of the next epoch the one at their place."""
+    def neighbour_pairs(self, rows: NDArray[np.int64], count: int = NEIGHBOURS) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Pair points with their nearest neighbours in the same epoch, and with the point at their place in the next epoch.
+
+        Parameters
+        ----------
+        rows : Rows of the points.
+        count : Neighbours of each point.
+
+        Returns
+        -------
+        (k,) and (k,) rows of the first and of the second point of each pair.
+        """
         pairs = [np.empty((2, 0), dtype=np.int64)]
-        wanted = np.zeros(len(self.plane), dtype=bool)
+        wanted = np.zeros(len(self.coordinates), dtype=bool)
         wanted[rows] = True
         for number, (group, tree) in enumerate(self._trees):
             own = group[wanted[group]]
-            pairs.append(_found(own, group, *tree.query(self.even_plane[own], count + 1, distance_upper_bound=_FARTHEST)))
+            pairs.append(
+                _pairs_from_query(
+                    own, group, *tree.query(self.scaled_coordinates[own], count + 1, distance_upper_bound=_FARTHEST)
+                )
+            )
             if number + 1 < len(self._trees):
                 following, other = self._trees[number + 1]
-                pairs.append(_found(own, following, *other.query(self.even_plane[own], [1], distance_upper_bound=1.0)))
+                pairs.append(
+                    _pairs_from_query(own, following, *other.query(self.scaled_coordinates[own], [1], distance_upper_bound=1.0))
+                )
         first, second = np.concatenate(pairs, axis=1)
         return first[first != second], second[first != second]
 
-    def median_around(self, z: FloatArray) -> FloatArray:
-        """(n,) median of each point and its ring of neighbours."""
+    def neighbour_median(self, z: FloatArray) -> FloatArray:
+        """Return the (n,) median of the values `z` (n,) of each point and its ring of neighbours."""
         found = np.empty(len(z))
         for group, near in self._rings:
             own = z[group]
@@ -143,34 +198,44 @@ class Sight:
 
     @cached_property
     def _rings(self) -> list[tuple[NDArray[np.int64], NDArray[np.int32]]]:
-        """Of each epoch: its points, and for each of them itself and its ring of neighbours, by their place among those."""
+        """For each epoch the rows of its points, and for each point itself and its neighbours, numbered among those rows."""
         counts = [min(NEIGHBOURS + 1, len(group)) for group, _ in self._trees]
         return [
-            (group, tree.query(self.even_plane[group], count, workers=-1)[1].astype(np.int32))
+            (group, tree.query(self.scaled_coordinates[group], count, workers=-1)[1].astype(np.int32))
             for (group, tree), count in zip(self._trees, counts, strict=True)
         ]
 
-    def beside(self, rows: NDArray[np.int64], spacings: float) -> NDArray[np.bool_]:
-        """(n,) points within some spacings of any of `rows`, whatever their epoch."""
-        distance = cKDTree(self.even_plane[rows]).query(self.even_plane, distance_upper_bound=spacings, workers=-1)[0]
+    def near(self, rows: NDArray[np.int64], spacings: float) -> NDArray[np.bool_]:
+        """Return (n,) whether each point lies within some point spacings of any of the points `rows`, in any epoch."""
+        distance = cKDTree(self.scaled_coordinates[rows]).query(
+            self.scaled_coordinates, distance_upper_bound=spacings, workers=-1
+        )[0]
         return np.asarray(np.isfinite(distance))
 
     def solid_angles(self, rows: NDArray[np.int64]) -> FloatArray:
-        """(m,) sr for which each of some points stands: a third of the Delaunay triangles of which it is a corner.
+        """Compute the solid angle of some points: a third of the Delaunay triangles of which each is a corner.
 
-        Points of one epoch share what is between them, lost returns included; triangles over a gap of several points count as
-        much as the largest usual one.
+        The points of one epoch thus share the area between them, including that of lost returns. Triangles across larger gaps
+        count at most four times the median area.
+
+        Parameters
+        ----------
+        rows : (m,) rows of the points.
+
+        Returns
+        -------
+        (m,) solid angles, sr.
         """
-        total = np.zeros(len(self.plane))
-        wanted = np.zeros(len(self.plane), dtype=bool)
+        total = np.zeros(len(self.coordinates))
+        wanted = np.zeros(len(self.coordinates), dtype=bool)
         wanted[rows] = True
         for group, tree in self._trees:
             own = group[wanted[group]]
             if not len(own):
                 continue
-            near = np.unique(tree.query(self.even_plane[own], min(_AROUND, len(group)))[1])
+            near = np.unique(tree.query(self.scaled_coordinates[own], min(_AROUND, len(group)))[1])
             chosen = group[near.ravel()]
-            corners = chosen[Delaunay(self.even_plane[chosen], qhull_options="Qbb QJ").simplices]
+            corners = chosen[Delaunay(self.scaled_coordinates[chosen], qhull_options="Qbb QJ").simplices]
             area = 0.5 * np.linalg.norm(area_normals(self.ray[corners]), axis=1)
             touching = wanted[corners].any(axis=1)
             area = np.minimum(area, _LARGEST_CELL * np.median(area[touching]))
@@ -179,17 +244,17 @@ class Sight:
 
 
 def _medians_of(values: FloatArray, rows: NDArray[np.int32]) -> FloatArray:
-    """(m,) medians of the values of some rows (m, k)."""
+    """(m,) medians of the values at some rows (m, k)."""
     return np.asarray(np.median(values[rows], axis=1))
 
 
 def _origins(measurement: TlsMeasurement, index: NDArray[np.int64]) -> FloatArray:
-    """(n, 3) where the rays of points begin."""
+    """(n, 3) origins of the rays of points of several scans, m."""
     return np.stack([scan.pose[0] for scan in measurement.scans])[measurement.scan_of[index]]
 
 
-def _apart_by_scan(plane: FloatArray, scan: NDArray[np.int64]) -> FloatArray:
-    """(n, 2) directions with those of each scan beside those of the one before it: what is near in them is near on the wall."""
+def _side_by_side(plane: FloatArray, scan: NDArray[np.int64]) -> FloatArray:
+    """(n, 2) coordinates with the scans side by side, so that points of different scans are never neighbours."""
     found, start = plane.copy(), 0.0
     for number in np.unique(scan):
         rows = scan == number
@@ -200,8 +265,8 @@ def _apart_by_scan(plane: FloatArray, scan: NDArray[np.int64]) -> FloatArray:
     return found
 
 
-def _apart(plane: FloatArray) -> FloatArray:
-    """(2,) how far off the nearest point is that lies rather along the one axis, and along the other, as a rule."""
+def _axis_spacings(plane: FloatArray) -> FloatArray:
+    """(2,) median distance to the nearest point along each axis, among neighbours that lie mostly along that axis."""
     some = plane[:: max(len(plane) // _SAMPLE, 1)]
     rows = cKDTree(plane).query(some, min(_NEAR, len(plane)))[1]
     offset = np.abs(plane[rows[:, 1:]] - some[:, None])
@@ -210,9 +275,9 @@ def _apart(plane: FloatArray) -> FloatArray:
     return np.where(np.isfinite(found), np.maximum(found, 1e-12), offset.max())
 
 
-def _found(
+def _pairs_from_query(
     own: NDArray[np.int64], group: NDArray[np.int64], distance: FloatArray, position: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """(2, k) pairs of points and those that a tree of `group` gave for them."""
+    """(2, k) pairs of the points `own` and of those that a tree of `group` found for them."""
     hit = np.isfinite(distance)
     return np.stack([np.repeat(own, hit.sum(axis=1)), group[position[hit]]])

@@ -71,5 +71,5 @@ def test_the_page_is_made(folder: Path) -> None:
 
 def test_a_damaged_record_is_refused(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "monitor.json").write_text("{}")
-    with pytest.raises(InputError, match=r"is no record of scarpsim monitor"):
+    with pytest.raises(InputError, match=r"is not a record of scarpsim monitor"):
         open_results(tmp_path)

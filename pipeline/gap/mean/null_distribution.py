@@ -1,0 +1,81 @@
+"""Simulate the null distribution: how large the log-likelihood ratio of every family gets without any effect."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.gap.mean.design import NULL_DRAWS, Design
+from pipeline.gap.mean.mean_model import CellCovariance
+from scene.common.keyed_random import KeyedRandom
+from scene.common.threads import map_in_threads
+from scene.geometry.mesh import FloatArray
+
+_NEAR_NULL = 8
+"""Number of the most likely covariances at which the draws are fitted."""
+
+
+@dataclass(frozen=True)
+class NullDistribution:
+    """Log-likelihood ratios of every family in simulations of pose, correlated error of the reference and noise alone.
+
+    Attributes
+    ----------
+    log_likelihood_ratios : For each family its largest ratio in each draw, (NULL_DRAWS,).
+    """
+
+    log_likelihood_ratios: Mapping[str, FloatArray]
+
+    @classmethod
+    def of(cls, design: Design, random: KeyedRandom) -> NullDistribution:
+        """Simulate the null distribution of a design.
+
+        Draws are made under the most likely covariance and fitted at the eight most likely ones; each family takes its best
+        variant.
+
+        Parameters
+        ----------
+        design : The candidates on one set of points.
+        random : Source of the random numbers.
+        """
+        near = design.equations.at_covariances(design.ranked_covariances[:_NEAR_NULL])
+        draws = design.model.null_draws(design.null_covariance, NULL_DRAWS, random.child("between"))
+
+        def values(at: CellCovariance) -> tuple[FloatArray, FloatArray, FloatArray]:
+            weighted = draws[at.basis] * at.weight[:, None]
+            constant = 0.5 * (np.log(at.weight).sum() - np.sum(draws[at.basis] * weighted, axis=0))
+            right = design.noise_products + design.fixed.between[at.basis].T @ weighted
+            return right, constant, design.sine_products.noise + design.sine_products.between[at.basis].T @ weighted
+
+        right, constant, waves = (np.stack(part) for part in zip(*map_in_threads(values, near.covariances), strict=True))
+        drawn = near.with_values(right, constant, waves)
+        plain, fixed, searched = drawn.profile_log_likelihood(design.pose_columns, design.plain_columns)
+        return cls(
+            {
+                name: np.maximum(np.concatenate([fixed[rows], searched[numbers]]).max(axis=0) - plain, 0.0)
+                for name, (rows, numbers) in design.families.by_name.items()
+            }
+        )
+
+    def penalty(self, family: str) -> float:
+        """Return the penalty of a family's score: twice its mean log-likelihood ratio under the null (k for k linear
+        coefficients).
+        """
+        return 2 * float(self.log_likelihood_ratios[family].mean())
+
+    def p_value(self, score: float, larger: Mapping[str, float] | None = None) -> float:
+        """Return the p-value (1 + b) / (1 + N) of a score: b of N simulations have a largest score over all families that
+        reaches it.
+
+        It is corrected for multiple testing, because the maximum over all families is the test statistic.
+
+        Parameters
+        ----------
+        score : Penalised log-likelihood ratio.
+        larger : Restricts the maximum to these families, whose ratios are multiplied by the given factors.
+        """
+        times = dict.fromkeys(self.log_likelihood_ratios, 1.0) if larger is None else larger
+        scores = np.stack([each * self.log_likelihood_ratios[name] - self.penalty(name) for name, each in times.items()])
+        return float((1 + np.sum(scores.max(axis=0) >= score)) / (1 + NULL_DRAWS))

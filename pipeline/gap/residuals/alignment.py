@@ -1,0 +1,197 @@
+"""Align the sensor with the reference: estimate its pose from the residuals by robust least squares.
+
+The surveyed pose is never exact, so the pose is a nuisance parameter of every fit. It has six values for each set-up, or seven
+(with a scale) for a surface without cameras.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.change.robust import nmad
+from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement
+from pipeline.gap.residuals.residuals import BoolArray, Residuals, Rows
+from pipeline.gap.residuals.several_scans import residuals_of_scans
+from pipeline.gap.residuals.stereo_residuals import stereo_residuals
+from pipeline.gap.residuals.surface_residuals import SurfaceResiduals, surface_residuals
+from pipeline.gap.residuals.tls_residuals import tls_residuals
+from pipeline.gap.thresholds import thresholds
+from scene.common.threads import map_in_threads
+from scene.geometry.mesh import FloatArray
+
+_ROUNDS = 6
+"""Most rounds of outlier rejection."""
+_AT_ONCE = 2048
+"""Rows factored together (100 kB for one set-up), whatever the number of threads, so that results do not depend on it."""
+_BLOCKS = 64
+"""Such groups of rows that a thread takes at a time."""
+_FEWEST = 100
+"""Fewest points for outliers to be rejected."""
+_RETRACE_FROM_M, _MOST_MOVES = 0.002, 3
+"""A pose that moves rays by more than this on the wall, m, needs new residuals; and how often that is repeated at most."""
+_RETRACE_FROM_SIGMAS, _MOST_MOVES_OF_SURFACES = 0.1, 12
+"""The same for a surface without cameras, in predicted sigmas averaged over its points: its nearest places on the reference
+change as it moves.
+"""
+
+
+def fit_pose_robustly(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
+    """Fit the pose to the residuals of usable points by least squares, and reject outliers in each round.
+
+    Parameters
+    ----------
+    residuals : Residuals of n points with k set-ups.
+
+    Returns
+    -------
+    (n,) residuals minus the effect of the pose; (6 k,) the pose, shift (m) and small rotation (rad) of each set-up in the wall
+    frame; and the NMAD of the standardised residuals, at least 1, which is above 1 if they are overdispersed.
+    """
+    kept, scale = residuals.usable.copy(), 1.0
+    value, pose, design = residuals.value, np.zeros(residuals.pose_jacobian.shape[1]), _weighted_design(residuals)
+    for _ in range(_ROUNDS):
+        before, pose = kept, _least_squares(design[kept])
+        value = residuals.value - residuals.pose_jacobian @ pose
+        z = np.abs(value / residuals.sigma)
+        scale = max(1.0, nmad(z[residuals.usable], 0.0))
+        kept = residuals.usable & (z < thresholds().points.registration_outlier_sigmas * scale)
+        if kept.sum() < _FEWEST:
+            kept = residuals.usable
+        if np.array_equal(kept, before):  # converged
+            break
+    return value, pose, scale
+
+
+def fit_pose(residuals: Residuals, rows: BoolArray | NDArray[np.int64]) -> FloatArray:
+    """Fit the pose to some of the residuals by weighted least squares.
+
+    Parameters
+    ----------
+    residuals : Residuals with their pose Jacobian.
+    rows : The points to use, as a mask or as row numbers.
+
+    Returns
+    -------
+    (6 k,) shift (m) and small rotation (rad) of each of k set-ups, wall frame.
+    """
+    return _least_squares(_weighted_design(residuals, rows))
+
+
+def _weighted_design(residuals: Residuals, rows: Rows = slice(None)) -> FloatArray:
+    """(m, 6 k + 1) pose Jacobian and, as last column, the residuals of some rows, both divided by sigma."""
+    design = np.empty((len(residuals.sigma[rows]), residuals.pose_jacobian.shape[1] + 1))
+    design[:, :-1], design[:, -1] = residuals.pose_jacobian[rows], residuals.value[rows]
+    design /= residuals.sigma[rows, None]
+    return design
+
+
+def _least_squares(design: FloatArray) -> FloatArray:
+    """(6 k,) least-squares coefficients of the first 6 k columns of `design` (n, 6 k + 1) for its last column."""
+    triangle = _triangular_factor(design)
+    return np.asarray(np.linalg.lstsq(triangle[:, :-1], triangle[:, -1], rcond=np.finfo(float).eps * len(design))[0])
+
+
+def _triangular_factor(design: FloatArray) -> FloatArray:
+    """(m, k) matrix with the same products of columns as `design` (n, k), by repeated QR of groups of rows that fit the cache."""
+    while len(design) > _AT_ONCE:
+        whole = len(design) // _AT_ONCE * _AT_ONCE
+        blocks = design[:whole].reshape(-1, _AT_ONCE, design.shape[1])
+        triangles = map_in_threads(_qr_factors, [blocks[start : start + _BLOCKS] for start in range(0, len(blocks), _BLOCKS)])
+        design = np.concatenate([*triangles, design[whole:]])
+    return design
+
+
+def _qr_factors(blocks: FloatArray) -> FloatArray:
+    """(b k, k) the triangular QR factors of b groups of rows (b, m, k)."""
+    return np.asarray(np.linalg.qr(blocks, mode="r")).reshape(-1, blocks.shape[2])
+
+
+def compute_raw_residuals(measurement: Measurement) -> Residuals:
+    """Compute residuals at the surveyed pose, for a laser scan, a stereo pair or a surface without cameras."""
+    if isinstance(measurement, SurfaceMeasurement):
+        return surface_residuals(measurement)
+    if isinstance(measurement, StereoMeasurement):
+        return stereo_residuals(measurement)
+    return residuals_of_scans(measurement) if measurement.scans else tls_residuals(measurement)
+
+
+def compute_residuals(measurement: Measurement) -> Residuals:
+    """Compute the residuals of a measurement. If it has several epochs, the differences between their poses are removed."""
+    found = compute_raw_residuals(measurement)
+    epochs = measurement.epochs[found.index]
+    numbers = np.unique(epochs)
+    if len(numbers) < 2:
+        return found
+    poses = np.stack([fit_pose_robustly(found.part(epochs == number))[1] for number in numbers])
+    apart = (poses - poses.mean(axis=0))[np.searchsorted(numbers, epochs)]
+    away = np.einsum("ni,ni->n", found.pose_jacobian, apart)
+    return replace(found, value=found.value - away, epoch_offset=away)
+
+
+class AlignedMeasurement(NamedTuple):
+    """A measurement with the sensor at its aligned pose.
+
+    Attributes
+    ----------
+    measurement : The measurement with that pose.
+    residuals : Its residuals there.
+    pose : (6 k,) total shift (m) and small rotation (rad) of each set-up from the surveyed pose, wall frame.
+    """
+
+    measurement: Measurement
+    residuals: Residuals
+    pose: FloatArray
+
+
+def align(
+    measurement: Measurement, trusted: NDArray[np.int64] | None = None, found: Residuals | None = None
+) -> AlignedMeasurement:
+    """Move the sensor to the pose that fits the residuals best, and compute the residuals there.
+
+    The pose is fitted to linearised residuals. If it moves the rays by more than 2 mm on the wall, the rays are traced again and
+    the fit is repeated, up to three times (twelve times for a surface without cameras).
+
+    Parameters
+    ----------
+    measurement : The measurement at its surveyed pose.
+    trusted : Rows of the measurement's points to fit; None for all.
+    found : Residuals at the surveyed pose, if they are already known.
+
+    Returns
+    -------
+    The measurement and its residuals at the fitted pose. The surveyed pose stays if the rays would miss the wall.
+    """
+    found = compute_residuals(measurement) if found is None else found
+    total = np.zeros(found.pose_jacobian.shape[1])
+    most = _MOST_MOVES_OF_SURFACES if isinstance(measurement, SurfaceMeasurement) else _MOST_MOVES
+    for _ in range(most if len(found) else 0):
+        pose = fit_pose_robustly(_restricted_to(found, trusted))[1]
+        if not _moves_rays_far(pose, found):
+            break
+        aligned = measurement.moved(pose)
+        new_residuals = compute_residuals(aligned)
+        if not len(new_residuals.value):  # no ray meets the wall from there
+            break
+        measurement, total, found = aligned, total + pose, new_residuals
+    return AlignedMeasurement(measurement, found, total)
+
+
+def _restricted_to(residuals: Residuals, trusted: NDArray[np.int64] | None) -> Residuals:
+    """Restrict the usable points to the trusted ones."""
+    return residuals if trusted is None else replace(residuals, usable=residuals.usable & np.isin(residuals.index, trusted))
+
+
+def _moves_rays_far(pose: FloatArray, residuals: Residuals) -> bool:
+    """Tell whether a pose moves the rays so far on the wall that they must be traced again."""
+    if isinstance(residuals, SurfaceResiduals):
+        return float(np.mean(np.abs(residuals.pose_jacobian @ pose) / residuals.sigma)) > _RETRACE_FROM_SIGMAS
+    for start in range(0, len(pose), 6):
+        own, columns = pose[start : start + 6], residuals.pose_jacobian[:, start : start + 6]
+        turn, shift = (float(np.linalg.norm(columns[:, part], axis=1).mean()) for part in (slice(3, 6), slice(3)))
+        if shift > 0 and np.linalg.norm(own[:3]) + turn / shift * np.linalg.norm(own[3:]) > _RETRACE_FROM_M:
+            return True
+    return False

@@ -1,0 +1,174 @@
+"""Trace the rays of a laser scan to the reference surface, and describe the surface where they hit it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pipeline.formats.measurements.measurement import TlsMeasurement
+from pipeline.gap.residuals.residuals import Rows, range_derivative, select_rows
+from scene.geometry.mesh import FloatArray, IntArray, barycentric
+from scene.geometry.point_planes import PointPlanes
+from sensors.signal_chain.pulses import PulseGeometry
+
+_PROBE_RAD = 6e-4
+"""Angle to the neighbouring rays that detect edges, rad: about the width of a beam."""
+_LEAST_COSINE = 0.05
+"""Smallest cosine of the incidence angle that is divided by."""
+
+
+@dataclass(frozen=True)
+class RayGeometry(PulseGeometry):
+    """Geometry of n laser rays as the equations of the effects use it, with what the residuals need beside it.
+
+    The fields of `PulseGeometry` describe the average direction of the beam under the current model.
+
+    Attributes
+    ----------
+    measured_m : (n,) measured ranges, m.
+    bulge_m : (n,) how much nearer the curved surface lies than the triangle between its points, m; included in `range_m`. None if
+        the reference is used as it is.
+    corner : (n, 3) vertices of the triangle that was hit; None if the vertices have no errors of their own.
+    weight : (n, 3) barycentric weights of these vertices at the hit.
+    plane_normal : (n, 3) normals, scanner frame, of the planes along which a deflected ray is followed; None: along the
+        triangles.
+    """
+
+    measured_m: FloatArray = field(default_factory=lambda: np.zeros(0))
+    bulge_m: FloatArray | None = None
+    corner: IntArray | None = None
+    weight: FloatArray | None = None
+    plane_normal: FloatArray | None = None
+
+    def part(self, rows: Rows) -> RayGeometry:
+        """Return the geometry of some of the rays."""
+        return select_rows(self, rows)
+
+    @property
+    def sensor_coordinates(self) -> FloatArray:
+        """(n, 2) azimuth and zenith angle, rad."""
+        return np.stack([self.azimuth, self.zenith], axis=1)
+
+    @property
+    def departure(self) -> FloatArray:
+        """(n,) measured range minus the range to the reference, m."""
+        return np.asarray(self.measured_m - self.range_m)
+
+
+@dataclass(frozen=True)
+class RayHits:
+    """Where n rays hit the reference surface.
+
+    For a reference made of points, incidence angles refer to planes through 24 points, because triangles lean with the noise of
+    their corners. That noise is also in the range, so it would imitate every effect that depends on the incidence angle. Where
+    noise dominates the scatter of the points, the normals are those of the planes too.
+
+    Attributes
+    ----------
+    distance : (n,) range to the surface, m; infinite or NaN without a hit.
+    normal : (n, 3) unit normals, of the triangle or of the plane through the points.
+    cos_incidence : (n,) cosine of the incidence angle.
+    curvature : (n,) largest deviation of the surface from the triangle's plane within a beam's width, m.
+    bulge : (n,) how much nearer the curved surface lies than the triangle, m; included in `distance`.
+    scatter : (n,) scatter of the reference's points about the planes, relative to its median.
+    corner, weight : As in `RayGeometry`.
+    """
+
+    distance: FloatArray
+    normal: FloatArray
+    cos_incidence: FloatArray
+    curvature: FloatArray
+    bulge: FloatArray | None = None
+    scatter: FloatArray | None = None
+    corner: IntArray | None = None
+    weight: FloatArray | None = None
+
+
+def cast_rays(measurement: TlsMeasurement, axes: list[FloatArray]) -> RayHits:
+    """Trace rays from the scanner to the reference surface.
+
+    Parameters
+    ----------
+    measurement : The scan, with its station and reference.
+    axes : Three (n, 3) arrays in the wall frame: unit directions of the rays, and their derivatives by azimuth and by zenith
+        angle.
+
+    Returns
+    -------
+    The hits, in the order of the rays.
+    """
+    ray, scene, position = axes[0], measurement.scene, measurement.station[0]
+    distance, face = scene.cast(position, ray)
+    face = np.maximum(face, 0)
+    normal = scene.mesh.normals[face]
+    curvature = np.zeros(len(ray))
+    for axis in axes[1:]:
+        flat = range_derivative(normal, ray, axis, distance)
+        for step in (_PROBE_RAD, -_PROBE_RAD):
+            beside = scene.cast(position, ray + step * axis)[0]
+            curvature = np.maximum(curvature, np.nan_to_num(np.abs(beside - distance - step * flat), nan=np.inf))
+    found = RayHits(distance, normal, np.abs(np.einsum("ni,ni->n", ray, normal)), curvature)
+    if measurement.planes is None and not measurement.reference_error_m:
+        return found
+    corner = scene.mesh.faces[face]
+    weight = barycentric(position + distance[:, None] * ray, scene.mesh.vertices[corner])
+    found = replace(found, corner=corner, weight=weight)
+    if measurement.planes is None:
+        return found
+    return _smoothed_hits(found, measurement.planes, ray, (corner, weight, scene.mesh.vertices[corner]))
+
+
+def redirect_hits(found: RayHits, nominal: FloatArray, real: FloatArray) -> RayHits:
+    """Compute the hits of deflected rays from those of the nominal rays, along the planes that the nominal rays hit.
+
+    This is for a reference whose scatter is mostly noise: there a deflected ray would follow the noise of a triangle.
+
+    Parameters
+    ----------
+    found : Hits of the nominal rays.
+    nominal : (n, 3) unit directions of the nominal rays.
+    real : (n, 3) unit directions of the deflected rays.
+
+    Returns
+    -------
+    The hits with the new distances and incidence angles.
+    """
+    before, after = (np.einsum("ni,ni->n", found.normal, each) for each in (nominal, real))
+    distance = found.distance * before / np.where(np.abs(after) > _LEAST_COSINE, after, np.nan)
+    return replace(found, distance=distance, cos_incidence=np.abs(after))
+
+
+_Triangles = tuple[IntArray, FloatArray, FloatArray]
+"""The triangles that were hit: vertex numbers (n, 3), barycentric weights (n, 3), and corner positions (n, 3 corners, 3)."""
+
+
+def _smoothed_hits(found: RayHits, planes: PointPlanes, ray: FloatArray, triangles: _Triangles) -> RayHits:
+    """Take incidence angle and scatter from planes through the points; if noise dominates, also normal and a curved surface."""
+    corner = triangles[0]
+    normal = planes.normal[corner]
+    normal = normal * np.where(np.einsum("nki,ni->nk", normal, found.normal) < 0, -1.0, 1.0)[..., None]
+    mean = normal.mean(axis=1)
+    mean /= np.linalg.norm(mean, axis=1, keepdims=True)
+    cosine = np.abs(np.einsum("ni,ni->n", ray, mean))
+    scatter = planes.along(ray, corner).max(axis=1) / planes.median_scatter_m
+    found = replace(found, cos_incidence=cosine, scatter=scatter)
+    if not planes.noise_dominates:
+        return found
+    towards = np.where(np.einsum("ni,ni->n", ray, found.normal) > 0, -1.0, 1.0)
+    bulge = towards * _height_above_triangles(normal, triangles) / np.maximum(cosine, _LEAST_COSINE)
+    return replace(found, distance=found.distance - bulge, normal=mean, bulge=bulge)
+
+
+def _height_above_triangles(normal: FloatArray, triangles: _Triangles) -> FloatArray:
+    """(n,) height of a curved surface above its triangles, from normals (n, 3 corners, 3) at their corners.
+
+    With barycentric coordinates b it is the sum over the sides of 4 b_i b_j d_ij, where d_ij = (n_j - n_i)·(p_j - p_i) / 8 is the
+    height of an arc above its chord.
+    """
+    _, weight, at = triangles
+    height = np.zeros(len(weight))
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        arc = np.einsum("ni,ni->n", normal[:, j] - normal[:, i], at[:, j] - at[:, i]) / 8
+        height += 4 * weight[:, i] * weight[:, j] * arc
+    return height

@@ -1,0 +1,360 @@
+"""Find compact regions where the surface itself changed, so that they are reported and not mistaken for sensor errors.
+
+Points whose residuals exceed some sigmas on the same side, and that are neighbours in the sensor's view, form a component. Let a
+share p of N points exceed the level by chance, and a share c of pairs agree in value. The expected number of components of m
+points is then about
+
+    E(m) = N a(m) p^m c^(m - 1)
+
+where a(m) counts the shapes of m cells that touch at sides or corners (fixed polyplets, OEIS A006770). A component is a change if
+far fewer than one such component is expected over all levels and both sides. It is extended to adjoining points at edges of the
+reference, and to the fringe where the residuals decline.
+
+Its volume sums the prisms of the rays between both surfaces, with the solid angle dO of each point:
+
+    V = |sum (R^3 - R0^3) / 3 dO|,  to first order |sum R0^2 dR sin z daz dz|
+
+Residuals are limited to what neighbours confirm, so that an outlier does not count. The standard deviation of the volume combines
+the noise of each ray; the common error of the surroundings, from how much more medians of neighbours scatter than white noise
+predicts; the rim (each straight side of sqrt(m) points is inside or not: sqrt(4 / 12) / sqrt(m) of the volume, a fifth more on
+simulated blocks); and the sides of the rock that are visible from an angle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.special import ndtri
+
+from pipeline.change.robust import nmad
+from pipeline.gap.residuals.residuals import BoolArray, Residuals
+from pipeline.gap.residuals.sensor_view import NEIGHBOURS, SensorView
+from pipeline.gap.residuals.standardized import group_medians, nmad_along_covariates, standardize
+from pipeline.gap.thresholds import thresholds
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import FloatArray
+
+Pairs = tuple[NDArray[np.int64], NDArray[np.int64]]
+"""Rows of the first and of the second point of pairs of neighbours."""
+
+_LEVELS = (2.5, 4.0, 8.0)
+"""Levels in sigmas above which points form components."""
+_RATIOS, _NOISE = (2.0, np.inf), 3.0
+"""Two neighbours agree if one residual exceeds the other at most by such a factor, or by so many sigmas. The narrow criterion
+makes chance components rarer; the wide one finds a block of five points with varying depth if there are few outliers.
+"""
+_SEARCHES = 2 * len(_LEVELS) * len(_RATIOS)
+"""Number of searches: both sides, each level, each ratio."""
+_SHAPES = np.cumsum(np.log([1, 4, 5, 5.5, 5.8, 6.006, 6.157, 6.271, 6.361, 6.433]))
+"""Logarithms of a(1) to a(10), from their ratios."""
+_GROWTH = float(np.log(6.6))
+"""Logarithm of the ratio a(m + 1) / a(m) = 6.6 for larger m."""
+_EDGE_STEPS = 3
+"""Steps by which a change may be extended over edges of the reference, in points."""
+_LEAST_MEDIAN_STD = 0.4
+"""Smallest standard deviation of medians of nine points, in sigmas; white noise gives 1.25 / 3."""
+_WHITE_MEDIAN_STD = 0.418
+"""Standard deviation of medians of nine standard normal values."""
+_RIM, _SIDES = 0.7, 0.03
+"""Relative standard deviation of a volume: by its rim, times one over the root of its number of points, and by its sides."""
+_ROUNDS = 3
+"""Most rounds of the search."""
+_SAMPLE, _ALMOST_ALL = 4000, 5.0
+"""Points sampled to estimate correlation, and sigmas at which their residuals are clipped."""
+
+
+@dataclass(frozen=True)
+class SceneChange:
+    """A region where the surface changed.
+
+    Attributes
+    ----------
+    corners : (k, 3) corners of the rays' prisms on the surfaces before and after, wall frame, m.
+    volume_m3 : Volume of the rock that is missing or was added, m³.
+    volume_std_m3 : Its standard deviation, m³.
+    offset_m : Median change of range, m, positive where rock is missing.
+    """
+
+    corners: FloatArray
+    volume_m3: float
+    volume_std_m3: float
+    offset_m: float
+
+    @property
+    def bounds(self) -> FloatArray:
+        """(2, 3) lowest and highest coordinates, wall frame, m."""
+        return np.stack([self.corners.min(axis=0), self.corners.max(axis=0)])
+
+    def to_dict(self, frame: WallFrame) -> dict[str, Any]:
+        """Return the entry of gap.json: the bounding box in the world frame, and the volume."""
+        world = frame.to_world(self.corners)
+        return {"bbox_m": [*world.min(axis=0).tolist(), *world.max(axis=0).tolist()], "volume_m3": self.volume_m3,
+                "volume_std_m3": self.volume_std_m3}  # fmt: skip
+
+
+def find_scene_changes(residuals: Residuals, view: SensorView, eligible: BoolArray) -> tuple[list[SceneChange], BoolArray]:
+    """Find regions where the surface changed.
+
+    The level of the surroundings and the scatter of the residuals are estimated again without the changes found, until no more
+    are found.
+
+    Parameters
+    ----------
+    residuals : Residuals after a rough alignment.
+    view : View of the same points.
+    eligible : (n,) points away from depth steps; only these are evidence of a change.
+
+    Returns
+    -------
+    The changes, largest first, and (n,) whether each point lies in or beside one.
+    """
+    beside = np.zeros(len(residuals), dtype=bool)
+    departure, error = np.zeros(len(residuals)), np.zeros((2, len(residuals)))
+    label = np.full(len(residuals), -1)
+    if eligible.sum() < NEIGHBOURS:
+        return [], beside
+    for _ in range(_ROUNDS):
+        before = beside
+        unchanged = eligible & ~beside
+        departure, z = standardize(residuals, view.scaled_coordinates, unchanged)
+        medians = view.neighbour_median(np.where(eligible, z, 0.0))
+        scatter = nmad_along_covariates(residuals, medians, unchanged)
+        shared = np.sqrt(np.maximum(scatter**2 - _WHITE_MEDIAN_STD**2, 0.0))
+        error = np.stack([np.abs(departure / np.where(z == 0, np.inf, z)), shared * residuals.sigma]) * residuals.unit_m
+        faint = medians / np.maximum(scatter, _LEAST_MEDIAN_STD)
+        faint[np.abs(medians) * residuals.sigma * residuals.unit_m < thresholds().changes.smallest_departure] = 0.0
+        label, limit = _components(z, faint, view, eligible)
+        members = np.flatnonzero(label >= 0)
+        beside = view.near(members, thresholds().changes.margin) if len(members) else np.zeros(len(residuals), dtype=bool)
+        if not (beside & ~before).any():
+            break
+    limited = departure * np.minimum(1.0, limit / np.maximum(np.abs(z), 1e-12))
+    return _measure_changes(label, limited, error, view), beside
+
+
+def drop_duplicates(changes: list[SceneChange]) -> list[SceneChange]:
+    """Drop changes that another scan shows too: those whose centre lies in the bounding box of a larger one."""
+    kept: list[SceneChange] = []
+    for change in changes:
+        middle = change.bounds.mean(axis=0)
+        if not any((each.bounds[0] < middle).all() and (middle < each.bounds[1]).all() for each in kept):
+            kept.append(change)
+    return kept
+
+
+def moved_share(residuals: Residuals, view: SensorView, eligible: BoolArray) -> float:
+    """Return the share of points that deviate from the reference together with their neighbours, anywhere and by any amount.
+
+    White noise moves a median of nine points by 0.4 sigma only; a wrong pose counts if much of the wall moved.
+
+    Parameters
+    ----------
+    residuals : Residuals after alignment.
+    view : View of the same points.
+    eligible : (n,) points that count.
+
+    Returns
+    -------
+    The share, from 0 to 1.
+    """
+    known = np.flatnonzero(eligible & np.isfinite(residuals.value))
+    if len(known) < NEIGHBOURS:
+        return 0.0
+    part = residuals.part(known)
+    medians = view.part(known).neighbour_median(part.value / part.sigma)
+    far = np.abs(medians) * part.sigma * part.unit_m > thresholds().changes.smallest_departure
+    return float(np.mean(far & (np.abs(medians) > thresholds().changes.moved_sigmas)))
+
+
+def _components(z: FloatArray, faint: FloatArray, view: SensorView, eligible: BoolArray) -> tuple[NDArray[np.int64], FloatArray]:
+    """Number of the change that contains each point (n,), -1 for none, and the sigmas (n,) that its neighbours confirm.
+
+    `z`: (n,) standardised residuals; `faint`: (n,) standardised medians of neighbours.
+    """
+    exceeds = np.abs(faint) > thresholds().changes.faint_sigmas
+    side = np.where(exceeds, np.sign(faint), np.sign(z)) * (exceeds | (np.abs(z) > _LEVELS[0]))
+    first, second = view.neighbour_pairs(np.flatnonzero(side))
+    together = side[first] * side[second] > 0
+    pairs, size = (first[together], second[together]), np.abs(z)
+    least = max(thresholds().changes.median_sigmas, _correlated_sigmas(z, view, eligible))
+    core = _faint_cores(faint, exceeds, pairs, eligible)
+    for sign, level, ratio in product((1.0, -1.0), _LEVELS, _RATIOS):
+        core |= _significant(sign * z, level, ratio, pairs, eligible, least)
+    whole = _extended(core, size, pairs, eligible)
+    label = _compact(_connected(whole, pairs), view, int(eligible.sum()))
+    inside = _select_pairs(pairs, whole[pairs[0]] & whole[pairs[1]])
+    most = np.zeros(len(z))
+    for one, other in (inside, inside[::-1]):
+        np.maximum.at(most, one, size[other])
+    return label, _agreement_limit(most, _RATIOS[0])
+
+
+def _faint_cores(faint: FloatArray, exceeds: BoolArray, pairs: Pairs, eligible: BoolArray) -> BoolArray:
+    """(n,) points of components of medians, one of which exceeds what noise reaches in a whole measurement."""
+    label = _connected(exceeds, pairs)
+    inside = label >= 0
+    highest = np.zeros(int(label.max(initial=-1)) + 1)
+    np.maximum.at(highest, label[inside], np.where(eligible, np.abs(faint), 0.0)[inside])
+    return np.isin(label, np.flatnonzero(highest > -ndtri(thresholds().changes.false_changes / (2 * eligible.sum())))) & inside
+
+
+def _agreeing(pairs: Pairs, size: FloatArray, ratio: float) -> Pairs:
+    """The pairs whose standardised residuals (n,) agree."""
+    one, other = size[pairs[0]], size[pairs[1]]
+    return _select_pairs(pairs, np.maximum(one, other) <= _agreement_limit(np.minimum(one, other), ratio))
+
+
+def _agreement_limit(size: FloatArray, ratio: float) -> FloatArray:
+    """Largest standardised residuals that still agree with others."""
+    return np.asarray(np.maximum(ratio * size, size + _NOISE))
+
+
+def _significant(z: FloatArray, level: float, ratio: float, pairs: Pairs, eligible: BoolArray, least: float) -> BoolArray:
+    """(n,) points of components above a level that are too large to be due to chance.
+
+    The share p of points that exceed the level by chance excludes the changes, so both are found together, by iteration. `least`:
+    smallest median of a component, in sigmas.
+    """
+    label = _connected(eligible & (z > level), _agreeing(pairs, np.abs(z), ratio))
+    inside = label >= 0
+    count = np.bincount(label[inside])
+    middle = group_medians(z[inside], label[inside], len(count), 1)
+    accepted = np.zeros(len(count), dtype=bool)
+    for _ in range(len(count)):
+        stray = np.sort(z[inside][~accepted[label[inside]]])
+        by_chance = _log_expected(count, int(eligible.sum()), len(stray), _agreeing_share(stray, ratio))
+        rare = by_chance < np.log(thresholds().changes.false_changes / _SEARCHES)
+        again = (count >= thresholds().changes.fewest) & (middle > least) & rare
+        if np.array_equal(again, accepted):
+            break
+        accepted = again
+    return np.isin(label, np.flatnonzero(accepted)) & inside
+
+
+def _log_expected(count: NDArray[np.int64], points: int, stray: int, agreeing: float) -> FloatArray:
+    """log E(m) of components of m = `count` points (see the module), if `stray` of `points` exceed the level by chance."""
+    shapes = np.where(
+        count <= len(_SHAPES),
+        _SHAPES[np.minimum(count, len(_SHAPES)) - 1],
+        _SHAPES[-1] + _GROWTH * (count - len(_SHAPES)),
+    )
+    share = np.log(max(stray, 1) / points)
+    return np.asarray(np.log(points) + shapes + count * share + (count - 1) * np.log(agreeing))
+
+
+def _agreeing_share(ordered: FloatArray, ratio: float) -> float:
+    """Share of pairs of values, sorted in ascending order, that agree."""
+    if len(ordered) < 2:
+        return 1.0
+    above = np.searchsorted(ordered, _agreement_limit(ordered, ratio), side="right") - np.arange(len(ordered)) - 1
+    return float(max(2 * above.sum(), 1) / (len(ordered) * (len(ordered) - 1)))
+
+
+def _correlated_sigmas(z: FloatArray, view: SensorView, eligible: BoolArray) -> float:
+    """Median of a component, in sigmas, that noise hardly reaches.
+
+    It is small for white noise, and as large as that of single points for correlated noise. It follows from the scatter of means
+    over a point and its neighbours.
+    """
+    known = np.flatnonzero(eligible)
+    first, second = view.neighbour_pairs(known[:: max(len(known) // _SAMPLE, 1)])
+    clipped = np.clip(z, -_ALMOST_ALL, _ALMOST_ALL)
+    counts = np.bincount(first, minlength=len(z))
+    total = clipped + np.bincount(first, clipped[second], len(z))
+    chosen = counts >= NEIGHBOURS // 2
+    if not chosen.any():
+        return 0.0
+    return nmad(total[chosen] / (counts[chosen] + 1)) * float(-ndtri(thresholds().changes.false_changes / (2 * len(known))))
+
+
+def _extended(core: BoolArray, size: FloatArray, pairs: Pairs, eligible: BoolArray) -> BoolArray:
+    """(n,) the cores, extended to adjoining points at edges of the reference and to the fringe where the residuals decline."""
+    whole, agreeing = core.copy(), _agreeing(pairs, size, _RATIOS[0])
+    for _ in range(_EDGE_STEPS):
+        for one, other in (agreeing, agreeing[::-1]):
+            reached = other[whole[one]]
+            whole[reached[~eligible[reached]]] = True
+    fringe = [other[whole[one] & (size[other] < size[one])] for one, other in (pairs, pairs[::-1])]
+    whole[np.concatenate(fringe)] = True
+    return whole
+
+
+def _connected(chosen: BoolArray, pairs: Pairs) -> NDArray[np.int64]:
+    """(n,) number of the connected component that contains each chosen point; -1 for other points."""
+    rows = np.flatnonzero(chosen)
+    number = np.full(len(chosen), -1)
+    number[rows] = np.arange(len(rows))
+    one, other = (number[each] for each in _select_pairs(pairs, chosen[pairs[0]] & chosen[pairs[1]]))
+    graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(len(rows), len(rows)))
+    label = np.full(len(chosen), -1)
+    if len(rows):
+        label[rows] = connected_components(graph, directed=False)[1]
+    return label
+
+
+def _select_pairs(pairs: Pairs, which: BoolArray) -> Pairs:
+    """Some of the pairs."""
+    return pairs[0][which], pairs[1][which]
+
+
+def _compact(label: NDArray[np.int64], view: SensorView, points: int) -> NDArray[np.int64]:
+    """Labels (n,) without regions that are no compact change: a large part of the wall, or a stripe."""
+    rows = np.flatnonzero(label >= 0)
+    if not len(rows):
+        return label
+    order = rows[np.argsort(label[rows], kind="stable")]
+    starts = np.flatnonzero(np.diff(label[order], prepend=-1))
+    place = view.scaled_coordinates[order]
+    length = (np.maximum.reduceat(place, starts) - np.minimum.reduceat(place, starts)).max(axis=1)
+    size = np.diff(np.append(starts, len(order))) / len(np.unique(view.epoch))
+    stripe = (length >= thresholds().changes.stripe_length) & (size <= 0.1 * length**2)
+    compact = (size * len(np.unique(view.epoch)) < thresholds().changes.largest_share * points) & ~stripe
+    return np.where(np.isin(label, label[order][starts][compact]), label, -1)
+
+
+def _measure_changes(label: NDArray[np.int64], departure: FloatArray, error: FloatArray, view: SensorView) -> list[SceneChange]:
+    """Measure the changes; largest volume first. `error`: (2, n) independent and common standard deviation of each ray's
+    residual, m.
+    """
+    rows = np.flatnonzero(label >= 0)
+    if not len(rows):
+        return []
+    solid = view.solid_angles(rows)
+    near, far = view.reference_m[rows], view.range_at_residual(rows, departure[rows])
+    volume = (far**3 - near**3) / 3 * solid
+    area = near**2 * solid
+    width = 0.5 * np.sqrt(area)
+    own, common = error[:, rows] * area
+    surfaces = [view.points_at(rows, each) for each in (near, far)]
+    order = np.argsort(label[rows], kind="stable")
+    found = []
+    for part in np.split(order, np.flatnonzero(np.diff(label[rows][order])) + 1):
+        corners = np.concatenate([_box(surface[part], width[part]) for surface in surfaces])
+        moved = float(np.median((far - near)[part]))
+        epochs = view.epoch[rows[part]]
+        whole = abs(_mean_of_epochs(volume[part], epochs))
+        each = len(part) / len(np.unique(epochs))
+        white = float(np.sqrt(np.sum(own[part] ** 2))) * each / len(part)
+        rim, sides = whole * _RIM / np.sqrt(each), whole * _SIDES
+        std = float(np.linalg.norm([white, common[part].sum() * each / len(part), rim, sides]))
+        found.append(SceneChange(corners, whole, std, moved))
+    return sorted(found, key=lambda change: -change.volume_m3)
+
+
+def _box(points: FloatArray, width: FloatArray) -> FloatArray:
+    """(2 k, 3) points (k, 3) moved by half a cell to either side along the wall, wall frame."""
+    aside = width[:, None] * np.array([1.0, 1.0, 0.0])
+    return np.concatenate([points - aside, points + aside])
+
+
+def _mean_of_epochs(volume: FloatArray, epoch: NDArray[np.int64]) -> float:
+    """Mean over epochs of summed volumes (by point); epochs with less than half as many points as another are left out."""
+    _, number, counts = np.unique(epoch, return_inverse=True, return_counts=True)
+    whole = counts >= 0.5 * counts.max()
+    return float(np.bincount(number, volume)[whole].mean())

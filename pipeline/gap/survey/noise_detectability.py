@@ -1,0 +1,119 @@
+"""Compute, before there are data, from which size effects on the noise and on missing returns can be detected."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pipeline.gap.noise_and_edges.variance_model import variance_candidates
+from pipeline.gap.survey.survey_design import DETECTION_SNR, view_signatures
+from pipeline.gap.survey.survey_views import Survey, SurveyView, TlsView
+from pipeline.gap.thresholds import thresholds
+from sensors.effects import catalogue
+from sensors.effects.base import Effect
+from sensors.effects.detection_limit import DetectionLimit
+from sensors.effects.precipitation import Precipitation
+from sensors.effects.range_quantization import RangeQuantization
+
+_LOSSES = 0.01
+"""Share of returns that is assumed to be missing anyway."""
+_NO_NUMBER = "no closed-form signature: gap tests it, but its detectable size is not computed here"
+"""Note for effects whose detectable size is not computed."""
+
+
+@dataclass(frozen=True)
+class NoiseOrLossEffect:
+    """An effect on the noise or on missing returns.
+
+    Attributes
+    ----------
+    name : Name of the effect, with the sensor as prefix.
+    parameter : Name of its main parameter.
+    seen_from : Detectable size: the parameter value at a signal-to-noise ratio of 5; NaN if it is not computed.
+    note : Condition or reason, in words.
+    """
+
+    name: str
+    parameter: str
+    seen_from: float
+    note: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the entry of identifiability.json."""
+        return {
+            "name": self.name,
+            "parameter": self.parameter,
+            "seen_from": self.seen_from if np.isfinite(self.seen_from) else None,
+            "note": self.note,
+        }
+
+
+def noise_and_loss_effects(survey: Survey) -> tuple[NoiseOrLossEffect, ...]:
+    """List every effect of the catalogue that is not systematic, with its detectable size where that can be computed."""
+    view = survey.views[0]
+    found = {each.name: each for each in _variance_effects(view)}
+    if isinstance(view, TlsView):
+        found |= {each.name: each for each in (_quantisation(), _detection_limit(view), _precipitation(view))}
+    names = {f"{survey.sensor}.{effect.tag()}": effect for effect in catalogue(survey.sensor)}
+    mean = _systematic_names(view)
+    unknown = {name: NoiseOrLossEffect(name, "", np.nan, _unknown(effect)) for name, effect in names.items()}
+    return tuple(found.get(name, unknown[name]) for name in names if name not in mean)
+
+
+def _unknown(effect: type[Effect]) -> str:
+    """Why an effect has no detectable size here."""
+    return f"needs {' and '.join(effect.needs)}: gap does not test it" if effect.needs else _NO_NUMBER
+
+
+def _systematic_names(view: SurveyView) -> set[str]:
+    """Names of the systematic effects."""
+    return {f"{view.residuals.sensor}.{candidate.name}" for candidate in view_signatures(view)}
+
+
+def _variance_effects(view: SurveyView) -> list[NoiseOrLossEffect]:
+    """Effects on the variance: sigma_i² = model + theta f_i has the information sum (f_i / sigma_i²)² / 2 on theta."""
+    residuals = view.residuals
+    candidates = variance_candidates(residuals)
+    found: dict[str, NoiseOrLossEffect] = {}
+    excess = thresholds().variance.least_excess
+    for candidate in candidates:
+        form = candidate.variance.sum(axis=1) / residuals.sigma**2
+        information = 0.5 * float(np.sum(form**2)) * view.point_count / len(residuals)
+        theta = DETECTION_SNR / np.sqrt(max(information, 1e-300))
+        least = excess / max(float(np.mean(form)), 1e-300)
+        note = "" if theta > least else f"smaller ones add less than {100 * excess:.0f} % to the variance and are not named"
+        value = candidate.parameters(np.full(len(candidate.names), max(theta, least)))[candidate.names[0]]
+        name = f"{residuals.sensor}.{candidate.name}"
+        if name not in found or value < found[name].seen_from:
+            found[name] = NoiseOrLossEffect(name, candidate.names[0], float(value), note)
+    return list(found.values())
+
+
+def _quantisation() -> NoiseOrLossEffect:
+    """Range quantisation, which shows as a comb in the distribution of the ranges."""
+    note = "from the comb of ranges, if the file stores them more finely than the step"
+    return NoiseOrLossEffect(f"tls.{RangeQuantization.tag()}", "step_m", 1e-4, note)
+
+
+def _detection_limit(view: TlsView) -> NoiseOrLossEffect:
+    """The detection limit: losing the k weakest echoes has the log-likelihood ratio k ln(1 / losses); SNR 5 means 12.5."""
+    power = view.residuals.geometry.power
+    if power is None:
+        return NoiseOrLossEffect(f"tls.{DetectionLimit.tag()}", "minimum_power", np.nan, "needs recorded powers")
+    share = 0.5 * DETECTION_SNR**2 / np.log(1 / _LOSSES) / view.point_count
+    value = float(np.quantile(power, min(max(share, 1 / len(power)), 1.0)))
+    return NoiseOrLossEffect(
+        f"tls.{DetectionLimit.tag()}", "minimum_power", value, "as soon as the weakest echoes are lost; needs the pattern"
+    )
+
+
+def _precipitation(view: TlsView) -> NoiseOrLossEffect:
+    """Precipitation: information on beta in the share of losses p = 1 - (1 - p0) exp(-2 beta R), with p0 unknown too."""
+    distance = view.residuals.geometry.range_m
+    jacobian = np.stack([2 * distance * (1 - _LOSSES), np.ones_like(distance)], axis=1)
+    weight = view.point_count / len(distance) / (_LOSSES * (1 - _LOSSES))
+    information = weight * jacobian.T @ jacobian
+    rate = DETECTION_SNR * float(np.sqrt(np.linalg.inv(information)[0, 0]))
+    return NoiseOrLossEffect(f"tls.{Precipitation.tag()}", "rate_per_m", rate, f"beside {100 * _LOSSES:.0f} % of other losses")
