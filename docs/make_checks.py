@@ -1,6 +1,7 @@
-"""Try a bad input of each kind at each door and write docs/reference/formats/checks.md: `python docs/make_checks.py`.
+"""Try a bad input of each kind with each reader and write docs/reference/formats/checks.md: `python docs/make_checks.py`.
 
-A door is a command, an option or a function that reads files of some kind. tests/test_checks.py tries them too, against the page.
+A reader is a command, an option or a function that reads files of some kind. tests/test_checks.py compares the page with the
+results.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ Make = Callable[[Path], None]
 _HEAD = """# Checks of input files
 
 This page says which faults of a file are found, and by which command, option or function. It is for those who wonder whether
-a fault of their data could go unnoticed. Each cell was tried: *refused* means that the door answers with one message that
+a fault of their data could go unnoticed. Each cell was tried: *refused* means that the reader answers with one message that
 names the file, what is wrong, what is allowed and how to mend it, and that it writes nothing. Commands end with exit status
 2, functions raise `InputError`.
 """
@@ -52,17 +53,14 @@ names the file, what is wrong, what is allowed and how to mend it, and that it w
 class Kind:
     """Files of one kind, and how commands and functions are tried with faults in them.
 
-    Attributes
-    ----------
-    title : Heading of the kind.
-    suffix : Suffix of the files' names.
-    doors : What reads such files, by name: the words of a command (FILE for the file), or a function.
-    faults : How a file with each fault is made.
+    suffix: suffix of the files' names; readers: what reads such files, by name: the words of a command (FILE for the file), or a
+    function; faults: functions that make a file with each fault; good: function that makes a file without a fault; refusing:
+    readers that also refuse good files; long: readers that take long with a good file.
     """
 
     title: str
     suffix: str
-    doors: dict[str, tuple[str, ...] | Callable[[Path], object]]
+    readers: dict[str, tuple[str, ...] | Callable[[Path], object]]
     faults: dict[str, Make]
     good: Make | None = None
     refusing: tuple[str, ...] = ()
@@ -283,7 +281,7 @@ KINDS = (
 
 
 def prepare(folder: Path) -> None:
-    """Write the good files that the doors need beside the bad one."""
+    """Write the good files that the readers need beside the bad one."""
     write_ply(folder / "wall.ply", _sheet())
     GOOD_POINTS(folder / "scan.ply")
     _raster(folder / "map.tif")
@@ -292,13 +290,15 @@ def prepare(folder: Path) -> None:
     (folder / "found.json").write_text(json.dumps([BOX]))
 
 
-def outcome(kind: Kind, door: str, fault: str) -> str:
-    """Return what a door does with a file that has a fault, in a prepared working folder: "refused", or what it does instead."""
+def outcome(kind: Kind, reader: str, fault: str) -> str:
+    """Return what a reader does with a file that has a fault, in a prepared working folder: "refused", or what it
+    does instead.
+    """
     file = Path(f"bad{kind.suffix}")
     make = kind.good if fault == NO_FAULT else kind.faults[fault]
     if make is not None:
         make(file)
-    through = kind.doors[door]
+    through = kind.readers[reader]
     if callable(through):
         try:
             through(file)
@@ -317,22 +317,22 @@ def outcome(kind: Kind, door: str, fault: str) -> str:
 
 
 def table(kind: Kind, found: dict[tuple[str, str], str]) -> str:
-    """Return the table of one kind of files: a row for each fault, a column for each door."""
-    lines = [f"| fault | {' | '.join(kind.doors)} |", "|---" * (len(kind.doors) + 1) + "|"]
-    lines += [f"| {fault} | {' | '.join(found[door, fault] for door in kind.doors)} |" for fault in kind.faults]
+    """Return the table of one kind of files: a row for each fault, a column for each reader."""
+    lines = [f"| fault | {' | '.join(kind.readers)} |", "|---" * (len(kind.readers) + 1) + "|"]
+    lines += [f"| {fault} | {' | '.join(found[reader, fault] for reader in kind.readers)} |" for fault in kind.faults]
     return "\n".join(lines)
 
 
 def tried(kind: Kind) -> dict[tuple[str, str], str]:
-    """Return what each door does with each fault, every time in a folder of its own."""
+    """Return what each reader does with each fault, each time in a new folder."""
     found, here = {}, Path.cwd()
-    for door in kind.doors:
+    for reader in kind.readers:
         for fault in kind.faults:
             with tempfile.TemporaryDirectory() as folder:
                 os.chdir(folder)
                 try:
                     prepare(Path())
-                    found[door, fault] = outcome(kind, door, fault)
+                    found[reader, fault] = outcome(kind, reader, fault)
                 finally:
                     os.chdir(here)
     return found

@@ -54,7 +54,7 @@ def chosen(prefix: str) -> list[Case]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("prefix", AT_THE_DOOR)
-def test_what_is_refused_at_the_door(prefix: str, materials: Path, tmp_path: Path) -> None:
+def test_what_is_refused_on_reading(prefix: str, materials: Path, tmp_path: Path) -> None:
     bad = []
     for number, case in enumerate(chosen(prefix)):
         if set(case.needs) <= {path.name for path in materials.iterdir()}:

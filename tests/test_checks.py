@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from make_checks import KINDS, NO_FAULT, PAGE, REFUSED, TAKEN, Kind, outcome, prepare, table
 
-CASES = [(kind, door, fault) for kind in KINDS for door in kind.doors for fault in kind.faults]
+CASES = [(kind, reader, fault) for kind in KINDS for reader in kind.readers for fault in kind.faults]
 
 
 @pytest.fixture(autouse=True)
@@ -19,23 +19,25 @@ def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     prepare(tmp_path)
 
 
-@pytest.mark.parametrize(("kind", "door", "fault"), CASES, ids=[f"{kind.title}, {door}, {fault}" for kind, door, fault in CASES])
-def test_every_door_refuses_every_fault(kind: Kind, door: str, fault: str) -> None:
-    assert outcome(kind, door, fault) == REFUSED
+@pytest.mark.parametrize(
+    ("kind", "reader", "fault"), CASES, ids=[f"{kind.title}, {reader}, {fault}" for kind, reader, fault in CASES]
+)
+def test_every_reader_refuses_every_fault(kind: Kind, reader: str, fault: str) -> None:
+    assert outcome(kind, reader, fault) == REFUSED
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind.good is not None], ids=lambda kind: kind.title)
 def test_a_file_without_a_fault_gets_through(kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Otherwise a command that refuses everything would seem to check everything."""
-    for number, door in enumerate(door for door in kind.doors if door not in kind.long):
+    for number, reader in enumerate(reader for reader in kind.readers if reader not in kind.long):
         folder = tmp_path / str(number)
         folder.mkdir()
         monkeypatch.chdir(folder)
         prepare(folder)
-        assert outcome(kind, door, NO_FAULT) == (REFUSED if door in kind.refusing else TAKEN), door
+        assert outcome(kind, reader, NO_FAULT) == (REFUSED if reader in kind.refusing else TAKEN), reader
 
 
 def test_the_page_has_every_cell() -> None:
     page = PAGE.read_text()
     for kind in KINDS:
-        assert table(kind, {(door, fault): REFUSED for door in kind.doors for fault in kind.faults}) in page
+        assert table(kind, {(reader, fault): REFUSED for reader in kind.readers for fault in kind.faults}) in page

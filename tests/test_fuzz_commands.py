@@ -1,7 +1,7 @@
 """Each command with random damage in arguments and files: exit status 0 or 2, one line of error, nothing left behind.
 
-The commands run in this process up to where their work begins (DOORS). FUZZ_EXAMPLES sets the number of cases of each command: 25
-here, 500 in benchmarks/fuzz.py, which with --through also goes further and measures time and memory.
+The commands run in this process up to where their work starts (WORK_STARTS). FUZZ_EXAMPLES sets the number of cases of each
+command: 25 here, 500 in benchmarks/fuzz.py, which with --through also goes further and measures time and memory.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from benchmarks.bad_inputs.run import said
 from pipeline.cli.main import COMMANDS
 from scene.common.errors import InputError
 
-DOORS = (
+WORK_STARTS = (
     "pipeline.run.simulation:_make_epochs",
     "pipeline.planning.inspect:inspect",
     "pipeline.comparison.comparison:compare",
@@ -52,11 +52,11 @@ def materials(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def _doors(monkeypatch: pytest.MonkeyPatch) -> None:
+def _stop_where_work_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     def stop(*_: Any, **__: Any) -> Any:
         raise InputError("the work would begin here")
 
-    for place in DOORS:
+    for place in WORK_STARTS:
         module, name = place.split(":")
         monkeypatch.setattr(import_module(module), name, stop)
     monkeypatch.setenv("KERAS_BACKEND", "none")  # is looked for after all else, and not found
@@ -66,7 +66,7 @@ def test_every_command_is_drawn() -> None:
     assert set(SET_UPS) == set(COMMANDS)
 
 
-@pytest.mark.usefixtures("_doors")
+@pytest.mark.usefixtures("_stop_where_work_starts")
 @pytest.mark.parametrize("command", SET_UPS)
 def test_a_command_with_odd_words_and_files(command: str, materials: Path, tmp_path: Path) -> None:
     numbers, before = count(), _peak_bytes()

@@ -432,13 +432,12 @@ def test_a_comment_on_the_place_of_ply_points_is_said(tmp_path: Path) -> None:
     assert read_points(tmp_path / "a.ply").notes == ("its header has 'offset 345200 6389400 0', which is not applied",)
 
 
-# --- every door
+# --- every reader
 
 
-def test_every_door_reads_the_unit_and_leaves_fillers_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """All readers treat a file in US feet alike.
-
-    They are `read_measurement` (gap, calibrate, compare --measured), Python's `measure`, and `surface`.
+def test_every_reader_uses_the_unit_and_leaves_fillers_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`read_measurement` (gap, calibrate, compare --measured), Python's `measure`, and `surface` read one file in US
+    feet alike.
     """
     case = tmp_path / "case"
     case.mkdir()

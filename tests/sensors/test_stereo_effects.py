@@ -84,10 +84,7 @@ def ray(camera: Camera, u: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def bouguet(left: Camera, right: Camera) -> tuple[FloatArray, FloatArray, float]:
-    """Return the rotations of the left and the right camera into the rectified frame, and the base.
-
-    Each camera is turned by half of the relative rotation, then the base is turned to x.
-    """
+    """Return rotations into the rectified frame (x along the base), each by half of the relative rotation, and the base."""
     half = Rotation.from_rotvec(0.5 * Rotation.from_matrix(left.rotation.T @ right.rotation).as_rotvec())
     base = half.inv().apply(left.rotation.T @ (right.position - left.position))
     axis = np.cross(base, [1.0, 0, 0])
@@ -101,9 +98,7 @@ def bouguet(left: Camera, right: Camera) -> tuple[FloatArray, FloatArray, float]
 
 @dataclass(frozen=True)
 class Change:
-    """Real minus nominal camera: interior, rotation vector in its own frame, shift in the world; row jitter (amplitude, period,
-    phase).
-    """
+    """Real minus nominal camera: interior, rotation vector (own frame), shift (world), jitter (amplitude, period, phase)."""
 
     interior: dict[str, float]
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -128,9 +123,7 @@ NONE = Change({})
 
 
 def recorded(pair: CameraPair, left: Change, right: Change, normal: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
-    """Return the points (n, 3), wall frame, that a matcher with the nominal calibration reports for left pixels of a plane
-    through 0.
-    """
+    """Return the points (n, 3), wall frame, that a nominally calibrated matcher finds for left pixels of a plane through 0."""
     nominal = pair.in_wall_frame(FRAME)
     real_left, real_right = left.apply(nominal.left), right.apply(nominal.right)
     sight = ray(real_left, u - left.displacement(v), v) @ real_left.rotation.T
