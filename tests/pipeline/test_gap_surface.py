@@ -222,7 +222,7 @@ BAD = {
     "all NaN": "no point with finite values",
     "scanner": "needs laser scans",
     "half": "half works only with laser scans",
-    "cameras too": "whose cameras are not at hand",
+    "cameras too": "--photographs: cannot be combined with --cameras",
     "a model in pixels": "a model whose noise is in metres",
     "cameras in the model": "the model has focal_length",
 }
