@@ -291,9 +291,7 @@ def prepare(folder: Path) -> None:
 
 
 def outcome(kind: Kind, reader: str, fault: str) -> str:
-    """Return what a reader does with a file that has a fault, in a prepared working folder: "refused", or what it
-    does instead.
-    """
+    """Return what a reader does with a faulty file in a prepared working folder: "refused", or what it does instead."""
     file = Path(f"bad{kind.suffix}")
     make = kind.good if fault == NO_FAULT else kind.faults[fault]
     if make is not None:

@@ -436,9 +436,7 @@ def test_a_comment_on_the_place_of_ply_points_is_said(tmp_path: Path) -> None:
 
 
 def test_every_reader_uses_the_unit_and_leaves_fillers_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`read_measurement` (gap, calibrate, compare --measured), Python's `measure`, and `surface` read one file in US
-    feet alike.
-    """
+    """`read_measurement` (gap, calibrate, compare --measured), Python's `measure`, and `surface` read US feet alike."""
     case = tmp_path / "case"
     case.mkdir()
     write_scan(case, 1, step_rad=0.012)
