@@ -66,13 +66,38 @@ def pages() -> Iterator[dict[str, str]]:
 
 
 def messages() -> Iterator[dict[str, str]]:
-    """Errors that users see, as they stand in the code."""
+    """Errors that users see, as they stand in the code, with the texts that the module keeps in constants."""
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            texts = _constants(tree)
+            for node in ast.walk(tree):
                 if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "InputError" and node.args:
-                    parts = [ast.unparse(node.args[0]), *(f"{key.arg}: {ast.unparse(key.value)}" for key in node.keywords)]
+                    filled = _WithTexts(texts).visit(node)
+                    parts = [ast.unparse(filled.args[0]), *(f"{key.arg}: {ast.unparse(key.value)}" for key in filled.keywords)]
                     yield {"where": f"{path.relative_to(ROOT)}:{node.lineno}", "text": "; ".join(parts)}
+
+
+def _constants(tree: ast.Module) -> dict[str, ast.expr]:
+    """Return the texts that a module assigns to names at its top level."""
+    return {
+        target.id: node.value
+        for node in tree.body
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant | ast.JoinedStr)
+        for target in node.targets
+        if isinstance(target, ast.Name)
+    }
+
+
+class _WithTexts(ast.NodeTransformer):
+    """Put the text of a constant in the place of its name."""
+
+    def __init__(self, texts: dict[str, ast.expr]) -> None:
+        self._texts = texts
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        """Replace a name of a constant."""
+        return self._texts.get(node.id, node)
 
 
 def drawn(seed: int) -> list[dict[str, Any]]:
