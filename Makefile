@@ -9,6 +9,7 @@ help:
 	@echo 'make setup-all   what tests, documentation and benchmarks need too; the targets below do it themselves'
 	@echo 'make demo        simulate both sensors on the demo wall, into a new folder under runs/'
 	@echo 'make test        lint, spelling, types and tests'
+	@echo 'make validate    long statistical tests and trainings, as before a release (see docs/validation/tests.md)'
 	@echo 'make docs        the documentation site, in site/index.html'
 	@echo 'make format      put the code into the project'"'"'s format'
 	@echo 'make benchmarks  every benchmark that makes its own data, each with its ratio to the limit measured in the same run'
