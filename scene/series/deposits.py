@@ -116,7 +116,7 @@ def lay_fragments(
     height = float(box.mean(axis=0) @ ground.up) - ground.level_m
     generator = random.child("places").generator()
     start = box.mean(axis=0) + ground.aside * generator.normal(0.0, config.spread * max(height, 0.0), (len(shapes), 1))
-    start = start + ground.outward * (np.ptp(box, axis=0).max() + generator.random((len(shapes), 1)))
+    start = start + ground.outward * (np.ptp(box, axis=0).max() * (0.6 + 0.4 * generator.random((len(shapes), 1))))
     low, high = np.concatenate([start, box]).min(axis=0)[:2] - 2.0, np.concatenate([start, box]).max(axis=0)[:2] + 2.0
     low[1] = wall.vertices[:, 1].min()
     rows = faces_under_boxes(wall, np.stack([low, high])[None])

@@ -168,3 +168,9 @@ def _touch(box: FloatArray, other: FloatArray, distance_m: float) -> bool:
     """Return whether two boxes (2, 3) are nearer in x and in y than a distance, m."""
     gap = np.maximum(box[0, :2] - other[1, :2], other[0, :2] - box[1, :2])
     return bool(gap.max() < max(distance_m, 1e-9))
+
+
+def no_blocks() -> Blocks:
+    """Return an empty collection of blocks."""
+    start = np.zeros(1, dtype=np.int32)
+    return Blocks(np.empty((0, 3)), np.empty((0, 3), dtype=np.int32), start, start, (), np.empty((0, 3)), np.empty((0, 3)))
