@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from scene.common.config import Config
 from scene.common.keyed_random import KeyedRandom
-from scene.geometry.mesh import FloatArray
+
+FloatArray = NDArray[np.float64]
 
 
 class Cycle(Config):
