@@ -20,8 +20,8 @@ from pipeline.export.perspective import PerspectiveView, draw_wall
 from pipeline.formats.files.atomic import write_bytes, writing
 from pipeline.report.figures import COLOURS, DIFFERENCE_LABEL, SCALE_SIGMAS, SEQUENTIAL
 from pipeline.report.page import litres, millimetres
-from pipeline.report.progress import Progress
 from pipeline.report.plain_text import plain_text
+from pipeline.report.progress import Progress
 from pipeline.report.words import counted
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray, TriangleMesh
