@@ -20,14 +20,14 @@ class Cycle(Config):
     largest_after_h: float = Field(0.0, description="when it is largest, after the first epoch [h]")
 
 
-class Table(Config):
+class TimeTable(Config):
     """Values at some times, with straight lines between them and the first and last value beyond."""
 
     hours: tuple[float, ...] = Field(min_length=1, description="times after the first epoch, increasing [h]")
     values: tuple[float, ...] = Field(min_length=1, description="values at these times, in the quantity's unit")
 
     @model_validator(mode="after")
-    def _paired(self) -> Table:
+    def _paired(self) -> TimeTable:
         if len(self.hours) != len(self.values):
             raise ValueError(f"{len(self.hours)} hours need as many values, got {len(self.values)}")
         if not np.all(np.diff(self.hours) > 0):
@@ -41,7 +41,7 @@ class Course(Config):
     random_walk: float = Field(0.0, ge=0, description="standard deviation of the change in one day; it grows as the root of time")
     drift: float = Field(0.0, description="change per day")
     cycle: Cycle | None = Field(None, description="a sine, such as that of the day's temperature")
-    table: Table | None = Field(None, description="values at some times")
+    table: TimeTable | None = Field(None, description="values at some times")
 
     @model_validator(mode="after")
     def _changing(self) -> Course:

@@ -14,7 +14,7 @@ LAST_SHARE = 0.01
 """Share of the lead time before failure at which a block that follows the inverse-velocity law has moved by `displacement_m`."""
 
 
-class PowerLaw(Config):
+class MagnitudeFrequency(Config):
     """Magnitude-frequency law of rockfalls: N(> V) = a V^-exponent between the smallest and the largest volume.
 
     Dussauge, Grasso, Helmstetter (2003), "Statistical analysis of rockfall volume distributions: implications for rockfall
@@ -26,7 +26,7 @@ class PowerLaw(Config):
     largest: float = Field(1.0, ge=1e-6, le=1e6, description="largest volume [m3]")
 
     @model_validator(mode="after")
-    def _ordered(self) -> PowerLaw:
+    def _ordered(self) -> MagnitudeFrequency:
         if self.largest < self.smallest:
             raise ValueError("largest must not be below smallest")
         return self
@@ -40,7 +40,7 @@ class PowerLaw(Config):
 class VolumeLaw(Config):
     """Distribution of the volumes of rockfalls."""
 
-    power_law: PowerLaw = PowerLaw()
+    power_law: MagnitudeFrequency = MagnitudeFrequency()
 
 
 class RockfallRate(Config):

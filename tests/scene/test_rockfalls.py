@@ -15,7 +15,7 @@ from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import TriangleMesh, signed_volumes
 from scene.ray_casting.raycast import RayCaster
-from scene.series.config import DepositsConfig, EventConfig, Motion, PowerLaw, PrecursorConfig, RockfallRate, VolumeLaw
+from scene.series.config import DepositsConfig, EventConfig, MagnitudeFrequency, Motion, PrecursorConfig, RockfallRate, VolumeLaw
 from scene.series.deposits import Ground
 from scene.series.events import drawn_rockfalls, given_rockfalls, numbered
 from scene.series.evolution import Rules, WallState, advanced
@@ -44,7 +44,7 @@ def closed_volume(mesh: TriangleMesh) -> float:
 
 
 def test_volumes_follow_the_power_law_and_times_are_a_poisson_process() -> None:
-    law = PowerLaw(exponent=0.7, smallest=0.01, largest=2.0)
+    law = MagnitudeFrequency(exponent=0.7, smallest=0.01, largest=2.0)
     rate = RockfallRate(rate_per_day=40.0, volume_m3=VolumeLaw(power_law=law))
     found = drawn_rockfalls(rate, None, 24.0 * 100, RANDOM)
     assert len(found) == pytest.approx(4000, abs=4 * 4000**0.5)
