@@ -11,6 +11,8 @@ from pipeline.formats.files.atomic import filling, write_json
 from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.planning.maps import Plan, plans
 from pipeline.planning.report import write_plan_report
+from pipeline.planning.series import SeriesPlan
+from pipeline.planning.series_report import series_parts
 from pipeline.report.map_styles import quantity_style
 from pipeline.report.progress import Progress
 from pipeline.report.provenance import versions
@@ -37,18 +39,18 @@ def inspect(config: SimulationConfig, sensors: Sequence[SensorName], progress: P
     return found
 
 
-def write_plans(out: Path, config: SimulationConfig, found: Sequence[Plan]) -> Path:
-    """Write maps, plan.json and report.html; return the report's path.
+def write_plans(out: Path, config: SimulationConfig, found: Sequence[Plan], series: Sequence[SeriesPlan] = ()) -> Path:
+    """Write maps, plan.json and report.html, with the promises of `series` if given; return the report's path.
 
     Maps are named <sensor>_<map>.tif, or <sensor>_station_<n>_<map>.tif for one of several stations; SI, wall frame. The
     folder appears when everything has been written. Raises InputError if it is in use.
     """
     with filling(out) as folder:
-        _write(folder, config, found)
+        _write(folder, config, found, series)
     return out / REPORT_FILE
 
 
-def _write(out: Path, config: SimulationConfig, found: Sequence[Plan]) -> None:
+def _write(out: Path, config: SimulationConfig, found: Sequence[Plan], series: Sequence[SeriesPlan]) -> None:
     """Write everything into the folder."""
     for each in found:
         for plotted in each.maps:
@@ -60,8 +62,9 @@ def _write(out: Path, config: SimulationConfig, found: Sequence[Plan]) -> None:
         "schema": 1,
         "seed": config.seed,
         "plans": [each.to_dict() for each in found],
+        **({"series": [each.to_dict() for each in series]} if series else {}),
         "config": config.model_dump(mode="json"),
         "versions": versions(),
     }
     write_json(out / PLAN_FILE, record)
-    write_plan_report(out / REPORT_FILE, found, config.model_dump(mode="json"))
+    write_plan_report(out / REPORT_FILE, found, config.model_dump(mode="json"), series_parts(series))

@@ -96,11 +96,24 @@ def _in_the_middle(plan: Plan, name: str) -> float | None:
     return next(found for found in plan.maps if found.name == name).summary(plan.in_middle)["middle"]
 
 
-def write_plan_report(path: Path, plans: Sequence[Plan], config: Mapping[str, Any]) -> None:
-    """Write report.html completely or not at all. Equal arguments give equal bytes."""
+def write_plan_report(path: Path, plans: Sequence[Plan], config: Mapping[str, Any], series: Sequence[Any] = ()) -> None:
+    """Write report.html completely or not at all. Equal arguments give equal bytes.
+
+    Parameters
+    ----------
+    path : Path
+        The page.
+    plans : sequence of Plan
+        What it shows.
+    config : mapping
+        The resolved config.
+    series : sequence of SeriesPart
+        Promises of series.
+    """
     page = template("planning/report.html.jinja").render(
         title=f"{plans[0].wall.replace('_', ' ').capitalize()}: a plan",
         parts=[_part(plan) for plan in plans],
+        series=series,
         depth_ratio=plans[0].config.depth_ratio,
         config=yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True),
     )

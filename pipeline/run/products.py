@@ -112,22 +112,49 @@ def write_epoch(out: Path, config: SimulationConfig, site: SensorSite, reference
         images = list(_images(out, config, epoch, reference, name))
         sigma = max(epoch.statistics.outside.nmad, 1e-4) if epoch.statistics.outside.count else 1e-3
         difference_style(out / f"{name}.tif", SCALE_SIGMAS * sigma)
-        masks = epoch.raster.block != WALL
-        write_bytes(out / f"{name}.png", difference_figure(epoch.difference, grid, epoch.raster.block, sigma))
-        largest = sorted(epoch.blocks, key=lambda record: -record["volume_m3"])
-        captions = {record["label"]: f"{litres(record['volume_m3'])} l" for record in largest}
-        zooms = blocks_figure(epoch.difference, grid, epoch.raster.block, sigma, captions)
-        if zooms is not None:
-            write_bytes(out / f"blocks_{epoch.number:03d}.png", zooms)
-        write_bytes(
-            out / f"hillshade_{epoch.number:03d}.png", hillshade_figure(epoch.raster.heights, grid, f"Epoch {epoch.number}")
-        )
-        histogram = histogram_figure(epoch.difference[~masks], epoch.difference[masks])
-        write_bytes(out / f"histogram_{epoch.number:03d}.png", histogram)
-        if epoch.registration is not None:
-            write_bytes(out / f"icp_{epoch.number:03d}.png", convergence_figure(epoch.registration.history))
+        if _is_pictured(epoch):
+            _write_pictures(out, name, reference, epoch, sigma)
         write_json(folder / EPOCH_RECORD, _record(config, epoch, images, sigma))
     return _checksums(out, written)
+
+
+def _is_pictured(epoch: LaterEpoch) -> bool:
+    """Return whether an epoch has pictures: in a series, only those have in which rocks fell since the epoch before."""
+    if epoch.since_last is None or not epoch.rockfalls:
+        return True
+    new = epoch.since_last.block
+    return bool(((new > WALL) & (new <= epoch.rockfalls)).any())
+
+
+def _write_pictures(out: Path, name: str, reference: ReferenceEpoch, epoch: LaterEpoch, sigma: float) -> None:
+    """Write the report's pictures of an epoch.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the run.
+    name : str
+        Name of the difference map, without suffix.
+    reference : ReferenceEpoch
+        The reference.
+    epoch : LaterEpoch
+        The epoch.
+    sigma : float
+        Noise that sets the colour scale, m.
+    """
+    grid = reference.raster.grid
+    masks = epoch.raster.block != WALL
+    write_bytes(out / f"{name}.png", difference_figure(epoch.difference, grid, epoch.raster.block, sigma))
+    largest = sorted(epoch.blocks, key=lambda record: -record["volume_m3"])
+    captions = {record["label"]: f"{litres(record['volume_m3'])} l" for record in largest}
+    zooms = blocks_figure(epoch.difference, grid, epoch.raster.block, sigma, captions)
+    if zooms is not None:
+        write_bytes(out / f"blocks_{epoch.number:03d}.png", zooms)
+    write_bytes(out / f"hillshade_{epoch.number:03d}.png", hillshade_figure(epoch.raster.heights, grid, f"Epoch {epoch.number}"))
+    histogram = histogram_figure(epoch.difference[~masks], epoch.difference[masks])
+    write_bytes(out / f"histogram_{epoch.number:03d}.png", histogram)
+    if epoch.registration is not None:
+        write_bytes(out / f"icp_{epoch.number:03d}.png", convergence_figure(epoch.registration.history))
 
 
 def _checksums(out: Path, written: list[Path]) -> Checksums:
