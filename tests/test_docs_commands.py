@@ -212,7 +212,7 @@ PARSED = (
     "scarpsim dataset split sets/thirteen --by sensor --out sets/thirteen_by",
     "scarpsim detect detector/best runs/bulga --out found",
     "scarpsim detect default runs/bulga --out found",
-    "scarpsim detect default runs/bulga --unmirrored",
+    "scarpsim detect default runs/bulga --mirrored",
     "scarpsim detect default sets/direct/test --out found",
     "scarpsim evaluate sets/direct/test found/detections.json --by size_class --confidence 0.95",
     "scarpsim detect baseline runs/bulga --out found_by_threshold",

@@ -122,7 +122,7 @@ def _save(form: str, run: Any, number: int, path: Path, width: int, progress: An
             save_gltf(run, number, path)
         return
     if form == "copc":
-        from pipeline.run.products import write_cloud
+        from pipeline.run.clouds import write_cloud
 
         with progress.stage("points"):
             write_cloud(path, *run.survey_points(number))
