@@ -19,7 +19,7 @@ from pipeline.precision.detectability import (
     smallest_block,
     smallest_clear_block,
 )
-from pipeline.precision.surface import BoolArray, Places, WallRaster, seen_from, wall_raster
+from pipeline.precision.surface import BoolArray, Places, WallRaster, visible_from, wall_raster
 from pipeline.run.site import SensorSite
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
@@ -167,8 +167,8 @@ def _stereo_plan(wall: str, pair: StereoPair, caster: RayCaster, raster: WallRas
     """Compute the plan of a stereo pair."""
     places, nominal = raster.places, pair.cameras.in_wall_frame(pair.frame)
     found = stereo.stereo_geometry(pair, places, config.image_sigma_px)
-    left = found.in_left & seen_from(caster, places, nominal.left.position)
-    right = found.in_right & seen_from(caster, places, nominal.right.position)
+    left = found.in_left & visible_from(caster, places, nominal.left.position)
+    right = found.in_right & visible_from(caster, places, nominal.right.position)
     both = left & right
     _require_seen(both, "no part of the wall is seen by both cameras", "cameras")
     middle = middle_places(raster, both)
@@ -218,7 +218,7 @@ def _tls_plan(
     """Compute the plan of one station of a laser scanner."""
     places = raster.places
     found = tls.tls_geometry(scanner, places)
-    in_sight = seen_from(caster, places, scanner.position)
+    in_sight = visible_from(caster, places, scanner.position)
     seen = in_sight & found.reached
     _require_seen(
         seen, "no part of the wall is seen by the scanner", "station" if station is None else f"station, number {station}"

@@ -90,7 +90,7 @@ def wall_raster(caster: RayCaster, gsd_m: float | None = None) -> WallRaster:
     return WallRaster(grid, found.reshape(grid.shape), places)
 
 
-def seen_from(caster: RayCaster, places: Places, viewpoint: FloatArray) -> BoolArray:
+def visible_from(caster: RayCaster, places: Places, viewpoint: FloatArray) -> BoolArray:
     """Return whether each place (n,) faces `viewpoint` (3,), m, with nothing in between."""
     facing = np.einsum("ni,ni->n", places.normals, places.points - viewpoint) < 0
     origin = vector(viewpoint)
