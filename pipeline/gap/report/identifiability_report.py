@@ -40,7 +40,17 @@ class _Row:
 
 
 def write_identifiability(out: Path, found: Sequence[Identifiability]) -> Path:
-    """Write the files of one analysis per sensor into `out` and return the path of report.html."""
+    """Write report.html, identifiability.json and the figures into a folder.
+
+    Parameters
+    ----------
+    out : folder to write.
+    found : one analysis for each sensor.
+
+    Returns
+    -------
+    Path : path of report.html.
+    """
     record = {"schema": 1, "surveys": [each.to_dict() for each in found], "versions": versions()}
     write_json(out / "identifiability.json", record)
     pictures = {each.sensor: matrix_figure(list(each.names), each.cosines, each.survival) for each in found}
@@ -59,7 +69,7 @@ def write_identifiability(out: Path, found: Sequence[Identifiability]) -> Path:
 
 
 def summarise(found: Identifiability) -> str:
-    """Return what the analysis says, as a paragraph."""
+    """Return the result of an analysis as a paragraph: which effects the pose hides, and which pairs look alike."""
     weak = [name for name, share in zip(found.names, found.survival, strict=True) if share < 0.1]
     pairs = found.similar_pairs()
     parts = [f"{_INSTRUMENTS[found.sensor]}, {found.points:,} points on smooth parts of the wall."]

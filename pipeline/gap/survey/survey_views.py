@@ -87,8 +87,7 @@ class SurveyView:
 
     @property
     def sigma(self) -> FloatArray:
-        """(n,) predicted standard deviations in the unit of the observable, with which a subsample has the weight of all points.
-        """
+        """(n,) predicted standard deviations in the unit of the observable; they give a subsample the weight of all points."""
         return self.residuals.sigma * np.sqrt(len(self.residuals) / max(self.point_count, 1))
 
 
