@@ -53,7 +53,7 @@ class TlsResiduals(Residuals):
 
     @property
     def reference_variance(self) -> FloatArray:
-        """(n,) variance of the ranges that errors of the reference's vertices cause, m²: the sum of squared weights times theirs."""
+        """(n,) variance of the ranges, m², that independent errors of the reference's vertices cause."""
         return _reference_variance(self.reference_error_m, self.geometry)
 
     @property
