@@ -160,8 +160,8 @@ def page(effect: type[Effect], comparison: Comparison) -> str:
         f"The map shows the recorded {_quantity(effect)} with the effect of the example minus that without it. Red is farther"
         f" away, as missing rock would be. {SCENES[effect.sensor]} There is no other noise.",
         _figures(comparison),
-        "[From symptom to cause](../gap/symptoms.md) compares the maps of all effects. The [glossary](../glossary.md) explains the"
-        " words. `docs/make_gallery.py` writes this page from the code; do not edit it.",
+        "[From symptom to cause](../gap/symptoms.md) compares the maps of all effects. The [glossary](../glossary.md) explains"
+        " the words. `docs/make_gallery.py` writes this page from the code; do not edit it.",
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -210,8 +210,8 @@ def _figures(comparison: Comparison) -> str:
     spread = 1.4826 * np.median(np.abs(values - median))
     return (
         f"Over all cells the difference has a mean of {values.mean():.2f} mm, a standard deviation of {values.std():.2f} mm and"
-        f" an NMAD of {spread:.2f} mm. The effect leaves {100 * comparison.lost.sum() / cells:.2f} % of the cells without a value,"
-        f" and gives a value to {100 * comparison.gained.sum() / cells:.2f} % that have none without it."
+        f" an NMAD of {spread:.2f} mm. The effect leaves {100 * comparison.lost.sum() / cells:.2f} % of the cells without a"
+        f" value, and gives a value to {100 * comparison.gained.sum() / cells:.2f} % that have none without it."
     )
 
 
