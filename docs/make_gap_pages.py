@@ -217,8 +217,8 @@ def symptoms_page(found: list[Symptom], tables: dict[str, Identifiability]) -> s
     lines = [
         "# From symptom to cause",
         "",
-        "This page shows how each effect of [the catalogue](../effects/README.md) looks in a map of the residuals. It is for users"
-        " who see a pattern in such a map and look for its cause. `docs/make_gap_pages.py` writes it; do not edit it.",
+        "This page shows how each effect of [the catalogue](../effects/README.md) looks in a map of the residuals. It is for"
+        " users who see a pattern in such a map and look for its cause. `docs/make_gap_pages.py` writes it; do not edit it.",
         "",
         "A *residual* is the measured minus the predicted range or depth, in mm. Each map shows the residuals that one effect of"
         " typical size makes on a generated wall, seen from 105 m without noise, **after a shift and a rotation of the sensor are"
@@ -228,9 +228,10 @@ def symptoms_page(found: list[Symptom], tables: dict[str, Identifiability]) -> s
         "| column | meaning |",
         "|---|---|",
         "| pattern | what the residuals depend on: their mean, their standard deviation, or where there are none |",
-        "| left by the pose fit | share of the effect's pattern, as a root mean square, that no shift or rotation of the sensor"
-        " imitates |",
-        f"| looks like | effects whose pattern has a correlation (cosine) of at least {SIMILAR_COSINE:g} with this one on that wall |",
+        "| left by the pose fit | share of the effect's pattern, as a root mean square, that no shift or rotation of the"
+        " sensor imitates |",
+        f"| looks like | effects whose pattern has a correlation (cosine) of at least {SIMILAR_COSINE:g} with this one on that"
+        " wall |",
     ]
     for kind, title in _KINDS.items():
         rows = [each for each in found if each.kind == kind]
@@ -370,10 +371,10 @@ def verdicts() -> dict[str, Verdict]:
     }  # fmt: skip
 
 
-_TERMS = """An *effect* is a sensor error of [the catalogue](../effects/README.md). The *gap* is how far the measurement lies from the
-model's prediction, *before* and *after* the named effects are in the model. The *floor* is what the model's own noise leaves. The
-[glossary](../glossary.md#model-and-measurement) explains further words, and [how gap works](../../explanation/how_gap_works.md)
-the tests."""
+_TERMS = """An *effect* is a sensor error of [the catalogue](../effects/README.md). The *gap* is how far the measurement lies from
+the model's prediction, *before* and *after* the named effects are in the model. The *floor* is what the model's own noise leaves.
+The [glossary](../glossary.md#model-and-measurement) explains further words, and
+[how gap works](../../explanation/how_gap_works.md) the tests."""
 _PICTURES = """The maps show how much deeper the surface was measured than predicted, and the measured over the predicted standard
 deviation. On the left is the model before the named effects, on the right after them. The bar shows the gap on the validation
 blocks."""
@@ -384,8 +385,8 @@ def verdict_page(name: str, verdict: Verdict, found: GapDiagnosis) -> str:
     pictures = [_PICTURES, f"![maps](images/verdict_{name}.png)", f"![gap](images/gap_{name}.png)"]
     parts = [
         f"# {name}",
-        f"`{name}` is a verdict of `scarpsim gap`, which compares a measurement with the model of its sensor. This page is for users"
-        f" who got it. It says:",
+        f"`{name}` is a verdict of `scarpsim gap`, which compares a measurement with the model of its sensor. This page is for"
+        " users who got it. It says:",
         f"> {VERDICTS[name]}",
         _TERMS,
         f"## When it is given\n\n{verdict.when}",
@@ -394,8 +395,8 @@ def verdict_page(name: str, verdict: Verdict, found: GapDiagnosis) -> str:
         f"> {paragraph(found, rank_disagreements(found))}",
         f"The terminal shows:\n\n```text\n{summarise(found)}\n```",
         *(pictures if found.gap is not None else []),
-        "[From symptom to cause](symptoms.md) shows the pattern of each effect. `docs/make_gap_pages.py` writes this page; do not edit"
-        " it.",
+        "[From symptom to cause](symptoms.md) shows the pattern of each effect. `docs/make_gap_pages.py` writes this page; do not"
+        " edit it.",
     ]
     return "\n\n".join(parts) + "\n"
 
