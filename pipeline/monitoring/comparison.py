@@ -90,7 +90,7 @@ def compare_epoch(reference: ReferenceHeights, points: FloatArray, stable: Seque
         return found, find_regions(found)
 
     _, regions = changed(alignment.stable)
-    change, regions = changed(alignment.quiet & ~_surely_changed(regions, difference.shape))
+    change, regions = changed(alignment.stable & ~_surely_changed(regions, difference.shape))
     return EpochChange(alignment.transform.after(first), alignment, change, regions)
 
 

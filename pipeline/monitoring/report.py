@@ -59,10 +59,10 @@ def headline(result: Result) -> list[str]:
         parts = [_kind_in_words(epoch, kind) for kind in ("missing", "added")]
         found = "; ".join(part for part in parts if part) or "no change beyond the level of detection"
         marked = sum(bool(region.marks) for region in epoch.regions)
-        doubtful = f" {marked} of them have a mark: something else may have feigned the change." if marked else ""
+        doubtful = f" An edge, vegetation or noise may explain {marked} of {len(epoch.regions)} events (marked)." if marked else ""
         told.append(
-            f"Epoch {epoch.number}, {epoch.source.name}{when}: {found}. A pixel shows changes from "
-            f"{1e3 * epoch.record.level_m:.1f} mm on (95 %).{doubtful}"
+            f"Epoch {epoch.number}, {epoch.source.name}{when}: {found}. The level of detection of "
+            f"a single pixel is {1e3 * epoch.record.level_m:.1f} mm (95 %, median).{doubtful}"
         )
     return told
 

@@ -37,13 +37,14 @@ from pipeline.gap.naming.verdict import (
     reduced_noise,
     verdict_of,
 )
+from pipeline.gap.noise_and_edges.heavy_tails import HeavyTails, find_heavy_tails
 from pipeline.gap.noise_and_edges.missing_returns import (
     LOSS_EFFECTS,
     LossExplanation,
     count_isolated_returns,
     explain_missing_returns,
 )
-from pipeline.gap.noise_and_edges.variance_model import HeavyTails, VarianceScore, find_heavy_tails
+from pipeline.gap.noise_and_edges.variance_model import VarianceScore
 from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.scene_changes import SceneChange, moved_share
