@@ -66,8 +66,8 @@ def markdown(found: Json) -> str:
         _READING,
         "## What the measurements hold\n\n" + _NUISANCES,
         "## Compared with two simple methods\n\nBoth take residuals as independent and give one name: the effect with the "
-        "largest |z| (estimate over its standard error) above 3, or the best effect by the Bayesian information criterion (BIC) if "
-        "it is ahead by more than 10.\n\n" + _baselines(found),
+        "largest |z| (estimate over its standard error) above 3, or the best effect by the Bayesian information criterion (BIC) "
+        "if it is ahead by more than 10.\n\n" + _baselines(found),
         "## Answers by effect\n\nEach true effect counts once, also those of measurements with several effects, "
         "which the figures above leave out. Weak effects,\nwith S/N x sin(angle) below 8, are in brackets. "
         "A name that begins with `off_` is an error outside the catalogue.\n\n" + _by_effect(found["by_effect"]),

@@ -50,8 +50,8 @@ _WORDS = """| kind of measurement | what it contains |
 | unknown, no_gap, insufficient_data | this [verdict](../reference/glossary.md#model-and-measurement), and no effect |
 
 The right answer is `no_gap` for the kinds none and change, and `unknown` for off. "Ratio" is the signal-to-noise ratio of an
-effect, in brackets what is left of it when the most similar other effect is fitted too. "p of what remains" is the p-value of the misfit
-that is left. Intervals are binomial, 95 %.
+effect, in brackets what is left of it when the most similar other effect is fitted too. "p of what remains" is the p-value of
+the misfit that is left. Intervals are binomial, 95 %.
 """
 LEVEL_90 = float(norm.ppf(0.95))
 EDGED = ("strips", "tiles")
@@ -183,7 +183,8 @@ the program's assumptions. It is for users who want to know how far the results 
 - {right} of {len(clear)} clear effects are answered rightly: their signal-to-noise ratio is at least {CLEAR:.0f} beside the most
   similar other effect.
 - {len(wrong)} of {len(spoke)} answers that name an effect contain a wrong name.
-- {rejected} of {len(quiet)} measurements without an effect are not answered with `no_gap`, and {_named(quiet)} of them name an effect.
+- {rejected} of {len(quiet)} measurements without an effect are not answered with `no_gap`, and {_named(quiet)} of them
+  name an effect.
 - {blamed} of {len(moved)} measurements in which only rock fell are not answered with `no_gap`.
 """
 
