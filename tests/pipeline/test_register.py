@@ -323,7 +323,13 @@ def test_errors_name_what_is_wrong(reference: ReferenceSurface) -> None:
         (points, points, normals[:-1], {}, r"reference normals: expected shape \(240, 3\)"),
         (points, points, normals * 0, {}, "reference normals: 240 of 240 are zero"),
         (points, points, None, {}, "icp.method: point_to_plane needs"),
-        (points, points, normals, {"subsample_points": True, "subsample_ratio": 0.99}, "icp.subsample_ratio: the subsample would leave only 2 of 240"),
+        (
+            points,
+            points,
+            normals,
+            {"subsample_points": True, "subsample_ratio": 0.99},
+            "icp.subsample_ratio: the subsample would leave only 2 of 240",
+        ),
         (points + 0.4, points, normals, {"outlier_distance_threshold": 1e-4}, "icp.outlier_distance_threshold: only"),
     ]
     for moving, target, directions, values, message in cases:

@@ -43,7 +43,7 @@ def title(found: GapDiagnosis) -> str:
     """Return the outcome as a headline."""
     names = [" or ".join([effect.name, *effect.alike]) for effect in found.effects if effect.kind == "physical"]
     match found.verdict:
-        case "no_gap" | "unknown" if found.evidence.only_too_noisy(found.effects):
+        case "no_gap" | "unknown" if found.evidence.only_noise_too_large(found.effects):
             return "No missing effect was found, but the model is too noisy"
         case "no_gap":
             return "No effect is missing"
@@ -54,11 +54,11 @@ def title(found: GapDiagnosis) -> str:
         case "unknown" if not found.effects:
             return "Measurement and model disagree, and nothing that was tried explains it"
         case "unknown" if not any(effect.kind == "empirical" for effect in found.effects):
-            if found.evidence.stays_open:
+            if found.evidence.gap_stays_open:
                 return f"{join_words(names)} closes little of the gap: something else is missing"
-            if found.evidence.supports_nothing:
+            if found.evidence.effects_unsupported:
                 return f"{join_words(names)} does not make the gap smaller: something else may be missing"
-            if found.evidence.stays_rejected:
+            if found.evidence.misfit_stays:
                 return f"{join_words(names)} leaves a misfit larger than chance would: something else is missing"
             return f"{join_words(names)}, and something that adds noise to the residuals"
         case "unknown" if isinstance(found.residuals, SurfaceResiduals):

@@ -195,3 +195,21 @@ def _moves_rays_far(pose: FloatArray, residuals: Residuals) -> bool:
         if shift > 0 and np.linalg.norm(own[:3]) + turn / shift * np.linalg.norm(own[3:]) > _RETRACE_FROM_M:
             return True
     return False
+
+
+def at_points_of(found: Residuals, part: Residuals) -> Residuals:
+    """Restrict residuals to the points of other residuals.
+
+    Points that are no longer on smooth surface, or that became outliers, are left out.
+
+    Parameters
+    ----------
+    found : residuals to restrict, for example with other effects in the model.
+    part : residuals of the points to keep.
+    """
+    registered_residuals, _, noise_ratio = fit_pose_robustly(found)
+    good = found.usable & (np.abs(registered_residuals) < thresholds().points.outlier_sigmas * noise_ratio * found.sigma)
+    place = np.full(int(max(found.index.max(initial=-1), part.index.max())) + 1, -1)
+    place[found.index[good]] = np.flatnonzero(good)
+    rows = place[part.index]
+    return found.part(rows[rows >= 0])
