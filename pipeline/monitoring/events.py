@@ -183,8 +183,8 @@ def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change
     """Measure the region of a mask whose pixels all have data.
 
     Volume and significance are those of the whole mask. Heights come from 3 x 3 pixels, so that a sharp edge is spread over
-    neighbouring ones: outline and area are those of the pixels with at least `_EDGE_SHARE` of the largest depth around them, and the
-    median depth is that of the pixels with at least half of it.
+    neighbouring ones: outline and area are those of the pixels with at least `_EDGE_SHARE` of the largest depth around them, and
+    the median depth is that of the pixels with at least half of it.
     """
     row, column, mask = _padded(mask, row, column, change.difference.shape)
     window = (slice(row, row + mask.shape[0]), slice(column, column + mask.shape[1]))
