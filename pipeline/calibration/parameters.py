@@ -40,11 +40,11 @@ _ALLOWED = {
 
 @dataclass(frozen=True)
 class NoiseParameters:
-    """The parameters of one sensor model that are fitted, and their bounds.
+    """The noise parameters of a sensor model that a calibration fits, and their bounds.
 
     Attributes
     ----------
-    base : The model before the calibration.
+    base : The sensor model before the calibration.
     names : (k,) names of the parameters.
     low, high : (k,) bounds, in the parameters' units. The search itself works on natural logarithms.
     """
@@ -55,7 +55,7 @@ class NoiseParameters:
     high: FloatArray
 
     def model(self, values: Sequence[float] | FloatArray) -> Model:
-        """Return the base model with these (k,) parameter values; everything else, effects included, stays unchanged."""
+        """Return the sensor model with these (k,) parameter values; everything else, effects included, stays unchanged."""
         found = dict(zip(self.names, (float(value) for value in values), strict=True))
         noise = self.base.noise
         plain: dict[str, Any] = {name: value for name, value in found.items() if not name.startswith(ORIENTATION)}
@@ -64,7 +64,7 @@ class NoiseParameters:
         return self.base.model_copy(update={"noise": noise.model_copy(update=plain)})
 
     def meaning(self, name: str) -> str:
-        """Describe a parameter in the words of the config, without its unit."""
+        """Describe a parameter in words, as the config's documentation does, without its unit."""
         if name == ORIENTATION:
             return "all sigmas of the orientation, as a multiple of the config's"
         section, _, key = name.rpartition(".")
@@ -73,7 +73,7 @@ class NoiseParameters:
         return f"standard deviation: {words}" if section else words
 
     def values(self, logarithms: FloatArray) -> FloatArray:
-        """Convert (..., k) natural logarithms to parameter values, clipped to the bounds."""
+        """Convert natural logarithms of the parameters (..., k) to parameter values, clipped to the bounds."""
         return np.clip(np.exp(logarithms), self.low, self.high)
 
 
@@ -89,7 +89,7 @@ def _orientation(base: OrientationNoise, found: dict[str, float]) -> Orientation
 
 
 def noise_parameters(base: Model, names: Sequence[str]) -> NoiseParameters:
-    """Return the parameters to fit.
+    """Select the noise parameters of a sensor model to fit, and choose their bounds.
 
     Parameters
     ----------

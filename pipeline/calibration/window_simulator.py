@@ -59,21 +59,21 @@ class _Patch:
 
 
 class WindowSimulator:
-    """Simulates difference maps of noise alone in windows of the wall.
+    """Simulates difference maps that contain only noise, in windows of the wall, which is much faster than whole maps.
 
     Parameters
     ----------
-    config, site : As for a whole simulation.
+    config, site : Config and site as for a whole simulation.
     windows : Windows on the grid of the measured maps.
     of_points : Whether a pixel is the mean distance of its points from the wall; otherwise two surfaces are compared.
-    reference_error : Error of the surface that the points are compared with.
+    reference_error : Error of the surface that the points are compared with; None for none.
 
     Attributes
     ----------
     observations : Number of observations simulated so far.
     cells : Flat indices of the sensor cells that each observation traces.
     caster : The wall, for ray casting.
-    silent : The sensor model with its effects but without noise.
+    noiseless_model : The sensor model with its effects but without noise.
 
     Raises
     ------
@@ -106,11 +106,11 @@ class WindowSimulator:
 
     @cached_property
     def target(self) -> ReferenceSurface:
-        """The noiseless wall, which observations are registered to."""
+        """The wall without noise, to which observations are registered."""
         return ReferenceSurface.build(self.site.mesh.vertices, self.site.mesh.vertex_normals())
 
     def maps(self, model: Model, epochs: int, random: KeyedRandom) -> FloatArray:
-        """Simulate difference maps in the windows.
+        """Simulate difference maps of an unchanged wall in the windows.
 
         Each map subtracts a later epoch from the same noisy reference epoch. Maps of points instead measure the distance to the
         known wall; the simulated error of that wall is then the same in all epochs.
@@ -141,7 +141,7 @@ class WindowSimulator:
         return self.windows.cut(values)
 
     def heights(self, model: Model, random: KeyedRandom) -> FloatArray:
-        """Return the (k, n, n) heights, m, of one noisy observation's surface after registration; NaN without data."""
+        """Simulate one observation and return the (k, n, n) heights of its surface in the windows, m; NaN without data."""
         return self._raster(self._surface(self._registered(model, random)))
 
     def _registered(self, model: Model, random: KeyedRandom) -> FloatArray:
