@@ -150,12 +150,18 @@ def _maps(paths: Sequence[Path], config: SimulationConfig, random: KeyedRandom) 
         return found, tuple(f"epoch {number}" for number in range(1, len(found.maps) + 1))
     for path in paths:
         if path.suffix.lower() not in (".tif", ".tiff"):
-            raise InputError("not a difference map", where=str(path), allowed="one folder, or GeoTIFFs of one grid")
+            raise InputError(
+                "the file is not a difference map",
+                where=str(path),
+                allowed="one folder of results or measurements, or GeoTIFFs that share a grid",
+            )
     rasters, grids = zip(*map(read_geotiff, paths), strict=True)
     for path, grid in zip(paths, grids, strict=True):
         if grid != grids[0]:
             raise InputError(
-                f"the grid {grid} differs from {grids[0]} of {paths[0].name}", where=str(path), remedy="resample to one grid"
+                f"the grid {grid} differs from {grids[0]} of {paths[0].name}",
+                where=str(path),
+                remedy="resample the maps to one grid",
             )
     return MeasuredMaps("maps", grids[0], np.stack(rasters), None), tuple(path.stem for path in paths)
 

@@ -29,7 +29,9 @@ def with_model(site: SensorSite, model: StereoModel) -> SensorSite:
     """
     if not isinstance(site.sensor, StereoPair):
         raise InputError(
-            "noise maps need simulated matching", where="matcher", remedy="use the stereo sensor with matcher: simulated"
+            "noise can only be varied for a stereo pair with simulated matching",
+            where="sensor, matcher",
+            remedy="use the stereo sensor with matcher: simulated",
         )
     return replace(site, sensor=replace(site.sensor, model=model))
 

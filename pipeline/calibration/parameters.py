@@ -108,8 +108,8 @@ def noise_parameters(base: Model, names: Sequence[str]) -> NoiseParameters:
             raise InputError(
                 f"'{name}' is not a noise parameter of the {base.sensor} sensor", where="calibration.fit", remedy=hint
             )
-    if len(set(chosen)) < len(chosen):
-        raise InputError("a parameter is listed twice", where="calibration.fit")
+    if twice := sorted({name for name in chosen if chosen.count(name) > 1}):
+        raise InputError(f"{twice[0]} is listed twice", where="calibration.fit", remedy="list each parameter once")
     bounds = np.array([_bounds(base, name) for name in chosen])
     return NoiseParameters(base, chosen, bounds[:, 0], bounds[:, 1])
 
@@ -143,5 +143,9 @@ def _bounds(base: Model, name: str) -> tuple[float, float]:
         return _BOUNDS[name]
     sigma = getattr(base.noise.orientation, name.removeprefix(f"{ORIENTATION}.")).sigma
     if not sigma > 0:
-        raise InputError("its sigma in the model is 0, so its scale is unknown", where=f"calibration.fit: {name}")
+        raise InputError(
+            f"the sigma of {name} is 0 in the model, so its scale is unknown",
+            where="calibration.fit",
+            remedy="give it a sigma in the model, or leave it out",
+        )
     return _OF_SIGMA[0] * sigma, _OF_SIGMA[1] * sigma

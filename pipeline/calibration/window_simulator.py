@@ -205,7 +205,9 @@ class WindowSimulator:
             rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
             if len(rows) == 0:
                 raise InputError(
-                    "the sensor does not see a window of the measured maps", where="cameras, station", remedy="check the site"
+                    "the simulated sensor does not see a part of the wall that the measured maps show",
+                    where="cameras, station",
+                    remedy="give it the position and direction of the measurement",
                 )
             span = [
                 slice(max(int(place[0]) - _MARGIN_CELLS, 0), min(int(place[-1]) + _MARGIN_CELLS + 1, size))
@@ -251,19 +253,19 @@ def _sensor_for_cells(sensor: StereoPair | LaserScanner, model: Model, cells: ND
 def _supported_sensor(config: SimulationConfig, site: SensorSite) -> StereoPair | LaserScanner:
     """Return the sensor, or raise InputError if it cannot be simulated cell by cell."""
     if not isinstance(site.sensor, StereoPair | LaserScanner):
-        raise InputError("noise parameters need simulated matching", where="matcher", allowed="simulated")
+        raise InputError("the noise of a real matcher cannot be fitted", where="matcher", allowed="simulated")
     if site.further_stations:
         raise InputError("cannot calibrate with several stations", where="station", remedy="keep only the station of the maps")
     if config.reconstruction != "direct" or config.surface.method != "grid" or config.surface.holes != "keep":
         raise InputError(
-            "calibration reconstructs the surface from the sensor's own grid",
+            "a calibration needs a surface that is made directly from the sensor's own grid",
             where="reconstruction, surface",
             allowed="reconstruction: direct, surface: {method: grid, holes: keep}",
         )
     if names := effects_needing_neighbours(site.sensor.model):
         raise InputError(
-            f"{', '.join(names)}: needs the whole picture or scan, but calibration simulates only windows of it",
+            f"calibration simulates only parts of a picture or scan, and these effects need all of it: {', '.join(names)}",
             where="sensor.effects",
-            remedy="remove it from the model",
+            remedy="remove them from the model",
         )
     return site.sensor

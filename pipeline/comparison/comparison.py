@@ -68,7 +68,11 @@ def compare_sensors(
         If the sizes, a measured folder or a sensor cannot be used.
     """
     if sizes_m is not None and not 0 < sizes_m[0] <= sizes_m[1]:
-        raise InputError(f"got {sizes_m[0]:g} and {sizes_m[1]:g} m", where="--sizes-m", allowed="0 < smallest <= largest")
+        raise InputError(
+            f"the block sizes {sizes_m[0]:g} and {sizes_m[1]:g} m are not a range",
+            where="--sizes-m",
+            allowed="0 < smallest <= largest",
+        )
     progress = progress or Progress()
     progress.plan({"figures": _FIGURES_S * len(sensors)})
     config = sensors[0].config

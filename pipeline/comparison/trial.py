@@ -192,7 +192,7 @@ def _check_one_frame(sensors: Sequence[SensorSetup], sites: Sequence[SensorSite]
     for each, site in zip(sensors, sites, strict=True):
         if not np.allclose(site.frame.matrix, sites[0].frame.matrix, atol=1e-9):
             raise InputError(
-                f"faces another side of the wall than {sensors[0].name}",
+                f"the sensor faces another side of the wall than {sensors[0].name}",
                 where=each.name,
                 remedy="compare sensors that face the same side",
             )
