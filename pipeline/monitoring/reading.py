@@ -194,7 +194,7 @@ def find_epochs(paths: Sequence[Path], times: Sequence[str] = ()) -> list[EpochS
                 raise InputError("is given twice", where=str(file), remedy="name each epoch once")
             seen[real] = source.name
     timed = [
-        EpochSource(source.path, source.files, time_of(source.path, given), source.run)
+        EpochSource(source.path, source.files, time_of(source.path if source.run is None else source.files[0], given), source.run)
         for source, given in zip(found, times or itertools.repeat(None, len(found)), strict=True)
     ]
     check_order([source.time for source in timed], [source.name for source in timed])

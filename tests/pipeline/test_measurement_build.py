@@ -389,7 +389,7 @@ def asked(*more: str, reference: str = "wall.ply", scanner: str = "riegl_vz400i"
 
 
 BAD: dict[str, tuple[Callable[[Case, Path], list[str]], str]] = {
-    "no reference": (lambda case, folder: [str(as_laz(case, folder)), "--scanner", "x"], "a mesh, a cloud, another epoch, or half"),
+    "no reference": (lambda case, folder: [str(as_laz(case, folder)), "--scanner", "x"], "a mesh, a cloud, another epoch"),
     "no such reference": (asked(reference="no.ply"), "no.ply: there is no such file"),
     "no such scanner": (asked(scanner="riegl_vz400j"), "riegl_vz400i"),
     "millimetres": (move(lambda points: 1000 * points), "add --unit mm"),

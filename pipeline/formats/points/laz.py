@@ -67,14 +67,36 @@ class PulseChannels:
 
 @dataclass(frozen=True)
 class LazHeader:
-    """Header values. scale_m: step of the stored coordinates; date: of the file; wkt: coordinate system, if known."""
+    """Header values.
+
+    Attributes
+    ----------
+    scale_m : float
+        Step of the stored coordinates, m.
+    date : datetime.date
+        Date of the file.
+    wkt : str
+        Coordinate system, if known.
+    standard_time : bool
+        Whether the points' times are GPS seconds since 1980-01-06 minus 1e9, as `gps_seconds` gives; else seconds from any
+        moment.
+    """
 
     scale_m: float = 1e-6
     date: datetime.date = datetime.date(2000, 1, 1)
     wkt: str = ""
+    standard_time: bool = False
 
 
 _PLAIN, _USUAL = PulseChannels(), LazHeader()
+_GPS_START = datetime.datetime(1980, 1, 6, tzinfo=datetime.UTC)
+_LEAP_SECONDS, _ADJUSTED_S = 18, 1e9
+"""GPS time minus UTC since 2017, and what LAS subtracts from GPS seconds (LAS 1.4, global encoding)."""
+
+
+def gps_seconds(time: datetime.datetime) -> float:
+    """Return a time in UTC as LAS stores standard GPS time, s."""
+    return (time - _GPS_START).total_seconds() + _LEAP_SECONDS - _ADJUSTED_S
 
 
 @dataclass(frozen=True)
@@ -271,6 +293,8 @@ def _header(cloud: PointCloud, given: LazHeader, full_scale: float) -> laspy.Las
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.generating_software, header.system_identifier, header.creation_date = "scarpsim", "scarpsim", given.date
     header.global_encoding.wkt = True  # required for point formats from 6
+    if given.standard_time:
+        header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     header.add_extra_dims([laspy.ExtraBytesParams(name, channel.dtype) for name, channel in cloud.extra.items()])
     for record in header.vlrs.get("ExtraBytesVlr"):
         for dimension in record.extra_bytes_structs:  # without extremes, which laspy takes from the first point of each piece
