@@ -256,7 +256,7 @@ def symptoms_page(found: list[Symptom], tables: dict[str, Identifiability]) -> s
 def _alike(name: str, table: Identifiability) -> str:
     if name not in table.names:
         return ""
-    return ", ".join(table.names[other].partition(".")[2] for other in table.alike(table.names.index(name)))
+    return ", ".join(table.names[other].partition(".")[2] for other in table.similar_effects(table.names.index(name)))
 
 
 def make_symptoms() -> None:

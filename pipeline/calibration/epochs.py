@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pipeline.change.difference import DifferenceStatistics, statistics
-from pipeline.noise.statistics import Normality, TailFigures, normality, tails, without_outliers
+from pipeline.noise.statistics import Normality, TailFigures, normality, tail_figures, without_outliers
 from pipeline.noise.variogram import Variogram, VariogramModel, effective_sample_size, fit_variogram, variogram
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -89,7 +89,9 @@ def epoch_noise(name: str, stable: NDArray[np.floating], windows: FloatArray, gs
     independent = sum(
         effective_sample_size(model, ~np.isnan(part), gsd_m) for part in windows if np.count_nonzero(~np.isnan(part))
     )
-    return EpochNoise(name, statistics(stable), tails(stable), normality(windows, independent, random), found, model, independent)
+    return EpochNoise(
+        name, statistics(stable), tail_figures(stable), normality(windows, independent, random), found, model, independent
+    )
 
 
 def trend(values: Sequence[float]) -> Trend:

@@ -26,7 +26,7 @@ from pipeline.comparison.detection_curve import DetectionCurve, detection_curve
 from pipeline.comparison.trial import SensorObservations, Trial
 from pipeline.noise.measured import MeasuredMaps
 from pipeline.noise.statistics import (
-    Bin,
+    BinStatistics,
     DensityHistogram,
     Normality,
     TailFigures,
@@ -34,7 +34,7 @@ from pipeline.noise.statistics import (
     normality,
     quantile_edges,
     statistics_by_bin,
-    tails,
+    tail_figures,
     without_outliers,
 )
 from pipeline.noise.variogram import Variogram, VariogramModel, effective_sample_size, fit_variogram, variogram
@@ -64,7 +64,7 @@ class MapNoise:
     ----------
     stable : Statistics pooled over the epochs.
     per_epoch : Statistics of each epoch.
-    tails, normality, histogram : Shape of the distribution.
+    tail_figures, normality, histogram : Shape of the distribution.
     variogram, model : Empirical variogram of the differences within five NMAD, and the fitted model.
     effective : Number of independent pixels on the first map's stable ground, which has `pixels` pixels.
     pixels : Stable pixels of the first map.
@@ -198,7 +198,7 @@ class SensorAssessment:
     sensor: str
     noise: MapNoise
     wall: DifferenceStatistics
-    by: dict[str, list[Bin]]
+    by: dict[str, list[BinStatistics]]
     detection: DetectionSummary
     visible: float
     complete: float
@@ -245,7 +245,7 @@ def map_noise(stable: Raster, gsd_m: float, random: KeyedRandom) -> MapNoise:
     return MapNoise(
         stable=statistics(stable),
         per_epoch=[statistics(each) for each in stable],
-        tails=tails(stable),
+        tails=tail_figures(stable),
         normality=normality(stable[0], effective, random.child("normality")),
         histogram=histogram(stable),
         variogram=found,
@@ -315,12 +315,12 @@ def _scan_seconds(seen: SensorObservations) -> float | None:
     return float(sum(each.depth.size * (each.pulse_interval_s or 0.0) for each in looks))
 
 
-def _by_covariates(stable: Raster, trial: Trial, seen: SensorObservations) -> dict[str, list[Bin]]:
+def _by_covariates(stable: Raster, trial: Trial, seen: SensorObservations) -> dict[str, list[BinStatistics]]:
     """Compute statistics of the stable differences by range, incidence angle, distance from edges, and albedo."""
     step = int(np.ceil(np.sqrt(stable.size / _MOST_BINNED)))
     part = stable[:, ::step, ::step]
 
-    def against(covariate: NDArray[np.floating], edges: FloatArray | None = None) -> list[Bin]:
+    def against(covariate: NDArray[np.floating], edges: FloatArray | None = None) -> list[BinStatistics]:
         thinned = covariate[::step, ::step]
         return statistics_by_bin(part, np.broadcast_to(thinned, part.shape), quantile_edges(thinned) if edges is None else edges)
 

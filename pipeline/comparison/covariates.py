@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from pipeline.precision.surface import Places, seen_from
+from pipeline.precision.surface import Places, visible_from
 from scene.common.backend import dr
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray
@@ -134,7 +134,7 @@ def visible(wall: UntouchedWall, caster: RayCaster, viewpoints: Sequence[FloatAr
     places = Places(
         wall.points[wall.found], wall.normals[wall.found].astype(np.float64), wall.albedo[wall.found].astype(np.float64)
     )
-    seen = np.stack([seen_from(caster, places, viewpoint) for viewpoint in viewpoints])
+    seen = np.stack([visible_from(caster, places, viewpoint) for viewpoint in viewpoints])
     result = np.zeros(wall.found.shape, dtype=bool)
     result[wall.found] = seen.all(axis=0) if every else seen.any(axis=0)
     return result

@@ -123,11 +123,17 @@ def covariate_figure(found: Sequence[SensorAssessment]) -> bytes:
     panels = figure.subplots(2, 2, sharey=True).ravel()
     for axes, (key, (label, factor)) in zip(panels, COVARIATES.items(), strict=True):
         for colour, each in zip(_colours(len(found)), found, strict=True):
-            bins = [item for item in each.by[key] if item.of.count]
+            bins = [item for item in each.by[key] if item.statistics.count]
             high = [item.high if np.isfinite(item.high) else 2 * item.low for item in bins]
             middle = [(item.low + top) / 2 * factor for item, top in zip(bins, high, strict=True)]
             axes.plot(
-                middle, [item.of.nmad * 1e3 for item in bins], "o-", color=colour, markersize=3.5, linewidth=1.2, label=each.name
+                middle,
+                [item.statistics.nmad * 1e3 for item in bins],
+                "o-",
+                color=colour,
+                markersize=3.5,
+                linewidth=1.2,
+                label=each.name,
             )
         if key == "edge_m":
             _metric(axes)
