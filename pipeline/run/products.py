@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.change.annotate import LabelledImage, coco
+from pipeline.change.annotate import LabelledImage, by_kind, coco
 from pipeline.change.difference import statistics
 from pipeline.change.m3c2 import M3c2Map
 from pipeline.change.tiles import tiles
@@ -31,7 +31,7 @@ from pipeline.formats.rasters.geotiff import write_geotiff, write_tiff
 from pipeline.formats.records.run_files import epoch_folder
 from pipeline.run.acquisition import Acquisition
 from pipeline.run.epoch import LaterEpoch, ReferenceEpoch
-from pipeline.run.recorded_points import recorded_points, scans_of
+from pipeline.run.recorded_points import at_time, recorded_points, scans_of
 from pipeline.run.site import SensorSite
 from pipeline.surface.metashape_export import write_metashape_export
 from scene.blocks.block import Blocks
@@ -45,6 +45,8 @@ Checksums = dict[str, str]
 """SHA-256 of files by their names relative to the run's folder."""
 M3C2_ANNOTATIONS = "annotations_m3c2"
 """Key in an epoch's record, and the name of the run's file."""
+CHANGE_ANNOTATIONS = "annotations_change"
+"""The same for the maps of the change since the epoch before, in a series."""
 
 
 def is_whole(out: Path, checksums: Checksums, where: Path) -> bool:
@@ -63,13 +65,14 @@ def write_reference(
     from pipeline.run import pictures  # loads slowly, so not before it is needed
 
     with noting() as written, _folder(out, 0) as folder:
-        _write_common(folder, config, site, seen, reference.surface, reference.caster.mesh, [])
+        _write_common(folder, config, site, 0, seen, reference.surface, reference.caster.mesh, [])
         pictures.write_reference_pictures(out, reference)
         record = {
             "epoch": 0,
             **_seen_record(seen),
             "blocks": [],
-            "annotations": coco([], config.annotation),
+            **_time(config, 0),
+            "annotations": _annotations(config, [], 1 if config.series else 0),
         }
         write_json(folder / EPOCH_RECORD, record)
     return _checksums(out, written)
@@ -82,7 +85,7 @@ def write_epoch(out: Path, config: SimulationConfig, site: SensorSite, reference
     name = f"difference_{epoch.number:03d}"
     grid = reference.raster.grid
     with noting() as written, _folder(out, epoch.number) as folder:
-        _write_common(folder, config, site, epoch.seen, epoch.surface, epoch.carved.mesh, epoch.blocks)
+        _write_common(folder, config, site, epoch.number, epoch.seen, epoch.surface, epoch.carved.mesh, epoch.blocks)
         write_geotiff(
             out / f"{name}.tif", epoch.difference, grid, description="reference minus epoch, m; missing rock is positive"
         )
@@ -90,6 +93,9 @@ def write_epoch(out: Path, config: SimulationConfig, site: SensorSite, reference
             _write_block_meshes(folder / "blocks", site.mesh, epoch.solids)
         if epoch.m3c2 is not None:
             _write_m3c2(out, epoch.number, epoch.m3c2)
+        if epoch.since_last is not None:
+            path, words = out / f"change_{epoch.number:03d}.tif", "epoch before minus epoch, m; missing rock is positive"
+            write_geotiff(path, epoch.since_last.difference, grid, description=words)
         images = list(_images(out, config, epoch, reference, name))
         sigma = max(epoch.statistics.outside.nmad, 1e-4) if epoch.statistics.outside.count else 1e-3
         pictures.write_epoch_pictures(out, epoch, grid, sigma)
@@ -116,9 +122,33 @@ def _record(config: SimulationConfig, epoch: LaterEpoch, images: list[LabelledIm
             "sigma_m": sigma,
         },
         "blocks": epoch.blocks,
-        "annotations": coco(images, config.annotation),
+        **_time(config, epoch.number),
+        "annotations": _annotations(config, images, epoch.rockfalls),
+        **_change_record(config, epoch),
         **({} if epoch.m3c2 is None else _m3c2_record(config, epoch.number, epoch.m3c2)),
     }
+
+
+def _annotations(config: SimulationConfig, images: list[LabelledImage], rockfalls: int) -> dict[str, Any]:
+    """Annotate images. In a series, only missing rock is annotated, or all kinds, each as a category of its own."""
+    if config.series is not None and not config.series.kinds and rockfalls:
+        images = [replace(each, block=np.where(each.block <= rockfalls, each.block, WALL).astype(np.int32)) for each in images]
+    found = coco(images, config.annotation)
+    return by_kind(found, rockfalls) if config.series is not None and config.series.kinds and rockfalls else found
+
+
+def _change_record(config: SimulationConfig, epoch: LaterEpoch) -> dict[str, Any]:
+    """Make the part of an epoch's record about the change since the epoch before."""
+    if epoch.since_last is None:
+        return {}
+    labels = np.where(np.isnan(epoch.since_last.difference), WALL, epoch.since_last.block).astype(np.int32)
+    image = LabelledImage(f"change_{epoch.number:03d}.tif", labels, epoch.raster.grid, epoch.number)
+    return {CHANGE_ANNOTATIONS: _annotations(config, [image], epoch.rockfalls)}
+
+
+def _time(config: SimulationConfig, number: int) -> dict[str, str]:
+    """Return the time of an epoch of a series for its record."""
+    return {} if config.series is None else {"time": config.series.when(number).isoformat().replace("+00:00", "Z")}
 
 
 def _m3c2_record(config: SimulationConfig, number: int, found: M3c2Map) -> dict[str, Any]:
@@ -167,18 +197,23 @@ def _write_common(
     folder: Path,
     config: SimulationConfig,
     site: SensorSite,
+    number: int,
     seen: Acquisition,
     surface: TriangleMesh,
     truth: TriangleMesh,
     blocks: list[dict[str, Any]],
 ) -> None:
     """Write what every epoch has: points, depth map, surface, truth, blocks."""
-    from pipeline.run import clouds  # loads slowly, so not before it is needed
+    from pipeline.formats.points.laz import LazHeader, gps_seconds
+    from pipeline.run import clouds  # these load slowly, so not before they are needed
 
     products = config.products
-    cloud = recorded_points(seen.observations)
-    clouds.write_cloud(folder / "points.laz", cloud)
-    clouds.write_formats(folder / "points", products.formats, cloud, partial(scans_of, seen.observations), "")
+    cloud, header = recorded_points(seen.observations), LazHeader()
+    if config.series is not None:
+        cloud = at_time(cloud, gps_seconds(config.series.when(number)))
+        header = LazHeader(date=config.series.when(number).date(), standard_time=True)
+    clouds.write_cloud(folder / "points.laz", cloud, header)
+    clouds.write_formats(folder / "points", products.formats, cloud, partial(scans_of, seen.observations), header)
     if seen.observation.sensor == "stereo":
         depth = seen.observation.depth.astype(np.float32)
         write_tiff(folder / "depth_left.tif", depth, description="depth along the left camera's axis, m")
@@ -189,11 +224,10 @@ def _write_common(
     write_json(folder / "blocks.json", blocks)
     if products.world or (products.world is None and isinstance(config.wall, ImportedWall)):
         cloud = replace(cloud, points=site.frame.to_world(cloud.points))
-        wkt = wkt_of(products.crs, "products.crs") if products.crs else ""
-        clouds.write_cloud(folder / "points_world.laz", cloud, wkt)
-        clouds.write_formats(
-            folder / "points_world", products.formats, cloud, partial(scans_of, seen.observations, site.frame), wkt
-        )
+        header = replace(header, wkt=wkt_of(products.crs, "products.crs") if products.crs else "")
+        scans = partial(scans_of, seen.observations, site.frame)
+        clouds.write_cloud(folder / "points_world.laz", cloud, header)
+        clouds.write_formats(folder / "points_world", products.formats, cloud, scans, header)
         if products.surface:
             write_ply(folder / "surface_world.ply", _in_world(surface, site))
     if products.metashape and seen.depth_maps is not None:
