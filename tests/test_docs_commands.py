@@ -253,6 +253,7 @@ NAMED = (
     "scarpsim compare CONFIG [CONFIG ...] [--measured FOLDER ...] [--epochs N] [--sizes-m FIRST LAST | --blocks config] "
     "[--own-step]",
     "scarpsim detect",
+    "scarpsim evaluate",
     "scarpsim export",
     "scarpsim gap",
     "scarpsim gap --identifiability",

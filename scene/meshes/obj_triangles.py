@@ -26,7 +26,7 @@ def read_triangles(text: bytes) -> TriangleMesh | None:
     """
     if b"\\" in text:  # lines that go on in the next one
         return None
-    lines = _Lines(text)
+    lines = _ObjLines(text)
     vertex, face = lines.which(b"v"), lines.which(b"f")
     other = np.unique(lines.first[~(vertex | face)])
     if not vertex.any() or not face.any() or not set(other.tolist()) <= set(_IGNORED):
@@ -44,7 +44,7 @@ def read_triangles(text: bytes) -> TriangleMesh | None:
     return TriangleMesh(vertices, faces.astype(np.int32))
 
 
-class _Lines:
+class _ObjLines:
     """The lines of a text. first: (n,) their first bytes."""
 
     def __init__(self, text: bytes) -> None:
