@@ -353,7 +353,7 @@ def _converged(given: SearchInput, first: MeanSearch, alone: _SingleFit) -> _Sin
 
 
 def _search_beside(given: SearchInput, chosen: SearchOutcome) -> SearchOutcome | None:
-    """Repeat the search further the selected effects; None where there are none, or where one is out of bounds."""
+    """Search for effects in addition to the selected ones; None if there are none, or if one is out of bounds."""
     physical = [each for each in chosen.estimates if not each.candidate.empirical]
     if not physical or out_of_bounds(given.measurement, chosen.estimates, chosen.residuals):
         return None
