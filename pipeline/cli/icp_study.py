@@ -71,7 +71,12 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
     from scene.common.keyed_random import KeyedRandom
 
     if not 0 <= arguments.offset_m <= MOST_OFFSET_M:
-        raise InputError(f"got {arguments.offset_m:g}", where="--offset-m", allowed=f"0 to {MOST_OFFSET_M:g} m")
+        raise InputError(
+            f"got {arguments.offset_m:g}",
+            where="--offset-m",
+            allowed=f"0 to {MOST_OFFSET_M:g} m",
+            remedy="give a length in metres",
+        )
     out = empty_folder(arguments.out or new_folder(Path("runs"), "icp_study"))
     with shown_progress(quiet=arguments.quiet) as progress:
         if arguments.source.is_dir():

@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
     """Mesh the point cloud and write the PLY file."""
     out = arguments.out
     if out.suffix.lower() != ".ply":
-        raise InputError(f"got '{out.suffix}'", where="--out", allowed=".ply")
+        raise InputError(f"got '{out.suffix}'", where="--out", allowed=".ply", remedy="choose a file name that ends in .ply")
     if out.exists():
         raise InputError("exists already", where=str(out), remedy="choose another name with --out")
     import numpy as np

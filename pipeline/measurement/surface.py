@@ -80,7 +80,7 @@ def _check(request: Request) -> None:
 def _read(path: Path, request: Request) -> RawScan:
     """Read the points of a cloud, the vertices of a mesh, or the pixels of an elevation model."""
     if not path.is_file():
-        raise InputError("there is no such file", where=str(path), allowed="a cloud, a mesh, a DEM")
+        raise InputError("there is no such file", where=str(path), allowed="a cloud, a mesh, a DEM", remedy="check the path")
     if path.suffix.lower() in DEMS:
         dem = reference_from_dem(path, request.unit)
         words = ("the heights of an elevation model", *dem.words[1:])
@@ -145,7 +145,12 @@ def _model(request: Request, cloud: RawScan, reference: Reference) -> tuple[Ster
     if request.model is not None:
         model = read_model(request.model)
         if not isinstance(model, StereoModel):
-            raise InputError("the model is of a laser scanner", where=str(request.model), allowed="sensor: stereo")
+            raise InputError(
+                "the model is of a laser scanner",
+                where=str(request.model),
+                allowed="sensor: stereo",
+                remedy="name a model of a stereo pair with --model",
+            )
         check_in_metres(model, str(request.model))
         return model, (f"as in {request.model}",)
     guess = StereoModel(

@@ -249,7 +249,7 @@ def test_configs_by_object_mapping_file_and_keyword_are_one(run: Run, tmp_path: 
     [
         (lambda: configure(rockfall__cuont=5), "did you mean 'count'"),
         (lambda: configure("glendal"), "did you mean 'glendale'"),
-        (lambda: simulate(), "the config has both; give sensor='tls'"),
+        (lambda: simulate(), "and none was chosen; give sensor='tls'"),
         (lambda: simulate(sensor="radar"), "allowed: 'stereo', 'tls'"),
         (lambda: simulate(wall={"mesh": Path("nothing.ply")}, sensor="tls"), "nothing.ply"),
     ],

@@ -295,7 +295,7 @@ def read_model(path: Path) -> TlsModel | StereoModel:
 def sensor_model(values: Any, where: str) -> TlsModel | StereoModel:
     """Return the sensor model of a mapping of keys; where: name of the file, for errors."""
     if not isinstance(values, dict) or values.get("sensor") not in ("tls", "stereo"):
-        raise InputError("names no sensor", where=where, allowed="sensor: tls, sensor: stereo")
+        raise InputError("names no sensor", where=where, allowed="sensor: tls, sensor: stereo", remedy="add one of these lines")
     return parse(_ModelFile, {"sensor": values}, where).sensor
 
 
@@ -407,7 +407,8 @@ def _scanner_pose(config: MeasurementConfig, where: str) -> ScannerPose:
 
 def _check_sensor(config: MeasurementConfig, model: TlsModel | StereoModel, where: str) -> None:
     if model.sensor != config.sensor:
-        raise InputError(f"model is of sensor {model.sensor}, the measurement of {config.sensor}", where=where)
+        what = f"the model is of sensor {model.sensor}, the measurement of {config.sensor}"
+        raise InputError(what, where=where, remedy="name a model of the same sensor")
 
 
 def _check(found: Measurement, cloud: PointCloud, config: MeasurementConfig, where: str) -> None:
