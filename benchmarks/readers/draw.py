@@ -44,6 +44,8 @@ def definitions() -> Iterator[dict[str, str]]:
 def _public(node: ast.stmt, place: str) -> Iterator[dict[str, str]]:
     if not isinstance(node, ast.FunctionDef | ast.ClassDef) or node.name.startswith("_"):
         return
+    if any(ast.unparse(each) == "overload" for each in node.decorator_list):
+        return  # the function below the overloads has the docstring
     yield {"where": f"{place}: {node.name}", "text": f"{_signature(node)}\n{ast.get_docstring(node) or '(no docstring)'}"}
     for inner in node.body if isinstance(node, ast.ClassDef) else ():
         if isinstance(inner, ast.FunctionDef) and not inner.name.startswith("_") and ast.get_docstring(inner):

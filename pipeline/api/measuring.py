@@ -24,10 +24,9 @@ from pipeline.formats.measurements.measurement import (
     assembled,
     nominal_pair,
     read_measurement,
-    read_model,
-    sensor_model,
 )
 from pipeline.formats.measurements.measurement import Measurement as Measured
+from pipeline.formats.measurements.model_file import read_model, sensor_model
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points.points import read_points
 from pipeline.gap.naming import workflow

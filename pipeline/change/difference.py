@@ -90,7 +90,7 @@ def surface_raster(mesh: TriangleMesh, grid: Grid) -> SurfaceRaster:
 
 
 def cast_raster(caster: RayCaster, grid: Grid) -> SurfaceRaster:
-    """Do the same as `surface_raster` for a mesh that is already prepared for ray casting."""
+    """Rasterise a mesh (wall frame) that is already prepared for ray casting, as `surface_raster` does."""
     hits, point = caster.look_down(grid)
     z = mi.Float32(dr.select(hits.valid, point.z, np.nan))
     if caster.mesh.face_block is not None:

@@ -26,7 +26,7 @@ _DEFAULT_SPLIT_KEYS = "sensor,noise,size"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim dataset` on its parser."""
     parser.add_argument(
         "words",
         nargs="+",

@@ -25,7 +25,7 @@ FORMS = (*_SUFFIXES, *_SETS, "package")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim export` on its parser."""
     sets = " and ".join(_SETS)
     parser.add_argument("folder", type=Path, metavar="FOLDER", help=f"a run; for {sets} a data set; for package any result")
     parser.add_argument(

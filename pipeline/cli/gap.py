@@ -22,7 +22,7 @@ EXAMPLE = """  scarpsim gap my_measurement --out diagnosis
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim gap` on its parser."""
     parser.add_argument(
         "measurement",
         nargs="+",

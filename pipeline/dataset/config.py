@@ -43,7 +43,7 @@ class ScaledModel(Config):
         return self
 
     def on(self, wall: str) -> StereoModel | TlsModel:
-        """Return the model with its noise scaled for a wall."""
+        """Return the sensor model for maps of the given wall: its noise times the factor of that wall."""
         factor = self.scale[wall] if isinstance(self.scale, dict) else self.scale
         sigmas = {key: value for key, value in self.model.noise.model_dump().items() if key not in _NO_SIGMA}
         values = {key: _scaled(value, factor) for key, value in sigmas.items() if self.scaled in ("all", key)}

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.config.presets import read_preset
-from pipeline.formats.measurements.measurement import read_model
+from pipeline.formats.measurements.model_file import read_model
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.measurement.folder import Interpretation, MeasurementContent, write
 from pipeline.measurement.photogrammetry import describe_view, read_pair, viewing_rotation

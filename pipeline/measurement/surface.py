@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.formats.measurements.config import MeasurementConfig
-from pipeline.formats.measurements.measurement import Material, SurfaceMeasurement, assembled, read_model
+from pipeline.formats.measurements.measurement import Material, SurfaceMeasurement, assembled
+from pipeline.formats.measurements.model_file import read_model
 from pipeline.formats.measurements.surface_fit import air_side, check_in_metres
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.gap.residuals.surface_noise import estimate_surface_noise
