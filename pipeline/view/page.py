@@ -77,7 +77,7 @@ def layout(results: Results, other: Results | None = None) -> html.Main:
 
 
 def register_callbacks(app: dash.Dash, results: Results, lock: Lock, other: Results | None = None) -> None:
-    """Connect the page's parts.
+    """Connect the parts of the page, so that a choice in one redraws the others.
 
     Parameters
     ----------

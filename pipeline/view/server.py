@@ -66,6 +66,7 @@ def open_results(folder: Path, detections: Path | None = None) -> Results:
         where=str(folder),
         allowed="a run (run.json), a result of scarpsim gap (gap.json) or monitor (monitor.json), "
         "a split of a data set (annotations.json)",
+        remedy="give one of these folders",
     )
 
 
