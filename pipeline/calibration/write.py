@@ -20,20 +20,19 @@ from pipeline.report.provenance import versions
 from scene.common.keyed_random import KeyedRandom
 from scene.common.yaml_text import yaml_line
 from scene.geometry.mesh import FloatArray
-from scene.ray_casting.raycast import RayCaster
 
 MODEL_FILE, RECORD_FILE, REPORT_FILE = "calibrated.yaml", "calibration.json", "report.html"
 
 
 def write(out: Path, config: SimulationConfig, result: CalibrationResult, inputs: Sequence[Path]) -> Path:
-    """Write the result folder; it appears only when everything is in it.
+    """Write all files of a calibration into a folder, which appears only when everything is in it.
 
     Parameters
     ----------
     out : Folder to write.
     config : The resolved config.
     result : The calibration.
-    inputs : Paths that the maps were read from, for the record.
+    inputs : Paths from which the maps were read, for the record.
 
     Returns
     -------
@@ -71,12 +70,15 @@ def _whole_map(config: SimulationConfig, result: CalibrationResult) -> FloatArra
     """Simulate one map of the whole wall on the measured maps' grid, m; NaN where those have no data."""
     site = result.simulated_site()
     random = KeyedRandom(config.seed).child("calibrate", "whole")
-    values = noise_map(config, site, site, RayCaster(site.mesh), random, result.inputs.grid)
+    values = noise_map(config, site, site, site.caster_of(site.mesh), random, result.inputs.grid)
     return np.where(np.isnan(result.inputs.maps[-1]), np.float32(np.nan), values)
 
 
 def model_yaml(result: CalibrationResult) -> str:
-    """Return the calibrated sensor model as YAML for `simulate --set sensor=calibrated.yaml`, with the intervals as comments."""
+    """Return the calibrated sensor model as YAML, with the intervals as comments.
+
+    The file can be used as `simulate --set sensor=calibrated.yaml`.
+    """
     found, names = result.found, result.parameters.names
     share = result.confidence
     lines = [f"# Calibrated on {len(result.epochs)} difference map(s) by scarpsim calibrate; intervals of {100 * share:.0f} %."]
@@ -121,7 +123,12 @@ def to_dict(result: CalibrationResult) -> dict[str, Any]:
         "correlation": {"names": names, "matrix": found.correlation},
         "inseparable": [{"names": [first, second], "correlation": value} for first, second, value in result.inseparable()],
         "orientation_patterns": None if result.patterns is None else result.patterns.to_dict(),
-        "cost": {"value": found.cost, "statistics": len(result.statistics), "p_value": found.misfit_p, "settled": found.settled},
+        "cost": {
+            "value": found.cost,
+            "statistics": len(result.statistics),
+            "p_value": found.misfit_p,
+            "settled": found.converged,
+        },
         "statistics": [
             {"name": name, "measured": measured, "expected": mean, "log_sigma": sigma, "standardised": misfit}
             for name, measured, mean, sigma, misfit in zip(

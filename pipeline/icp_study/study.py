@@ -29,7 +29,7 @@ from pipeline.formats.records.result_files import read_surface
 from pipeline.formats.records.result_records import RUN_FILE, read_run
 from pipeline.formats.records.run_files import epoch_folder
 from pipeline.registration.closest_points import ReferenceSurface
-from pipeline.registration.register import IcpConfig, fit, register_to
+from pipeline.registration.register import IcpConfig, measure_fit, register_to
 from pipeline.registration.rigid import RigidTransform
 from pipeline.report.progress import Progress
 from pipeline.run.epoch import observe_epoch, observe_reference
@@ -53,7 +53,7 @@ _TO_TRUTH = IcpConfig(outlier_distance_threshold=0.2, threshold=0.0, delta_thres
 
 @dataclass(frozen=True)
 class StudyEpoch:
-    """An epoch to be registered.
+    """An epoch of the study, displaced by a known motion, that is to be registered.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class PoseError:
 
 @dataclass(frozen=True)
 class StudyRow:
-    """One registration.
+    """Result of one registration with one setting.
 
     Attributes
     ----------
@@ -387,7 +387,7 @@ class _PoseEvaluator:
             )
         error = self.error(found.transform, epoch.true)
         step = max(len(epoch.points) // _FIT_SAMPLE, 1)
-        fitted = fit(self.target, found.apply(epoch.points[::step]), config)
+        fitted = measure_fit(self.target, found.apply(epoch.points[::step]), config)
         return StudyRow(
             parameter,
             value,

@@ -87,7 +87,7 @@ class Alignment:
     def sigma(self, raster: HeightRaster) -> NDArray[np.float32]:
         """Standard deviation of the registration's effect on each pixel's height, (h, w), m; NaN without data."""
         design = _design(raster, self.centre)
-        variance = np.einsum("khw,kl,lhw->hw", design, self.covariance, design)
+        variance = (design * np.tensordot(self.covariance.astype(np.float32), design, 1)).sum(axis=0)
         return np.sqrt(np.maximum(variance, 0.0)).astype(np.float32)
 
     def to_dict(self) -> dict[str, Any]:
@@ -159,7 +159,7 @@ def refine(reference: HeightRaster, epoch: HeightRaster, areas: Sequence[Area]) 
     fit = _robust_fit(design, target, weight, expected)
     whole = _design(epoch, centre)
     for _ in range(_REFITS):
-        rest = np.where(compared, difference - np.einsum("k,khw->hw", fit.parameters, whole), np.nan)
+        rest = np.where(compared, difference - np.tensordot(fit.parameters.astype(np.float32), whole, 1), np.nan)
         stable = _stable(rest, reference, epoch, fit.limit, compared, bool(areas))
         fitted = _thinned(stable)
         design, target, weight = (
@@ -196,7 +196,7 @@ def applied(alignment: Alignment, epoch: HeightRaster) -> NDArray[np.float32]:
     """Return the epoch's heights, (h, w), m, once the fit of `refine` is applied, to first order in its small motion."""
     shift = alignment.transform.apply(alignment.centre) - alignment.centre
     parameters = np.concatenate([shift, alignment.transform.rotation_vector])
-    change = np.einsum("k,khw->hw", parameters, _design(epoch, alignment.centre))
+    change = np.tensordot(parameters.astype(np.float32), _design(epoch, alignment.centre), 1)
     return np.asarray(epoch.height + change.astype(np.float32))
 
 
@@ -212,7 +212,8 @@ def _design(raster: HeightRaster, centre: FloatArray) -> FloatArray:
     x, y = _places(raster.grid)
     x, y, z = x - centre[0], y - centre[1], raster.height.astype(np.float64) - centre[2]
     a, b = raster.slope_x.astype(np.float64), raster.slope_y.astype(np.float64)
-    return np.stack([-a, -b, np.ones_like(z) + 0 * z, y + b * z, -x - a * z, a * y - b * x])
+    found = np.stack([-a, -b, 0 * z + 1, y + b * z, -x - a * z, a * y - b * x], dtype=np.float32, casting="same_kind")
+    return np.asarray(found)
 
 
 def _weights_by_sigma(reference: HeightRaster, epoch: HeightRaster, where: NDArray[np.bool_]) -> FloatArray:

@@ -24,6 +24,7 @@ from pipeline.config.series import RegularTimes, SeriesConfig
 from pipeline.config.simulation import SensorName, SimulationConfig
 from pipeline.monitoring.comparison import ReferenceHeights, compare_epoch
 from pipeline.monitoring.frame import raster_of
+from pipeline.monitoring.gridding import WallPoints
 from pipeline.report.progress import Progress
 from pipeline.run.acquisition import acquire
 from pipeline.run.recorded_points import recorded_points
@@ -312,7 +313,7 @@ class _Trials:
         series = Series.of(config, given, site, random)
         points = _scanned(series, site.mesh, 0, 1, random.child("promise", "reference"))
         grid = raster_of(points, None)
-        return cls(series, grid, ReferenceHeights.of(points, grid), RayCaster(site.mesh))
+        return cls(series, grid, ReferenceHeights.of(WallPoints.of(points), grid), RayCaster(site.mesh))
 
     def missing(self, number: int, scans: int, sample: _Sample) -> float:
         """Make an epoch in which blocks are missing; returns the median level of detection, m."""
@@ -365,7 +366,7 @@ class _Trials:
         """
         epoch = 1 + int(number * _GOLDEN % 1.0 * (self.series.series.count - 1))
         points = _scanned(self.series, mesh, epoch, scans, random.child("scan", scans))
-        found = compare_epoch(self.reference, points, (), self.series.config.seed)
+        found = compare_epoch(self.reference, WallPoints.of(points), (), self.series.config.seed)
         label = after.labels_down(self.grid, np.zeros((*self.grid.shape, 2), dtype=np.float32))
         listed = np.zeros(int(label.max(initial=0)) + _MOST_BLOCKS + 1, dtype=bool)
         for region in found.regions:

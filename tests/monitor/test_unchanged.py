@@ -52,7 +52,7 @@ def test_noise_is_measured_where_most_of_the_wall_changed(both_signs: bool) -> N
 
 
 def test_the_registration_is_as_uncertain_as_it_says() -> None:
-    """Ten epochs, a third of the wall missing in patches: errors over their standard deviations have unit variance +- 40 %."""
+    """Ten epochs, a third of the wall missing in patches: errors over their standard deviations scatter by 1.0, within 40 %."""
     random = np.random.default_rng(4)
     grid = Grid(0.0, HEIGHT_M, 0.1, int(WIDTH_M / 0.1), int(HEIGHT_M / 0.1))
 
