@@ -73,7 +73,9 @@ def monitor(
     unknown = sorted(set(options) - set(MonitorOptions.__dataclass_fields__))
     if unknown:
         allowed = ", ".join(MonitorOptions.__dataclass_fields__)
-        raise InputError(f"unknown option '{unknown[0]}'", where="monitor", allowed=allowed)
+        raise InputError(
+            f"unknown option '{unknown[0]}'", where="monitor", allowed=allowed, remedy="correct the name, or leave it out"
+        )
     values: dict[str, Any] = dict(options)
     for name in _VECTORS:
         if values.get(name) is not None:
@@ -136,7 +138,12 @@ class Monitoring:
         number = self.result.epochs[-1].number if epoch is None else epoch
         path = self.folder / f"map_{number:03d}.png"
         if not path.is_file():
-            raise InputError(f"there is no epoch {number}", where="plot", allowed=f"1 to {len(self.result.epochs)}")
+            raise InputError(
+                f"there is no epoch {number}",
+                where="plot",
+                allowed=f"1 to {len(self.result.epochs)}",
+                remedy="choose one of these epochs",
+            )
         return Picture(path.read_bytes())
 
     def summary(self) -> str:

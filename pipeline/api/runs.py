@@ -214,7 +214,10 @@ class Epoch:
         if not path.is_file():
             kinds = [name for name in PICTURES if (self.run.folder / f"{name}_{self.number:03d}{suffix}").is_file()]
             raise InputError(
-                f"epoch {self.number} has no '{kind}'", where=str(self.run.folder), allowed=", ".join(kinds) or "none"
+                f"epoch {self.number} has no '{kind}'",
+                where=str(self.run.folder),
+                allowed=", ".join(kinds) or "none",
+                remedy="choose one of these products, or simulate with it (`products` in the config)",
             )
         return path
 
@@ -260,7 +263,11 @@ class Epoch:
         """Statistics of the differences outside the blocks, SI units, and the RMS of the registration."""
         outside = self.record.get("statistics", {}).get("outside_blocks")
         if outside is None:
-            raise InputError(f"epoch {self.number} has no statistics", where=str(self.run.folder / RUN_FILE))
+            raise InputError(
+                f"epoch {self.number} has no statistics",
+                where=str(self.run.folder / RUN_FILE),
+                remedy="continue the run with simulate(..., resume=True)",
+            )
         registration = self.record.get("registration")
         return {"epoch": self.number, **outside, "registration_rms_m": registration and registration.get("rms_m")}
 

@@ -35,7 +35,14 @@ from sensors.stereo.stereo_pair import StereoPair
 
 _ALIKE = 0.9
 """Absolute correlation above which two parameters count as inseparable."""
-STAGES = {"read": 1.0, "statistics": 1.0, "prepare": 2.0, "round 1": 20.0, "last round": 100.0, "compare": 2.0}
+STAGES = {
+    "read maps": 1.0,
+    "describe noise": 1.0,
+    "prepare simulation": 2.0,
+    "search, round 1": 20.0,
+    "search, last round": 100.0,
+    "compare searches": 2.0,
+}
 """Expected duration of each stage, s, for the progress display; the search corrects them when it knows how many maps it needs."""
 _GREEDY_OBSERVATIONS = 300
 """Observations that the greedy search is expected to simulate, for the progress display."""
@@ -43,14 +50,15 @@ _GREEDY_OBSERVATIONS = 300
 
 @dataclass(frozen=True)
 class OrientationPatterns:
-    """Difference maps that the orientation errors of the left camera cause, after registration.
+    """Difference maps that errors of the left camera's orientation cause, after registration.
 
-    They show which orientation parameters can be told apart. Where the model moves both cameras alike, the maps are of both.
+    They show which orientation parameters can be told apart. If the sensor model moves both cameras alike, the maps are those of
+    both cameras.
 
     Attributes
     ----------
     names : (k,) names of the orientation parameters with a non-zero sigma.
-    size_m : (k,) RMS of the map of an error of one sigma, m.
+    size_m : (k,) RMS of the map that an error of one sigma causes, m.
     cosines : (k, k) cosines of the angles between the maps; near 1 in magnitude, two parameters make the same pattern.
     """
 
@@ -65,14 +73,15 @@ class OrientationPatterns:
 
 @dataclass(frozen=True)
 class GreedyComparison:
-    """Result of the greedy search on the same maps, for comparison with `NoiseSearch`.
+    """Result of a simple search that changes one parameter at a time, on the same maps, for comparison with `NoiseSearch`.
 
     Attributes
     ----------
-    result : The greedy search's end point.
+    result : End point of the simple (greedy) search.
     cost : Cost of that end point, from newly simulated maps.
     costs : For each round of `NoiseSearch`, the number of maps simulated so far and the cost of its estimate.
-    overtaken : Maps after which `NoiseSearch` first had a simulation nearer to the measurement than `cost`; None: never.
+    overtaken : Number of simulated maps after which `NoiseSearch` first had a simulation nearer to the measurement than `cost`;
+        None: never.
     """
 
     result: GreedyResult
@@ -83,26 +92,26 @@ class GreedyComparison:
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """The fitted noise parameters, with all that the report and `calibration.json` need.
+    """The fitted noise parameters of a sensor model, with all that the report and `calibration.json` need.
 
     Attributes
     ----------
     config : The resolved config of the calibration.
     sensor : "stereo" or "tls".
     inputs : The measured maps, their stable ground and the simulated site.
-    windows : Windows in which measured and simulated maps were compared.
+    windows : Windows of the wall in which measured and simulated maps were compared.
     epochs : Noise statistics of each measured map.
-    median_trend, std_trend : Trends of the median and the standard deviation over the epochs.
+    median_trend, std_trend : Trends of the maps' median and standard deviation over the epochs.
     systematic : (h, w) mean of the measured maps, m; NaN outside stable ground.
     parameters : The fitted parameters and their bounds.
     found : Estimate, intervals and goodness of fit.
-    statistics : (m,) names of the summary statistics.
+    statistics : (m,) names of the summary statistics that were compared.
     observed : (m,) summary statistics of the measurement (logarithms of lengths in m).
     patterns : Maps of the orientation errors; None for a laser scanner or a model without such errors.
-    baseline : Result of the greedy search; None if it was not asked for.
+    baseline : Comparison with the greedy search; None if it was not asked for.
     predicted : (k, n, n) windows of one map simulated with the fitted noise, m.
     rate : Simulated observations per second.
-    cells : Cells of the sensor that each simulated observation traces.
+    cells : Number of cells of the sensor that each simulated observation traces.
     seconds : Duration of the whole calibration, s.
     """
 
@@ -131,7 +140,7 @@ class CalibrationResult:
         return self.config.calibration.confidence
 
     def simulated_site(self) -> SensorSite:
-        """Return the site with the calibrated sensor model."""
+        """Return the simulated site, the sensor in front of the wall, with the calibrated sensor model."""
         sensor: Any = self.inputs.site.sensor
         return replace(self.inputs.site, sensor=replace(sensor, model=self.model))
 
@@ -141,9 +150,11 @@ class CalibrationResult:
         return self.parameters.model(np.exp(self.found.x))
 
     def inseparable(self) -> list[tuple[str, str, float]]:
-        """Return pairs of parameters that the maps cannot separate: both names, and their correlation.
+        """Return pairs of parameters of which the maps determine only a combination.
 
-        It is the correlation of their errors; pairs over 0.9 in magnitude are listed.
+        Returns
+        -------
+        For each pair both names and the correlation of their errors, over 0.9 in magnitude.
         """
         names, matrix = self.parameters.names, self.found.correlation
         rows, columns = np.nonzero(np.triu(np.abs(matrix) > _ALIKE, 1))
@@ -173,8 +184,8 @@ def calibrate(
         If the maps or the config cannot be used.
     """
     began, random = time.perf_counter(), KeyedRandom(config.seed)
-    progress.plan(STAGES | ({"compare": OBSERVATION_S * _GREEDY_OBSERVATIONS} if with_greedy else {}))
-    with progress.stage("read"):
+    progress.plan(STAGES | ({"compare searches": OBSERVATION_S * _GREEDY_OBSERVATIONS} if with_greedy else {}))
+    with progress.stage("read maps"):
         inputs = read_inputs(paths, config, sensor, random)
     return calibrate_inputs(config, sensor, inputs, progress, with_greedy=with_greedy, began=began)
 
@@ -188,12 +199,15 @@ def calibrate_inputs(
     with_greedy: bool = True,
     began: float | None = None,
 ) -> CalibrationResult:
-    """Fit the noise parameters to difference maps that are already in memory.
+    """Fit the noise parameters of a sensor model to difference maps that are already in memory.
 
     Parameters
     ----------
-    config, sensor, progress, with_greedy : As in `calibrate`.
+    config : Config of the simulated site; `config.seed` determines all random numbers.
+    sensor : "stereo" or "tls".
     inputs : The measured maps, their stable ground and the site to simulate.
+    progress : Receives the stages and their progress.
+    with_greedy : Whether to run the greedy search too, for comparison.
     began : Start of the calibration on the clock of `time.perf_counter`, s; None: now.
 
     Raises
@@ -205,12 +219,12 @@ def calibrate_inputs(
     random, settings = KeyedRandom(config.seed).child("calibrate"), config.calibration
     windows = inputs.windows(config)
     measured = np.stack([windows.cut(values) for values in inputs.maps]).astype(np.float64)
-    with progress.stage("statistics"):
+    with progress.stage("describe noise"):
         epochs = tuple(
             epoch_noise(name, inputs.on_stable(number), measured[number], inputs.grid.gsd, random.child("normality", number))
             for number, name in enumerate(inputs.names)
         )
-    with progress.stage("prepare"):
+    with progress.stage("prepare simulation"):
         error = inputs.reference_error
         simulator = WindowSimulator(config, inputs.site, windows, of_points=inputs.of_points, reference_error=error)
         summary = SummaryStatistics(windows, simulator.noiseless_heights, _direction_to_sensor(inputs.site.sensor, windows))
@@ -224,7 +238,7 @@ def calibrate_inputs(
     started, before = time.perf_counter(), simulator.observations
     found = search.run(observed, settings.simulations, settings.confidence)
     rate = (simulator.observations - before) / (time.perf_counter() - started)
-    with progress.stage("compare"):
+    with progress.stage("compare searches"):
         baseline = _baseline(search, found, summary, observed, random) if with_greedy else None
         patterns = _patterns(simulator, inputs.site.sensor) if isinstance(inputs.site.sensor, StereoPair) else None
         predicted = simulator.maps(fitted.model(np.exp(found.x)), 1, random.child("predicted"))[0]

@@ -17,7 +17,7 @@ EXAMPLE = """  scarpsim detect default runs/my_run --out found
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim detect` on its parser."""
     parser.add_argument(
         "model",
         metavar="MODEL",
@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Find the blocks and write masks, tables and pictures."""
+    """Find fallen blocks in difference maps and write masks, tables and pictures."""
     from pipeline.cli.train import load_keras
     from pipeline.detection.products.run import BASELINE, CONFIDENCES, detect, sorted_confidences
     from pipeline.formats.files.atomic import check_place, new_folder

@@ -14,7 +14,7 @@ EXAMPLE = """  scarpsim inspect my_site.yaml
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim inspect` on its parser."""
     parser.add_argument(
         "config",
         type=Path,
@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Compute the maps of the set-up and write the report."""
+    """Compute the maps of what a set-up can see and write the report."""
     from pipeline.config.bundled import config_path
     from pipeline.config.simulation import load_config
     from pipeline.formats.files.atomic import empty_folder, new_folder

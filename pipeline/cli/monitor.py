@@ -22,7 +22,7 @@ EXAMPLE = """  scarpsim monitor march.laz april.laz --out april
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim monitor` on its parser."""
     parser.add_argument(
         "epochs",
         nargs="+",
@@ -87,7 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Compare the epochs and write maps, events and report."""
+    """Compare real epochs with the first one and write maps, events and report."""
     from pipeline.monitoring.follow import follow
     from pipeline.monitoring.report import headline
     from pipeline.monitoring.run import monitor_paths

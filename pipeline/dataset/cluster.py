@@ -49,7 +49,7 @@ _RUNS_EACH = 2
 
 
 def runs(orders: Sequence[EpochOrder], workers: int) -> list[Run]:
-    """Divide orders into runs of equal length that share a stage, so that a worker sets up the stage once."""
+    """Divide epochs into groups of equal length that share wall, sensor and reference, so that a worker sets these up once."""
     longest = min(max(len(orders) // (_RUNS_EACH * workers), 1), _LONGEST_RUN)
     found = []
     for _, same in groupby(orders, key=lambda order: (order.source, order.stage)):

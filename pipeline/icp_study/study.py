@@ -53,7 +53,7 @@ _TO_TRUTH = IcpConfig(outlier_distance_threshold=0.2, threshold=0.0, delta_thres
 
 @dataclass(frozen=True)
 class StudyEpoch:
-    """An epoch to be registered.
+    """An epoch of the study, displaced by a known motion, that is to be registered.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class PoseError:
 
 @dataclass(frozen=True)
 class StudyRow:
-    """One registration.
+    """Result of one registration with one setting.
 
     Attributes
     ----------

@@ -86,13 +86,15 @@ def read_measured(folder: Path, config: DifferenceConfig, icp: IcpConfig | None,
     files = sorted(folder.glob("difference_*.tif")) or sorted(folder.glob("*.tif"))
     if not files:
         raise InputError(
-            "contains no measured epochs", where=str(folder), remedy=f"name a folder with {FILE} or with difference maps (*.tif)"
+            "the folder contains no measured epochs",
+            where=str(folder),
+            remedy=f"name a folder with {FILE} or with difference maps (*.tif)",
         )
     maps, grids = zip(*map(read_geotiff, files), strict=True)
     for file, grid in zip(files, grids, strict=True):
         if grid != grids[0]:
             raise InputError(
-                f"its grid {grid} differs from {grids[0]} of {files[0].name}",
+                f"the map's grid {grid} differs from {grids[0]} of {files[0].name}",
                 where=str(file),
                 remedy="bring the maps to one grid",
             )

@@ -94,7 +94,9 @@ def variogram(
     """
     rasters = values[None] if values.ndim == 2 else values
     if np.isfinite(rasters).sum(axis=(1, 2)).max(initial=0) < 2:
-        raise InputError("fewer than two pixels have data", where="variogram")
+        raise InputError(
+            "fewer than two pixels have data, which determines no variogram", where="variogram", remedy="give maps with data"
+        )
     size = rasters.shape[1:]
     reach = largest_lag_m or gsd_m * max(size) / 2
     steps = tuple(int(min(np.ceil(reach / gsd_m), extent - 1)) for extent in size)
@@ -135,7 +137,11 @@ def _averaged(
         along, across = (np.abs(column), row) if direction == "x" else (row, np.abs(column))
         wanted &= across <= _SECTOR * along
     if not wanted.any():
-        raise InputError(f"no two pixels with data lie within {reach:g} m", where="variogram", remedy="raise the largest lag")
+        raise InputError(
+            f"no two pixels with data lie within {reach:g} m of each other, which determines no variogram",
+            where="variogram",
+            remedy="use a larger lag, or maps with more data",
+        )
     edges = np.geomspace(0.5, max(reach / gsd_m, 1.0) * (1 + 1e-6), _LAGS + 1) * gsd_m
     number = np.clip(np.searchsorted(edges, distance[wanted], side="right") - 1, 0, _LAGS - 1)
     count = np.bincount(number, pairs[wanted], _LAGS).astype(np.float64)

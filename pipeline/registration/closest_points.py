@@ -185,7 +185,9 @@ def checked_cloud(points: FloatArray, name: str) -> FloatArray:
     if _on_a_line(points[:: max(len(points) // _BLOCK, 1)]) and _on_a_line(
         points
     ):  # the sample alone may be one column of a grid
-        raise InputError("the points lie on one line, which determines no pose", where=name)
+        raise InputError(
+            "the points lie on one line, which determines no pose", where=name, remedy="use points that cover a surface"
+        )
     return points
 
 

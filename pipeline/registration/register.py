@@ -148,10 +148,8 @@ class Registration:
     ----------
     transform : RigidTransform
         Transform from moving to reference coordinates.
-    converged : bool
-        Whether a convergence threshold was met.
-    reason : str
-        Why the search stopped, in words.
+    converged, reason : bool, str
+        Whether a convergence threshold was met, and why the search stopped, in words.
     history : tuple of IcpIteration
         All iterations in order.
     """
@@ -469,7 +467,9 @@ def _point_step(moments: FloatArray) -> _Step:
     cross = moments[:3, 3:6] / count - np.outer(mean_p, mean_d)
     u, singular, vt = np.linalg.svd(spread + cross)
     if not singular[1] > ON_A_LINE * singular[0]:
-        raise InputError("the pairs left within the outlier threshold lie on one line", where="icp.outlier_distance_threshold")
+        raise InputError(
+            "the points within the outlier threshold lie on one line", where="icp.outlier_distance_threshold", remedy="raise it"
+        )
     rotation = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
     turn = rotation - np.eye(3)
     shift = mean_d - turn @ mean_p

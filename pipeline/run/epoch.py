@@ -103,7 +103,7 @@ class LaterEpoch:
 
 @dataclass(frozen=True)
 class SinceLast:
-    """Change since the epoch before, (h, w): the one before minus this one, m, and the labels of what is new."""
+    """Change since the epoch before. difference: (h, w) that epoch minus this one, m; block: (h, w) labels of what is new."""
 
     difference: NDArray[np.float32]
     block: IntArray

@@ -25,7 +25,7 @@ _REMEDY = "run scarpsim monitor again"
 
 
 class MonitorResults:
-    """Epochs against the reference. Steps are the epochs, each in every view of the wall; items are the events."""
+    """Result of `scarpsim monitor` for the page: its steps are the epochs in each view of the wall, its items the events."""
 
     step_name = "epoch"
     surfaces = {"epoch": "as measured", "reference": "reference"}  # noqa: RUF012
@@ -46,7 +46,9 @@ class MonitorResults:
             self._events = [dict(each) for each in self._record["events"]]
         except (KeyError, TypeError, ValueError):
             raise InputError("is not a record of scarpsim monitor", where=str(folder / MONITOR_FILE), remedy=_REMEDY) from None
-        self.title = f"{folder.name}: {len(epochs)} epochs against {names.get('0', 'the reference')}"
+        self.title = (
+            f"{folder.name}: {len(epochs)} {'epoch' if len(epochs) == 1 else 'epochs'} against {names.get('0', 'the reference')}"
+        )
         self.steps = {
             key: f"epoch {key.split()[0]}, {names.get(key.split()[0], '')}" + (f", view {view['view']}" if len(views) > 1 else "")
             for key, view in self._views.items()
@@ -58,7 +60,7 @@ class MonitorResults:
         self._numbers = lru_cache(2)(self._event_raster)
 
     def layers(self, step: str) -> list[Layer]:
-        """Change, level of detection, shaded rock and relief."""
+        """Return the quantities that can give the colours: change, level of detection, shaded rock and relief."""
         limit = SCALE_SIGMAS * self._levels[step] / _NORMAL_95 * _MM
         return [
             Layer("difference", "reference minus epoch (missing rock positive)", "mm", _MM, diverging=True, limit=limit),
@@ -68,7 +70,7 @@ class MonitorResults:
         ]
 
     def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
-        """The reference, or it minus the change, coloured by the layer."""
+        """Return the surface in the window: the reference, or the epoch (reference minus change), coloured by the layer."""
         reference, grid = self._map(self._reference(step))
         rows, columns, factor = cut(grid, window, budget)
         part = reference[rows, columns]
@@ -84,7 +86,7 @@ class MonitorResults:
         return Patch(*centres(grid, rows, columns, factor), height, value, middle, factor)
 
     def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
-        """The registered points with their change and level of detection."""
+        """Return the registered points in the window, with their change and level of detection."""
         path = self.folder / f"epoch_{_epoch(step):03d}.laz"
         if not path.is_file():
             return None
@@ -96,7 +98,7 @@ class MonitorResults:
         return PointLayer(local[shown], None, facts, len(shown) / max(len(local), 1))
 
     def items(self, step: str) -> list[Item]:
-        """The events of the epoch."""
+        """Return the events of an epoch."""
         return [_item(each) for each in self._events if _key(each["epoch"], each.get("view", 1)) == step]
 
     def _path(self, name: str, step: str) -> Path:

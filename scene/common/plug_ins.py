@@ -45,6 +45,11 @@ def load_plug_ins(group: str, needs: str, is_one: Callable[[Any], bool], taken: 
                 f"does not load ({type(error).__name__}: {error})", where=where, remedy="mend or uninstall that package"
             ) from error
         if not is_one(value):
-            raise InputError(f"is a {type(value).__name__}", where=where, allowed=needs)
+            raise InputError(
+                f"is a {type(value).__name__}",
+                where=where,
+                allowed=needs,
+                remedy="change the entry point in the package that it comes from",
+            )
         found[entry.name] = value
     return found

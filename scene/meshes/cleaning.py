@@ -126,7 +126,11 @@ def inconsistent_faces(mesh: TriangleMesh, where: str) -> NDArray[np.bool_]:
     links = np.concatenate([pair + np.stack([none, flip], axis=1), pair + np.stack([none + count, count - flip], axis=1)])
     label = connected_groups(links, 2 * count)
     if np.any(label[:count] == label[count:]):
-        raise InputError("the surface has only one side (a Moebius strip), so it has no outside", where=where)
+        raise InputError(
+            "the surface has only one side (a Moebius strip), so it has no outside",
+            where=where,
+            remedy="cut the surface, or export it anew",
+        )
     size = np.bincount(label[:count], minlength=label.max() + 1)
     minor = size[label[:count]] < size[label[count:]]
     tie = (size[label[:count]] == size[label[count:]]) & (label[:count] > label[count:])

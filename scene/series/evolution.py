@@ -29,7 +29,7 @@ KINDS = ("missing", "moved", "deposit")
 
 @dataclass(frozen=True)
 class Rules:
-    """What does not change in a series.
+    """What stays the same in a time series of one wall: the rockfalls to come and how blocks are placed.
 
     Attributes
     ----------

@@ -200,7 +200,11 @@ def _read(path: Path, unit: str) -> TriangleMesh:
         problem = f"has vertices of {vertices.shape[-1]} coordinates and faces of {faces.shape[-1]} corners"
         raise InputError(problem, where=where, allowed="3 and 3", remedy="export it anew, as triangles")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(f"a triangle names vertex {faces.max()} of {len(vertices)}", where=where, remedy="export it anew")
+        raise InputError(
+            f"a triangle refers to vertex {faces.max()}, but there are {len(vertices)} vertices, counted from 0",
+            where=where,
+            remedy="export it anew",
+        )
     return TriangleMesh(vertices, faces.astype(np.int32), _albedo(mesh))
 
 

@@ -89,7 +89,10 @@ def find_inputs(places: Sequence[Path]) -> list[InputMap]:
         files = sorted(place.glob("difference_*.tif")) if place.is_dir() else [place]
         if not files:
             raise InputError(
-                "no difference map found", where=str(place), allowed="a TIFF, a run folder, or a folder with annotations.json"
+                "no difference map found",
+                where=str(place),
+                allowed="a TIFF, a run folder, or a folder with annotations.json",
+                remedy="name a difference map, or a folder that contains some",
             )
         result += [InputMap(file, file.name, {"file_name": file.name}) for file in files]
     for path, count in Counter(item.path for item in result).items():

@@ -131,10 +131,20 @@ def _read_plugged(path: Path) -> PointCloud:
     reader = further.get(path.suffix.lower()[1:])
     if reader is None:
         allowed = " ".join([*SUFFIXES, *(f".{name}" for name in further)])
-        raise InputError(f"unknown format '{path.suffix}'", where=str(path), allowed=allowed)
+        raise InputError(
+            f"unknown format '{path.suffix}'",
+            where=str(path),
+            allowed=allowed,
+            remedy="export the points in one of these formats",
+        )
     cloud = reader(path)
     if not isinstance(cloud, PointCloud):
-        raise InputError(f"its reader returned a {type(cloud).__name__}", where=str(path), allowed="a PointCloud")
+        raise InputError(
+            f"its reader returned a {type(cloud).__name__}",
+            where=str(path),
+            allowed="a PointCloud",
+            remedy="correct the reader in the package that provides it",
+        )
     return cloud
 
 
