@@ -266,11 +266,13 @@ class NoiseSearch:
     def _run_once(self, observed: FloatArray, simulations: int, confidence: float, density: int) -> SearchResult:
         """Approach the minimum, simulate the last round around it, and repeat that round while the minimum lies outside of it."""
         last = OBSERVATION_S * (self.epochs + 1) * simulations
-        self.progress.plan({f"round {number}": 2 * OBSERVATION_S * self._round_size for number in range(2, _APPROACHES + 1)})
-        self.progress.plan({"round 1": 2 * OBSERVATION_S * self._first_size(density), "last round": last})
+        self.progress.plan(
+            {f"search, round {number}": 2 * OBSERVATION_S * self._round_size for number in range(2, _APPROACHES + 1)}
+        )
+        self.progress.plan({"search, round 1": 2 * OBSERVATION_S * self._first_size(density), "search, last round": last})
         x, covariance, history = self._approach(observed, density)
         for attempt in range(1 + _MORE_ROUNDS):
-            stage = f"last round{' again' * attempt}"
+            stage = f"search, last round{' again' * attempt}"
             self.progress.plan({stage: last})
             with self.progress.stage(stage):
                 sample = self._sample(self._around(x, covariance, simulations), self.epochs)
@@ -304,7 +306,7 @@ class NoiseSearch:
         sample = Simulations(np.empty((0, len(self.low))), np.empty((0, len(observed))))
         points, history = self.low + sobol * (self.high - self.low), []
         for number in range(_APPROACHES):
-            with self.progress.stage(f"round {number + 1}"):
+            with self.progress.stage(f"search, round {number + 1}"):
                 sample = sample.with_more(self._sample(points, 1))
             near = sample.at(np.argsort(_distance(sample.s, observed))[:size])
             surface = ResponseSurface.fit(near)

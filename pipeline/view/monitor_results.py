@@ -43,7 +43,9 @@ class MonitorResults:
             self._events = [dict(each) for each in self._record["events"]]
         except (KeyError, TypeError, ValueError):
             raise InputError("is not a record of scarpsim monitor", where=str(folder / MONITOR_FILE), remedy=_REMEDY) from None
-        self.title = f"{folder.name}: {len(epochs)} epochs against {names.get('0', 'the reference')}"
+        self.title = (
+            f"{folder.name}: {len(epochs)} {'epoch' if len(epochs) == 1 else 'epochs'} against {names.get('0', 'the reference')}"
+        )
         self.steps = {key: f"epoch {key}, {names.get(key, '')}" for key in self._levels}
         if not self.steps:
             raise InputError("contains no epoch", where=str(folder), remedy=_REMEDY)

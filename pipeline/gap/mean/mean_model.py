@@ -336,12 +336,14 @@ _CORRELATIONS: list[Callable[[FloatArray], FloatArray]] = [
 class ProjectedColumns:
     """k design columns (or residuals), divided into their parts within and between the m cells of the wall.
 
+    The reference's error varies little within a cell, so only the part between cells depends on its covariance.
+
     Attributes
     ----------
     within : (n, k) deviations within cells.
     within_weighted : (n, k) deviations times the inverse covariance of their noise, so that a.within.T @ b.within_weighted are
         the inner products of two sets of columns.
-    between : For each correlation function of the reference error, the (m, k) cell means in its eigenvectors.
+    between : For each trial correlation function of the reference error, the (m, k) cell means in its eigenvectors.
     """
 
     within: FloatArray
@@ -366,7 +368,7 @@ class ProjectedColumns:
         return ProjectedColumns(within, weighed, [part[:, columns] for part in self.between])
 
     def in_bases(self, bases: list[int]) -> ProjectedColumns:
-        """Keep the cell means for only some of the correlation functions, given by their indices."""
+        """Keep the cell means for only some of the trial correlation functions of the reference error, given by their indices."""
         return ProjectedColumns(self.within, self.within_weighted, [self.between[basis] for basis in bases])
 
     def append(self, other: ProjectedColumns) -> ProjectedColumns:

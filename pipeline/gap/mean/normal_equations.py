@@ -31,10 +31,10 @@ _AT_ONCE = 8
 
 @dataclass(frozen=True)
 class SineProducts:
-    """Inner products of w searched sines (2 w columns) with other columns, of which normal equations are made.
+    """Inner products of the columns of w searched sines with other columns, from which normal equations are built.
 
-    The part within cells is weighted by the inverse covariance of the noise. The part between cells depends on the covariance of
-    the cell means and is added by `at`.
+    Each sine has two columns. The part within cells of the wall is weighted by the inverse covariance of the noise. The part
+    between cells depends on the covariance of the cell means and is added by `at`.
 
     Attributes
     ----------
@@ -42,7 +42,8 @@ class SineProducts:
     own : (w, 2, 2) products of each sine's two columns with each other, within cells.
     right : (2 w, v) products with v columns of residuals, within cells.
     noise : (2 w, d) products with d draws of noise, within cells.
-    between : For each correlation function of the reference error, the (m, 2 w) cell means in its eigenvectors.
+    between : For each trial correlation function of the reference error, the (m, 2 w) means of the sines in m cells, in its
+        eigenvectors.
     """
 
     fixed: FloatArray
@@ -200,7 +201,7 @@ class NormalEquations:
     """Normal equations X' V^-1 X b = X' V^-1 y of pose and all candidates, under each of C covariances V.
 
     From them, any set of candidates is scored without returning to the points. Searched sines have products only with themselves
-    and with the h held columns: those of the pose and of effects beside which others are scored.
+    and with the h held columns. These belong to the pose and to effects that stay in the model while others are scored.
 
     Attributes
     ----------
@@ -239,7 +240,7 @@ class NormalEquations:
         return replace(self, right=right, constant=constant, wave_right=wave_right)
 
     def with_sine_products(self, columns: list[int], products: FloatArray) -> NormalEquations:
-        """Hold `a` more fixed columns, so that sines can be scored beside them.
+        """Hold `a` more fixed columns, so that sines can be scored in addition to them.
 
         Parameters
         ----------
@@ -276,11 +277,11 @@ class NormalEquations:
         return np.asarray(np.linalg.solve(regular, right * scale[:, :, None]) * scale[:, :, None])
 
     def profile_log_likelihood(self, base: list[int], fixed: list[list[int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Compute the profile log-likelihood of each candidate beside a base: the maximum over the C covariances.
+        """Compute the profile log-likelihood with each candidate added to a base model: the maximum over the C covariances.
 
         Parameters
         ----------
-        base : Numbers of the columns that every fit contains; they must be held.
+        base : Numbers of the columns of the base model; they must be held.
         fixed : For each of f candidates the numbers of its columns.
 
         Returns

@@ -86,7 +86,7 @@ class SelectionResult:
     reference_sigma: float
     noise_ratio: float
 
-    def p_beside(self, named: Sequence[NamedEffect]) -> float | None:
+    def p_value_given(self, named: Sequence[NamedEffect]) -> float | None:
         """Return the p-value of the misfit that remains if only some of the selected effects are kept in the model.
 
         Parameters
@@ -113,8 +113,8 @@ def select_effects(
 ) -> tuple[list[NamedEffect], SelectionResult]:
     """Select the systematic effects and noise terms that explain the residuals.
 
-    The effects that a linearised search finds are put into the model, residuals are computed again, and the search is repeated
-    beside them. Strong effects are refitted without linearising (`nonlinear_refit`). Noise terms are fitted to the remaining
+    The effects that a linearised search finds are put into the model, residuals are computed again, and further effects are
+    searched. Strong effects are refitted without linearising (`nonlinear_refit`). Noise terms are fitted to the remaining
     residuals and weight the next search.
 
     Parameters
@@ -125,8 +125,8 @@ def select_effects(
     random : source of random numbers for the null distributions.
     excluded : families (name, empirical) that are not tried, or `NONPARAMETRIC_TERMS` for all empirical ones. A family whose best
         value is out of bounds is added, and the selection is repeated.
-    grid_noise : grid-correlated noise that an earlier selection left. The selection is repeated beside it, because such noise
-        imitates non-parametric terms and errors of the reference.
+    grid_noise : grid-correlated noise that an earlier selection left. The selection is repeated with it in the model, because
+        such noise imitates non-parametric terms and errors of the reference.
 
     Returns
     -------
@@ -177,7 +177,7 @@ def select_effects(
     if implausible and not _explains_everything(found):
         wrong |= implausible
     design = found.search.design
-    left = design.residuals_after([each.candidate for each in found.beside])
+    left = design.residuals_after([each.candidate for each in found.further])
     if found.chosen and not wrong:
         noise_terms, variance_tried, note = _fit_variance(measurement, found.residuals, design.cells, left, random, excluded)
     if noise_terms in ([], [grid_noise]) and (_GRID_NOISE, False) not in excluded:
@@ -209,7 +209,7 @@ def select_effects(
     table = {"names": [f"{part.sensor}.{name}" for name in names], "cosines": cosines.tolist(), "survival": survival.tolist()}
     tried = found.chosen[0].family_scores if found.chosen else found.tried
     without_nulls = tuple(item for item in tried if not item.name.startswith(SPATIAL_NULL))
-    sigma = design.reference_sigma([each.candidate for each in found.beside])
+    sigma = design.reference_sigma([each.candidate for each in found.further])
     noise_ratio_left = nmad(left / found.residuals.sigma, 0.0)
     result = SelectionResult(
         without_nulls,

@@ -343,13 +343,13 @@ def _angle_term(candidate: Candidate, error: FloatArray, item: SelectedEffect, p
 def merge_angle_curves(
     angles: list[NamedEffect], later: list[NamedEffect], part: Residuals
 ) -> tuple[list[NamedEffect], list[NamedEffect]]:
-    """Add up curves of the same angle's error that two successive selections found along the same covariate.
+    """Add up error curves of a recorded angle that two successive selections found for the same angle and covariate.
 
     Parameters
     ----------
     angles : curves of the first selection.
-    later : effects that were found with those curves in the model.
-    part : residuals, for the range of the covariates.
+    later : effects that the second selection found with those curves in the model.
+    part : residuals, which give the range of each covariate.
 
     Returns
     -------
