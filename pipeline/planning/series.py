@@ -313,7 +313,7 @@ class _Trials:
         series = Series.of(config, given, site, random)
         points = _scanned(series, site.mesh, 0, 1, random.child("promise", "reference"))
         grid = raster_of(points, None)
-        return cls(series, grid, ReferenceHeights.of(WallPoints.of(points), grid), RayCaster(site.mesh))
+        return cls(series, grid, ReferenceHeights.of(WallPoints.of(points), (grid,)), RayCaster(site.mesh))
 
     def missing(self, number: int, scans: int, sample: _Sample) -> float:
         """Make an epoch in which blocks are missing; returns the median level of detection, m."""
@@ -373,7 +373,8 @@ class _Trials:
             if region.kind == kind:
                 listed[label[region.window][region.mask]] = True
         listed[WALL] = False
-        return label, np.isfinite(found.change.difference), listed, float(np.nanmedian(found.change.significance.level))
+        (change,) = found.changes
+        return label, np.isfinite(change.difference), listed, float(np.nanmedian(change.significance.level))
 
 
 def _scanned(series: Series, mesh: TriangleMesh, epoch: int, scans: int, random: KeyedRandom) -> FloatArray:
