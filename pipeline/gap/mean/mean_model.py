@@ -58,7 +58,7 @@ _NOTHING = 1e-14
 
 @dataclass(frozen=True, eq=False)
 class CellCovariance:
-    """One trial covariance of the m cell means: correlated error of the reference plus noise.
+    """One trial covariance of the means of m cells of the wall: correlated error of the reference plus noise.
 
     It is held by its eigenvalues, in units in which the noise of a cell mean is independent with variance 1.
 
@@ -160,7 +160,9 @@ class MeanModel:
     def restrict(
         self, designs: list[ProjectedColumns], value: ProjectedColumns
     ) -> tuple[MeanModel, list[CellCovariance], list[int]]:
-        """Drop covariances under which the residuals are unlikely with each of the given designs, to save time later.
+        """Drop trial covariances of the reference error under which the residuals are unlikely, to save time later.
+
+        A covariance is kept if the residuals are likely under it with at least one of the given sets of columns fitted.
 
         Parameters
         ----------
@@ -194,7 +196,7 @@ class MeanModel:
 
     @property
     def covariances(self) -> list[CellCovariance]:
-        """Every combination of a remaining correlation function and an amplitude of the reference error."""
+        """Every combination of a remaining correlation function of the reference error and a trial amplitude."""
         return [self._covariance(basis, float(ratio)) for basis in range(len(self._bases)) for ratio in (0.0, *_RATIOS)]
 
     def _orthonormal_planes(self, offsets: list[FloatArray]) -> sparse.csr_array:
@@ -243,7 +245,7 @@ class MeanModel:
         return np.asarray(weighted[rows] - self._across[rows] @ planes)
 
     def in_bases(self, means: FloatArray) -> list[FloatArray]:
-        """Transform cell means to the eigenvectors of each correlation function, in which their covariance is diagonal.
+        """Transform cell means to the eigenvectors of each trial correlation function, in which their covariance is diagonal.
 
         Parameters
         ----------

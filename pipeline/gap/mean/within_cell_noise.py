@@ -73,7 +73,7 @@ class WithinCellNoise:
         return self.nodes.shape[1] == 0
 
     def to_nodes(self, columns: FloatArray, means: FloatArray | None = None) -> FloatArray:
-        """Return the product Z' times k columns, with Z as in the class.
+        """Multiply columns by Z', the transposed weights with which noise at q grid nodes acts on the n deviations.
 
         Parameters
         ----------
@@ -88,13 +88,17 @@ class WithinCellNoise:
         return found if means is None else found - self.means.T @ means
 
     def solve(self, on_nodes: FloatArray) -> FloatArray:
-        """Return K^-1 times (q, k) columns, with K as in the class."""
+        """Return K^-1 times (q, k) columns over the q grid nodes.
+
+        K = w C^-1 + Z'Z is the information matrix of the node values, times the white variance w.
+        """
         return np.asarray(cho_solve((self.root, True), on_nodes)) if len(self.root) else on_nodes
 
     def whiten(self, on_nodes: FloatArray) -> FloatArray:
-        """Return L^-1 times (q, k) columns, with K = L L' as in the class.
+        """Transform (q, k) columns over the q grid nodes so that their inner products are weighted by K^-1.
 
-        Inner products of the results are inner products weighted by K^-1.
+        The result is L^-1 times the columns, with K = w C^-1 + Z'Z = L L', the information matrix of the node values, times the
+        white variance w.
         """
         return np.asarray(solve_triangular(self.root, on_nodes, lower=True)) if len(self.root) else on_nodes
 

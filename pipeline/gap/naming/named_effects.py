@@ -53,17 +53,17 @@ class NamedEffect:
     kind : "physical" for an effect of the catalogue, "empirical" for a term without a physical cause.
     entry : entry for the model's `effects`: name and parameter values.
     std : standard deviations of the parameters, by key.
-    alike : names of the other effects that this measurement cannot distinguish from it.
+    indistinguishable : names of the other effects that this measurement cannot distinguish from it.
     p_value : p-value from the simulated null distribution; None if none was simulated.
     gain : log-likelihood ratio of the models with and without it; on validation blocks once it was validated.
-    split_by : further measurement that would tell it from those in `alike`; "" without any.
+    split_by : further measurement that would tell it from those in `indistinguishable`; "" without any.
     """
 
     name: str
     kind: str
     entry: dict[str, Any]
     std: dict[str, float]
-    alike: tuple[str, ...]
+    indistinguishable: tuple[str, ...]
     p_value: float | None
     gain: float
     split_by: str = ""
@@ -83,7 +83,7 @@ class NamedEffect:
         parameters = {key: {"value": value, "std": self.std.get(key)} for key, value in self.entry.items() if key != "name"}
         return {
             "name": self.name,
-            "cannot_be_told_from": list(self.alike),
+            "cannot_be_told_from": list(self.indistinguishable),
             "split_by": self.split_by,
             "kind": self.kind,
             "parameters": parameters,
@@ -211,7 +211,7 @@ def effect_from_locking(found: Locking) -> NamedEffect:
 
 def effect_from_variance(found: VarianceTerm, sensor: str) -> NamedEffect:
     """Name a fitted noise term as an effect of the sensor ("tls" or "stereo")."""
-    alike = tuple(f"{sensor}.{name}" for name in found.alike)
+    alike = tuple(f"{sensor}.{name}" for name in found.indistinguishable)
     empirical = found.empirical or effect_of(found.effect).empirical
     entry = {"name": found.effect, **found.parameters}
     name, kind = f"{sensor}.{found.effect}", "empirical" if empirical else "physical"
