@@ -77,6 +77,8 @@ class ChangedRegion:
         "edge", "vegetation", "thin": what else may explain the change; "insignificant": a detector's that noise may explain.
     identity : int
         Number of the event; 0 as yet unknown.
+    view : int
+        Number of the view of the wall in whose map it lies, from 1 on.
     """
 
     kind: Kind
@@ -97,6 +99,7 @@ class ChangedRegion:
     score: float = float("nan")
     marks: tuple[str, ...] = ()
     identity: int = 0
+    view: int = 1
 
     @property
     def window(self) -> tuple[slice, slice]:
@@ -110,7 +113,11 @@ class ChangedRegion:
             "kind", "row", "column", "x_m", "y_m", "z_m", "width_m", "height_m", "area_m2", "depth_median_m", "depth_largest_m",
             "volume_m3", "volume_std_m3", "significance", "score",
         )  # fmt: skip
-        return {name: getattr(self, name) for name in names} | {"marks": list(self.marks), "id": self.identity}
+        return {name: getattr(self, name) for name in names} | {
+            "marks": list(self.marks),
+            "id": self.identity,
+            "view": self.view,
+        }
 
 
 @dataclass(frozen=True)
@@ -299,6 +306,8 @@ class Catalogue:
 
 def _shared_share(one: ChangedRegion, other: ChangedRegion) -> float:
     """Pixels that two regions share, over those of the smaller one."""
+    if one.view != other.view:
+        return 0.0
     top, left = max(one.row, other.row), max(one.column, other.column)
     bottom = min(one.row + one.mask.shape[0], other.row + other.mask.shape[0])
     right = min(one.column + one.mask.shape[1], other.column + other.mask.shape[1])

@@ -55,11 +55,11 @@ class Rules:
     random: KeyedRandom
 
     def label(self, number: int, kind: str) -> int:
-        """Return the block label of a rockfall and a kind."""
+        """Return the label of what a rockfall leaves in a mesh. kind: "missing" (niche), "moved" (block) or "deposit"."""
         return KINDS.index(kind) * len(self.rockfalls) + number
 
     def rockfall_of(self, label: int) -> tuple[Rockfall, str]:
-        """Return the rockfall and the kind of a block label above 0."""
+        """Return the rockfall and the kind (see `label`) to which a label above 0 belongs."""
         kind, index = divmod(label - 1, len(self.rockfalls))
         return self.rockfalls[index], KINDS[kind]
 
