@@ -67,7 +67,7 @@ class _Part:
 
 
 def summary(plan: Plan) -> str:
-    """Describe a plan as aligned lines of text for the terminal."""
+    """Describe a plan as lines of text for the terminal: its single figures and the summaries of its maps."""
     lines = [f"{plan.instrument}, wall {plan.wall}", f"  {answer(plan)}"]
     lines += [f"  {title:<52}{value:>12}" for title, value in _figures(plan)]
     lines.append(f"  {'map':<52}{'middle':>12}{'median':>10}{'5 %':>10}{'95 %':>10}")
