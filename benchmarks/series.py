@@ -215,7 +215,7 @@ def promised_rows(outcomes: Sequence[Outcome], plan: SeriesPlan) -> Iterator[str
 
 def lead_rows(outcomes: Sequence[Outcome], plan: SeriesPlan) -> Iterator[str]:
     """Rows of the table of lead times."""
-    yield "| volume | blocks that moved | listed before the fall | promised lead, 95 % | reached by | median lead: promised, found |"
+    yield "| volume | blocks that moved | listed before | promised lead, 95 % | reached by | median lead: promised, found |"
     yield "|---|---|---|---|---|---|"
     promise, every = plan.promises[0], plan.every_h or 1.0
     for low, high in CLASSES_L:
