@@ -97,7 +97,7 @@ CHECKED_ELSEWHERE = (
     "series",
     "view",
 )
-"""How-tos that other tests check: test_docs_commands.py, monitor/, test_plug_ins.py, test_building.py, pipeline/test_series.py."""
+"""How-tos that other tests check: test_docs_commands.py, monitor/, test_plug_ins.py, test_building.py, test_series.py."""
 
 
 def test_every_how_to_has_its_picture() -> None:
