@@ -1,0 +1,163 @@
+"""Run the benchmarks of docs/validation/performance.md, keep their figures, and write the table of that page.
+
+    python benchmarks/performance.py                        all rows, about an hour on two quiet cores
+    python benchmarks/performance.py --only tls epoch_tls   some rows; the others keep their figures
+    python benchmarks/performance.py --page                 the table from the figures that are kept
+
+Each benchmark runs twice, with an empty cache of compiled kernels and with the one that the first run filled. The figures are
+kept in docs/validation/performance.json, each row with machine, load, commit and date. The README takes its times from there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from documents import write_between
+from measure import empty_kernel_cache
+
+ROOT = Path(__file__).parents[1]
+RECORD, PAGE = (ROOT / "docs" / "validation" / f"performance.{kind}" for kind in ("json", "md"))
+MARKS = "<!-- performance -->", "<!-- end of performance -->"
+_NUMBER = r"\s+([\d.]+)"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the table.
+
+    what: what is measured; command: words after `python benchmarks/`; figures: name with unit of each figure, and the regular
+    expression that finds it in what the command prints; aim: what each figure should be.
+    """
+
+    what: str
+    command: str
+    figures: dict[str, str]
+    aim: str
+
+
+RATIO, MEMORY = {"ratio": rf"ratio{_NUMBER}"}, {"GB": rf"peak memory[a-z ]*{_NUMBER} GB"}
+ROWS = {
+    "tls": Row(
+        "laser scan, 5 M pulses on 1.3 M triangles, with noise",
+        "tls.py",
+        {"of the bare ray rate": rf"share of the bare rate{_NUMBER}", "x Open3D's rate": rf"rate over Open3D's{_NUMBER}"}
+        | MEMORY,
+        "at least 0.5 and 1",
+    ),
+    "tls_beam": Row(
+        "laser scan, 1 M pulses of 19 sub-rays",
+        "tls_beam.py",
+        {"of the bare ray rate": rf"share of the bare rate, beam{_NUMBER}"} | MEMORY,
+        "at least 0.5",
+    ),
+    "laz": Row(
+        "LAZ with three extra dimensions, 3 M points",
+        "laz.py",
+        {"x laspy's writing rate": rf"writing rate over laspy's{_NUMBER}", "M points/s read": rf"reading rate{_NUMBER}"} | MEMORY,
+        "at least 1 and 1",
+    ),
+    "stereo": Row("stereo pair at medium quality, same wall", "stereo.py", RATIO | MEMORY, "ratio to the bare casts at most 3"),
+    "sgbm": Row("rendered frames matched by SGBM", "sgbm.py", RATIO | MEMORY, "ratio to render and matcher at most 1.5; 8 GB"),
+    "carve": Row("1,500 blocks into 2.5 M triangles", "carve.py", RATIO, "ratio to one bare boolean at most 2"),
+    "difference": Row("difference raster 3500 x 1500", "difference.py", MEMORY, "at most 2 bare casts"),
+    "icp": Row("ICP of 1 M points", "icp.py", {"GB": rf"peak memory{_NUMBER} GB"}, "at most Open3D's time"),
+    "epoch_stereo": Row(
+        "a Glendale epoch with 1,500 blocks, all products, stereo pair",
+        "epoch.py",
+        {"s": rf"one epoch{_NUMBER} s"} | RATIO | MEMORY,
+        "about 30 s, ratio at most 5, 4 GB",
+    ),
+    "epoch_tls": Row(
+        "the same with the laser scanner",
+        "epoch.py tls",
+        {"s": rf"one epoch{_NUMBER} s"} | RATIO | MEMORY,
+        "about 30 s, ratio at most 5, 4 GB",
+    ),
+    "gap_tls": Row(
+        "diagnosis of about 1 M laser ranges",
+        "gap.py tls",
+        {"s": rf"all steps, [\d,]+ points{_NUMBER} s"} | MEMORY,
+        "60 s, 4 GB",
+    ),
+    "gap_stereo": Row(
+        "diagnosis of about 1 M disparities",
+        "gap.py stereo",
+        {"s": rf"all steps, [\d,]+ points{_NUMBER} s"} | MEMORY,
+        "60 s, 4 GB",
+    ),
+}
+"""The rows by name. A benchmark that empties the cache itself, as gap.py does, prints each figure twice; the last one counts."""
+
+
+def figures(row: Row, text: str) -> dict[str, float | None]:
+    """Return the row's figures in what its command printed; None for one that is not there."""
+    found = {name: re.findall(pattern, text) for name, pattern in row.figures.items()}
+    return {name: float(values[-1]) if values else None for name, values in found.items()}
+
+
+def machine() -> str:
+    """Return processor, cores and memory of this machine in words."""
+    information = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""
+    name = re.search(r"model name\s*:\s*(.+)", information)
+    gigabytes = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+    return f"{name[1] if name else platform.machine()}, {os.cpu_count()} cores, {gigabytes:.0f} GB"
+
+
+def measured(row: Row) -> dict[str, Any]:
+    """Run a row's benchmark with the empty and with the filled kernel cache; return its figures, with where and when."""
+    script, *words = row.command.split()
+    command = [sys.executable, str(ROOT / "benchmarks" / script), *words]
+    found: dict[str, Any] = {"load": round(os.getloadavg()[0], 1)}
+    with empty_kernel_cache() as environment:
+        for cache in ("empty", "filled"):
+            done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+            found[cache] = figures(row, done.stdout)
+    revision = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False)
+    when = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
+    return found | {"machine": machine(), "commit": revision.stdout.strip(), "date": when}
+
+
+def table(record: dict[str, Any]) -> str:
+    """Return the table of the rows that have figures, and the machines on which they were measured."""
+    lines = ["| what | filled kernel cache | empty | aim | command | measured |", "|---|---|---|---|---|---|"]
+    machines = list(dict.fromkeys(each["machine"] for each in record.values()))
+    for name, row in ROWS.items():
+        if found := record.get(name):
+            filled, empty = (_words(found[cache]) for cache in ("filled", "empty"))
+            where = f"{found['date']}, {found['commit']}, load {found['load']}, machine {machines.index(found['machine']) + 1}"
+            lines.append(f"| {row.what} | {filled} | {empty} | {row.aim} | `benchmarks/{row.command}` | {where} |")
+    places = [f"Machine {number}: {each}." for number, each in enumerate(machines, 1)]
+    return "\n".join([*lines, "", " ".join(places), "", "This table is written by `python benchmarks/performance.py`."])
+
+
+def _words(values: dict[str, float | None]) -> str:
+    """Return figures with their units."""
+    return ", ".join(f"{name} {value:g}" if name == "ratio" else f"{value:g} {name}" for name, value in values.items() if value)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="+", choices=list(ROWS), default=list(ROWS))
+    parser.add_argument("--page", action="store_true", help="measure nothing")
+    given = parser.parse_args()
+    record = json.loads(RECORD.read_text(encoding="utf-8")) if RECORD.exists() else {}
+    for name in [] if given.page else given.only:
+        print(f"== {ROWS[name].command}", flush=True)
+        record[name] = measured(ROWS[name])
+        print(_words(record[name]["filled"]), flush=True)
+        RECORD.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    write_between(PAGE, MARKS, table(record))
+
+
+if __name__ == "__main__":
+    main()
