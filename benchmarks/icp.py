@@ -15,7 +15,7 @@ import numpy as np
 import open3d as o3d
 
 from pipeline.registration.closest_points import ReferenceSurface
-from pipeline.registration.register import IcpConfig, Registration, fit, register
+from pipeline.registration.register import IcpConfig, Registration, measure_fit, register
 from pipeline.registration.rigid import RigidTransform
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -106,7 +106,7 @@ def main() -> None:
     print(f"{'':26}{'s':>7}{'to the faster Open3D':>22}{'RMS mm':>12}{'inliers':>11}{'off the truth mm':>18}")
     for name, result in results.items():
         moved = result.apply(moving)
-        left = fit(surface, moved, config)
+        left = measure_fit(surface, moved, config)
         off = np.sqrt(np.mean(np.sum((result.apply(OFFSET.apply(truth)) - truth) ** 2, axis=1)))
         ratio, rms = seconds[name] / peer, left.rms_m * 1e3
         print(f"{name:26}{seconds[name]:7.2f}{ratio:22.2f}{rms:12.4f}{left.inliers:11,}{off * 1e3:18.3f}")
