@@ -419,5 +419,5 @@ def shared_scale_m(noises: list[MapNoise]) -> float:
 
 
 def grid_record(grid: Grid) -> dict[str, float]:
-    """Return the raster that all maps share as `comparison.json` holds it."""
+    """Return the origin, pixel size and shape of the raster that all maps share, for `comparison.json`."""
     return {"x_min_m": grid.x_min, "y_max_m": grid.y_max, "gsd_m": grid.gsd, "width_px": grid.width, "height_px": grid.height}

@@ -354,7 +354,7 @@ class ProjectedColumns:
 
     @classmethod
     def concatenate(cls, parts: Sequence[ProjectedColumns]) -> ProjectedColumns:
-        """Join the columns of several sets, in their order."""
+        """Join the columns of several sets of the same points, in their order."""
         if len(parts) == 1:
             return parts[0]
         within = np.concatenate([each.within for each in parts], axis=1)
@@ -364,7 +364,7 @@ class ProjectedColumns:
         return cls(within, weighed, [np.concatenate(basis, axis=1) for basis in bases])
 
     def select(self, columns: list[int]) -> ProjectedColumns:
-        """Return the columns with these numbers."""
+        """Return the columns with the given numbers, from 0, in that order."""
         within = self.within[:, columns]
         weighed = within if self.within_weighted is self.within else self.within_weighted[:, columns]
         return ProjectedColumns(within, weighed, [part[:, columns] for part in self.between])
@@ -374,7 +374,7 @@ class ProjectedColumns:
         return ProjectedColumns(self.within, self.within_weighted, [self.between[basis] for basis in bases])
 
     def append(self, other: ProjectedColumns) -> ProjectedColumns:
-        """Return these columns followed by those of another set."""
+        """Return these columns followed by the columns of another set of the same points."""
         return ProjectedColumns.concatenate([self, other])
 
 

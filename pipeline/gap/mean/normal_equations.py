@@ -128,13 +128,15 @@ def _by_basis(covariances: list[CellCovariance]) -> dict[int, list[int]]:
 
 @dataclass(frozen=True, eq=False)
 class NoiseDraws:
-    """Simulated noise within cells, from which the noise of any design column's coefficient is computed.
+    """Simulated noise, from which the noise of the coefficient of any design column is computed.
+
+    The noise consists of white noise and of noise at q grid nodes that neighbouring points share.
 
     Attributes
     ----------
     rows : Slice of n' of the points on which white noise is drawn.
     white : (n', d) white noise of d draws, in single precision, which is enough here.
-    on_nodes : (q, d) contribution of grid-correlated noise at its q nodes (see `WithinCellNoise.draw`).
+    on_nodes : (q, d) contribution of the noise at the nodes (see `WithinCellNoise.draw`).
     """
 
     rows: slice

@@ -103,10 +103,11 @@ class WithinCellNoise:
         return np.asarray(solve_triangular(self.root, on_nodes, lower=True)) if len(self.root) else on_nodes
 
     def draw(self, white: FloatArray, rows: slice, cell_sums: FloatArray, random: KeyedRandom) -> FloatArray:
-        """Draw the part of simulated noise that depends on the nodes, for inner products c' R^-1 r of columns c with noise r.
+        """Draw the part of simulated noise that acts through the grid nodes, once for any number of design columns.
 
-        With white noise e and node values n, the noise is r = sqrt(w) e + Z n. Its product with a column is c' R^-1 r = c' e /
-        sqrt(w) + (Z' c)' K^-1 (C^-1 n - Z' e / sqrt(w)). Returned is the factor behind (Z' c)'.
+        The noise r = sqrt(w) e + Z n has white noise e and node values n with covariance C. Its inner product with a column c,
+        weighted by the inverse of the covariance R = w I + Z C Z', is c' R^-1 r = c' e / sqrt(w) + (Z' c)' f. Returned is f =
+        K^-1 (C^-1 n - Z' e / sqrt(w)) with K = w C^-1 + Z'Z.
 
         Parameters
         ----------
@@ -117,7 +118,7 @@ class WithinCellNoise:
 
         Returns
         -------
-        (q, d) factor of each draw.
+        (q, d) vectors f, one for each draw.
         """
         own = random.generator().standard_normal((len(self.root), white.shape[1]))
         if not self.is_white:

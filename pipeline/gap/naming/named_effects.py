@@ -183,7 +183,7 @@ def relative_size(entry: dict[str, Any]) -> float:
 
 
 def effect_from_range_step(comb: RangeStep, part: Residuals) -> NamedEffect:
-    """Name the rounding of ranges (range quantisation) as an effect.
+    """Convert the rounding of ranges to a named effect (range quantisation), as an entry of gap.json.
 
     Its log-likelihood ratio is set to at least 1 for each range, because rounded ranges leave no doubt.
 
@@ -198,7 +198,7 @@ def effect_from_range_step(comb: RangeStep, part: Residuals) -> NamedEffect:
 
 
 def effect_from_locking(found: Locking) -> NamedEffect:
-    """Name pixel locking that was found in the measured disparities as an effect."""
+    """Convert pixel locking that was found in measured disparities to a named effect, as an entry of gap.json."""
     entry = {
         "name": PixelLocking.tag(),
         "amplitude_px": found.amplitude_px,
@@ -210,7 +210,13 @@ def effect_from_locking(found: Locking) -> NamedEffect:
 
 
 def effect_from_variance(found: VarianceTerm, sensor: str) -> NamedEffect:
-    """Name a fitted noise term as an effect of the sensor ("tls" or "stereo")."""
+    """Convert a fitted noise term to a named effect, as an entry of gap.json.
+
+    Parameters
+    ----------
+    found : the noise term.
+    sensor : "tls" or "stereo".
+    """
     alike = tuple(f"{sensor}.{name}" for name in found.indistinguishable)
     empirical = found.empirical or effect_of(found.effect).empirical
     entry = {"name": found.effect, **found.parameters}
@@ -219,13 +225,13 @@ def effect_from_variance(found: VarianceTerm, sensor: str) -> NamedEffect:
 
 
 def effect_from_edges(found: EdgeEffect) -> NamedEffect:
-    """Name an effect that was found at depth steps."""
+    """Convert an effect that was found at depth steps to a named effect, as an entry of gap.json."""
     entry = {"name": found.name, **found.effect.model_dump(mode="json", exclude_unset=True)}
     return NamedEffect(f"{found.effect.sensor}.{found.name}", "physical", entry, found.std, (), None, found.gain)
 
 
 def effect_from_tails(part: Residuals, sigma: float, gain: float) -> NamedEffect:
-    """Name heavy tails as additional white noise marked empirical, because the catalogue has no effect for them.
+    """Describe heavy tails as additional white noise marked empirical, because the catalogue has no effect for them.
 
     Parameters
     ----------
@@ -238,7 +244,7 @@ def effect_from_tails(part: Residuals, sigma: float, gain: float) -> NamedEffect
 
 
 def effect_from_losses(found: LossExplanation, intensity: FloatArray | None) -> NamedEffect:
-    """Name the effect that explains missing returns of laser pulses.
+    """Convert an explanation of missing laser returns to a named effect, as an entry of gap.json.
 
     Parameters
     ----------
