@@ -68,7 +68,6 @@ FURTHER = {
         "scarpsim dataset": ["--set", "parts.0.train=1", "--set", "parts.0.val=1", "--set", "tiles.size_px=192"],
         "scarpsim train": ["--set", "training.epochs=1"],
         "scarpsim detect": ["--no-pictures"],
-        "scarpsim detect default": ["--unmirrored"],
         "simulate": [*SMALL_WALL, *FEW_POINTS, *FEW_BLOCKS],
     },
 }

@@ -74,7 +74,8 @@ def messages() -> Iterator[dict[str, str]]:
             tree = ast.parse(path.read_text(encoding="utf-8"))
             texts = _constants(tree)
             for node, function in _errors(tree):
-                filled = _WithTexts(texts | _local_texts(function, node.lineno)).visit(node)
+                given = texts | _given_texts(tree, function) | _local_texts(function, node.lineno)
+                filled = _WithTexts(given).visit(node)
                 parts = [ast.unparse(filled.args[0]), *(f"{key.arg}: {ast.unparse(key.value)}" for key in filled.keywords)]
                 yield {"where": f"{path.relative_to(ROOT)}:{node.lineno}", "text": "; ".join(parts)}
 
@@ -100,6 +101,26 @@ def _local_texts(function: ast.AST, line: int) -> dict[str, ast.expr]:
             found[node.targets[0].id] = node.value
     texts = ast.Constant | ast.JoinedStr | ast.IfExp | ast.BoolOp
     return {name: value for name, value in found.items() if isinstance(value, texts)}
+
+
+def _given_texts(tree: ast.Module, function: ast.AST) -> dict[str, ast.expr]:
+    """Return the texts that a function gets as arguments: those of its first call in the module, or its defaults."""
+    if not isinstance(function, ast.FunctionDef):
+        return {}
+    every = function.args
+    names = [each.arg for each in every.args]
+    found: dict[str, ast.expr] = dict(zip(names[len(names) - len(every.defaults) :], every.defaults, strict=True))
+    found |= {each.arg: value for each, value in zip(every.kwonlyargs, every.kw_defaults, strict=True) if value is not None}
+    calls = (node for node in ast.walk(tree) if isinstance(node, ast.Call) and _called(node) == function.name)
+    for call in list(calls)[:1]:
+        found |= dict(zip([name for name in names if name not in ("self", "cls")], call.args, strict=False))
+        found |= {key.arg: key.value for key in call.keywords if key.arg}
+    return {name: value for name, value in found.items() if isinstance(value, ast.Constant | ast.JoinedStr)}
+
+
+def _called(call: ast.Call) -> str:
+    """Return the name of the function or method that a call calls."""
+    return str(getattr(call.func, "id", getattr(call.func, "attr", "")))
 
 
 def _constants(tree: ast.Module) -> dict[str, ast.expr]:

@@ -15,7 +15,7 @@ from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points.laz import EXACT_INTENSITY
 from pipeline.formats.points.pcd import write_pcd
 from pipeline.formats.points.xyz import write_xyz
-from pipeline.run.products import write_cloud
+from pipeline.run.clouds import write_cloud
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 

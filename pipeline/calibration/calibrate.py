@@ -67,7 +67,7 @@ class OrientationPatterns:
     cosines: FloatArray
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content as `calibration.json` holds it."""
+        """Return the fields as a dictionary, as `calibration.json` holds them."""
         return {"names": self.names, "rms_m": self.size_m, "cosines": self.cosines}
 
 

@@ -65,7 +65,7 @@ class CalibrationInputs:
     reference_error: ReferenceError | None = None
 
     def windows(self, config: SimulationConfig) -> Windows:
-        """Choose the windows in which measured and simulated maps are compared."""
+        """Choose the windows of the wall in which measured and simulated maps are compared, by the config's number and size."""
         return choose_windows(self.stable, self.grid, config.calibration)
 
     def on_stable(self, number: int) -> NDArray[np.floating]:

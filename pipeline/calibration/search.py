@@ -89,7 +89,7 @@ class Simulations:
         return Simulations(np.concatenate([self.x, other.x]), np.concatenate([self.s, other.s]))
 
     def at(self, rows: NDArray[Any]) -> Simulations:
-        """Return the simulations of some rows, given as indices or a mask."""
+        """Return a subset of the simulations, given as indices or a mask."""
         return Simulations(self.x[rows], self.s[rows])
 
 
@@ -132,7 +132,7 @@ class ResponseSurface:
         return cls(centre, scale, coefficients, covariance, linalg.solve_triangular(factor, np.eye(len(factor)), lower=True))
 
     def mean(self, x: FloatArray) -> FloatArray:
-        """Return the (m,) expected statistics at logarithmic parameters (k,)."""
+        """Return the (m,) summary statistics that are expected for logarithmic noise parameters (k,)."""
         return _design(((x - self.centre) / self.scale)[None])[0] @ self.coefficients
 
     def misfit(self, x: FloatArray, observed: FloatArray) -> FloatArray:
@@ -150,7 +150,7 @@ class ResponseSurface:
         return self.whitening @ (observed - self.mean(x))
 
     def jacobian(self, x: FloatArray) -> FloatArray:
-        """Return the (m, k) derivatives of `misfit` at logarithmic parameters (k,)."""
+        """Return the (m, k) derivatives of `misfit` by the logarithmic noise parameters, at (k,) values of these."""
         return -self.whitening @ (_gradient((x - self.centre) / self.scale) @ self.coefficients).T / self.scale
 
     def minimum(self, observed: FloatArray, start: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:

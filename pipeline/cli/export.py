@@ -130,7 +130,7 @@ def _save(form: str, run: Any, number: int, path: Path, width: int, progress: An
         return
     if form == "copc":
         from pipeline.formats.points.laz import LazHeader
-        from pipeline.run.products import write_cloud
+        from pipeline.run.clouds import write_cloud
 
         with progress.stage("points"):
             cloud, wkt = run.survey_points(number)

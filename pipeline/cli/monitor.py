@@ -44,6 +44,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="X,Y,Z",
         help="measure change along it, towards the sensor (default: mean plane)",
     )
+    parser.add_argument(
+        "--views",
+        type=one_of(*map(str, range(1, 7))),
+        metavar="N",
+        help="number of parts of the wall with maps of their own (default: as its corners and overhangs need)",
+    )
     parser.add_argument("--scanner", metavar="PRESET", help="also predict the level of detection of this scanner")
     parser.add_argument("--model", type=Path, metavar="FILE", help="sensor model (model.yaml) instead of --scanner")
     parser.add_argument("--photographs", action="store_true", help="the epochs are from photographs")
@@ -115,6 +121,7 @@ def _options(arguments: argparse.Namespace) -> MonitorOptions:
     return MonitorOptions(
         position=None if arguments.position is None else np.array(arguments.position),
         direction=None if arguments.direction is None else np.array(arguments.direction),
+        views=None if arguments.views is None else int(arguments.views),
         gsd_m=arguments.gsd,
         stable=() if arguments.stable is None else read_areas(arguments.stable),
         unit=arguments.unit,

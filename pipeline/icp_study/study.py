@@ -217,7 +217,12 @@ def surfaces_of_run(folder: Path, epochs: int) -> tuple[SimulationConfig, str, l
     if len(records) < 2:
         raise InputError("has no epoch after the reference", where=str(folder), remedy="finish it with simulate --resume")
     if epochs >= len(records):
-        raise InputError(f"got {epochs}", where="--epochs", allowed=f"1 to {len(records) - 1}, as many epochs as {folder} has")
+        raise InputError(
+            f"got {epochs}",
+            where="--epochs",
+            allowed=f"1 to {len(records) - 1}, as many epochs as {folder} has",
+            remedy="choose a number in this range",
+        )
     config = load_config(path, [], None, None)
     found = []
     for number, applied in records[: epochs + 1]:

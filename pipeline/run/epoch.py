@@ -138,7 +138,7 @@ STAGES = {"carve": 4.0, "observe": 3.0, "mesh": 1.0, "register": 4.0, "differenc
 def observe_reference(config: SimulationConfig, site: SensorSite, random: KeyedRandom, progress: Progress) -> ReferenceEpoch:
     """Observe the untouched wall, reconstruct it and rasterise it. `random` is the run's source."""
     with progress.stage("epoch 0: observe"):
-        caster = RayCaster(with_wetness(config, site.mesh))
+        caster = site.caster_of(with_wetness(config, site.mesh))
         for where, viewpoint in site.viewpoints.items():
             check_in_front(caster, viewpoint, where)
         seen = acquire(config, reference_sensor(config, site), caster, random.child("epoch", 0, "observe"))

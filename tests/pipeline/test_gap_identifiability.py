@@ -59,7 +59,7 @@ def moved_by(azimuth: Array, zenith: Array, distance: Array, name: str) -> Array
 def test_the_table_writes_shares_with_a_space(found: Identifiability) -> None:
     head, *rows = format_table(found).splitlines()
     for row, share in zip(rows, found.survival, strict=True):
-        assert row[: head.index("seen from")].endswith(f" {100 * share:.1f} %  ")
+        assert row[: head.index("detectable from")].endswith(f" {100 * share:.1f} %  ")
 
 
 @pytest.mark.parametrize("name", ["range_offset", "vertical_index", "collimation", "trunnion_tilt"])

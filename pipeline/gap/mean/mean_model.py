@@ -58,7 +58,7 @@ _NOTHING = 1e-14
 
 @dataclass(frozen=True, eq=False)
 class CellCovariance:
-    """One trial covariance of the m cell means: correlated error of the reference plus noise.
+    """One trial covariance of the means of m cells of the wall: correlated error of the reference plus noise.
 
     It is held by its eigenvalues, in units in which the noise of a cell mean is independent with variance 1.
 
@@ -160,7 +160,9 @@ class MeanModel:
     def restrict(
         self, designs: list[ProjectedColumns], value: ProjectedColumns
     ) -> tuple[MeanModel, list[CellCovariance], list[int]]:
-        """Drop covariances under which the residuals are unlikely with each of the given designs, to save time later.
+        """Drop trial covariances of the reference error under which the residuals are unlikely, to save time later.
+
+        A covariance is kept if the residuals are likely under it with at least one of the given sets of columns fitted.
 
         Parameters
         ----------
@@ -194,7 +196,7 @@ class MeanModel:
 
     @property
     def covariances(self) -> list[CellCovariance]:
-        """Every combination of a remaining correlation function and an amplitude of the reference error."""
+        """Every combination of a remaining correlation function of the reference error and a trial amplitude."""
         return [self._covariance(basis, float(ratio)) for basis in range(len(self._bases)) for ratio in (0.0, *_RATIOS)]
 
     def _orthonormal_planes(self, offsets: list[FloatArray]) -> sparse.csr_array:
@@ -243,7 +245,7 @@ class MeanModel:
         return np.asarray(weighted[rows] - self._across[rows] @ planes)
 
     def in_bases(self, means: FloatArray) -> list[FloatArray]:
-        """Transform cell means to the eigenvectors of each correlation function, in which their covariance is diagonal.
+        """Transform cell means to the eigenvectors of each trial correlation function, in which their covariance is diagonal.
 
         Parameters
         ----------
@@ -352,7 +354,7 @@ class ProjectedColumns:
 
     @classmethod
     def concatenate(cls, parts: Sequence[ProjectedColumns]) -> ProjectedColumns:
-        """Join the columns of several sets, in their order."""
+        """Join the columns of several sets of the same points, in their order."""
         if len(parts) == 1:
             return parts[0]
         within = np.concatenate([each.within for each in parts], axis=1)
@@ -362,7 +364,7 @@ class ProjectedColumns:
         return cls(within, weighed, [np.concatenate(basis, axis=1) for basis in bases])
 
     def select(self, columns: list[int]) -> ProjectedColumns:
-        """Return the columns with these numbers."""
+        """Return the columns with the given numbers, from 0, in that order."""
         within = self.within[:, columns]
         weighed = within if self.within_weighted is self.within else self.within_weighted[:, columns]
         return ProjectedColumns(within, weighed, [part[:, columns] for part in self.between])
@@ -372,7 +374,7 @@ class ProjectedColumns:
         return ProjectedColumns(self.within, self.within_weighted, [self.between[basis] for basis in bases])
 
     def append(self, other: ProjectedColumns) -> ProjectedColumns:
-        """Return these columns followed by those of another set."""
+        """Return these columns followed by the columns of another set of the same points."""
         return ProjectedColumns.concatenate([self, other])
 
 

@@ -261,7 +261,9 @@ def keep_implausible_in_class(
         sensor, name = item.name.split(".", 1)
         instead = item.kind == "physical" and item.effect.shows_in == ShowsIn.MEAN and name not in before
         alike = {f"{sensor}.{each.candidate.name}" for each in implausible if instead or name in each.indistinguishable}
-        found.append(replace(item, alike=(*item.alike, *sorted(alike - {item.name, *item.alike}))))
+        found.append(
+            replace(item, indistinguishable=(*item.indistinguishable, *sorted(alike - {item.name, *item.indistinguishable})))
+        )
     return found
 
 

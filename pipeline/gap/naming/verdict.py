@@ -146,7 +146,7 @@ def verdict_of(named: Sequence[NamedEffect], evidence: Evidence) -> str:
         return "unknown"
     if len(named) > 1:
         return "several"
-    return "ambiguous" if named[0].alike else "named"
+    return "ambiguous" if named[0].indistinguishable else "named"
 
 
 def verdict_sentence(verdict: str, named: Sequence[NamedEffect], evidence: Evidence) -> str:
