@@ -60,6 +60,12 @@ ROWS = {
         {"of the bare ray rate": rf"share of the bare rate, beam{_NUMBER}"} | MEMORY,
         "at least 0.5",
     ),
+    "tls_process": Row(
+        "the scene on which HELIOS++ was measured, as one process, with 19 sub-rays",
+        "tls_process.py",
+        {"x HELIOS++'s rate": r"by its CPU time, at best\s+[\d.]+ M\s+([\d.]+) x", "s": rf"process from PLY to LAS{_NUMBER} s"},
+        "at least 5, at most 11 s",
+    ),
     "laz": Row(
         "LAZ file of 3 million points with three extra dimensions",
         "laz.py",
@@ -74,6 +80,9 @@ ROWS = {
         "ratio to render and matcher at most 1.5; 8 GB",
     ),
     "carve": Row("carving 1,500 blocks out of 2.5 million triangles", "carve.py", RATIO, "ratio to one bare boolean at most 2"),
+    "carve_large": Row(
+        "the same out of 16 million triangles", "carve.py --large", {"GB": r"carve\s+[\d.]+\s+([\d.]+)"}, "at most 6 GB"
+    ),
     "difference": Row("difference map of 3500 x 1500 px", "difference.py", MEMORY, "at most 2 bare casts"),
     "icp": Row("registration (ICP) of 1 million points", "icp.py", {"GB": rf"peak memory{_NUMBER} GB"}, "at most Open3D's time"),
     "epoch_stereo": Row(
@@ -161,7 +170,8 @@ def main() -> None:
         record[name] = measured(ROWS[name])
         print(_words(record[name]["filled"]), flush=True)
         RECORD.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-    write_between(PAGE, MARKS, table(record))
+    if record:
+        write_between(PAGE, MARKS, table(record))
 
 
 if __name__ == "__main__":
