@@ -337,8 +337,9 @@ def verdicts() -> dict[str, Verdict]:
             " Registration and regions where rock moved (`scene_changes`) are reported, but do not count as a gap. If the model"
             " predicts more noise than there is, the report says so with the noise that would fit (`lower_noise` under"
             " `remaining`).",
-            "Nothing has to be added. `scarpsim gap MEASUREMENT --identifiability` tells how large an effect could remain "
-            "unseen.",
+            "Nothing has to be added. Smaller effects may be hidden: `detectable` in gap.json and the report list the size from "
+            "which each would have shown with a probability of 95 %. If the reference is better than its error was estimated "
+            "(`reference_error_m`), say so with `--reference-error`, and smaller effects show.",
             "Noise, a slightly wrong pose, a reference that errs by fractions of a millimetre, and lost returns.",
             _case(seed=1),
         ),

@@ -140,6 +140,7 @@ class MeanModel:
             return np.maximum(values, 0.0), vectors
 
         self._bases: list[tuple[FloatArray, FloatArray]] = map_in_threads(basis, _CORRELATIONS)
+        self._ratios = [0.0, *map(float, _RATIOS)]
         self._white = CellCovariance(0, 0.0, np.ones(len(self._total)))
 
     def __len__(self) -> int:
@@ -155,7 +156,7 @@ class MeanModel:
         return CellCovariance(length, ratio, 1 / (1 + ratio * self._bases[length][0])) if ratio else self._white
 
     def restrict(
-        self, designs: list[ProjectedColumns], value: ProjectedColumns
+        self, designs: list[ProjectedColumns], value: ProjectedColumns, most_sigma: float = np.inf
     ) -> tuple[MeanModel, list[CellCovariance], list[int]]:
         """Keep only covariances under which the residuals are likely, whichever of the designs is fitted.
 
@@ -163,13 +164,14 @@ class MeanModel:
         ----------
         designs : The designs to fit: the smallest and the largest one.
         value : The residuals, as one column.
+        most_sigma : Largest standard deviation of the reference's error, in the unit of the observable.
 
         Returns
         -------
         The model with only the correlations that are kept; the covariances; and the numbers of the kept correlations, for
         `ProjectedColumns.in_bases`.
         """
-        ratios = [0.0, *map(float, _RATIOS)]
+        ratios = [ratio for ratio in self._ratios if ratio <= (most_sigma / self.typical_sigma) ** 2]
         normals = [_NormalEquations.of(design, value) for design in designs]
 
         def highest(which: tuple[_NormalEquations, int]) -> tuple[int, float]:
@@ -181,7 +183,7 @@ class MeanModel:
         tops, heights = (np.reshape(part, shape) for part in zip(*found, strict=True))
         kept = [int(basis) for basis in np.flatnonzero((heights > heights.max(axis=1, keepdims=True) - _WORSE).any(axis=0))]
         narrower = copy(self)
-        narrower._bases = [self._bases[basis] for basis in kept]
+        narrower._bases, narrower._ratios = [self._bases[basis] for basis in kept], ratios
         chosen: list[CellCovariance] = []
         for number, basis in enumerate(kept):
             low, high = max(tops[:, basis].min() - 1, 0), min(tops[:, basis].max() + 1, len(ratios) - 1)
@@ -192,7 +194,7 @@ class MeanModel:
     @property
     def covariances(self) -> list[CellCovariance]:
         """Every covariance with the correlations that are kept."""
-        return [self._covariance(basis, float(ratio)) for basis in range(len(self._bases)) for ratio in (0.0, *_RATIOS)]
+        return [self._covariance(basis, float(ratio)) for basis in range(len(self._bases)) for ratio in self._ratios]
 
     def _orthonormal_planes(self, offsets: list[FloatArray]) -> sparse.csr_array:
         """(3 m, n) orthonormal rows of a plane in each cell: means, and slopes along each of the offsets (n,)."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +29,7 @@ class NullDistribution:
     log_likelihood_ratios: Mapping[str, FloatArray]
 
     @classmethod
-    def of(cls, design: Design, random: KeyedRandom) -> NullDistribution:
+    def of(cls, design: Design, random: KeyedRandom, ranked: Sequence[int] | None = None) -> NullDistribution:
         """Simulate the null distribution of a design.
 
         Draws are made under the most likely covariance and fitted at the eight most likely ones; each family takes its best
@@ -39,9 +39,11 @@ class NullDistribution:
         ----------
         design : The candidates on one set of points.
         random : Source of the random numbers.
+        ranked : Numbers of the covariances, the most likely first; by default those of the measured residuals.
         """
-        near = design.equations.at_covariances(design.ranked_covariances[:_NEAR_NULL])
-        draws = design.model.null_draws(design.null_covariance, NULL_DRAWS, random.child("between"))
+        likely = (design.ranked_covariances if ranked is None else list(ranked))[:_NEAR_NULL]
+        near = design.equations.at_covariances(likely)
+        draws = design.model.null_draws(near.covariances[0], NULL_DRAWS, random.child("between"))
 
         def values(at: CellCovariance) -> tuple[FloatArray, FloatArray, FloatArray]:
             weighted = draws[at.basis] * at.weight[:, None]
@@ -77,6 +79,15 @@ class NullDistribution:
         score : Penalised log-likelihood ratio.
         larger : Restricts the maximum to these families, whose ratios are multiplied by the given factors.
         """
+        return float((1 + np.sum(self._largest_scores(larger) >= score)) / (1 + NULL_DRAWS))
+
+    def critical_score(self, significance: float, larger: Mapping[str, float] | None = None) -> float:
+        """Return the score that must be exceeded for a p-value of at most `significance`; `larger` is that of `p_value`."""
+        allowed = max(int(significance * (1 + NULL_DRAWS) + 1e-9) - 1, 0)
+        return float(np.sort(self._largest_scores(larger))[-1 - allowed])
+
+    def _largest_scores(self, larger: Mapping[str, float] | None) -> FloatArray:
+        """(NULL_DRAWS,) largest score over the families in each simulation."""
         times = dict.fromkeys(self.log_likelihood_ratios, 1.0) if larger is None else larger
         scores = np.stack([each * self.log_likelihood_ratios[name] - self.penalty(name) for name, each in times.items()])
-        return float((1 + np.sum(scores.max(axis=0) >= score)) / (1 + NULL_DRAWS))
+        return np.asarray(scores.max(axis=0))

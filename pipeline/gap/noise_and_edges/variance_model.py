@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pipeline.change.robust import nmad
+from pipeline.gap.noise_and_edges.sign_flips import null_p_value
 from pipeline.gap.residuals.residuals import BoolArray, Geometry, Residuals
 from pipeline.gap.residuals.wall_blocks import WallCells, wall_block_numbers
 from pipeline.gap.thresholds import thresholds
@@ -21,8 +22,6 @@ from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, ShowsIn
 
-DRAWS = 1999
-"""Number of sign flips of the null distribution."""
 _LEAST_REMAINING_VARIANCE = 0.3
 """Least share of a point's variance that the plane of its cell must leave."""
 _LEAST_WHITE_SHARE, _EXPECTATION_DRAWS = 0.02, 10
@@ -410,26 +409,6 @@ def _gain_over(squares: FloatArray, first: FloatArray, second: FloatArray, block
 def _log_likelihood_gain(squares: FloatArray, added: FloatArray) -> float:
     """Log-likelihood ratio of an added variance (n,)."""
     return float(0.5 * np.sum(squares * added / (1 + added) - np.log1p(added)))
-
-
-def null_p_value(squares: FloatArray, shapes: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
-    """Return the p-value (1 + b) / (1 + N) of the largest standardised score over the candidates.
-
-    The null distribution has the signs flipped by wall block.
-
-    Parameters
-    ----------
-    squares : (n,) squared deviations over the predicted variance.
-    shapes : (n,) candidate variances over the predicted one.
-    block : (n,) wall block of each point.
-    random : source of random numbers.
-    """
-    _, number = np.unique(block, return_inverse=True)
-    scores = np.stack([np.bincount(number, (squares - 1) * shape) for shape in shapes])
-    size = np.sqrt(np.sum(scores**2, axis=1))
-    signs = random.child("spread").generator().choice([-1.0, 1.0], size=(scores.shape[1], DRAWS))
-    largest = np.max(scores @ signs / size[:, None], axis=0)
-    return float((1 + np.sum(largest >= np.max(scores.sum(axis=1) / size))) / (1 + DRAWS))
 
 
 @dataclass(frozen=True)
