@@ -29,8 +29,8 @@ from pipeline.gap.naming.nonlinear_refit import (
     _with_equivalence_class,
     fit_jointly,
     search_at_joint_fit,
-    with_fitted_variance,
 )
+from pipeline.gap.naming.search_residuals import with_fitted_variance
 from pipeline.gap.naming.validation_scores import validate_effects
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm, fit_variance_model

@@ -22,7 +22,7 @@ from pipeline.gap.naming import workflow
 from pipeline.gap.naming.effect_selection import NONPARAMETRIC_TERMS, _note_most_similar
 from pipeline.gap.naming.gap_score import simulate_errors
 from pipeline.gap.naming.named_effects import NamedEffect, with_effects
-from pipeline.gap.naming.nonlinear_refit import at_points_of
+from pipeline.gap.naming.search_residuals import at_points_of
 from pipeline.gap.naming.selection_passes import PassInput, PassInputs, SelectionPass, best_pass
 from pipeline.gap.naming.validation_scores import ValidatedEffects
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect

@@ -30,12 +30,10 @@ from pipeline.gap.naming.nonlinear_refit import (
     SearchInput,
     SearchOutcome,
     absorbed_by_registration,
-    at_points_of,
     out_of_bounds,
     select_and_refit,
-    with_added_variance,
-    with_fitted_variance,
 )
+from pipeline.gap.naming.search_residuals import at_points_of, with_added_variance, with_fitted_variance
 from pipeline.gap.noise_and_edges.grid_noise import find_grid_noise, separate_white_and_grid_noise
 from pipeline.gap.noise_and_edges.noise_power import detectable_noise
 from pipeline.gap.noise_and_edges.pixel_locking import NoiseBounds, find_locking
