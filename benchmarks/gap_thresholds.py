@@ -211,7 +211,18 @@ def main() -> None:
     found = table(cases, arguments.out)
     print(found)
     if arguments.table:
-        arguments.table.write_text(f"{_HEAD}\n\n{_made_by(arguments)}\n\n{found}\n")
+        arguments.table.write_text(f"{_HEAD}\n\n{_made_by(arguments)}\n\n{found}\n\n{decided()}")
+
+
+def decided() -> str:
+    """Return a table of all thresholds with their units and what each decides."""
+    lines = ["## What the thresholds decide", "", "| threshold | value | unit | what it decides |", "|---|---|---|---|"]
+    for key in keys():
+        group, name = key.split(".")
+        values = getattr(Thresholds(), group)
+        field = type(values).model_fields[name]
+        lines.append(f"| `{key}` | {getattr(values, name):g} | {field.json_schema_extra['unit']} | {field.description} |")
+    return "\n".join(lines) + "\n"
 
 
 def _made_by(arguments: argparse.Namespace) -> str:
@@ -231,11 +242,13 @@ who wonder whether a default decides their case. `--set` changes a threshold for
     scarpsim gap my_measurement --set mean.class_margin=4 --set points.fewest=500 --out diagnosis
 
 Each threshold of `pipeline/gap/thresholds.py` was set to 0.7 and 1.4 times its value, on development cases of some thousand
-points of the [closed-form generator](gap_closed_form.md). The table counts the cases that use the threshold, those whose
-answer (verdict or names) changes, and what becomes wrong or right. A threshold that no case uses, or that is newer than the
-run, is not listed. "-" means that the value is not allowed, or that the time was up.
+points of the [closed-form generator](gap_closed_form.md). For each of both values the table has four counts: the cases that use
+the threshold, those whose answer (verdict or names) changes, those that become wrong, and those that become right. A threshold
+that no case uses, or that is newer than the run, is not listed. "-" means that the value is not allowed, or that the time was
+up.
 
-A few cases show which thresholds are near an edge, not how often they decide."""
+So few cases show which thresholds are close to changing an answer, but not how often they do. [What the thresholds
+decide](#what-the-thresholds-decide) is at the end of the page."""
 
 
 if __name__ == "__main__":

@@ -24,12 +24,12 @@ from pipeline.run.simulation import simulate
 
 COLUMNS = (
     "sensor, direction",
-    "stable: raster NMAD",
-    "M3C2 NMAD",
-    "raster minus M3C2: median, NMAD",
-    "stable core points beyond LoD",
-    "blocks: M3C2 over raster",
-    "core points in blocks beyond LoD",
+    "noise of the map on stable rock (NMAD)",
+    "the same of M3C2",
+    "map minus M3C2: median, NMAD",
+    "stable points beyond the LoD (5 % expected)",
+    "mean change of the blocks: M3C2 over map",
+    "points in blocks beyond the LoD",
 )
 
 

@@ -42,10 +42,10 @@ NO_FAULT = "none of these"
 Make = Callable[[Path], None]
 _HEAD = """# Checks of input files
 
-This page says which faults of a file are found, and by which command, option or function. It is for those who wonder whether
-a fault of their data could go unnoticed. Each cell was tried: *refused* means that the reader answers with one message that
-names the file, what is wrong, what is allowed and how to mend it, and that it writes nothing. Commands end with exit status
-2, functions raise `InputError`.
+This page lists faults of input files and says which command, option or function finds them. It is for users who wonder whether a
+fault of their data could go unnoticed. Each cell was tried. *Refused* means that the program writes nothing and gives one
+message, which says what is wrong, where, what is allowed and what to do. A command then ends with exit status 2, and a function
+raises `InputError`.
 """
 
 
@@ -144,11 +144,11 @@ depth_map: high
 difference: {gsd_m: 0.1}
 """
 ANY: dict[str, Make] = {
-    "does not exist": lambda path: None,
-    "is a folder": lambda path: path.mkdir(),
-    "is a pipe": lambda path: os.mkfifo(path),
-    "is empty": lambda path: path.write_bytes(b""),
-    "holds other bytes": lambda path: path.write_bytes(bytes(range(256)) * 40),
+    "The file does not exist": lambda path: None,
+    "It is a folder": lambda path: path.mkdir(),
+    "It is a named pipe": lambda path: os.mkfifo(path),
+    "It is empty": lambda path: path.write_bytes(b""),
+    "It contains random bytes": lambda path: path.write_bytes(bytes(range(256)) * 40),
 }
 GOOD_POINTS = _cloud(_grid_points())
 KINDS = (
@@ -164,13 +164,13 @@ KINDS = (
         },
         {
             **ANY,
-            "is cut off": _cut(GOOD_POINTS),
-            "only NaN": _cloud(_grid_points() * np.nan),
-            "one place": _cloud(np.ones((500, 3))),
-            "one line": _cloud(np.outer(np.arange(500.0), [1.0, 1.0, 0.5])),
-            "single precision far off": _cloud((_grid_points() + UTM).astype(np.float32)),
-            "1e9 m away": _cloud(_grid_points() + 1e9),
-            "another place than the sensor's": _cloud(_grid_points() + UTM),
+            "It is truncated": _cut(GOOD_POINTS),
+            "All coordinates are NaN": _cloud(_grid_points() * np.nan),
+            "All points lie at one place": _cloud(np.ones((500, 3))),
+            "All points lie on one line": _cloud(np.outer(np.arange(500.0), [1.0, 1.0, 0.5])),
+            "Coordinates of UTM size were rounded to single precision": _cloud((_grid_points() + UTM).astype(np.float32)),
+            "Points lie 1e9 m from the origin": _cloud(_grid_points() + 1e9),
+            "Points and sensor are in different coordinate systems": _cloud(_grid_points() + UTM),
         },
         GOOD_POINTS,
         long=("`gap SCAN`",),
@@ -186,11 +186,13 @@ KINDS = (
         },
         {
             **ANY,
-            "is cut off": _cut(_mesh(lambda points: points)),
-            "a vertex is NaN": _mesh(lambda points: _with(5, np.nan, points)),
-            "a vertex at 1e300 m": _mesh(lambda points: _with(5, 1e300, points)),
-            "single precision far off": _mesh(lambda points: (points + UTM).astype(np.float32).astype(np.float64)),
-            "no size": _mesh(lambda points: points * 1e-9),
+            "It is truncated": _cut(_mesh(lambda points: points)),
+            "A vertex is NaN": _mesh(lambda points: _with(5, np.nan, points)),
+            "A vertex lies 1e300 m from the origin": _mesh(lambda points: _with(5, 1e300, points)),
+            "Coordinates of UTM size were rounded to single precision": _mesh(
+                lambda points: (points + UTM).astype(np.float32).astype(np.float64)
+            ),
+            "The mesh is smaller than a micrometre": _mesh(lambda points: points * 1e-9),
         },
         _mesh(lambda points: points),
         long=("`inspect`",),
@@ -204,12 +206,12 @@ KINDS = (
         },
         {
             **ANY,
-            "is cut off": _cut(_raster),
-            "no place": _changed_tiff(),
-            "degrees": _changed_tiff(extratags=[*PLACE, GEO_DEGREES]),
-            "turned": _changed_tiff(extratags=TURNED),
-            "three bands": lambda path: tifffile.imwrite(path, np.ones((40, 50, 3), np.float32), extratags=PLACE),
-            "infinite values": lambda path: tifffile.imwrite(path, np.full((40, 50), np.inf, np.float32), extratags=PLACE),
+            "It is truncated": _cut(_raster),
+            "It states no coordinates (georeference)": _changed_tiff(),
+            "Its coordinates are degrees": _changed_tiff(extratags=[*PLACE, GEO_DEGREES]),
+            "Its rows and columns are rotated against the axes": _changed_tiff(extratags=TURNED),
+            "It has three bands": lambda path: tifffile.imwrite(path, np.ones((40, 50, 3), np.float32), extratags=PLACE),
+            "It has infinite values": lambda path: tifffile.imwrite(path, np.full((40, 50), np.inf, np.float32), extratags=PLACE),
         },
         _raster,
         ("`measurement --reference`",),  # another surface than the scan's
@@ -218,7 +220,7 @@ KINDS = (
         "Cameras",
         ".xml",
         {"`simulate`": ("simulate", "--sensor", "stereo", "--config", "site.yaml", "--set", "cameras=FILE", "--out", "out")},
-        {**ANY, "no cameras": lambda path: path.write_text("<document><chunk/></document>")},
+        {**ANY, "It contains no cameras": lambda path: path.write_text("<document><chunk/></document>")},
         lambda path: write_metashape(path, {"left": _camera(-2.5), "right": _camera(2.5)}),
     ),
     Kind(
@@ -230,11 +232,11 @@ KINDS = (
         },
         {
             **ANY,
-            "a box outside": _annotated(bbox=[15, 15, 40, 4], segmentation=None),
-            "a polygon of two corners": _annotated(segmentation=[[1, 1, 2, 2]]),
-            "a box that is no number": _annotated(bbox=["a", 1, 1, 1]),
-            "an image that is not there": _annotated(image_id=9),
-            "a category that is not there": _annotated(category_id=9),
+            "A box lies outside its image": _annotated(bbox=[15, 15, 40, 4], segmentation=None),
+            "A polygon has two corners": _annotated(segmentation=[[1, 1, 2, 2]]),
+            "A box contains a word instead of a number": _annotated(bbox=["a", 1, 1, 1]),
+            "An annotation names an image that is not listed": _annotated(image_id=9),
+            "An annotation names a category that is not listed": _annotated(category_id=9),
         },
         _annotated(iscrowd=0),
     ),
@@ -248,9 +250,9 @@ KINDS = (
         },
         {
             **ANY,
-            "an unknown key": lambda path: path.write_text("sede: 1\n"),
-            "a key twice": lambda path: path.write_text("seed: 1\nseed: 2\n"),
-            "a list": lambda path: path.write_text("- 1\n"),
+            "It has an unknown key": lambda path: path.write_text("sede: 1\n"),
+            "It has a key twice": lambda path: path.write_text("seed: 1\nseed: 2\n"),
+            "It is a list instead of keys with values": lambda path: path.write_text("- 1\n"),
         },
         lambda path: path.write_text(SITE),
         ("`dataset`",),
@@ -271,10 +273,10 @@ KINDS = (
             "`compare --measured`": ("compare", "site.yaml", "--measured", "FILE", "--out", "out"),
         },
         {
-            "does not exist": lambda path: None,
-            "is empty": lambda path: path.mkdir(),
-            "is a file": lambda path: path.write_bytes(bytes(range(256))),
-            "its records hold other bytes": _other_records,
+            "The file does not exist": lambda path: None,
+            "It is empty": lambda path: path.mkdir(),
+            "It is a file": lambda path: path.write_bytes(bytes(range(256))),
+            "Its records contain random bytes": _other_records,
         },
     ),
 )
@@ -339,7 +341,7 @@ def tried(kind: Kind) -> dict[tuple[str, str], str]:
 def main() -> None:
     parts = [_HEAD, *(f"## {kind.title}\n\n{table(kind, tried(kind))}\n" for kind in KINDS)]
     PAGE.write_text(
-        "\n".join(parts) + "\nThis page is written by `python docs/make_checks.py`; a test holds it to what the commands do.\n"
+        "\n".join(parts) + "\n`python docs/make_checks.py` writes this page, and a test compares it with what the commands do.\n"
     )
 
 

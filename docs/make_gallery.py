@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+from effect_words import STAGES, symbols
 from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -46,10 +47,23 @@ GSD_M = 0.25
 SEED = 1
 STEREO_QUIET = {"parallax_sigma_px": 0.0, "regularization_sigma_px": 0.0}
 TLS_QUIET = TlsNoise(range_sigma_m=0.0, range_ppm=0.0, angle_sigma_rad=0.0)
+SENSORS = {"stereo": "stereo pair", "tls": "laser scanner"}
 SCENES = {
-    "stereo": "Glendale's pair (D810, 50 mm, 105 m, base 28 m), depth map of medium quality",
-    "tls": "a scanner 105 m in front of the wall, steps of 0.5 mrad",
+    "stereo": "Two Nikon D810 cameras with 50 mm lenses and a base of 28 m see a generated wall from 105 m. The depth"
+    " map has medium quality: one cell for 4 x 4 px of the left image.",
+    "tls": "A laser scanner sees a generated wall from 105 m, with angular steps of 0.5 mrad.",
 }
+_INDEX = """# The effects
+
+An effect is one way in which a real laser scanner or stereo pair differs from an ideal one: a systematic error, or noise. This
+catalogue is for users who simulate sensor errors, or who read the name of one in a diagnosis by `scarpsim gap`. Each effect has a
+page with its equation, its parameters and a map of what it does to a measurement.
+
+`docs/make_gallery.py` writes these pages; do not edit them."""
+_ORDER = """## When an effect acts
+
+A simulated sensor applies its effects in stages, in the order of this table, whatever their order in the config. A laser scanner
+has the stages from `aim` to `return`, a stereo pair those from `camera` to `point`."""
 LEVELS = 17
 LOST, GAINED, NOTHING = "#333333", "#2ca02c", "#d0d0d0"
 
@@ -129,19 +143,27 @@ def example(effect: type[Effect]) -> Effect:
 def page(effect: type[Effect], comparison: Comparison) -> str:
     """Return the Markdown page of an effect."""
     shown, name = example(effect), f"{effect.sensor}.{effect.model_fields['name'].default}"
-    described = inspect.cleandoc(effect.__doc__ or "")
+    found = ", or whose diagnosis with `scarpsim gap` names it" if effect not in FURTHER_EFFECTS else ""
+    stage = effect.stage.name.lower()
     parts = [
         f"# {name}",
         inspect.cleandoc(sys.modules[effect.__module__].__doc__ or ""),
-        f"```text\n{described}\n```",
-        f"Acts at the stage `{effect.stage.name.lower()}`. Written by `docs/make_gallery.py`; do not edit.",
-        _parameters(effect),
+        f"This page defines an error of a {SENSORS[effect.sensor]}. It is for users who simulate it{found}.",
+        f"**What it means:** {effect.means}\n\n**What to do:** {effect.act}",
+        f"## Equation\n\n```text\n{inspect.cleandoc(effect.__doc__ or '')}\n```",
+        symbols(effect),
+        f"When the program simulates a measurement, {STAGES[effect.stage]} (stage [`{stage}`](README.md#when-an-effect-acts)).",
+        f"## Parameters\n\n{_parameters(effect)}",
+        "With the default values the effect is off. The source `empirical` means that no publication gives the value.",
         f"## In a config\n\n```yaml\n{yaml(shown)}\n```",
         f"## Its difference map\n\n![{name}]({name}.png)",
-        f"{SCENES[effect.sensor]}, no other noise: recorded {_quantity(effect)} with the effect of the example minus that without"
-        f" it, cell by cell; positive is farther away, as missing rock would be. {_figures(comparison)}",
+        f"The map shows the recorded {_quantity(effect)} with the effect of the example minus that without it. Red is farther"
+        f" away, as missing rock would be. {SCENES[effect.sensor]} There is no other noise.",
+        _figures(comparison),
+        "[From symptom to cause](../gap/symptoms.md) compares the maps of all effects. The [glossary](../glossary.md) explains"
+        " the words. `docs/make_gallery.py` writes this page from the code; do not edit it.",
     ]
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def yaml(shown: Effect) -> str:
@@ -187,9 +209,9 @@ def _figures(comparison: Comparison) -> str:
     cells, median = comparison.without.valid.sum(), np.median(values)
     spread = 1.4826 * np.median(np.abs(values - median))
     return (
-        f"Mean {values.mean():.2f} mm, StD {values.std():.2f} mm, NMAD {spread:.2f} mm;"
-        f" {100 * comparison.lost.sum() / cells:.2f} % of the cells are lost,"
-        f" {100 * comparison.gained.sum() / cells:.2f} % are gained."
+        f"Over all cells the difference has a mean of {values.mean():.2f} mm, a standard deviation of {values.std():.2f} mm and"
+        f" an NMAD of {spread:.2f} mm. The effect leaves {100 * comparison.lost.sum() / cells:.2f} % of the cells without a"
+        f" value, and gives a value to {100 * comparison.gained.sum() / cells:.2f} % that have none without it."
     )
 
 
@@ -254,12 +276,14 @@ def _palette_png(figure: Figure) -> bytes:
 
 def index() -> str:
     """Return the page that lists all effects' pages."""
-    lines = ["# The effects", "", "Written by `docs/make_gallery.py`; do not edit."]
-    for title, effects in (("Laser scanner", TLS_EFFECTS), ("Stereo", (*STEREO_EFFECTS, *FURTHER_EFFECTS))):
-        lines += ["", f"## {title}", ""]
+    lines = [_INDEX]
+    for title, effects in (("Laser scanner", TLS_EFFECTS), ("Stereo pair", (*STEREO_EFFECTS, *FURTHER_EFFECTS))):
+        lines += ["", f"## {title}", "", "| effect | what it is |", "|---|---|"]
         for effect in effects:
             name = f"{effect.sensor}.{effect.model_fields['name'].default}"
-            lines.append(f"- [{name}]({name}.md): {inspect.cleandoc(sys.modules[effect.__module__].__doc__ or '')}")
+            lines.append(f"| [{name}]({name}.md) | {inspect.cleandoc(sys.modules[effect.__module__].__doc__ or '')} |")
+    lines += ["", _ORDER, "", "| stage | what happens |", "|---|---|"]
+    lines += [f"| `{stage.name.lower()}` | {words[0].upper()}{words[1:]}. |" for stage, words in STAGES.items()]
     return "\n".join(lines) + "\n"
 
 

@@ -217,15 +217,21 @@ def symptoms_page(found: list[Symptom], tables: dict[str, Identifiability]) -> s
     lines = [
         "# From symptom to cause",
         "",
-        "This page shows how each effect of the catalogue looks in a map of the residuals, for users who see a pattern and look"
-        " for its cause. `docs/make_gap_pages.py` writes it from the effects; do not edit it.",
+        "This page shows how each effect of [the catalogue](../effects/README.md) looks in a map of the residuals. It is for"
+        " users who see a pattern in such a map and look for its cause. `docs/make_gap_pages.py` writes it; do not edit it.",
         "",
-        "Each map shows one effect at its typical values, on a wall in Glendale's style seen from 105 m, without noise. The "
-        "colour is the recorded range or depth with the effect minus that without it, **after a shift and a rotation of the "
-        "sensor are fitted**, in mm. Black: returns lost. The pattern depends on wall and distance. `scarpsim gap "
-        "--identifiability CONFIG` computes which effects can be told apart at your site.",
+        "A *residual* is the measured minus the predicted range or depth, in mm. Each map shows the residuals that one effect of"
+        " typical size makes on a generated wall, seen from 105 m without noise, **after a shift and a rotation of the sensor are"
+        " fitted**. Lost returns are black. The pattern depends on the wall and on the distance. `scarpsim gap --identifiability"
+        " CONFIG` computes which effects can be told apart at your site.",
         "",
-        f'"Looks like" lists effects whose signature has a cosine of at least {SIMILAR_COSINE:g} with this one on that wall.',
+        "| column | meaning |",
+        "|---|---|",
+        "| pattern | what the residuals depend on: their mean, their standard deviation, or where there are none |",
+        "| left by the pose fit | share of the effect's pattern, as a root mean square, that no shift or rotation of the"
+        " sensor imitates |",
+        f"| looks like | effects whose pattern has a correlation (cosine) of at least {SIMILAR_COSINE:g} with this one on that"
+        " wall |",
     ]
     for kind, title in _KINDS.items():
         rows = [each for each in found if each.kind == kind]
@@ -250,7 +256,7 @@ def symptoms_page(found: list[Symptom], tables: dict[str, Identifiability]) -> s
 def _alike(name: str, table: Identifiability) -> str:
     if name not in table.names:
         return ""
-    return ", ".join(table.names[other].partition(".")[2] for other in table.alike(table.names.index(name)))
+    return ", ".join(table.names[other].partition(".")[2] for other in table.similar_effects(table.names.index(name)))
 
 
 def make_symptoms() -> None:
@@ -298,78 +304,100 @@ def verdicts() -> dict[str, Verdict]:
     """Return the verdicts by name, with their examples."""
     return {
         "named": Verdict(
-            "The model without the effect is rejected (p-value of the best candidate at most 0.004). One effect of the "
-            "catalogue explains the disagreement, no non-parametric term explains clearly more, and no other effect scores "
-            "nearly as much.",
-            "Compare the effect's value with the manufacturer's or a calibration's, and simulate with model_after.yaml.",
-            "A mirror that wobbles by 80 microradians with a period of 37 scan lines.",
+            "The model without the effect is rejected: the best candidate has a p-value of at most 0.004. One effect of the "
+            "catalogue explains the disagreement. No other effect explains nearly as much, and no empirical curve explains "
+            "clearly more.",
+            "Compare the value of the effect with that of the manufacturer or of a calibration. Simulate with model_after.yaml, "
+            "which contains the effect.",
+            "The mirror of a scanner wobbles by 80 µrad, with a period of 37 scan lines.",
             _case(seed=11, angles=_wobble),
         ),
         "several": Verdict(
-            "As for `named`, with more than one effect: each improves the model beside the others.",
-            "The effects are sorted by how much they explain. Each has its own equivalence class; if it has several members, "
-            "the effect is not identified yet.",
-            "The wobble above, and noise that falls with the received power.",
+            "The conditions of [named](named.md) hold for more than one effect, and each improves the fit beside the others.",
+            "Begin with the first effect, because they are sorted by how much they explain. Each effect lists those from which "
+            "it cannot be told. If there are any, this measurement does not identify the effect yet.",
+            "The mirror of a scanner wobbles as in the example of [named](named.md), and the range noise is larger where less "
+            "light returns.",
             _case(seed=12, angles=_wobble, ranges=_noisy),
         ),
         "ambiguous": Verdict(
-            "An effect of the catalogue explains the disagreement, but other effects explain it as well: their score is within "
-            "3 of the best one (a factor of 20 in likelihood). `cannot_be_told_from` lists this equivalence class.",
-            "Make the measurement in `split_by`, or see with `scarpsim gap --identifiability` what would separate the class at "
-            "this site. model_after.yaml is right for surveys of the same geometry, whichever effect is true; elsewhere it may "
-            "be wrong.",
-            "An offset of all ranges by 2 mm: most of it looks like a shift of the scanner, the rest like a scale.",
+            "An effect of the catalogue explains the disagreement, but other effects explain it about as well. Their score, a "
+            "penalised log-likelihood, is within 3 of the best one, which is a factor of 20 in likelihood. "
+            "`cannot_be_told_from` in gap.json lists these effects.",
+            "Make the measurement that `split_by` in gap.json names. `scarpsim gap --identifiability` shows what would separate "
+            "the effects at your site. You can use model_after.yaml for surveys of this wall from this place, whichever effect "
+            "is true. Elsewhere it may be wrong.",
+            "All ranges of a scanner are too long by 2 mm. On this wall most of that looks like a shift of the scanner, and the "
+            "rest like a wrong scale.",
             _case(seed=13, ranges=lambda scan: scan.R + 0.002),
         ),
         "unknown": Verdict(
-            "The model is rejected, and the catalogue does not explain why. There are three cases. A non-parametric term of a "
-            "covariate explains clearly more (a score higher by 5) than any effect of the catalogue. Or nothing that was tried "
-            "passes validation, although the gap exceeds the floor by more than its uncertainty or the misfit has a p-value of "
-            "at most 0.01; the report then says where and how large. Or effects were named, but they leave most of the gap "
-            "open, or a misfit with that p-value beside a gap too small to show what they are worth.",
-            "See on which covariate it depends, and in what form. The empirical term in model_after.yaml reproduces it in "
-            "simulations, but only within the measured range of the covariate.",
-            "Ranges that jump by 4 mm in the middle of the scan, as after a knock.",
+            "The model is rejected, but the catalogue does not explain why. There are three cases:\n\n"
+            "1. An empirical curve of one covariate, such as the azimuth or the time, explains clearly more (a score higher by "
+            "5) than any effect of the catalogue.\n"
+            "2. Nothing that was tried passes the test on validation blocks, although the gap exceeds the floor by more than "
+            "its uncertainty, or the misfit has a p-value of at most 0.01. The report then says where the misfit is and how "
+            "large.\n"
+            "3. Effects were named, but they leave most of the gap open. Or they leave a misfit with such a p-value, and the "
+            "gap is too small to show what the effects are worth.",
+            "See in the report on which covariate the disagreement depends, and in what form. model_after.yaml holds an "
+            "empirical term that reproduces it in simulations, but only within the measured range of the covariate.",
+            "The ranges of a scanner jump by 4 mm in the middle of the scan, as after a knock.",
             _case(seed=18, ranges=lambda scan: scan.R + 0.002 * np.where(scan.az > 1.6, 1.0, -1.0)),
         ),
         "no_gap": Verdict(
-            "No effect was named, the gap is within its uncertainty of the floor, and the misfit has a p-value above 0.01."
-            " Registration and regions where rock moved (`scene_changes`) are reported, but do not count as a gap. If the model"
-            " predicts more noise than there is, the report says so with the noise that would fit (`lower_noise` under"
-            " `remaining`).",
-            "Nothing has to be added. Smaller effects may be hidden: `detectable` in gap.json and the report list the size from "
-            "which each would have shown with a probability of 95 %. If the reference is better than its error was estimated "
-            "(`reference_error_m`), say so with `--reference-error`, and smaller effects show.",
-            "Noise, a slightly wrong pose, a reference that errs by fractions of a millimetre, and lost returns.",
+            "Three things hold. No effect was named. The gap differs from the floor by no more than its uncertainty. The misfit "
+            "that remains has a p-value above 0.01. A corrected registration and regions where rock moved (`scene_changes` in "
+            "gap.json) are reported, but do not count as a gap. If the model predicts more noise than there is, the report "
+            "states the noise that would fit (`lower_noise` under `remaining` in gap.json).",
+            "You need not add anything to the model. Smaller effects may be hidden: `detectable` in gap.json and the report list "
+            "the size from which each would have shown with a probability of 95 %. If the reference is better than its error was "
+            "estimated (`reference_error_m`), say so with `--reference-error`, and smaller effects show.",
+            "A scan has noise, a slightly wrong pose, a reference with errors of fractions of a millimetre, and lost returns. "
+            "The model allows for all of them.",
             _case(seed=1),
         ),
         "insufficient_data": Verdict(
-            "Fewer than 800 points lie on smooth parts of the reference, where residuals are meaningful. Or nothing was named "
-            "and there are too few validation points to measure a gap. Or much of the wall moved, or the reference shows "
-            "another place or time: nothing closes the gap, and at least 30 % of the points lie off the reference together with "
-            "their neighbours, by more than 3 predicted standard deviations and 20 mm.",
-            "Scan more densely, or use a reference that covers the scan. If much moved, add `stable_areas` where nothing moved, "
-            "or use a reference of the same time.",
-            "A scan in steps of 0.05 rad.",
+            "There are three cases:\n\n"
+            "1. Fewer than 800 points lie on smooth parts of the reference, where residuals are meaningful.\n"
+            "2. Nothing was named, and there are too few validation points to measure a gap.\n"
+            "3. Much of the wall moved, or the reference shows another place or time. Nothing closes the gap, and at least 30 % "
+            "of the points lie off the reference together with their neighbours, by more than 3 predicted standard deviations "
+            "and 20 mm.",
+            "Scan more densely, or use a reference that covers the scan. If much rock moved, add `stable_areas` where nothing "
+            "moved to measurement.yaml, or use a reference of the same time.",
+            "A scan has angular steps of 0.05 rad, so only few points lie on the wall.",
             _case(seed=1, step_rad=0.05),
         ),
     }  # fmt: skip
 
 
+_TERMS = """An *effect* is a sensor error of [the catalogue](../effects/README.md). The *gap* is how far the measurement lies from
+the model's prediction, *before* and *after* the named effects are in the model. The *floor* is what the model's own noise leaves.
+The [glossary](../glossary.md#model-and-measurement) explains further words, and
+[how gap works](../../explanation/how_gap_works.md) the tests."""
+_PICTURES = """The maps show how much deeper the surface was measured than predicted, and the measured over the predicted standard
+deviation. On the left is the model before the named effects, on the right after them. The bar shows the gap on the validation
+blocks."""
+
+
 def verdict_page(name: str, verdict: Verdict, found: GapDiagnosis) -> str:
     """Return the Markdown page of a verdict."""
-    pictures = [f"![maps](images/verdict_{name}.png)"] if found.gap is not None else []
-    pictures += [f"![gap](images/gap_{name}.png)"] if found.gap is not None else []
+    pictures = [_PICTURES, f"![maps](images/verdict_{name}.png)", f"![gap](images/gap_{name}.png)"]
     parts = [
         f"# {name}",
-        VERDICTS[name],
-        f"**Given when**: {verdict.when}",
-        f"**What to do**: {verdict.what_to_do}",
-        f"## Example\n\n{verdict.case} Made by the tests' generator; this page is by `docs/make_gap_pages.py`.",
+        f"`{name}` is a verdict of `scarpsim gap`, which compares a measurement with the model of its sensor. This page is for"
+        " users who got it. It says:",
+        f"> {VERDICTS[name]}",
+        _TERMS,
+        f"## When it is given\n\n{verdict.when}",
+        f"## What to do\n\n{verdict.what_to_do}",
+        f"## Example\n\n{verdict.case} The report says of this simulated measurement:",
         f"> {paragraph(found, rank_disagreements(found))}",
-        f"```text\n{summarise(found)}\n```",
-        *pictures,
-        "[From symptom to cause](symptoms.md)",
+        f"The terminal shows:\n\n```text\n{summarise(found)}\n```",
+        *(pictures if found.gap is not None else []),
+        "[From symptom to cause](symptoms.md) shows the pattern of each effect. `docs/make_gap_pages.py` writes this page; do not"
+        " edit it.",
     ]
     return "\n\n".join(parts) + "\n"
 

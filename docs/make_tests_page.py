@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import tomllib
 from pathlib import Path
 
@@ -9,9 +10,11 @@ FOLDER = Path(__file__).parent
 PAGE, LIST = FOLDER / "validation" / "tests.md", FOLDER.parent / "tests" / "validation.toml"
 _HEAD = """# What the tests cover, and when they run
 
-This page is for developers. `make test` runs lint, spelling, types and the tests that take seconds each. `make validate` runs
-the long tests below; run it before each release and after each larger change. Whatever a long test covers as a whole has
-shorter tests of its parts in `make test`.
+This page lists the long tests, for developers who make a release or change a method. `make test` runs lint, spelling, types and
+the tests that take seconds each. `make validate` runs the tests below. Run it before each release and after each larger change.
+What a long test covers as a whole also has short tests of its parts in `make test`.
+
+The names of the long tests are in `tests/validation.toml`.
 """
 
 
@@ -21,16 +24,20 @@ def page() -> str:
     parts = [_HEAD]
     for group in groups:
         title, _, why = group["reason"].partition(": ")
-        names = [f"| `{file}` | {', '.join(_words(name) for name in group[file])} |" for file in group if file != "reason"]
+        names = [f"| `{file}` | {len(group[file])} | {_about(file)} |" for file in group if file != "reason"]
         about = [f"{why[0].upper()}{why[1:]}", ""] if why else []
-        parts.append("\n".join([f"## {title.rstrip('.')}\n", *about, "| file | tests |", "|---|---|", *names, ""]))
+        parts.append(
+            "\n".join(
+                [f"## {title.rstrip('.')}\n", *about, "| file | long tests | what the file tests |", "|---|---|---|", *names, ""]
+            )
+        )
     return "\n".join([*parts, "This page is written by `python docs/make_tests_page.py`.\n"])
 
 
-def _words(name: str) -> str:
-    """Return a test's name as words, with its parameter."""
-    plain, _, parameter = name.removeprefix("test_").partition("[")
-    return plain.replace("_", " ") + (f" ({parameter.rstrip(']')})" if parameter else "")
+def _about(file: str) -> str:
+    """Return the first sentence of a test file's docstring, which says what it tests."""
+    text = ast.get_docstring(ast.parse((FOLDER.parent / file).read_text(encoding="utf-8"))) or ""
+    return " ".join(text.partition("\n\n")[0].split()).replace("|", "/")
 
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ WORK_STARTS = (
     "pipeline.calibration.calibrate:calibrate_inputs",
     "pipeline.dataset.run:write_dataset_file",
     "pipeline.dataset.combine:_finish",
+    "pipeline.monitoring.run:compare_epoch",
     "pipeline.gap.naming.workflow:diagnose",
     "pipeline.gap.survey.identifiability:identifiability",
     "pipeline.detection.products.run:_write",

@@ -44,8 +44,7 @@ KNOWS = """
 import json
 from types import SimpleNamespace
 import numpy as np
-from pipeline.gap.residuals.residuals import NOT_SHARED
-from pipeline.gap.mean.signatures import mean_families
+from pipeline.gap.mean.signatures import systematic_families
 from pipeline.gap.noise_and_edges.variance_model import variance_candidates
 from pipeline.cli.json_schema import json_schema
 from scene.common.keyed_random import KeyedRandom
@@ -55,7 +54,7 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 at = PulseGeometry(*np.random.default_rng(1).uniform(0.4, 0.9, (9, 50)))
 residuals = SimpleNamespace(sensor="tls", geometry=at, candidates=catalogue("tls"))
-toy = next(each for each in mean_families(residuals, None) if each.name == "range_warm_up")
+toy = next(each for each in systematic_families(residuals, None) if each.name == "range_warm_up")
 shimmer = next(each for each in variance_candidates(residuals) if each.name == "range_shimmer")
 model = TlsModel(noise={"range_sigma_m": 0, "angle_sigma_rad": 0}, effects=[{"name": "range_shimmer", "sigma_per_m": 2e-3}])
 print(json.dumps({

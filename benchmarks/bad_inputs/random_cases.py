@@ -89,6 +89,10 @@ SET_UPS: dict[str, tuple[SetUp, ...]] = {
             ("pair/surface.xyz", "pair/wall.ply", "pair/cameras.yaml"),
         ),
     ),
+    "monitor": (
+        SetUp(("run", *_OUT), ("run",), (RUN,)),
+        SetUp(("raw/scan.ply", "measurement/scan.ply", "--position", "0,0,0", *_OUT), ("raw", "measurement"), _RAW[:1]),
+    ),
     "gap": (
         SetUp(("measurement", *_OUT), ("measurement",), tuple(f"measurement/{name}" for name in _MEASUREMENT)),
         SetUp(("pair", *_OUT), ("pair",), tuple(f"pair/{name}" for name in _PAIR)),

@@ -31,16 +31,28 @@ _NUISANCES = """| always present | size |
 Strengths are spread evenly in their logarithm from 2 to 120, up to three times the catalogue's largest typical size."""
 
 _LABELS = {
-    "gap closed, all cases' metres summed": "gap closed, summed over all cases in metres",
-    "the same, as the angle to the nearest other effect lets it (1 - sin^2, median)": "its expectation by the angle to the "
+    "false alarms on no-effect cases": "false alarms: the verdict is not `no_gap`, though there is no effect",
+    "right class at S/N x sin(angle) of 8 or more": "clear effects in the right class",
+    "wrong names among committed answers": "wrong names among the answers that name an effect",
+    "the class contains the truth": "named classes that contain the true effect",
+    "median size of the class": "median number of effects in a class",
+    "off-catalogue effects answered unknown": "errors outside the catalogue that are answered `unknown`",
+    "real change blamed on the sensor": "false alarms where only rock fell",
+    "gap closed on held-out data, effects named (median)": "share of the gap that the named effects close on validation blocks "
+    "(median)",
+    "gap closed, all cases' metres summed": "the same, of the sum of all gaps in metres",
+    "gap closed by the best wrong effect outside the class (median)": "share of the gap that the best wrong effect outside the "
+    "class closes (median)",
+    "the same, as the angle to the nearest other effect lets it (1 - sin^2, median)": "its expectation from the angle to the "
     "nearest other effect, 1 - sin^2 (median)",
-    "the same, where that angle leaves it 5 % at most": "the same, where the expectation is 5 % at most",
+    "the same, where that angle leaves it 5 % at most": "the share that it closes where the expectation is 5 % at most",
+    "rightly named, but the gap is within its uncertainty": "right names whose gap is within its uncertainty",
 }
 """Rows of the results whose names need more words on the page."""
 
-_READING = """"Undecided" means that the 95 % interval (Wilson) holds values that reach the goal and values that do not. The best
-wrong effect closes much of the gap wherever two signatures are alike: fitted freely, an effect at the angle a to the true one
-takes 1 - sin^2 a of its square, whatever the method."""
+_READING = """"Undecided" means that the 95 % interval (Wilson) contains values that reach the goal and values that do not. The
+best wrong effect closes much of the gap wherever two signatures are alike: fitted freely, an effect at the angle a to the true
+one takes 1 - sin^2 a of its square, whatever the method."""
 
 
 def markdown(found: Json) -> str:
@@ -54,13 +66,15 @@ def markdown(found: Json) -> str:
         _READING,
         "## What the measurements hold\n\n" + _NUISANCES,
         "## Compared with two simple methods\n\nBoth take residuals as independent and give one name: the effect with the "
-        "largest |z| above 3, or the best effect by BIC if it is ahead by more than 10.\n\n" + _baselines(found),
+        "largest |z| (estimate over its standard error) above 3, or the best effect by the Bayesian information criterion (BIC) "
+        "if it is ahead by more than 10.\n\n" + _baselines(found),
         "## Answers by effect\n\nEach true effect counts once, also those of measurements with several effects, "
         "which the figures above leave out. Weak effects,\nwith S/N x sin(angle) below 8, are in brackets. "
         "A name that begins with `off_` is an error outside the catalogue.\n\n" + _by_effect(found["by_effect"]),
-        "## Detection by strength\n\nSingle effects: found at all by S/N, in the right class by S/N x sin(angle).\n\n"
-        + _curves(found["detection"]),
-        "## Coverage of the 90 % intervals\n\n" + _coverage(found["coverage"]),
+        '## Detection by strength\n\nThe measurements have one effect each. "Found at all" is sorted by S/N, and "right class" '
+        "by S/N x sin(angle).\n\n" + _curves(found["detection"]),
+        "## Coverage of the 90 % intervals\n\nHow many of the intervals of each parameter contain its true value.\n\n"
+        + _coverage(found["coverage"]),
         "## Failures\n\n" + _failures(found["failures"]),
     ]
     return "\n\n".join(parts) + "\n"
@@ -81,9 +95,19 @@ works in closed form and shares no code with the sensors or the diagnosis.
 - {counted("wrong names among committed answers")} answers that name an effect hold a wrong name.
 - {counted("false alarms on no-effect cases")} measurements without an effect raise a false alarm.
 
-S/N is the strength of an effect: its signature after the pose fit, against the noise and the correlated error of the reference.
-S/N x sin(angle) is what is left of it when the nearest effect of another class is fitted too. An effect is clear if that is 8 or
-more. Signatures with a sine below 0.1 form one class."""
+## Words
+
+| word | meaning |
+| --- | --- |
+| effect | a sensor error of [the catalogue](../reference/effects/README.md) |
+| signature | the pattern of residuals that an effect makes |
+| class | effects that this measurement cannot tell apart: the angle between their signatures has a sine below 0.1 |
+| gap, floor | how much worse the measurement fits the model than it should; what noise alone leaves |
+| S/N | strength of an effect: its signature after the pose fit, against the noise and the correlated error of the reference |
+| S/N x sin(angle) | what is left of it when the nearest effect of another class is fitted too |
+| clear | an effect whose S/N x sin(angle) is 8 or more, in a measurement with no other effect |
+| validation blocks | parts of the wall that were not used to find effects |
+| `no_gap`, `unknown` | verdicts: measurement and model agree; they disagree, and no effect of the catalogue explains it |"""
 
 
 def _cases(found: Json) -> int:
@@ -100,7 +124,7 @@ def _made_by(found: Json) -> str:
     command = f"`{words}{chosen}{' --small' if settings['small'] else ''} --jobs 2 --out DIR --table {page}`"
     took = f"{seconds.get('median', 0):.0f} s (median), {seconds.get('longest', 0):.0f} s at most"
     row = (_cases(found), settings["seed"], settings.get("commit", ""), took, command)
-    return _table(("cases", "seed", "commit", "time of a case", "command"), [row])
+    return "## How the results were made\n\n" + _table(("cases", "seed", "commit", "time of a case", "command"), [row])
 
 
 def _table(head: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
@@ -144,7 +168,8 @@ def _baselines(found: Json) -> str:
         values = found["baselines"][name]
         cells = (values[key] for key in ("false_alarms", "change_blamed", "right", "wrong_names"))
         rows.append((label, *(f"{hits} of {count}" for hits, count in cells)))
-    return _table(("", "false alarms", "change blamed", "right class, clear", "wrong names among committed"), rows)
+    head = ("method", "false alarms", "false alarms where only rock fell", "clear effects in the right class", "wrong names")
+    return _table(head, rows)
 
 
 def _by_effect(counts: Json) -> str:

@@ -18,55 +18,55 @@ This page shows whether `scarpsim gap` names a known effect in a real measuremen
 ways that no generator makes: edges, twigs, relief between points, rounded coordinates. The page is for users who want to know
 what to expect from data of their own. The [closed-form generator](gap_closed_form.md) tests the same on simulated measurements.
 
-Each case is a measurement of ../shared/data into whose ranges, angles or disparities a known effect was put by a closed form
-(`benchmarks/gap_injections/formulas.py`, which uses NumPy and SciPy alone). It is then diagnosed as `scarpsim gap` does it. Made
-by
+Each case begins with one of eight real measurements. A known effect is added to its ranges, angles or disparities by a formula
+that shares no code with the program (`benchmarks/gap_injections/formulas.py`). The result is diagnosed as by `scarpsim gap`. This
+command makes the page:
 
     OMP_NUM_THREADS=1 python benchmarks/gap_injections/run.py --out /tmp/injections --page docs/validation/gap_injections.md"""
 
 _OUTCOMES = {
     "right": (
-        "names the effect, within 3 standard errors or 15 % of its size (a period within 5 %), and blames no other; for "
-        "an effect outside the catalogue (`off_...`): `unknown`, and no effect of the catalogue is blamed"
+        "names the effect and no other, with its size within 3 standard errors or 15 % (a period within 5 %); for "
+        "an error outside the catalogue (`off_...`): `unknown`, and no effect of the catalogue is named"
     ),
     "class": "lists the effect among those that cannot be told apart",
     "described": "has the effect with its size, but as an empirical term",
-    "size": "names the effect alone, with another size",
-    "missed": "names no effect of the catalogue; outside the catalogue: is not `unknown`",
-    "wrong": "blames another effect that was not named without the injection",
+    "size": "names the effect alone, with a wrong size",
+    "missed": "names no effect of the catalogue; for an error outside it: is not `unknown`",
+    "wrong": "names a wrong effect, which was not named without the injection",
     "refused": "is an error message",
 }
 """What each judgement means."""
 
 _STRENGTH = (
-    "S/N is the signal-to-noise ratio of what the effect does to the residuals beyond what a pose takes up. The "
-    "noise is taken as white, with the spread of the measurement itself (systematic effects) or the larger variance"
-    " (noise effects). Real errors are shared by neighbours and make it smaller."
+    "S/N is the signal-to-noise ratio of what the effect does to the residuals, after a shift and a rotation of the "
+    "sensor are fitted. The noise is taken as white. For systematic effects it is the scatter of the measurement "
+    "itself, for noise effects the larger of both variances. Neighbours share real errors, so the true ratio is smaller."
 )
 
 _CAUSES = {
     "ground of the forest, noise of 1 and 2 mm": (
-        "the relief between the points of the reference is as large (2.3 mm), and counts as [the reference's "
+        "the relief between the points of the reference is as large as the noise (2.3 mm), and counts as [the reference's "
         "error](../explanation/how_gap_works.md#references-made-of-points)"
     ),
-    "effects of more than ten typical sizes that the pose nearly undoes": (
-        "they are left out on purpose; what is named in their place has them in its class"
+    "effects of more than ten typical sizes that a shift or rotation of the sensor nearly imitates": (
+        "they are not searched for, on purpose; the effect that is named in their place lists them as alternatives"
     ),
     "angle noise of 1 mrad": (
-        "it moves points beyond their triangle, and a noise that depends on the incidence is named beside it"
+        "it moves points beyond their triangle of the reference, and noise that depends on the incidence is named beside it"
     ),
-    "`trees`, a constant offset": "an error of an angle and a wave of the range describe it as well",
+    "`trees`, a constant offset": "an error of an angle and a periodic error of the range describe it as well",
     "`rocks`": (
-        "residuals spread 2.4 times what the model predicts, and neighbours share most of that (relief, coordinates "
-        "rounded to 6 cm); its own intensity bias of -0.022 m adds to what was put in"
+        "the residuals scatter 2.4 times as much as the model predicts, and neighbours share most of that (relief, coordinates "
+        "rounded to 6 cm); the scan has an intensity bias of -0.022 m of its own, which adds to what was put in"
     ),
     "`light`, effects of hundredths of a pixel": (
-        "its noise is 0.009 px with 3 % of the points far out, and camera effects as small as that are blamed"
+        "its noise is 0.009 px with 3 % outliers, and camera effects of that size are named wrongly"
     ),
     "`light`, 3 px of the principal point, 5 px of the focal length": (
-        "the picture moves by 2 to 3 px over edges that are known to 0.01 px, so that edges count as change or noise"
+        "the image moves by 2 to 3 px across edges that are known to 0.01 px, so the edges count as change or noise"
     ),
-    "a wave along rows of S/N 120": "it is found, but does not hold on the validation blocks",
+    "a wave along rows of S/N 120": "it is found, but does not pass the test on the validation blocks",
 }
 """Where cases fail, and why."""
 
@@ -101,7 +101,16 @@ def _bases(bases: dict[str, Json]) -> str:
         found = bases[name]
         last = found.get("as_diagnosed", found["as_it_is"])
         rows.append([f"`{name}`", BASES[name].about, f"{last['points']:,}", _verdict(found["as_it_is"]), _base_words(found)])
-    return _table(("name", "what", "points", "answer", "answer with the noise that it proposes; effects are put into this"), rows)
+    return _table(
+        (
+            "name",
+            "content",
+            "points",
+            "answer with the noise of the data sheet",
+            "answer with the noise that the first answer proposes, which is used below",
+        ),
+        rows,
+    )
 
 
 def _base_words(found: Json) -> str:
@@ -142,11 +151,12 @@ def _in_short(rows: list[Json]) -> str:
         right = sum(row in good for row in group)
         wrong = sum(row["judgement"] == "wrong" for row in group)
         said.append(
-            f"On {words}, {right} of {len(group)} answers are right or hold the effect in their class, and {wrong} blame another."
+            f"On {words}, {right} of {len(group)} answers name the effect or list it among those that cannot be told apart,"
+            f" and {wrong} name a wrong effect."
         )
     said.append(
         f"In {len(spoiled)} of the {len(known)} good answers on effects of the catalogue the verdict is still `unknown`, because "
-        "the disagreement that the measurement had before stays unexplained."
+        "the measurement disagreed with its model before the injection already."
     )
     return " ".join(said)
 

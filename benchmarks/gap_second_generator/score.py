@@ -33,8 +33,25 @@ folders and answers, without knowledge of the program. So it makes other assumpt
 | stereo pairs | converging cameras, a matcher's noise on grids |
 | strength of an effect | signal-to-noise ratio of 6 to 100, no more than a few times the catalogue's typical size |
 """
-_WORDS = """"More" is a right name beside another one, and "part" one of two effects. "Ratio" is the signal-to-noise ratio of an
-effect, and "apart" what the nearest other effect leaves of it. Intervals are binomial, 95 %.
+_WORDS = """| kind of measurement | what it contains |
+|---|---|
+| none | no effect |
+| change | no effect, but rock that fell or moved |
+| off | one error that is not in the catalogue |
+| one, two | one or two effects of the catalogue |
+
+| outcome | what the answer says |
+|---|---|
+| alone | the true effect, without alternatives |
+| class | the true effect among those that cannot be told apart |
+| more | the true effect and a wrong one |
+| part | one of two true effects |
+| wrong name | a wrong effect |
+| unknown, no_gap, insufficient_data | this [verdict](../reference/glossary.md#model-and-measurement), and no effect |
+
+The right answer is `no_gap` for the kinds none and change, and `unknown` for off. "Ratio" is the signal-to-noise ratio of an
+effect, in brackets what is left of it when the most similar other effect is fitted too. "p of what remains" is the p-value of
+the misfit that is left. Intervals are binomial, 95 %.
 """
 LEVEL_90 = float(norm.ppf(0.95))
 EDGED = ("strips", "tiles")
@@ -163,10 +180,12 @@ def _in_short(results: list[Result]) -> str:
     return f"""This page shows how `scarpsim gap` does on {len(results)} simulated measurements of a generator that does not share
 the program's assumptions. It is for users who want to know how far the results of one generator carry over to other data.
 
-- {right} of {len(clear)} clear effects (ratio of {CLEAR:.0f} or more, the nearest other apart) are answered rightly.
-- {len(wrong)} of {len(spoke)} answers that name an effect hold a wrong name.
-- {rejected} of {len(quiet)} measurements without an effect are rejected; an effect is named in {_named(quiet)} of them.
-- {blamed} of {len(moved)} measurements with nothing but changes of the scene are rejected.
+- {right} of {len(clear)} clear effects are answered rightly: their signal-to-noise ratio is at least {CLEAR:.0f} beside the most
+  similar other effect.
+- {len(wrong)} of {len(spoke)} answers that name an effect contain a wrong name.
+- {rejected} of {len(quiet)} measurements without an effect are not answered with `no_gap`, and {_named(quiet)} of them
+  name an effect.
+- {blamed} of {len(moved)} measurements in which only rock fell are not answered with `no_gap`.
 """
 
 
@@ -193,15 +212,17 @@ def _rates(results: list[Result]) -> str:
     inside, checked = sum(each.inside for each in results), sum(each.intervals for each in results)
     jumping, even = ([each for each in quiet if (each.truth["error"]["kind"] in EDGED) is edged] for edged in (True, False))
     rows = {
-        f"right, of effects of a ratio of {CLEAR:.0f} or more, the nearest other apart": _count(clear, lambda each: each.right),
-        "false alarms, no effect": _count(quiet, _alarmed),
-        "of these, the reference wrong in strips or tiles": _count(jumping, _alarmed),
-        "the reference wrong by a bend or a fractal": _count(even, _alarmed),
-        "false alarms, change only": _count(moved, _alarmed),
+        f"clear effects (ratio of {CLEAR:.0f} or more beside the most similar other) that are answered rightly": _count(
+            clear, lambda each: each.right
+        ),
+        "false alarms without an effect": _count(quiet, _alarmed),
+        "the same, if the reference is wrong in strips or tiles": _count(jumping, _alarmed),
+        "the same, if the reference is wrong by a bend or a fractal": _count(even, _alarmed),
+        "false alarms where only rock fell": _count(moved, _alarmed),
         "wrong names among answers that name": _count(spoke, lambda each: each.outcome in _BLAMING),
-        "90 % intervals that hold the truth": share(inside, checked),
-        "p-value of what remains below 0.01, no effect": share(sum(each < 0.01 for each in p), len(p)),
-        "median seconds": f"{np.median([each.answer['said']['seconds'] for each in results]):.0f}",
+        "90 % intervals that contain the truth": share(inside, checked),
+        "p-values of what remains below 0.01, without an effect": share(sum(each < 0.01 for each in p), len(p)),
+        "median time of a diagnosis, s": f"{np.median([each.answer['said']['seconds'] for each in results]):.0f}",
     }
     return "| | |\n|---|---|\n" + "".join(f"| {key} | {value} |\n" for key, value in rows.items())
 

@@ -19,6 +19,7 @@ from pipeline.detection.products.events import Event, read_events
 from pipeline.formats.files.atomic import empty_folder
 from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.report.notebook_progress import python_progress
+from pipeline.report.words import counted
 from scene.common.errors import InputError, OutsideError
 
 if TYPE_CHECKING:
@@ -129,7 +130,7 @@ class Detections:
 
     def summary(self) -> str:
         """Return the number of events and their volume as one line of text."""
-        return f"{len(self)} blocks with a score of {self.confidence:g} or more, {self.volume_m3:.3g} m³"
+        return f"{counted(len(self), 'block')} with a score of {self.confidence:g} or more, {self.volume_m3:.3g} m³"
 
     def __repr__(self) -> str:
         return f"<Detections: {self.summary()}>"

@@ -21,6 +21,7 @@ from pipeline.monitoring.products import COLUMNS, Result
 from pipeline.monitoring.report import headline
 from pipeline.monitoring.run import monitor_paths
 from pipeline.report.notebook_progress import python_progress
+from pipeline.report.words import counted
 from scene.common.errors import InputError
 
 if TYPE_CHECKING:
@@ -150,7 +151,7 @@ class Monitoring:
         return f"<Monitoring: {self.summary()}>"
 
     def _repr_html_(self) -> str:
-        rows = {f"epoch {epoch.number}": f"{len(epoch.regions)} events" for epoch in self.result.epochs}
+        rows = {f"epoch {epoch.number}": counted(len(epoch.regions), "event") for epoch in self.result.epochs}
         return html_table(self.summary(), rows, self.plot())
 
     def _map(self, kind: str, number: int) -> xarray.DataArray:

@@ -22,6 +22,7 @@ from pipeline.formats.records.result_records import RUN_FILE, read_annotations
 from pipeline.formats.records.run_files import RunFiles, epoch_folder
 from pipeline.report.notebook_progress import python_progress
 from pipeline.report.page import millimetres
+from pipeline.report.words import counted
 from scene.common.errors import InputError
 from scene.geometry.frame import WallFrame
 
@@ -178,7 +179,7 @@ class Run:
         return self[epoch].plot(kind)
 
     def __repr__(self) -> str:
-        return f"<Run {self.folder}: {self.sensor}, {len(self.epochs)} epochs>"
+        return f"<Run {self.folder}: {self.sensor}, {counted(len(self.epochs), 'epoch')}>"
 
     def _repr_html_(self) -> str:
         rows: dict[str, Any] = {"sensor": self.sensor, "seed": self.record.get("seed"), "epochs": len(self.epochs)}

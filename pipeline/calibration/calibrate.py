@@ -43,14 +43,15 @@ _GREEDY_OBSERVATIONS = 300
 
 @dataclass(frozen=True)
 class OrientationPatterns:
-    """Difference maps that the orientation errors of the left camera cause, after registration.
+    """Difference maps that errors of the left camera's orientation cause, after registration.
 
-    They show which orientation parameters can be told apart. Where the model moves both cameras alike, the maps are of both.
+    They show which orientation parameters can be told apart. If the sensor model moves both cameras alike, the maps are those of
+    both cameras.
 
     Attributes
     ----------
     names : (k,) names of the orientation parameters with a non-zero sigma.
-    size_m : (k,) RMS of the map of an error of one sigma, m.
+    size_m : (k,) RMS of the map that an error of one sigma causes, m.
     cosines : (k, k) cosines of the angles between the maps; near 1 in magnitude, two parameters make the same pattern.
     """
 
@@ -65,14 +66,15 @@ class OrientationPatterns:
 
 @dataclass(frozen=True)
 class GreedyComparison:
-    """Result of the greedy search on the same maps, for comparison with `NoiseSearch`.
+    """Result of a simple search that changes one parameter at a time, on the same maps, for comparison with `NoiseSearch`.
 
     Attributes
     ----------
-    result : The greedy search's end point.
+    result : End point of the simple (greedy) search.
     cost : Cost of that end point, from newly simulated maps.
     costs : For each round of `NoiseSearch`, the number of maps simulated so far and the cost of its estimate.
-    overtaken : Maps after which `NoiseSearch` first had a simulation nearer to the measurement than `cost`; None: never.
+    overtaken : Number of simulated maps after which `NoiseSearch` first had a simulation nearer to the measurement than `cost`;
+        None: never.
     """
 
     result: GreedyResult
@@ -83,26 +85,26 @@ class GreedyComparison:
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """The fitted noise parameters, with all that the report and `calibration.json` need.
+    """The fitted noise parameters of a sensor model, with all that the report and `calibration.json` need.
 
     Attributes
     ----------
     config : The resolved config of the calibration.
     sensor : "stereo" or "tls".
     inputs : The measured maps, their stable ground and the simulated site.
-    windows : Windows in which measured and simulated maps were compared.
+    windows : Windows of the wall in which measured and simulated maps were compared.
     epochs : Noise statistics of each measured map.
-    median_trend, std_trend : Trends of the median and the standard deviation over the epochs.
+    median_trend, std_trend : Trends of the maps' median and standard deviation over the epochs.
     systematic : (h, w) mean of the measured maps, m; NaN outside stable ground.
     parameters : The fitted parameters and their bounds.
     found : Estimate, intervals and goodness of fit.
-    statistics : (m,) names of the summary statistics.
+    statistics : (m,) names of the summary statistics that were compared.
     observed : (m,) summary statistics of the measurement (logarithms of lengths in m).
     patterns : Maps of the orientation errors; None for a laser scanner or a model without such errors.
-    baseline : Result of the greedy search; None if it was not asked for.
+    baseline : Comparison with the greedy search; None if it was not asked for.
     predicted : (k, n, n) windows of one map simulated with the fitted noise, m.
     rate : Simulated observations per second.
-    cells : Cells of the sensor that each simulated observation traces.
+    cells : Number of cells of the sensor that each simulated observation traces.
     seconds : Duration of the whole calibration, s.
     """
 
@@ -131,7 +133,7 @@ class CalibrationResult:
         return self.config.calibration.confidence
 
     def simulated_site(self) -> SensorSite:
-        """Return the site with the calibrated sensor model."""
+        """Return the simulated site, the sensor in front of the wall, with the calibrated sensor model."""
         sensor: Any = self.inputs.site.sensor
         return replace(self.inputs.site, sensor=replace(sensor, model=self.model))
 
@@ -141,9 +143,11 @@ class CalibrationResult:
         return self.parameters.model(np.exp(self.found.x))
 
     def inseparable(self) -> list[tuple[str, str, float]]:
-        """Return pairs of parameters that the maps cannot separate: both names, and their correlation.
+        """Return pairs of parameters of which the maps determine only a combination.
 
-        It is the correlation of their errors; pairs over 0.9 in magnitude are listed.
+        Returns
+        -------
+        For each pair both names and the correlation of their errors, over 0.9 in magnitude.
         """
         names, matrix = self.parameters.names, self.found.correlation
         rows, columns = np.nonzero(np.triu(np.abs(matrix) > _ALIKE, 1))
@@ -188,12 +192,15 @@ def calibrate_inputs(
     with_greedy: bool = True,
     began: float | None = None,
 ) -> CalibrationResult:
-    """Fit the noise parameters to difference maps that are already in memory.
+    """Fit the noise parameters of a sensor model to difference maps that are already in memory.
 
     Parameters
     ----------
-    config, sensor, progress, with_greedy : As in `calibrate`.
+    config : Config of the simulated site; `config.seed` determines all random numbers.
+    sensor : "stereo" or "tls".
     inputs : The measured maps, their stable ground and the site to simulate.
+    progress : Receives the stages and their progress.
+    with_greedy : Whether to run the greedy search too, for comparison.
     began : Start of the calibration on the clock of `time.perf_counter`, s; None: now.
 
     Raises

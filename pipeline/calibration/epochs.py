@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from pipeline.change.difference import DifferenceStatistics, statistics
-from pipeline.noise.statistics import Normality, TailFigures, normality, tails, without_outliers
+from pipeline.noise.statistics import Normality, TailFigures, normality, tail_figures, without_outliers
 from pipeline.noise.variogram import Variogram, VariogramModel, effective_sample_size, fit_variogram, variogram
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -22,16 +22,16 @@ from scene.geometry.mesh import FloatArray
 
 @dataclass(frozen=True)
 class EpochNoise:
-    """Noise statistics of one difference map over stable ground.
+    """Noise statistics of one measured difference map over stable ground.
 
     Attributes
     ----------
     name : Name of the map.
     size : Median, standard deviation, RMSE and NMAD, m.
-    tails : Skewness and excess kurtosis.
+    tails : Quantiles, skewness and excess kurtosis.
     normality : Test for a normal distribution, on only as many values as are independent.
     variogram, model : Empirical variogram and the model fitted to it.
-    independent : Effective sample size of all windows together.
+    independent : Number of independent values in all windows together (effective sample size).
     """
 
     name: str
@@ -89,11 +89,13 @@ def epoch_noise(name: str, stable: NDArray[np.floating], windows: FloatArray, gs
     independent = sum(
         effective_sample_size(model, ~np.isnan(part), gsd_m) for part in windows if np.count_nonzero(~np.isnan(part))
     )
-    return EpochNoise(name, statistics(stable), tails(stable), normality(windows, independent, random), found, model, independent)
+    return EpochNoise(
+        name, statistics(stable), tail_figures(stable), normality(windows, independent, random), found, model, independent
+    )
 
 
 def trend(values: Sequence[float]) -> Trend:
-    """Fit a line to one value per epoch, m, in the order of the epochs."""
+    """Fit a line to one value per epoch, m, in the order of the epochs, and test whether its slope differs from 0."""
     if len(values) < 4:
         return Trend(None, None)
     line = stats.linregress(np.arange(len(values)), values)
@@ -101,8 +103,14 @@ def trend(values: Sequence[float]) -> Trend:
 
 
 def systematic(maps: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return the (h, w) mean of (e, h, w) maps over the epochs, m; NaN where any map is NaN.
+    """Return the mean of the difference maps over the epochs: what all epochs share, such as errors of the reference.
 
-    It holds what all epochs share, such as errors of the reference.
+    Parameters
+    ----------
+    maps : (e, h, w) difference maps, m.
+
+    Returns
+    -------
+    (h, w) mean, m; NaN where any map is NaN.
     """
     return np.asarray(np.mean(maps, axis=0, dtype=np.float64), dtype=np.float32)

@@ -26,7 +26,7 @@ _START_FACTOR = 4.0
 
 @dataclass(frozen=True)
 class GreedyResult:
-    """End point of the greedy search.
+    """End point of a search that changes one parameter at a time.
 
     Attributes
     ----------
@@ -43,15 +43,17 @@ class GreedyResult:
 def greedy_search(
     simulate: Simulate, parameters: NoiseParameters, start: FloatArray, std: int, target: float, random: KeyedRandom
 ) -> GreedyResult:
-    """Run the greedy search.
+    """Lower one noise parameter at a time until the simulated standard deviation equals the measured one.
+
+    This is the method of the thesis (section 4.1.5), run as a baseline for `NoiseSearch`.
 
     Parameters
     ----------
-    simulate : Simulates epochs and returns the logarithms of their summary statistics.
-    parameters : Names and bounds of the parameters.
-    start : (k,) parameter values, scaled here to the noise at which the search starts.
+    simulate : Function that simulates epochs and returns the logarithms of their summary statistics.
+    parameters : Names and bounds of the k parameters.
+    start : (k,) parameter values. The search begins at a multiple of them that gives four times the measured noise.
     std : Index of the standard deviation among the summary statistics.
-    target : Logarithm of the measured standard deviation.
+    target : Logarithm of the measured standard deviation, m.
     random : Source of the simulations' random numbers.
     """
 

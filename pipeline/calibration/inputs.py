@@ -50,7 +50,7 @@ class CalibrationInputs:
     maps : (e, h, w) differences, m; NaN without data.
     stable : (h, w) true on stable ground that has data in every map.
     drawn : Whether the user drew the stable areas; otherwise they were detected.
-    site : The instrument in front of the reference surface.
+    site : The sensor in front of the reference surface.
     of_points : Whether a pixel is the mean distance of its points from the reference; otherwise maps compare two surfaces.
     reference_error : Error of a reference surface that is made of points; None if it is unknown or zero.
     """
@@ -69,22 +69,22 @@ class CalibrationInputs:
         return choose_windows(self.stable, self.grid, config.calibration)
 
     def on_stable(self, number: int) -> NDArray[np.floating]:
-        """Return the (h, w) map of this number, m, with NaN outside stable ground."""
+        """Return the map with the index `number`, (h, w), m, with NaN outside stable ground."""
         return np.where(self.stable, self.maps[number], np.float32(np.nan))
 
 
 def config_of(paths: Sequence[Path]) -> Path | None:
-    """Return the path of the first `run.json` in the input folders, which serves as the config; None if there is none."""
+    """Return the path of the first `run.json` in the input folders, which serves as the config; None if no folder has one."""
     return next((path / RUN_FILE for path in paths if (path / RUN_FILE).is_file()), None)
 
 
 def sensor_of(paths: Sequence[Path], config: SimulationConfig, wanted: SensorName | None) -> SensorName:
-    """Return the sensor that measured the inputs.
+    """Return the sensor that measured the inputs: "stereo" or "tls".
 
     Parameters
     ----------
     paths : The input folders or files.
-    config : Consulted where neither the inputs nor `wanted` say.
+    config : Consulted if neither the inputs nor `wanted` say which sensor it was.
     wanted : The sensor that the user named; None if the user named none.
 
     Raises
@@ -150,12 +150,18 @@ def _maps(paths: Sequence[Path], config: SimulationConfig, random: KeyedRandom) 
         return found, tuple(f"epoch {number}" for number in range(1, len(found.maps) + 1))
     for path in paths:
         if path.suffix.lower() not in (".tif", ".tiff"):
-            raise InputError("not a difference map", where=str(path), allowed="one folder, or GeoTIFFs of one grid")
+            raise InputError(
+                "the file is not a difference map",
+                where=str(path),
+                allowed="one folder of results or measurements, or GeoTIFFs that share a grid",
+            )
     rasters, grids = zip(*map(read_geotiff, paths), strict=True)
     for path, grid in zip(paths, grids, strict=True):
         if grid != grids[0]:
             raise InputError(
-                f"the grid {grid} differs from {grids[0]} of {paths[0].name}", where=str(path), remedy="resample to one grid"
+                f"the grid {grid} differs from {grids[0]} of {paths[0].name}",
+                where=str(path),
+                remedy="resample the maps to one grid",
             )
     return MeasuredMaps("maps", grids[0], np.stack(rasters), None), tuple(path.stem for path in paths)
 

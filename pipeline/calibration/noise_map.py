@@ -23,10 +23,15 @@ from sensors.stereo.stereo_pair import StereoPair
 
 
 def with_model(site: SensorSite, model: StereoModel) -> SensorSite:
-    """Return the site with another model of its stereo pair; raise InputError if its sensor is not a simulated stereo pair."""
+    """Return the site with another sensor model of its stereo pair.
+
+    Raises InputError if its sensor is not a stereo pair with simulated matching.
+    """
     if not isinstance(site.sensor, StereoPair):
         raise InputError(
-            "noise maps need simulated matching", where="matcher", remedy="use the stereo sensor with matcher: simulated"
+            "noise can only be varied for a stereo pair with simulated matching",
+            where="sensor, matcher",
+            remedy="use the stereo sensor with matcher: simulated",
         )
     return replace(site, sensor=replace(site.sensor, model=model))
 
@@ -39,17 +44,17 @@ def noise_map(
     random: KeyedRandom,
     grid: Grid | None = None,
 ) -> NDArray[np.float32]:
-    """Simulate the difference map of two observations of an unchanged wall.
+    """Simulate the difference map of two observations of an unchanged wall, which contains only noise.
 
     Both observations draw independent noise. The second is registered to the first if the config has ICP.
 
     Parameters
     ----------
     config : Settings of surface, registration and difference map.
-    before, after : The same site, with the sensor as it is at each observation.
+    before, after : The same site, with the sensor as it is at the first and at the second observation.
     caster : The wall, for ray casting.
     random : Source of the random numbers.
-    grid : Grid of the map; None: over the first observation's surface.
+    grid : Grid of the map; None: a grid over the first observation's surface.
 
     Returns
     -------

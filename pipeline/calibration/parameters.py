@@ -40,11 +40,11 @@ _ALLOWED = {
 
 @dataclass(frozen=True)
 class NoiseParameters:
-    """The parameters of one sensor model that are fitted, and their bounds.
+    """The noise parameters of a sensor model that a calibration fits, and their bounds.
 
     Attributes
     ----------
-    base : The model before the calibration.
+    base : The sensor model before the calibration.
     names : (k,) names of the parameters.
     low, high : (k,) bounds, in the parameters' units. The search itself works on natural logarithms.
     """
@@ -55,7 +55,7 @@ class NoiseParameters:
     high: FloatArray
 
     def model(self, values: Sequence[float] | FloatArray) -> Model:
-        """Return the base model with these (k,) parameter values; everything else, effects included, stays unchanged."""
+        """Return the sensor model with these (k,) parameter values; everything else, effects included, stays unchanged."""
         found = dict(zip(self.names, (float(value) for value in values), strict=True))
         noise = self.base.noise
         plain: dict[str, Any] = {name: value for name, value in found.items() if not name.startswith(ORIENTATION)}
@@ -64,7 +64,7 @@ class NoiseParameters:
         return self.base.model_copy(update={"noise": noise.model_copy(update=plain)})
 
     def meaning(self, name: str) -> str:
-        """Describe a parameter in the words of the config, without its unit."""
+        """Describe a parameter in words, as the config's documentation does, without its unit."""
         if name == ORIENTATION:
             return "all sigmas of the orientation, as a multiple of the config's"
         section, _, key = name.rpartition(".")
@@ -73,7 +73,7 @@ class NoiseParameters:
         return f"standard deviation: {words}" if section else words
 
     def values(self, logarithms: FloatArray) -> FloatArray:
-        """Convert (..., k) natural logarithms to parameter values, clipped to the bounds."""
+        """Convert natural logarithms of the parameters (..., k) to parameter values, clipped to the bounds."""
         return np.clip(np.exp(logarithms), self.low, self.high)
 
 
@@ -89,7 +89,7 @@ def _orientation(base: OrientationNoise, found: dict[str, float]) -> Orientation
 
 
 def noise_parameters(base: Model, names: Sequence[str]) -> NoiseParameters:
-    """Return the parameters to fit.
+    """Select the noise parameters of a sensor model to fit, and choose their bounds.
 
     Parameters
     ----------
@@ -108,8 +108,8 @@ def noise_parameters(base: Model, names: Sequence[str]) -> NoiseParameters:
             raise InputError(
                 f"'{name}' is not a noise parameter of the {base.sensor} sensor", where="calibration.fit", remedy=hint
             )
-    if len(set(chosen)) < len(chosen):
-        raise InputError("a parameter is listed twice", where="calibration.fit")
+    if twice := sorted({name for name in chosen if chosen.count(name) > 1}):
+        raise InputError(f"{twice[0]} is listed twice", where="calibration.fit", remedy="list each parameter once")
     bounds = np.array([_bounds(base, name) for name in chosen])
     return NoiseParameters(base, chosen, bounds[:, 0], bounds[:, 1])
 
@@ -143,5 +143,9 @@ def _bounds(base: Model, name: str) -> tuple[float, float]:
         return _BOUNDS[name]
     sigma = getattr(base.noise.orientation, name.removeprefix(f"{ORIENTATION}.")).sigma
     if not sigma > 0:
-        raise InputError("its sigma in the model is 0, so its scale is unknown", where=f"calibration.fit: {name}")
+        raise InputError(
+            f"the sigma of {name} is 0 in the model, so its scale is unknown",
+            where="calibration.fit",
+            remedy="give it a sigma in the model, or leave it out",
+        )
     return _OF_SIGMA[0] * sigma, _OF_SIGMA[1] * sigma

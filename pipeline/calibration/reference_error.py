@@ -14,7 +14,7 @@ from scene.ray_casting.raycast import RayCaster
 
 @dataclass(frozen=True)
 class ReferenceError:
-    """Random error of the vertices of a reference surface.
+    """Random error of the vertices of a reference surface that is made of points.
 
     Attributes
     ----------
@@ -36,10 +36,10 @@ class ReferenceError:
         return cls(measurement.reference_error_m, planes is None or planes.noise_dominates, measurement.viewpoint)
 
     def moved(self, points: FloatArray, wall: RayCaster, random: KeyedRandom) -> FloatArray:
-        """Shift points as if the wall's vertices had errors, so that their distances from the given wall contain these errors.
+        """Shift points along their rays so that their distances from the given wall contain errors of the wall's vertices.
 
         With barycentric weights w of a point in its triangle, vertex errors e change the range to the triangle by sum w e, as in
-        `pipeline/gap`. The point is shifted by the opposite amount along its ray.
+        `pipeline/gap`. The point is shifted by the opposite amount.
 
         Parameters
         ----------

@@ -42,7 +42,7 @@ class _Table:
 
 
 def summary(result: CalibrationResult) -> str:
-    """Return the result as a few lines of text."""
+    """Return the fitted parameters with their intervals, and warnings, as a few lines of text for the terminal."""
     found = result.found
     lines = [f"{_maps(len(result.epochs))} of a {_INSTRUMENTS[result.sensor]}"]
     lines += [f"  {name:<26}{text}" for name, text in _values(result)]
@@ -52,7 +52,7 @@ def summary(result: CalibrationResult) -> str:
 
 
 def warnings(result: CalibrationResult) -> list[str]:
-    """Return sentences that a reader must know before using the values, such as inseparable parameters or a misfit."""
+    """Return what a reader must know before using the values, as sentences, such as inseparable parameters or a misfit."""
     found, error = result.found, result.inputs.reference_error
     texts = []
     if error is not None:
@@ -71,7 +71,7 @@ def warnings(result: CalibrationResult) -> list[str]:
             f"The model does not fit these maps (p = {found.misfit_p:.3f}, below {_LEAST_P:g}); largest misfits: {names}. "
             "`scarpsim gap` may find the reason."
         )
-    if not found.settled:
+    if not found.converged:
         texts.append(
             "The search did not converge: the values lie outside the last simulations. Increase calibration.simulations."
         )
@@ -83,17 +83,21 @@ def warnings(result: CalibrationResult) -> list[str]:
 
 
 def scale_m(result: CalibrationResult) -> float:
-    """Return the NMAD of the last measured map in the windows, m, which scales the colours of all maps."""
+    """Return the noise that scales the colours of all maps of a report, m: the NMAD of the last measured map in the windows."""
     return max(statistics(result.windows.cut(result.inputs.maps[-1])).nmad, 1e-6)
 
 
 def pictures(result: CalibrationResult, simulated: FloatArray | None) -> Pictures:
-    """Draw all pictures of the report.
+    """Draw all pictures of the report of a calibration.
 
     Parameters
     ----------
     result : The calibration.
     simulated : (h, w) simulated map of the whole wall, m; None if there is none.
+
+    Returns
+    -------
+    For each picture its file name without ending, its caption, and the PNG.
     """
     inputs, sigma = result.inputs, scale_m(result)
     none = np.zeros(inputs.grid.shape, dtype=np.int32)
@@ -134,7 +138,7 @@ def pictures(result: CalibrationResult, simulated: FloatArray | None) -> Picture
 
 
 def write_calibration_report(path: Path, result: CalibrationResult, shown: Pictures, config: Mapping[str, Any]) -> None:
-    """Write report.html, or nothing if it fails.
+    """Write report.html of a calibration, or nothing if it fails.
 
     Parameters
     ----------

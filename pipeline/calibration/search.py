@@ -73,31 +73,38 @@ simulated maps.
 
 @dataclass(frozen=True)
 class Simulations:
-    """Simulated statistics with their parameters: x (n, k) logarithms of the parameters, s (n, m) statistics."""
+    """Parameters of n simulations and the summary statistics that each gave.
+
+    Attributes
+    ----------
+    x : (n, k) natural logarithms of the parameters.
+    s : (n, m) summary statistics.
+    """
 
     x: FloatArray
     s: FloatArray
 
     def with_more(self, other: Simulations) -> Simulations:
-        """Append the simulations of another set."""
+        """Return these simulations followed by those of another set."""
         return Simulations(np.concatenate([self.x, other.x]), np.concatenate([self.s, other.s]))
 
     def at(self, rows: NDArray[Any]) -> Simulations:
-        """Return the simulations of these rows (indices or a mask)."""
+        """Return the simulations of some rows, given as indices or a mask."""
         return Simulations(self.x[rows], self.s[rows])
 
 
 @dataclass(frozen=True)
 class ResponseSurface:
-    """Response surface: how the mean of the statistics depends on the parameters, and their scatter.
+    """Response surface: how the summary statistics depend on the noise parameters, and how they scatter.
 
-    The mean is a quadratic polynomial of z = (x - centre) / scale, with x the logarithmic parameters.
+    The mean of the statistics is a quadratic polynomial of z = (x - centre) / scale, with x the logarithms of the parameters. The
+    cost of parameters is the squared Mahalanobis distance of the measured statistics from that mean.
 
     Attributes
     ----------
-    centre, scale : (k,) mean and standard deviation of the logarithmic parameters it was fitted to.
+    centre, scale : (k,) mean and standard deviation of the logarithmic parameters to which it was fitted.
     coefficients : (terms, m) coefficients of the polynomial.
-    covariance : (m, m) covariance of the statistics of one simulated set.
+    covariance : (m, m) covariance of the statistics of one simulation.
     whitening : (m, m) L^-1 with L L^T = covariance.
     """
 
@@ -109,7 +116,10 @@ class ResponseSurface:
 
     @classmethod
     def fit(cls, sample: Simulations) -> ResponseSurface:
-        """Fit the polynomial by least squares and estimate the covariance of its residuals, shrunk to the diagonal."""
+        """Fit the surface to simulations by least squares.
+
+        The covariance is that of the residuals, with its off-diagonal elements reduced (shrinkage).
+        """
         centre, scale = np.mean(sample.x, axis=0), np.maximum(np.std(sample.x, axis=0), 1e-6)
         design = _design((sample.x - centre) / scale)
         coefficients = np.asarray(np.linalg.lstsq(design, sample.s, rcond=None)[0], dtype=np.float64)
@@ -122,25 +132,35 @@ class ResponseSurface:
         return cls(centre, scale, coefficients, covariance, linalg.solve_triangular(factor, np.eye(len(factor)), lower=True))
 
     def mean(self, x: FloatArray) -> FloatArray:
-        """Return the (m,) expected statistics at (k,) logarithmic parameters."""
+        """Return the (m,) expected statistics at logarithmic parameters (k,)."""
         return _design(((x - self.centre) / self.scale)[None])[0] @ self.coefficients
 
     def misfit(self, x: FloatArray, observed: FloatArray) -> FloatArray:
-        """Return the (m,) whitened residuals, whose squares add up to the cost."""
+        """Return the whitened difference of observed and expected statistics, whose squares add up to the cost.
+
+        Parameters
+        ----------
+        x : (k,) logarithmic parameters.
+        observed : (m,) statistics of the measurement.
+
+        Returns
+        -------
+        (m,) differences, in standard deviations.
+        """
         return self.whitening @ (observed - self.mean(x))
 
     def jacobian(self, x: FloatArray) -> FloatArray:
-        """Return the (m, k) Jacobian of the whitened residuals."""
+        """Return the (m, k) derivatives of `misfit` at logarithmic parameters (k,)."""
         return -self.whitening @ (_gradient((x - self.centre) / self.scale) @ self.coefficients).T / self.scale
 
     def minimum(self, observed: FloatArray, start: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-        """Minimise the cost within bounds.
+        """Find the parameters of least cost within bounds.
 
         Parameters
         ----------
         observed : (m,) statistics of the measurement.
         start : (k,) logarithmic parameters to start at.
-        low, high : (k,) bounds.
+        low, high : (k,) bounds of the logarithmic parameters.
 
         Returns
         -------
@@ -152,27 +172,27 @@ class ResponseSurface:
         return found.x
 
     def covariance_at(self, x: FloatArray) -> FloatArray:
-        """Return the (k, k) covariance of the minimum, to first order."""
+        """Return the (k, k) covariance of logarithmic parameters estimated at the minimum x (k,), to first order."""
         jacobian = self.jacobian(x)
         return np.asarray(np.linalg.pinv(jacobian.T @ jacobian + 1e-6 * np.eye(len(x))), dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Result of a search; all parameters are natural logarithms.
+    """Result of a search for noise parameters. All parameters are natural logarithms.
 
     Attributes
     ----------
     x : (k,) estimate, corrected for bias.
-    low, high : (k,) ends of its interval.
-    errors : (n, k) errors of the estimates of simulated sets.
+    low, high : (k,) ends of its confidence interval.
+    errors : (n, k) errors of the estimates when n simulations are treated like the measurement (parametric bootstrap).
     surface : Response surface of the last round.
-    cost : Cost J at the minimum.
-    misfit_p : Share of simulated sets that fit worse than the measurement.
+    cost : Cost at the minimum.
+    misfit_p : Share of simulations that fit worse than the measurement: a p-value of the goodness of fit.
     misfit : (m,) measured minus expected statistics, in standard deviations.
     history : After each round, the number of maps simulated so far and the minimum.
     maps : Number of simulated maps.
-    settled : Whether the search converged, that is, the minimum lies among the simulations of the last round.
+    converged : Whether the minimum lies among the simulations of the last round.
     """
 
     x: FloatArray
@@ -185,30 +205,30 @@ class SearchResult:
     misfit: FloatArray
     history: tuple[tuple[int, FloatArray], ...]
     maps: int
-    settled: bool
+    converged: bool
 
     @property
     def correlation(self) -> FloatArray:
-        """(k, k) correlation of the estimates' errors."""
+        """(k, k) correlation of the errors of the estimates."""
         return np.atleast_2d(np.corrcoef(self.errors.T))
 
 
 class NoiseSearch:
-    """Searches for the noise parameters of one measurement.
+    """Searches for the noise parameters with which simulated maps have the same summary statistics as the measured ones.
 
     Parameters
     ----------
-    simulate : Simulates epochs and returns their statistics, see `Simulate`.
-    parameters : The parameters and their bounds.
+    simulate : Function that simulates epochs and returns their statistics, see `Simulate`.
+    parameters : The k parameters and their bounds.
     epochs : Number of measured epochs.
     random : Source of random numbers; the simulations are keyed by their number.
     progress : Receives the progress.
 
     Attributes
     ----------
-    simulated, maps : Number of simulated sets and of simulated maps.
+    simulated, maps : Number of simulations, and of the maps in them, so far.
     approached : For every simulation in order, the number of maps simulated so far and its (m,) statistics.
-    terms : Coefficients of the quadratic polynomial.
+    terms : Number of coefficients of the quadratic polynomial.
     """
 
     def __init__(
@@ -223,13 +243,16 @@ class NoiseSearch:
         self.terms = 1 + count + count * (count + 1) // 2
 
     def run(self, observed: FloatArray, simulations: int, confidence: float) -> SearchResult:
-        """Find the minimum and its uncertainty, searching a second time if the misfit of the first minimum is significant.
+        """Find the parameters of least cost and their intervals.
+
+        If the misfit of the first minimum is significant, a second search with more starting points follows, and the better one
+        counts.
 
         Parameters
         ----------
         observed : (m,) statistics of the measurement.
-        simulations : Simulated sets in the last round.
-        confidence : Confidence level of the intervals.
+        simulations : Number of simulations in the last round.
+        confidence : Confidence level of the intervals, 0 to 1.
         """
         found = self._run_once(observed, simulations, confidence, _DENSITIES[0])
         for density in _DENSITIES[1:]:
@@ -330,7 +353,7 @@ class NoiseSearch:
         minimum: FloatArray,
         confidence: float,
         history: tuple[tuple[int, FloatArray], ...],
-        settled: bool,
+        converged: bool,
     ) -> SearchResult:
         """Compute the estimate's interval and the p-value of the misfit, from estimates of the simulated sets."""
         errors, costs = np.empty_like(sample.x), np.empty(len(sample.x))
@@ -350,24 +373,24 @@ class NoiseSearch:
         scaled = (observed - surface.mean(minimum)) / np.sqrt(np.diag(surface.covariance))
         low, high = np.clip(x - half, self.low, self.high), np.clip(x + half, self.low, self.high)
         return SearchResult(
-            x, low, high, errors, surface, cost, float(np.mean(costs >= cost)), scaled, history, self.maps, settled
+            x, low, high, errors, surface, cost, float(np.mean(costs >= cost)), scaled, history, self.maps, converged
         )
 
 
 def cost_of_new_simulations(
     search: NoiseSearch, surface: ResponseSurface, observed: FloatArray, x: FloatArray, sets: int = 4
 ) -> float:
-    """Estimate the cost of parameters from new simulations.
+    """Estimate the cost of parameters from new simulations instead of the response surface.
 
-    It is the cost of their mean statistics, corrected for the scatter of that mean.
+    It is the cost of the mean of their statistics, corrected for the scatter of that mean.
 
     Parameters
     ----------
-    search : Gives the simulator and the number of epochs.
-    surface : Gives the covariance of the statistics.
+    search : Provides the simulator and the number of epochs.
+    surface : Provides the covariance of the statistics.
     observed : (m,) statistics of the measurement.
     x : (k,) logarithmic parameters.
-    sets : Number of simulated sets.
+    sets : Number of simulations.
     """
     source = replace(search.random, path=(*search.random.path, "fresh"))
     values = search.parameters.values(x)

@@ -38,12 +38,12 @@ _LEAST_IN_CLASS = 10
 
 @dataclass(frozen=True)
 class SummaryStatistics:
-    """Computes the summary statistics of difference maps in windows.
+    """Computes the summary statistics of difference maps by which measured and simulated noise are compared.
 
     Attributes
     ----------
-    windows : The windows.
-    heights : (k, n, n) heights of the surface without noise, m.
+    windows : k windows of n by n pixels in which maps are compared.
+    heights : (k, n, n) heights of the wall's surface without noise, m.
     sight : (3,) unit vector from the wall to the sensor, wall frame.
     """
 
@@ -53,7 +53,7 @@ class SummaryStatistics:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the statistics, as group.statistic."""
+        """(m,) names of the statistics, as group.statistic, such as "size.nmad"."""
         return (
             "size.std", "size.nmad", "size.quantiles",
             *(f"variogram.{lag}px" for lag in self.lags),
@@ -63,7 +63,16 @@ class SummaryStatistics:
         )  # fmt: skip
 
     def compute(self, maps: FloatArray) -> FloatArray:
-        """Return the (m,) statistics of (e, k, n, n) difference maps, m, NaN where unknown."""
+        """Compute the statistics of e difference maps together.
+
+        Parameters
+        ----------
+        maps : (e, k, n, n) windows of the maps, m; NaN where unknown.
+
+        Returns
+        -------
+        (m,) logarithms of lengths in m.
+        """
         middle = np.nanmedian(maps, axis=(2, 3))
         rest = maps - middle[..., None, None]
         lengths = [
@@ -77,7 +86,7 @@ class SummaryStatistics:
 
     @cached_property
     def lags(self) -> tuple[int, ...]:
-        """Distances of the variogram, pixels, up to three quarters of a window."""
+        """Distances at which the variogram is computed, pixels, up to three quarters of a window."""
         return tuple(lag for lag in _LAGS_PX if lag <= 0.75 * self.windows.side)
 
     def _size(self, rest: FloatArray) -> list[float]:

@@ -59,21 +59,21 @@ class _Patch:
 
 
 class WindowSimulator:
-    """Simulates difference maps of noise alone in windows of the wall.
+    """Simulates difference maps that contain only noise, in windows of the wall, which is much faster than whole maps.
 
     Parameters
     ----------
-    config, site : As for a whole simulation.
+    config, site : Config and site as for a whole simulation.
     windows : Windows on the grid of the measured maps.
     of_points : Whether a pixel is the mean distance of its points from the wall; otherwise two surfaces are compared.
-    reference_error : Error of the surface that the points are compared with.
+    reference_error : Error of the surface that the points are compared with; None for none.
 
     Attributes
     ----------
     observations : Number of observations simulated so far.
     cells : Flat indices of the sensor cells that each observation traces.
     caster : The wall, for ray casting.
-    silent : The sensor model with its effects but without noise.
+    noiseless_model : The sensor model with its effects but without noise.
 
     Raises
     ------
@@ -106,11 +106,11 @@ class WindowSimulator:
 
     @cached_property
     def target(self) -> ReferenceSurface:
-        """The noiseless wall, which observations are registered to."""
+        """The wall without noise, to which observations are registered."""
         return ReferenceSurface.build(self.site.mesh.vertices, self.site.mesh.vertex_normals())
 
     def maps(self, model: Model, epochs: int, random: KeyedRandom) -> FloatArray:
-        """Simulate difference maps in the windows.
+        """Simulate difference maps of an unchanged wall in the windows.
 
         Each map subtracts a later epoch from the same noisy reference epoch. Maps of points instead measure the distance to the
         known wall; the simulated error of that wall is then the same in all epochs.
@@ -141,7 +141,7 @@ class WindowSimulator:
         return self.windows.cut(values)
 
     def heights(self, model: Model, random: KeyedRandom) -> FloatArray:
-        """Return the (k, n, n) heights, m, of one noisy observation's surface after registration; NaN without data."""
+        """Simulate one observation and return the (k, n, n) heights of its surface in the windows, m; NaN without data."""
         return self._raster(self._surface(self._registered(model, random)))
 
     def _registered(self, model: Model, random: KeyedRandom) -> FloatArray:
@@ -205,7 +205,9 @@ class WindowSimulator:
             rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
             if len(rows) == 0:
                 raise InputError(
-                    "the sensor does not see a window of the measured maps", where="cameras, station", remedy="check the site"
+                    "the simulated sensor does not see a part of the wall that the measured maps show",
+                    where="cameras, station",
+                    remedy="give it the position and direction of the measurement",
                 )
             span = [
                 slice(max(int(place[0]) - _MARGIN_CELLS, 0), min(int(place[-1]) + _MARGIN_CELLS + 1, size))
@@ -251,19 +253,19 @@ def _sensor_for_cells(sensor: StereoPair | LaserScanner, model: Model, cells: ND
 def _supported_sensor(config: SimulationConfig, site: SensorSite) -> StereoPair | LaserScanner:
     """Return the sensor, or raise InputError if it cannot be simulated cell by cell."""
     if not isinstance(site.sensor, StereoPair | LaserScanner):
-        raise InputError("noise parameters need simulated matching", where="matcher", allowed="simulated")
+        raise InputError("the noise of a real matcher cannot be fitted", where="matcher", allowed="simulated")
     if site.further_stations:
         raise InputError("cannot calibrate with several stations", where="station", remedy="keep only the station of the maps")
     if config.reconstruction != "direct" or config.surface.method != "grid" or config.surface.holes != "keep":
         raise InputError(
-            "calibration reconstructs the surface from the sensor's own grid",
+            "a calibration needs a surface that is made directly from the sensor's own grid",
             where="reconstruction, surface",
             allowed="reconstruction: direct, surface: {method: grid, holes: keep}",
         )
     if names := effects_needing_neighbours(site.sensor.model):
         raise InputError(
-            f"{', '.join(names)}: needs the whole picture or scan, but calibration simulates only windows of it",
+            f"calibration simulates only parts of a picture or scan, and these effects need all of it: {', '.join(names)}",
             where="sensor.effects",
-            remedy="remove it from the model",
+            remedy="remove them from the model",
         )
     return site.sensor

@@ -30,7 +30,7 @@ _BACKGROUND_CELLS = 15
 
 @dataclass(frozen=True)
 class Windows:
-    """k square windows with n pixels a side on a raster.
+    """k square windows with n pixels a side on a raster, in which maps are compared.
 
     Attributes
     ----------
@@ -46,12 +46,12 @@ class Windows:
     stable: BoolArray
 
     def cut(self, raster: NDArray[np.floating]) -> FloatArray:
-        """Cut the windows (k, n, n) out of a raster (h, w), with NaN outside stable ground."""
+        """Cut the windows out of a raster (h, w); return (k, n, n) values with NaN outside stable ground."""
         cut = np.stack([raster[row : row + self.side, column : column + self.side] for row, column in self.corner])
         return np.where(self.stable, cut, np.nan)
 
     def places(self) -> tuple[FloatArray, FloatArray]:
-        """Return the x and y of the pixels' centres, wall frame, m: (k, n, n) each."""
+        """Return the x and the y coordinates of the centres of all pixels, wall frame, m: (k, n, n) each."""
         row = self.corner[:, 0, None, None] + np.arange(self.side)[None, :, None] + 0.5
         column = self.corner[:, 1, None, None] + np.arange(self.side)[None, None, :] + 0.5
         shape = (len(self.corner), self.side, self.side)
@@ -65,11 +65,16 @@ class Windows:
 
 
 def stable_ground(maps: Sequence[NDArray[np.floating]]) -> BoolArray:
-    """Return the (h, w) mask of ground where no map shows a change, for use where the user drew no stable areas.
+    """Detect stable ground: return an (h, w) mask that is true where no map shows a change.
 
-    Medians of cells of 5 x 5 pixels, minus their median over 15 x 15 cells, are compared with four of their NMADs. Three or more
-    adjacent cells that exceed it are a change, with a margin of one cell. So are compact patches of pixels that exceed four NMADs
-    of all pixels. Single gross errors, and thin strips along edges, count as noise.
+    It is used if the user drew no stable areas. Medians of cells of 5 x 5 pixels, minus their median over 15 x 15 cells, are
+    compared with four of their NMADs. Three or more adjacent cells that exceed it are a change, with a margin of one cell. So are
+    compact patches of pixels that exceed four NMADs of all pixels. Single gross errors, and thin strips along edges, count as
+    noise.
+
+    Parameters
+    ----------
+    maps : Difference maps (h, w), m; NaN without data.
     """
     stable = np.ones(maps[0].shape, dtype=bool)
     for values in maps:
@@ -116,7 +121,7 @@ def _cell_medians(values: NDArray[np.floating]) -> FloatArray:
 
 
 def choose_windows(stable: BoolArray, grid: Grid, settings: CalibrationConfig) -> Windows:
-    """Choose windows spread evenly over the ground that is stable and has data in all maps.
+    """Choose windows spread evenly over the stable ground that has data in all maps.
 
     The candidates lie on a lattice of half a window. The first window is the most stable one; each next one is the farthest from
     those already chosen (Gonzalez 1985). The windows thus reach the ends of the wall, where deformations are largest.

@@ -26,14 +26,14 @@ MODEL_FILE, RECORD_FILE, REPORT_FILE = "calibrated.yaml", "calibration.json", "r
 
 
 def write(out: Path, config: SimulationConfig, result: CalibrationResult, inputs: Sequence[Path]) -> Path:
-    """Write the result folder; it appears only when everything is in it.
+    """Write all files of a calibration into a folder, which appears only when everything is in it.
 
     Parameters
     ----------
     out : Folder to write.
     config : The resolved config.
     result : The calibration.
-    inputs : Paths that the maps were read from, for the record.
+    inputs : Paths from which the maps were read, for the record.
 
     Returns
     -------
@@ -76,7 +76,10 @@ def _whole_map(config: SimulationConfig, result: CalibrationResult) -> FloatArra
 
 
 def model_yaml(result: CalibrationResult) -> str:
-    """Return the calibrated sensor model as YAML for `simulate --set sensor=calibrated.yaml`, with the intervals as comments."""
+    """Return the calibrated sensor model as YAML, with the intervals as comments.
+
+    The file can be used as `simulate --set sensor=calibrated.yaml`.
+    """
     found, names = result.found, result.parameters.names
     share = result.confidence
     lines = [f"# Calibrated on {len(result.epochs)} difference map(s) by scarpsim calibrate; intervals of {100 * share:.0f} %."]
@@ -121,7 +124,12 @@ def to_dict(result: CalibrationResult) -> dict[str, Any]:
         "correlation": {"names": names, "matrix": found.correlation},
         "inseparable": [{"names": [first, second], "correlation": value} for first, second, value in result.inseparable()],
         "orientation_patterns": None if result.patterns is None else result.patterns.to_dict(),
-        "cost": {"value": found.cost, "statistics": len(result.statistics), "p_value": found.misfit_p, "settled": found.settled},
+        "cost": {
+            "value": found.cost,
+            "statistics": len(result.statistics),
+            "p_value": found.misfit_p,
+            "settled": found.converged,
+        },
         "statistics": [
             {"name": name, "measured": measured, "expected": mean, "log_sigma": sigma, "standardised": misfit}
             for name, measured, mean, sigma, misfit in zip(

@@ -22,6 +22,10 @@ DETECTABLE_SNR, INVISIBLE_SNR = 4.0, 2.0
 seen at all."""
 BLOCK_CATEGORY = {"id": 1, "name": "block", "supercategory": "rockfall"}
 """The only category, in COCO's format."""
+KIND_CATEGORIES = [
+    {"id": number, "name": name, "supercategory": "rockfall"} for number, name in enumerate(("missing", "moved", "deposit"), 1)
+]
+"""The categories of a series that distinguishes kinds."""
 
 
 class AnnotationConfig(Config):
@@ -92,10 +96,20 @@ def coco(images: Iterable[LabelledImage], config: AnnotationConfig, info: dict[s
     }
 
 
+def by_kind(data_set: dict[str, Any], rockfalls: int) -> dict[str, Any]:
+    """Turn the block labels of a series into categories: of n rockfalls, kind k (from 0) of rockfall e has the label k n + e."""
+    annotations = [
+        {**each, "category_id": (each["block"] - 1) // rockfalls + 1, "block": (each["block"] - 1) % rockfalls + 1}
+        for each in data_set["annotations"]
+    ]
+    return {**data_set, "categories": KIND_CATEGORIES, "annotations": annotations}
+
+
 def merge(data_sets: Iterable[dict[str, Any]], info: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Merge several data sets of `coco` into one, with ids that count from 1 throughout."""
+    """Merge several data sets of `coco` into one, with ids that count from 1 throughout; categories are those of the last."""
     result = coco([], AnnotationConfig(), info)
     for data_set in data_sets:
+        result["categories"] = data_set["categories"]
         before = len(result["images"])
         result["images"] += [{**image, "id": image["id"] + before} for image in data_set["images"]]
         for annotation in data_set["annotations"]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pipeline.cli.command_output import CommandOutput
 from pipeline.cli.parser import add_output_options
+from pipeline.report.words import counted
 
 SUMMARY = "find rockfalls in difference maps: masks, events, pictures"
 EXAMPLE = """  scarpsim detect default runs/my_run --out found
@@ -74,7 +75,7 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
             unmirrored=arguments.unmirrored,
         )
     volume = sum(item.volume_m3 for item in found)
-    told = f"{len(found)} blocks with a score of {min(confidences):g} or more, {volume:.3g} m³"
+    told = f"{counted(len(found), 'block')} with a score of {min(confidences):g} or more, {volume:.3g} m³"
     document = {
         "folder": str(out),
         "confidence": min(confidences),

@@ -122,10 +122,12 @@ def _save(form: str, run: Any, number: int, path: Path, width: int, progress: An
             save_gltf(run, number, path)
         return
     if form == "copc":
+        from pipeline.formats.points.laz import LazHeader
         from pipeline.run.products import write_cloud
 
         with progress.stage("points"):
-            write_cloud(path, *run.survey_points(number))
+            cloud, wkt = run.survey_points(number)
+            write_cloud(path, cloud, LazHeader(wkt=wkt, standard_time=bool(run.record["config"].get("series"))))
         return
     from pipeline.export import pictures
 

@@ -26,7 +26,7 @@ from pipeline.comparison.detection_curve import DetectionCurve, detection_curve
 from pipeline.comparison.trial import SensorObservations, Trial
 from pipeline.noise.measured import MeasuredMaps
 from pipeline.noise.statistics import (
-    Bin,
+    BinStatistics,
     DensityHistogram,
     Normality,
     TailFigures,
@@ -34,7 +34,7 @@ from pipeline.noise.statistics import (
     normality,
     quantile_edges,
     statistics_by_bin,
-    tails,
+    tail_figures,
     without_outliers,
 )
 from pipeline.noise.variogram import Variogram, VariogramModel, effective_sample_size, fit_variogram, variogram
@@ -58,7 +58,7 @@ _SIZE_CLASSES = 8
 
 @dataclass(frozen=True)
 class MapNoise:
-    """Noise of a stack of difference maps over stable ground.
+    """Noise of several difference maps over stable ground.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class MapNoise:
     tails, normality, histogram : Shape of the distribution.
     variogram, model : Empirical variogram of the differences within five NMAD, and the fitted model.
     effective : Number of independent pixels on the first map's stable ground, which has `pixels` pixels.
-    pixels : Stable pixels of the first map.
+    pixels : Number of stable pixels of the first map.
     level : (h, w) level of detection of a pixel, m.
     """
 
@@ -105,11 +105,11 @@ class MapNoise:
 
 @dataclass(frozen=True)
 class DetectionClass:
-    """Detection of the blocks whose size (or depth) lies in [low_m, high_m).
+    """How many of the fallen blocks in one class of size (or depth) were detected.
 
     Attributes
     ----------
-    low_m, high_m : Limits of the class, m.
+    low_m, high_m : The class [low_m, high_m) of size or depth, m.
     blocks, seen : Number of blocks, and of those detected.
     interval : 95 % confidence interval of the share detected.
     volume_error, volume_spread : Median and NMAD of measured over true volume minus 1; None without blocks.
@@ -139,7 +139,7 @@ class DetectionClass:
 
 @dataclass(frozen=True)
 class DetectionSummary:
-    """Which of the fallen blocks a sensor detected.
+    """Which of the fallen blocks a sensor detected, and its false alarms.
 
     Attributes
     ----------
@@ -176,19 +176,19 @@ class DetectionSummary:
 
 @dataclass(frozen=True)
 class SensorAssessment:
-    """All results of one sensor.
+    """All results of one sensor in a comparison.
 
     Attributes
     ----------
     name, sensor : Name in the comparison; "stereo" or "tls".
     noise : Noise over stable ground.
-    wall : Errors of the difference maps everywhere, niches included.
-    by : Statistics over stable ground by bins of each covariate.
-    detection : Detected blocks.
+    wall : Errors of the difference maps everywhere, niches of fallen blocks included.
+    by : For each covariate, statistics over stable ground in bins of it.
+    detection : Which fallen blocks were detected.
     visible : Share of the wall that the sensor can see.
     complete, complete_of_visible, complete_of_hidden : Share of pixels with data, mean over the epochs: of the whole wall, of the
         part that the sensor can see, and of the part that it cannot, where triangles bridge a gap.
-    points : Points of the reference epoch.
+    points : Number of points of the reference epoch.
     scan_seconds : Duration of the measurement of one epoch, s; None for cameras.
     seconds : Mean computing time of an epoch, s.
     registration_rms_m : Mean RMS distance of ICP's inliers, m; None without ICP.
@@ -198,7 +198,7 @@ class SensorAssessment:
     sensor: str
     noise: MapNoise
     wall: DifferenceStatistics
-    by: dict[str, list[Bin]]
+    by: dict[str, list[BinStatistics]]
     detection: DetectionSummary
     visible: float
     complete: float
@@ -230,13 +230,13 @@ class SensorAssessment:
 
 
 def map_noise(stable: Raster, gsd_m: float, random: KeyedRandom) -> MapNoise:
-    """Compute the noise of a stack of difference maps.
+    """Compute the noise of several difference maps.
 
     Parameters
     ----------
     stable : (e, h, w) differences, m; NaN outside stable ground and without data.
     gsd_m : Pixel size, m.
-    random : Source of the subsample for the normality test.
+    random : Source of the random subsample for the normality test.
     """
     found = variogram(np.stack([without_outliers(each) for each in stable[:_VARIOGRAM_MAPS]]), gsd_m)
     model = fit_variogram(found)
@@ -245,7 +245,7 @@ def map_noise(stable: Raster, gsd_m: float, random: KeyedRandom) -> MapNoise:
     return MapNoise(
         stable=statistics(stable),
         per_epoch=[statistics(each) for each in stable],
-        tails=tails(stable),
+        tails=tail_figures(stable),
         normality=normality(stable[0], effective, random.child("normality")),
         histogram=histogram(stable),
         variogram=found,
@@ -264,13 +264,13 @@ def _cell_px(stable: Raster, gsd_m: float) -> int:
 
 
 def assess(trial: Trial, seen: SensorObservations, random: KeyedRandom) -> SensorAssessment:
-    """Compute all results of one sensor.
+    """Compute all results of one sensor in a comparison.
 
     Parameters
     ----------
-    trial : The comparison, with the true changes.
+    trial : The simulated comparison, with the true changes.
     seen : What this sensor observed.
-    random : Source of subsamples and of the footprints' places.
+    random : Source of random subsamples, and of the footprints' places for false alarms.
     """
     gsd = trial.grid.gsd
     random = random.child("compare", seen.setup.name)
@@ -298,7 +298,13 @@ def assess(trial: Trial, seen: SensorObservations, random: KeyedRandom) -> Senso
 
 
 def assess_measured(found: MeasuredMaps, random: KeyedRandom) -> MapNoise:
-    """Compute the noise of measured epochs over their stable areas; without such areas, over all but gross differences."""
+    """Compute the noise of measured epochs over their stable areas; without such areas, over all but gross differences.
+
+    Parameters
+    ----------
+    found : Difference maps of the measured epochs.
+    random : Source of the random subsample for the normality test.
+    """
     stable = (
         np.where(found.stable, found.maps, np.nan)
         if found.stable is not None
@@ -315,12 +321,12 @@ def _scan_seconds(seen: SensorObservations) -> float | None:
     return float(sum(each.depth.size * (each.pulse_interval_s or 0.0) for each in looks))
 
 
-def _by_covariates(stable: Raster, trial: Trial, seen: SensorObservations) -> dict[str, list[Bin]]:
+def _by_covariates(stable: Raster, trial: Trial, seen: SensorObservations) -> dict[str, list[BinStatistics]]:
     """Compute statistics of the stable differences by range, incidence angle, distance from edges, and albedo."""
     step = int(np.ceil(np.sqrt(stable.size / _MOST_BINNED)))
     part = stable[:, ::step, ::step]
 
-    def against(covariate: NDArray[np.floating], edges: FloatArray | None = None) -> list[Bin]:
+    def against(covariate: NDArray[np.floating], edges: FloatArray | None = None) -> list[BinStatistics]:
         thinned = covariate[::step, ::step]
         return statistics_by_bin(part, np.broadcast_to(thinned, part.shape), quantile_edges(thinned) if edges is None else edges)
 
@@ -361,7 +367,13 @@ def _detection(
 
 
 def class_edges(values: FloatArray, classes: int = _SIZE_CLASSES) -> FloatArray:
-    """Return the edges of classes of equal logarithmic width that cover all (k,) values."""
+    """Return the edges of classes of equal logarithmic width that cover all values.
+
+    Parameters
+    ----------
+    values : (k,) positive values, such as block sizes.
+    classes : Number of classes.
+    """
     if len(values) == 0:
         return np.array([0.01, 1.0])
     low, high = float(values.min()), float(values.max())
@@ -369,12 +381,12 @@ def class_edges(values: FloatArray, classes: int = _SIZE_CLASSES) -> FloatArray:
 
 
 def size_classes(blocks: list[BlockDetection], values: FloatArray, edges: FloatArray) -> list[DetectionClass]:
-    """Sort blocks into classes by one of their measures and count those detected.
+    """Sort fallen blocks into classes of size or depth and count those detected.
 
     Parameters
     ----------
     blocks : The k blocks.
-    values : (k,) size or depth, m.
+    values : (k,) their size or depth, m.
     edges : Edges of the classes, m.
     """
     place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
@@ -402,13 +414,10 @@ def _table(size: FloatArray, depth: FloatArray, hit: BoolArray) -> FloatArray:
 
 
 def shared_scale_m(noises: list[MapNoise]) -> float:
-    """Return the standard deviation that scales the colours of all maps, m.
-
-    It is the largest NMAD, so that no sensor's noise saturates.
-    """
+    """Return the noise that scales the colours of all maps in a comparison, m: the largest NMAD, so that no map saturates."""
     return max((each.stable.nmad for each in noises if each.stable.count), default=1e-3) or 1e-3
 
 
 def grid_record(grid: Grid) -> dict[str, float]:
-    """Return the shared raster as `comparison.json` holds it."""
+    """Return the raster that all maps share as `comparison.json` holds it."""
     return {"x_min_m": grid.x_min, "y_max_m": grid.y_max, "gsd_m": grid.gsd, "width_px": grid.width, "height_px": grid.height}

@@ -22,13 +22,13 @@ _FIGURES_S = 3.0
 
 @dataclass(frozen=True)
 class ComparisonResult:
-    """Result of a comparison.
+    """Result of comparing several sensors on one wall.
 
     Attributes
     ----------
     trial : What was simulated.
-    found : Results of each sensor, in the same order.
-    measured : Measured epochs with their noise.
+    found : Results of each sensor, in the order of the sensors.
+    measured : Measured epochs with their noise, for reference.
     config : The first sensor's config, as JSON types.
     """
 
@@ -38,7 +38,7 @@ class ComparisonResult:
     config: dict[str, Any]
 
     def noises(self) -> dict[str, MapNoise]:
-        """Return the noise by name, simulated sensors first."""
+        """Return the noise of every sensor and of every measured folder, by name, simulated sensors first."""
         return {each.name: each.noise for each in self.found} | {
             f"{maps.name} (measured)": noise for maps, noise in self.measured
         }
@@ -51,14 +51,13 @@ def compare_sensors(
     sizes_m: tuple[float, float] | None = (0.05, 0.8),
     progress: Progress | None = None,
 ) -> ComparisonResult:
-    """Simulate sensors on one wall with the same blocks and compare their results, with measured epochs for reference.
+    """Simulate several sensors on one wall with the same fallen blocks, and compare their results.
 
     Parameters
     ----------
     sensors : The sensors; the wall, blocks and seed are those of the first.
-    measured : Folders of measured epochs as `read_measured` takes them. They are read first, so that a mistake costs no
-        simulation;
-        the first config gives their GSD and ICP.
+    measured : Folders of measured epochs as `read_measured` takes them, for reference. They are read first, so that a mistake
+        costs no simulation; the first config gives their pixel size and ICP.
     epochs : Number of epochs with rockfall.
     sizes_m : Block sizes in the first and the last epoch, m; None: the blocks of the config.
     progress : Receives the progress; None: nothing is shown.
@@ -69,7 +68,11 @@ def compare_sensors(
         If the sizes, a measured folder or a sensor cannot be used.
     """
     if sizes_m is not None and not 0 < sizes_m[0] <= sizes_m[1]:
-        raise InputError(f"got {sizes_m[0]:g} and {sizes_m[1]:g} m", where="--sizes-m", allowed="0 < smallest <= largest")
+        raise InputError(
+            f"the block sizes {sizes_m[0]:g} and {sizes_m[1]:g} m are not a range",
+            where="--sizes-m",
+            allowed="0 < smallest <= largest",
+        )
     progress = progress or Progress()
     progress.plan({"figures": _FIGURES_S * len(sensors)})
     config = sensors[0].config

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from pipeline.precision.surface import Places, seen_from
+from pipeline.precision.surface import Places, visible_from
 from scene.common.backend import dr
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray
@@ -30,7 +30,7 @@ _LEAST_STEP_M = 0.05
 
 @dataclass(frozen=True)
 class UntouchedWall:
-    """The untouched wall at every pixel of a raster.
+    """The wall before any rockfall, at every pixel of a raster.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class UntouchedWall:
 
 
 def untouched_wall(caster: RayCaster, grid: Grid) -> UntouchedWall:
-    """Cast rays along -z onto the untouched wall (wall frame) at every pixel centre."""
+    """Cast rays along -z of the wall frame onto the untouched wall at every pixel centre of a raster."""
     hits, point = caster.look_down(grid)
     valid, normal, albedo = hits.valid, hits.normal, hits.albedo
     dr.eval(valid, point, normal, albedo)
@@ -70,7 +70,7 @@ def untouched_wall(caster: RayCaster, grid: Grid) -> UntouchedWall:
 
 
 def edge_distance(heights: NDArray[np.floating], gsd_m: float) -> Raster:
-    """Compute the distance of each pixel from the nearest edge.
+    """Compute the distance of each pixel from the nearest edge of the rock.
 
     An edge lies between neighbouring pixels whose heights differ by more than four pixel sizes and 5 cm.
 
@@ -96,12 +96,12 @@ def edge_distance(heights: NDArray[np.floating], gsd_m: float) -> Raster:
 
 
 def range_and_incidence(wall: UntouchedWall, viewpoints: Sequence[FloatArray]) -> tuple[Raster, Raster]:
-    """Compute the mean range and the mean incidence angle over several viewpoints.
+    """Compute range and incidence angle at every pixel of a wall, averaged over the viewpoints of a sensor.
 
     Parameters
     ----------
     wall : The wall at every pixel.
-    viewpoints : (3,) each, wall frame, m.
+    viewpoints : Positions (3,), wall frame, m: the stations, or the two cameras.
 
     Returns
     -------
@@ -123,18 +123,18 @@ def visible(wall: UntouchedWall, caster: RayCaster, viewpoints: Sequence[FloatAr
     Parameters
     ----------
     wall : The wall at every pixel.
-    caster : The wall, for ray casting.
-    viewpoints : (3,) each, wall frame, m.
-    every : Whether a pixel must be visible from every viewpoint, as for a stereo pair, or from any.
+    caster : The wall, for tests of visibility.
+    viewpoints : Positions (3,), wall frame, m: the stations, or the two cameras.
+    every : Whether a pixel must be visible from every viewpoint, as for a stereo pair, or from any one.
 
     Returns
     -------
-    (h, w) mask.
+    (h, w) true for visible pixels.
     """
     places = Places(
         wall.points[wall.found], wall.normals[wall.found].astype(np.float64), wall.albedo[wall.found].astype(np.float64)
     )
-    seen = np.stack([seen_from(caster, places, viewpoint) for viewpoint in viewpoints])
+    seen = np.stack([visible_from(caster, places, viewpoint) for viewpoint in viewpoints])
     result = np.zeros(wall.found.shape, dtype=bool)
     result[wall.found] = seen.all(axis=0) if every else seen.any(axis=0)
     return result

@@ -46,12 +46,12 @@ _PLACES = 10
 
 
 def level_of_detection(stable: NDArray[np.floating], cell_px: int) -> NDArray[np.float32]:
-    """Compute the level of detection of each pixel: the 95 % quantile of |difference| in its cell, over all epochs.
+    """Compute the level of detection of each pixel: the 95 % quantile of |difference| in its square cell, over all epochs.
 
     Parameters
     ----------
     stable : (e, h, w) differences, m; NaN outside stable ground and without data.
-    cell_px : Side of a square cell, pixels.
+    cell_px : Side of a cell, pixels.
 
     Returns
     -------
@@ -82,7 +82,7 @@ class BlockDetection:
     size_m : (2 V)^(1/3) of the fallen volume V, m: the side of a cube that was half embedded in the rock, as in `scarpsim
         inspect`.
     depth_m : True mean depth over its footprint, m.
-    footprint_px : Pixels of the map on which it changed the wall.
+    footprint_px : Number of pixels of the map on which it changed the wall (its footprint).
     data_share : Share of these pixels with data.
     mean_m : Mean difference on these, m; None with too little data.
     limit_m : Level of detection of that mean, m; None with too little data.
@@ -111,7 +111,7 @@ class BlockDetection:
 
 @dataclass(frozen=True)
 class BlockMeanTest:
-    """Test whether the mean change over a footprint exceeds its level of detection.
+    """Test whether the mean change over a block's footprint exceeds its level of detection.
 
     Attributes
     ----------
@@ -125,7 +125,13 @@ class BlockMeanTest:
     gsd_m: float
 
     def limit_m(self, footprint: BoolArray, window: tuple[slice, slice]) -> float:
-        """Return the level of detection, m, of the mean over a footprint (n, m) that lies in `window` of the map."""
+        """Return the level of detection of the mean change over a footprint, m.
+
+        Parameters
+        ----------
+        footprint : (n, m) mask of the block's pixels.
+        window : Rows and columns of the map that the mask covers.
+        """
         level = self.level[window][footprint].astype(np.float64)
         share = variance_of_mean(self.model, footprint, self.gsd_m) / self.model.sill_m2 if self.model.sill_m2 > 0 else 0.0
         return float(np.sqrt(np.mean(level**2) * share))
@@ -139,7 +145,7 @@ class BlockMeanTest:
         ----------
         change : (h, w) difference map, m.
         footprint : (n, m) mask of the block's pixels.
-        window : Place of the footprint in the map.
+        window : Rows and columns of the map that the mask covers.
 
         Returns
         -------
@@ -154,7 +160,17 @@ class BlockMeanTest:
 
 
 def footprints(block: IntArray, true_change: NDArray[np.floating]) -> Iterator[tuple[int, tuple[slice, slice], BoolArray]]:
-    """Yield each block's label, window in the map, and footprint in that window: its pixels where the wall receded."""
+    """Find the footprint of each fallen block: the pixels of its label where the wall receded.
+
+    Parameters
+    ----------
+    block : (h, w) block labels.
+    true_change : (h, w) true change of the wall, reference minus epoch, m.
+
+    Yields
+    ------
+    Label of the block, rows and columns of the map around it, and the mask of its footprint there.
+    """
     receded = np.where(true_change > 0, block, WALL)
     for label, window in enumerate(ndimage.find_objects(receded), start=1):
         if window is not None:
@@ -170,7 +186,7 @@ def detect_blocks(
     visible: BoolArray,
     test: BlockMeanTest,
 ) -> list[BlockDetection]:
-    """Test each block of an epoch.
+    """Test for each block of an epoch whether a difference map shows its fall.
 
     Parameters
     ----------
@@ -178,7 +194,7 @@ def detect_blocks(
     change : (h, w) the sensor's difference map, m.
     block, true_change : (h, w) true block labels and true change of the wall, reference minus epoch, m.
     records : The blocks as blocks.json holds them.
-    visible : (h, w) where the sensor sees the untouched wall.
+    visible : (h, w) true where the sensor sees the untouched wall.
     test : The test of a mean change.
     """
     found = {label: (window, footprint) for label, window, footprint in footprints(block, true_change)}
@@ -212,12 +228,12 @@ def detect_blocks(
 def false_alarms(
     stable: NDArray[np.floating], shapes: Sequence[BoolArray], test: BlockMeanTest, random: KeyedRandom
 ) -> tuple[int, int]:
-    """Place footprints at random on stable ground and count how many would be taken for blocks.
+    """Place footprints at random on stable ground and count how many would be taken for fallen blocks.
 
     Parameters
     ----------
     stable : (h, w) differences of one map, m; NaN outside stable ground.
-    shapes : Footprints of the blocks.
+    shapes : Footprints of the blocks, as masks.
     test : The test of a mean change.
     random : Source of the places.
 
@@ -240,7 +256,7 @@ def false_alarms(
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """Return Wilson's (1927) 95 % confidence interval of a share."""
+    """Return the 95 % confidence interval of a share, from the numbers of successes and trials (Wilson 1927)."""
     if trials == 0:
         return 0.0, 1.0
     share, factor = successes / trials, Z_95**2 / trials

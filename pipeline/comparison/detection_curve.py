@@ -57,13 +57,14 @@ _LAPSES_OF_NONE = np.array([0.051, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 0.9])
 
 @dataclass(frozen=True)
 class DetectionCurve:
-    """Fitted probability of detection P(x) = (1 - lapse) Phi((ln x - ln middle) / width).
+    """Probability that a fallen block is detected, fitted as P(x) = (1 - lapse) Phi((ln x - ln middle) / width) of its size x.
 
     Attributes
     ----------
     count, seen : Number of blocks, and of those detected.
     smallest_m, largest_m : Range of the block sizes, m.
-    middle_m, width, lapse : Parameters of the curve.
+    middle_m, width, lapse : Parameters of the curve: the size at half of its height, m; the width of its rise, in logarithms; and
+        the share that is missed at any size.
     smallest_95_m : Size from which 95 % are detected, m; None if the blocks determine it less well than to a factor of 1.5.
     between_m : Block sizes between which it then lies, m. None at an end: below or above all sizes. None altogether if
         `smallest_95_m` is given or the curve stays below 95 %.
@@ -82,7 +83,7 @@ class DetectionCurve:
     interval_m: tuple[float | None, float | None]
 
     def probability(self, size_m: FloatArray) -> FloatArray:
-        """Return the probability of detection at sizes, m."""
+        """Return the probability of detection of blocks with sizes (any shape), m."""
         return (1 - self.lapse) * special.ndtr((np.log(size_m) - np.log(self.middle_m)) / self.width)
 
     def to_dict(self) -> dict[str, Any]:
@@ -139,7 +140,17 @@ class _ProfileLikelihood:
 
 
 def detection_curve(size_m: FloatArray, seen: BoolArray) -> DetectionCurve | None:
-    """Fit the curve to blocks of sizes (k,), m, with their detections (k,); return None for fewer than ten blocks."""
+    """Fit the probability of detection to fallen blocks.
+
+    Parameters
+    ----------
+    size_m : (k,) sizes of the blocks, m.
+    seen : (k,) whether each was detected.
+
+    Returns
+    -------
+    The curve; None for fewer than ten blocks.
+    """
     if len(size_m) < LEAST_BLOCKS:
         return None
     log_size = np.log(size_m)

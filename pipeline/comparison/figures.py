@@ -46,7 +46,15 @@ COVARIATES = {
 
 @dataclass(frozen=True)
 class MapPanel:
-    """One map of a figure: values (h, w), m; block: labels whose outlines are drawn, or None."""
+    """One map of a figure.
+
+    Attributes
+    ----------
+    title : Its title.
+    values : (h, w) values, m; NaN without data.
+    grid : Its pixels.
+    block : (h, w) block labels whose outlines are drawn; None for none.
+    """
 
     title: str
     values: NDArray[np.floating]
@@ -55,14 +63,14 @@ class MapPanel:
 
 
 def side_by_side(panels: Sequence[MapPanel], limit_m: float, label: str, *, signed: bool) -> bytes:
-    """Draw maps in rows of two on one colour scale.
+    """Draw maps in rows of two on one colour scale, as PNG.
 
     Parameters
     ----------
     panels : The maps.
-    limit_m : End of the scale, m.
+    limit_m : Upper end of the scale, m.
     label : Label of the colour bar.
-    signed : Whether the scale begins at -limit_m or at 0.
+    signed : Whether the scale begins at -limit_m, else at 0.
     """
     columns = min(len(panels), 2)
     rows = -(-len(panels) // columns)
@@ -91,7 +99,7 @@ def side_by_side(panels: Sequence[MapPanel], limit_m: float, label: str, *, sign
 
 
 def noise_figure(noises: Mapping[str, MapNoise]) -> bytes:
-    """Draw histograms of the noise, linear and logarithmic, and variograms with their models.
+    """Draw histograms of the noise of several sensors, linear and logarithmic, and their variograms with models, as PNG.
 
     Dashed lines are normal distributions with the same median and NMAD.
     """
@@ -118,16 +126,22 @@ def noise_figure(noises: Mapping[str, MapNoise]) -> bytes:
 
 
 def covariate_figure(found: Sequence[SensorAssessment]) -> bytes:
-    """Draw the NMAD over stable ground against range, incidence angle, distance from edges, and albedo."""
+    """Draw the NMAD over stable ground against range, incidence angle, distance from edges, and albedo, as PNG."""
     figure = Figure(figsize=(_WIDTH_IN, 6.4), dpi=DPI, layout="constrained")
     panels = figure.subplots(2, 2, sharey=True).ravel()
     for axes, (key, (label, factor)) in zip(panels, COVARIATES.items(), strict=True):
         for colour, each in zip(_colours(len(found)), found, strict=True):
-            bins = [item for item in each.by[key] if item.of.count]
+            bins = [item for item in each.by[key] if item.statistics.count]
             high = [item.high if np.isfinite(item.high) else 2 * item.low for item in bins]
             middle = [(item.low + top) / 2 * factor for item, top in zip(bins, high, strict=True)]
             axes.plot(
-                middle, [item.of.nmad * 1e3 for item in bins], "o-", color=colour, markersize=3.5, linewidth=1.2, label=each.name
+                middle,
+                [item.statistics.nmad * 1e3 for item in bins],
+                "o-",
+                color=colour,
+                markersize=3.5,
+                linewidth=1.2,
+                label=each.name,
             )
         if key == "edge_m":
             _metric(axes)
@@ -138,7 +152,7 @@ def covariate_figure(found: Sequence[SensorAssessment]) -> bytes:
 
 
 def detection_figure(found: Sequence[SensorAssessment]) -> bytes:
-    """Draw the share of blocks detected against size and depth, and the volume errors.
+    """Draw the share of fallen blocks detected against size and depth, and the errors of their volumes, as PNG.
 
     Points are classes with 95 % intervals, lines the fitted curves. Volume errors are drawn for classes of which at least half
     are detected; below, the noise is as large as the volume.
@@ -170,7 +184,7 @@ def detection_figure(found: Sequence[SensorAssessment]) -> bytes:
 
 
 def table_figure(found: Sequence[SensorAssessment]) -> bytes:
-    """Draw the share of blocks detected by size and depth, one panel for each sensor; white: no such block."""
+    """Draw the share of fallen blocks detected by size and depth, one panel for each sensor, as PNG; white: no such block."""
     figure = Figure(figsize=(_WIDTH_IN, 4.0), dpi=DPI, layout="constrained")
     row = np.atleast_1d(figure.subplots(1, len(found), sharey=True))
     for axes, each in zip(row, found, strict=True):
@@ -188,12 +202,12 @@ def table_figure(found: Sequence[SensorAssessment]) -> bytes:
 
 
 def scale_limit_m(sigma_m: float) -> float:
-    """Return the end of the colour scale of difference maps, m."""
+    """Return the upper end of the colour scale of difference maps, m, for noise with the standard deviation sigma_m."""
     return SCALE_SIGMAS * sigma_m
 
 
 def level_limit_m(noises: Sequence[MapNoise]) -> float:
-    """Return the end of the colour scale of levels of detection, m: the 98 % quantile of the noisiest sensor."""
+    """Return the upper end of the colour scale of levels of detection, m: the 98 % quantile of the noisiest sensor."""
     tops = [float(np.nanquantile(noise.level, 0.98)) for noise in noises if np.isfinite(noise.level).any()]
     return max(tops, default=1e-3) or 1e-3
 

@@ -39,7 +39,10 @@ _NOTHING = "\N{EN DASH}"
 
 
 def write_comparison(out: Path, comparison: ComparisonResult) -> Path:
-    """Write the result folder, which appears only when everything is in it, and return the path of its report."""
+    """Write all files of a comparison into a folder, and return the path of the report.
+
+    The folder appears only when everything is in it.
+    """
     with filling(out) as folder:
         _write(folder, comparison)
     return out / "report.html"
@@ -86,7 +89,7 @@ def _write(out: Path, comparison: ComparisonResult) -> None:
 def answer(found: SensorAssessment) -> str:
     """Return the main result of a sensor as a sentence.
 
-    It states the smallest block that the sensor sees in 95 % of cases, and from which blocks this was estimated.
+    It states the smallest block that the sensor detects in 95 % of cases, and from which blocks this was estimated.
     """
     curve = found.detection.by_size
     if curve is None:
@@ -131,7 +134,7 @@ def _cm(size_m: float) -> str:
 
 
 def summary(comparison: ComparisonResult) -> str:
-    """Return the main results as lines of text."""
+    """Return the main results of a comparison as lines of text for the terminal."""
     steps = [(seen.setup.name, seen.setup.angular_step_rad) for seen in comparison.trial.seen]
     lines = [f"{name}: angular step {_step(step)}" for name, step in steps if step is not None]
     lines += [f"{name}: stable ground {noise.stable.summary()}" for name, noise in comparison.noises().items()]
@@ -173,7 +176,7 @@ def _shown(trial: Trial) -> int:
 
 
 def pictures(comparison: ComparisonResult) -> dict[str, bytes]:
-    """Draw the report's pictures as PNG, by file name."""
+    """Draw the pictures of a comparison's report as PNG, by file name."""
     trial, found, noises = comparison.trial, comparison.found, comparison.noises()
     number = _shown(trial)
     epoch = trial.epochs[number - 1]

@@ -32,7 +32,14 @@ _KINDS = ("", "sites", "scanners", "noise")
 
 @dataclass(frozen=True)
 class SensorSetup:
-    """One sensor of a comparison, with its config. The sections that describe wall and blocks are the same for all."""
+    """One sensor of a comparison, with its config.
+
+    Attributes
+    ----------
+    name : Name in the comparison.
+    sensor : "stereo" or "tls".
+    config : Its config. The sections that describe wall and blocks are the same for all sensors.
+    """
 
     name: str
     sensor: SensorName

@@ -47,13 +47,13 @@ _SIZE_SPREAD, _SMALLEST_SHARE = 0.15, 0.5
 
 @dataclass(frozen=True)
 class TrueEpoch:
-    """The true change of the wall before an epoch.
+    """The true change of the wall between the reference and one epoch.
 
     Attributes
     ----------
     number : Number of the epoch, from 1.
-    records : The blocks as blocks.json holds them.
-    block : (h, w) block labels.
+    records : The fallen blocks as blocks.json holds them.
+    block : (h, w) labels of the blocks.
     change : (h, w) change, reference minus epoch, m; 0 where nothing fell.
     stable : (h, w) true on stable ground.
     """
@@ -67,17 +67,17 @@ class TrueEpoch:
 
 @dataclass(frozen=True)
 class SensorObservations:
-    """What one sensor observed.
+    """What one sensor of a comparison observed.
 
     Attributes
     ----------
     setup : The sensor.
     site : The simulated site, with the sensor's viewpoints.
-    changes : (e, h, w) difference maps, m.
+    changes : (e, h, w) difference maps, reference minus epoch, m.
     points : Number of points of the reference and of each epoch.
     seconds : Computing time of each epoch without carving, s.
     registration_rms_m : RMS distance of ICP's inliers in each epoch, m; empty without ICP.
-    reference : The reference observation.
+    reference : The observation of the reference epoch.
     range_m, incidence_rad, visible : (h, w) range, m, incidence angle, rad, and visibility of the untouched wall.
     """
 
@@ -95,7 +95,7 @@ class SensorObservations:
 
 @dataclass(frozen=True)
 class Trial:
-    """The simulation behind a comparison.
+    """The simulation on which a comparison is based.
 
     Attributes
     ----------
@@ -114,15 +114,14 @@ class Trial:
 def compare(
     sensors: Sequence[SensorSetup], epochs: int, sizes_m: tuple[float, float] | None, progress: Progress | None = None
 ) -> Trial:
-    """Observe one wall before and after rockfall with every sensor.
+    """Simulate what every sensor observes of one wall before and after rockfall.
 
     Parameters
     ----------
     sensors : The sensors; the first one's config gives wall and blocks.
     epochs : Number of epochs with rockfall.
-    sizes_m : Block sizes in the first and the last epoch, m. They grow geometrically in between, so that the smallest visible
-        size
-        is bracketed. None: the blocks of the config.
+    sizes_m : Block sizes in the first and the last epoch, m. They grow geometrically in between, so that the smallest detectable
+        size is bracketed. None: the blocks of the config.
     progress : Receives the progress; None: nothing is shown.
 
     Raises
@@ -164,12 +163,12 @@ def compare(
 def rockfalls(
     config: RockfallConfig, bounds: FloatArray, epochs: int, sizes_m: tuple[float, float] | None
 ) -> list[RockfallConfig]:
-    """Return the rockfall settings of each epoch.
+    """Return the rockfall settings of each epoch of a comparison.
 
     Parameters
     ----------
     config : The rockfall of the config.
-    bounds : (2, 3) bounding box of the wall, m.
+    bounds : (2, 3) bounding box of the wall, wall frame, m.
     epochs : Number of epochs.
     sizes_m : Block sizes of the first and the last epoch, m; None: the config's blocks in each epoch.
 
@@ -193,7 +192,7 @@ def _check_one_frame(sensors: Sequence[SensorSetup], sites: Sequence[SensorSite]
     for each, site in zip(sensors, sites, strict=True):
         if not np.allclose(site.frame.matrix, sites[0].frame.matrix, atol=1e-9):
             raise InputError(
-                f"faces another side of the wall than {sensors[0].name}",
+                f"the sensor faces another side of the wall than {sensors[0].name}",
                 where=each.name,
                 remedy="compare sensors that face the same side",
             )

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import Discriminator, Field, SerializerFunctionWrapHandler, Tag, field_validator, model_serializer, model_validator
 
 from pipeline.change.annotate import AnnotationConfig
 from pipeline.change.difference import DifferenceConfig
@@ -17,6 +17,7 @@ from pipeline.config.bundled import bundled_config
 from pipeline.config.calibration import CalibrationConfig
 from pipeline.config.overrides import Override, apply_overrides
 from pipeline.config.presets import expand_shorthand, is_path, model_file, with_preset, without_keys_of_preset
+from pipeline.config.series import SeriesConfig
 from pipeline.formats.cameras.camera_files import oriented_files, read_oriented, stereo_pair
 from pipeline.formats.cameras.cameras import PairConfig, cameras_yaml_files, read_cameras_yaml
 from pipeline.precision.detectability import PlanningConfig
@@ -31,6 +32,7 @@ from scene.blocks.block import RockfallConfig
 from scene.common.config import Config, load_yaml, parse
 from scene.common.errors import InputError
 from scene.geometry.frame import FrameConfig
+from scene.walls.imported import ImportedWall
 from scene.walls.procedural import ProceduralWall
 from scene.walls.wall import WallConfig
 from sensors.cameras.camera import CameraPair
@@ -118,6 +120,11 @@ class SimulationConfig(Config):
     )
     frame: FrameConfig = Field(FrameConfig(), description="the wall frame, in which maps are made")
     rockfall: RockfallConfig = RockfallConfig()
+    series: SeriesConfig | None = Field(
+        None,
+        description="a wall over time in place of `epochs`: times, rockfall, events, precursor, deposits, surfaces, conditions "
+        "(howto/series.md); blocks then have the shapes of `rockfall`, not its number and size; none: epochs by themselves",
+    )
     wetness: WetnessConfig | None = Field(None, description="wet patches of the rock, in every epoch; none: dry")
     sensor: tuple[SensorModel, ...] = Field((), description="sensor models (noise and effects), at most one of each sensor")
     cameras: CamerasConfig = Field(
@@ -170,8 +177,30 @@ class SimulationConfig(Config):
     @model_validator(mode="before")
     @classmethod
     def _with_preset(cls, values: Any) -> Any:
-        """Write out the preset that `scanner` names."""
-        return with_preset(values) if isinstance(values, dict) else values
+        """Write out the preset that `scanner` names, and the wall of a series of surfaces."""
+        return with_preset(_with_first_surface(values)) if isinstance(values, dict) else values
+
+    @model_serializer(mode="wrap")
+    def _without_series(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave `series` out where there is none, so that such runs stay the same to the byte."""
+        values: dict[str, Any] = handler(self)
+        if self.series is None:
+            del values["series"]
+        return values
+
+    @model_validator(mode="after")
+    def _one_schedule(self) -> SimulationConfig:
+        """Refuse a series beside a contradicting number of epochs, or with surfaces of another wall."""
+        if self.series is None:
+            return self
+        if self.epochs not in (1, self.series.count - 1):
+            raise ValueError(f"`series.times` has {self.series.count - 1} epochs after the reference: leave `epochs` out")
+        if self.products.block_meshes:
+            raise ValueError("`products.block_meshes` are those of epochs by themselves: leave it out beside `series`")
+        first = self.series.surfaces[:1]
+        if first and not (isinstance(self.wall, ImportedWall) and tuple(self.wall.files) == first):
+            raise ValueError("`wall.mesh` must be the first of `series.surfaces`, or left out")
+        return self
 
     @field_validator("sensor", mode="before")
     @classmethod
@@ -212,6 +241,11 @@ class SimulationConfig(Config):
                 "millimetre; for another scanner, use another config (scarpsim compare)"
             )
         return stations
+
+    @property
+    def last_epoch(self) -> int:
+        """Number of the last epoch; the reference is 0."""
+        return self.epochs if self.series is None else self.series.count - 1
 
     def sensor_names(self) -> tuple[SensorName, ...]:
         """Return the sensors of which the config has a model; both if it has none, as both are then default."""
@@ -295,6 +329,16 @@ def resolved(
     return config
 
 
+def _with_first_surface(values: dict[str, Any]) -> dict[str, Any]:
+    """Take the first surface of a series as the wall if the config names none."""
+    series = values.get("series")
+    surfaces = series.get("surfaces") if isinstance(series, dict) else None
+    if not isinstance(surfaces, list | tuple) or not surfaces:
+        return values
+    wall = values.get("wall") or {}
+    return {**values, "wall": {"mesh": surfaces[0], **wall}} if isinstance(wall, dict) and "style" not in wall else values
+
+
 def _with_paths(values: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Return the values with all paths made absolute, relative to `folder`."""
 
@@ -310,6 +354,8 @@ def _with_paths(values: dict[str, Any], folder: Path) -> dict[str, Any]:
             result[section] = {**result[section], key: absolute(result[section][key])}
     if isinstance(result.get("cameras"), str):
         result["cameras"] = absolute(result["cameras"])
+    if isinstance(result.get("series"), dict) and "surfaces" in result["series"]:
+        result["series"] = {**result["series"], "surfaces": absolute(result["series"]["surfaces"])}
     for key in ("scanner", "sensor"):
         if isinstance(result.get(key), str) and is_path(result[key]):
             result[key] = absolute(result[key])

@@ -22,6 +22,7 @@ from pipeline.report.figures import COLOURS, DIFFERENCE_LABEL, SCALE_SIGMAS, SEQ
 from pipeline.report.page import litres, millimetres
 from pipeline.report.plain_text import plain_text
 from pipeline.report.progress import Progress
+from pipeline.report.words import counted
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray, TriangleMesh
 
@@ -117,7 +118,7 @@ def _epoch_picture(run: ExportedRun, number: int, view: PerspectiveView, limit: 
     values, grid = run.difference(number)
     blocks = run.blocks(number)
     volume, noise = sum(block["volume_m3"] for block in blocks), millimetres(run.limit_m(number) / SCALE_SIGMAS)
-    title = f"Epoch {number}: {len(blocks)} blocks of {litres(volume)} l fell; noise {noise} (NMAD)"
+    title = f"Epoch {number}: {counted(len(blocks), 'block')} of {litres(volume)} l fell; noise {noise} (NMAD)"
     labels = {block["label"]: np.array(block["position_m"]) for block in blocks[:_MOST_NUMBERED]}
     pixels = draw_wall(view, run.surface(number), values, grid, limit)
     return _framed(pixels, title, limit, {label: view.project(place[None])[0][0] for label, place in labels.items()})

@@ -200,7 +200,7 @@ class LockingThresholds(ThresholdGroup):
 
 
 class QuantizationThresholds(ThresholdGroup):
-    """Threshold of rounded ranges."""
+    """Threshold of the test whether ranges were rounded to a step."""
 
     least_resultant: PositiveFloat = threshold_field(
         0.2,

@@ -11,20 +11,20 @@ DEVELOPMENT, JUDGEMENT = "development cases", "judgement"
 
 
 class ThresholdGroup(BaseModel):
-    """A group of thresholds: frozen, without unknown keys, infinities or NaN."""
+    """Base class of a group of thresholds of `gap`: values are frozen, and unknown keys, infinities and NaN are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 def threshold_field(default: float, unit: str, decides: str, source: str, **bounds: Any) -> Any:
-    """Return the pydantic field of one threshold.
+    """Declare one threshold of `gap` as a pydantic field, with its documentation.
 
     Parameters
     ----------
-    default : value.
+    default : default value.
     unit : unit of the value, in words.
-    decides : what the threshold decides, as whole sentences.
+    decides : what the threshold decides, in whole sentences.
     source : where the value comes from.
-    bounds : limits on the value, as `pydantic.Field` takes them.
+    bounds : limits on the value, as keyword arguments of `pydantic.Field`.
     """
     return Field(default, description=decides, json_schema_extra={"unit": unit, "source": source}, **bounds)

@@ -334,7 +334,7 @@ class VerdictThresholds(ThresholdGroup):
 
 
 class Thresholds(ThresholdGroup):
-    """All thresholds of a diagnosis, in groups."""
+    """All thresholds of a diagnosis with `gap`, in groups."""
 
     points: PointThresholds = PointThresholds()
     mean: MeanThresholds = MeanThresholds()
@@ -354,21 +354,27 @@ _IN_USE: ContextVar[Thresholds] = ContextVar("thresholds", default=_DEFAULTS)
 
 
 def read_thresholds(overrides: Sequence[str]) -> Thresholds:
-    """Return the thresholds with the values that the user gave on the command line.
+    """Return the default thresholds with the values replaced that the user gave on the command line.
 
-    overrides: `group.key=value` each. Raises InputError for an unknown key or a value outside its bounds.
+    Parameters
+    ----------
+    overrides : replacements, each as `group.key=value`.
+
+    Raises
+    ------
+    InputError : a key is unknown or a value outside its bounds.
     """
     return parse(Thresholds, apply_overrides({}, overrides), "--set")
 
 
 def thresholds() -> Thresholds:
-    """Return the thresholds of the current diagnosis, the defaults outside of one."""
+    """Return the thresholds of the diagnosis that is running; the defaults outside of one."""
     return _IN_USE.get()
 
 
 @contextmanager
 def use_thresholds(chosen: Thresholds) -> Iterator[None]:
-    """Make `thresholds()` return the chosen thresholds inside the `with` block."""
+    """Make `thresholds()` return the given thresholds inside a `with` block."""
     token = _IN_USE.set(chosen)
     try:
         yield

@@ -29,7 +29,7 @@ from pipeline.formats.records.result_files import read_surface
 from pipeline.formats.records.result_records import RUN_FILE, read_run
 from pipeline.formats.records.run_files import epoch_folder
 from pipeline.registration.closest_points import ReferenceSurface
-from pipeline.registration.register import IcpConfig, fit, register_to
+from pipeline.registration.register import IcpConfig, measure_fit, register_to
 from pipeline.registration.rigid import RigidTransform
 from pipeline.report.progress import Progress
 from pipeline.run.epoch import observe_epoch, observe_reference
@@ -387,7 +387,7 @@ class _PoseEvaluator:
             )
         error = self.error(found.transform, epoch.true)
         step = max(len(epoch.points) // _FIT_SAMPLE, 1)
-        fitted = fit(self.target, found.apply(epoch.points[::step]), config)
+        fitted = measure_fit(self.target, found.apply(epoch.points[::step]), config)
         return StudyRow(
             parameter,
             value,

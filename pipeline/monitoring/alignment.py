@@ -5,8 +5,10 @@ and rotation w of the epoch change its height at a place (x, y), to first order,
 
     dz = tz + wx y - wy x - a (tx + wy z - wz y) - b (ty + wz x - wx z),
 
-a and b the slopes of the surface. Tukey's weights leave out what moved. The covariance of the six parameters comes from leaving
-out one block of the wall at a time (delete-a-group jackknife), since neighbouring pixels share their errors.
+a and b the slopes of the surface. Tukey's weights leave out what moved. The fit is repeated on the pixels that did not change
+sign-consistently (`unchanged.py`), as a robust fit alone is drawn towards changes that all have one sign. The covariance of the
+six parameters comes from leaving out one block of the wall at a time (delete-a-group jackknife), since neighbouring pixels share
+their errors.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from numpy.typing import NDArray
 
 from pipeline.change.areas import Area, in_areas
 from pipeline.monitoring.gridding import HeightRaster
+from pipeline.monitoring.unchanged import unchanged_pixels
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import IcpConfig, register_to
 from pipeline.registration.rigid import RigidTransform
@@ -47,7 +50,9 @@ _FEWEST_BLOCKS = 5
 _FEW_STABLE = 0.25
 """Share of the compared pixels below which the user is told that little of the wall is stable."""
 _FARTHEST_NOISE = 3.0
-"""Times the limit of the robust fit (14 standard deviations) beyond which a difference is no noise, however long its tails."""
+"""Times the limit of the robust fit (14 standard deviations) beyond which a difference in the user's stable areas is no noise."""
+_REFITS = 3
+"""Fits on the pixels that did not change, each after a new search for them."""
 _UNDETERMINED = 1e-7
 """Motions whose effect on the heights, relative to the largest, is smaller than this are left as they are."""
 
@@ -65,9 +70,7 @@ class Alignment:
     centre : (3,) array
         Centre of the rotation, wall frame, m.
     stable : (h, w) bool array
-        Pixels on which the registration rests.
-    quiet : (h, w) bool array
-        Those and pixels as far off as the long tails of noise reach.
+        Pixels that did not change, on which the registration rests and noise is measured.
     rms_m : float
         Root mean square of the differences on these pixels.
     notes : tuple of str
@@ -78,14 +81,13 @@ class Alignment:
     covariance: FloatArray
     centre: FloatArray
     stable: NDArray[np.bool_]
-    quiet: NDArray[np.bool_]
     rms_m: float
     notes: tuple[str, ...] = ()
 
     def sigma(self, raster: HeightRaster) -> NDArray[np.float32]:
         """Standard deviation of the registration's effect on each pixel's height, (h, w), m; NaN without data."""
         design = _design(raster, self.centre)
-        variance = np.einsum("khw,kl,lhw->hw", design, self.covariance, design)
+        variance = (design * np.tensordot(self.covariance.astype(np.float32), design, 1)).sum(axis=0)
         return np.sqrt(np.maximum(variance, 0.0)).astype(np.float32)
 
     def to_dict(self) -> dict[str, Any]:
@@ -154,24 +156,47 @@ def refine(reference: HeightRaster, epoch: HeightRaster, areas: Sequence[Area]) 
     design = _design(epoch, centre)[:, fitted]
     target, weight = difference[fitted].astype(np.float64), _weights_by_sigma(reference, epoch, fitted)
     expected = float(np.median(np.sqrt(weight) * np.hypot(reference.sigma[fitted], epoch.sigma[fitted])))
-    parameters, robust, limit = _robust_fit(design, target, weight, expected)
-    covariance, groups = _jackknife(design, target, weight * robust, _block_numbers(fitted))
-    rest = np.where(compared, difference - np.einsum("k,khw->hw", parameters, _design(epoch, centre)), np.nan)
-    stable = compared.copy()
-    apart = np.abs(rest[compared]) * np.sqrt(_weights_by_sigma(reference, epoch, compared))
-    stable[compared] = apart < limit
-    quiet = compared.copy()
-    quiet[compared] = apart < _FARTHEST_NOISE * limit
+    fit = _robust_fit(design, target, weight, expected)
+    whole = _design(epoch, centre)
+    for _ in range(_REFITS):
+        rest = np.where(compared, difference - np.tensordot(fit.parameters.astype(np.float32), whole, 1), np.nan)
+        stable = _stable(rest, reference, epoch, fit.limit, compared, bool(areas))
+        fitted = _thinned(stable)
+        design, target, weight = (
+            whole[:, fitted],
+            difference[fitted].astype(np.float64),
+            _weights_by_sigma(reference, epoch, fitted),
+        )
+        fit = _robust_fit(design, target, weight, expected)
+    covariance, groups = _jackknife(design, target, weight * fit.robust, _block_numbers(fitted))
+    rest = difference[fitted] - fit.parameters @ design
     notes = _notes(float(stable.sum() / compared.sum()), groups, bool(areas))
-    transform = RigidTransform.about(centre, parameters[3:], parameters[:3])
-    return Alignment(transform, covariance, centre, stable, quiet, float(np.sqrt(np.mean(rest[stable] ** 2))), notes)
+    transform = RigidTransform.about(centre, fit.parameters[3:], fit.parameters[:3])
+    return Alignment(transform, covariance, centre, stable, float(np.sqrt(np.mean(rest[fit.robust > 0] ** 2))), notes)
+
+
+def _stable(
+    rest: FloatArray,
+    reference: HeightRaster,
+    epoch: HeightRaster,
+    limit: float,
+    compared: NDArray[np.bool_],
+    given: bool,
+) -> NDArray[np.bool_]:
+    """(h, w) pixels that did not change: in areas that the user gave, all but the farthest ones; else those found here."""
+    if not given:
+        found = unchanged_pixels(rest / np.hypot(reference.sigma, epoch.sigma), compared)
+        return found if found.sum() >= _LEAST_PIXELS else compared & (np.abs(rest) < limit)
+    stable = compared.copy()
+    stable[compared] = np.abs(rest[compared]) * np.sqrt(_weights_by_sigma(reference, epoch, compared)) < _FARTHEST_NOISE * limit
+    return stable
 
 
 def applied(alignment: Alignment, epoch: HeightRaster) -> NDArray[np.float32]:
     """Return the epoch's heights, (h, w), m, once the fit of `refine` is applied, to first order in its small motion."""
     shift = alignment.transform.apply(alignment.centre) - alignment.centre
     parameters = np.concatenate([shift, alignment.transform.rotation_vector])
-    change = np.einsum("k,khw->hw", parameters, _design(epoch, alignment.centre))
+    change = np.tensordot(parameters.astype(np.float32), _design(epoch, alignment.centre), 1)
     return np.asarray(epoch.height + change.astype(np.float32))
 
 
@@ -187,7 +212,8 @@ def _design(raster: HeightRaster, centre: FloatArray) -> FloatArray:
     x, y = _places(raster.grid)
     x, y, z = x - centre[0], y - centre[1], raster.height.astype(np.float64) - centre[2]
     a, b = raster.slope_x.astype(np.float64), raster.slope_y.astype(np.float64)
-    return np.stack([-a, -b, np.ones_like(z) + 0 * z, y + b * z, -x - a * z, a * y - b * x])
+    found = np.stack([-a, -b, 0 * z + 1, y + b * z, -x - a * z, a * y - b * x], dtype=np.float32, casting="same_kind")
+    return np.asarray(found)
 
 
 def _weights_by_sigma(reference: HeightRaster, epoch: HeightRaster, where: NDArray[np.bool_]) -> FloatArray:
@@ -207,9 +233,16 @@ def _thinned(compared: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return few
 
 
-def _robust_fit(
-    design: FloatArray, target: FloatArray, weight: FloatArray, expected: float
-) -> tuple[FloatArray, FloatArray, float]:
+@dataclass(frozen=True)
+class _RobustFit:
+    """Shift and rotation (6,), Tukey's weights (n,), and the weighted residual, m, beyond which a weight is zero."""
+
+    parameters: FloatArray
+    robust: FloatArray
+    limit: float
+
+
+def _robust_fit(design: FloatArray, target: FloatArray, weight: FloatArray, expected: float) -> _RobustFit:
     """Iteratively reweighted least squares with Tukey's weights, from the median on.
 
     The scale begins at the spread of the residuals. Where much of the wall moved, that is far more than noise: it is lowered step
@@ -220,10 +253,6 @@ def _robust_fit(
     design, target, weight : (6, n), (n,), (n,) arrays
     expected : float
         Standard deviation of a weighted residual by the heights' own errors, m.
-
-    Returns
-    -------
-    parameters (6,), Tukey's weights (n,), and the weighted residual beyond which a weight is zero, m
     """
     parameters = np.zeros(6)
     parameters[2] = np.median(target)
@@ -240,7 +269,7 @@ def _robust_fit(
         settled = scale in (own, _MORE_THAN_EXPECTED * expected) or agree < _ENOUGH_AGREE
         if settled and np.abs((parameters - before) @ design).max() < _SETTLED_M:
             break
-    return parameters, robust, _TUKEY * scale
+    return _RobustFit(parameters, robust, _TUKEY * scale)
 
 
 def _normal_equations(design: FloatArray, target: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -41,6 +41,9 @@ _ISLAND = 0.3
 """Share of the largest part of a mask below which another part is no part of the outline."""
 _EDGE_PX = 5
 """Side of the square about a pixel in which an edge of the rock would be spread."""
+_EDGE_SHARE = 0.35
+"""Share of the largest depth in that square from which a pixel belongs to the outline. A vertical face, spread over 3 x 3 pixels,
+then keeps its place, and blocks that taper off towards their outline lose about 10 % of their area."""
 _GAP_SHARE, _RIM_SHARE = 1.0, 1.3
 """Shares of the volume in pixels without data, and in the pixels along the outline, that are taken as one standard deviation of
 it. They are set so that the intervals of simulated rockfalls hold the truth as often as they say (docs/validation/monitor.md)."""
@@ -71,7 +74,7 @@ class ChangedRegion:
     score : float
         A detector's, NaN without one.
     marks : tuple of str
-        "edge", "vegetation", "thin": what may have feigned the change; "insignificant": a detector's that noise may explain.
+        "edge", "vegetation", "thin": what else may explain the change; "insignificant": a detector's that noise may explain.
     identity : int
         Number of the event; 0 as yet unknown.
     """
@@ -180,7 +183,8 @@ def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change
     """Measure the region of a mask whose pixels all have data.
 
     Volume and significance are those of the whole mask. Heights come from 3 x 3 pixels, so that a sharp edge is spread over
-    neighbouring ones: outline, area and depth are those of the pixels with at least half the depth of what lies around.
+    neighbouring ones: outline and area are those of the pixels with at least `_EDGE_SHARE` of the largest depth around them, and
+    the median depth is that of the pixels with at least half of it.
     """
     row, column, mask = _padded(mask, row, column, change.difference.shape)
     window = (slice(row, row + mask.shape[0]), slice(column, column + mask.shape[1]))
@@ -193,7 +197,7 @@ def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change
     rim = whole & ~ndimage.binary_erosion(whole)
     rough = _GAP_SHARE * depth[whole & ~mask].sum(), _RIM_SHARE * np.abs(depth[rim]).sum()
     deepest = ndimage.grey_dilation(np.where(whole, depth, 0.0), size=(_EDGE_PX, _EDGE_PX))
-    inner = _without_islands(whole & (depth >= deepest / 2))
+    inner = _without_islands(whole & (depth >= _EDGE_SHARE * deepest))
     rows, columns = np.nonzero(inner)
     return ChangedRegion(
         kind=kind,
@@ -206,7 +210,7 @@ def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change
         width_m=(int(columns.max()) - int(columns.min()) + 1) * gsd,
         height_m=(int(rows.max()) - int(rows.min()) + 1) * gsd,
         area_m2=int(inner.sum()) * gsd**2,
-        depth_median_m=float(np.median(depth[inner])),
+        depth_median_m=float(np.median(depth[inner & (depth >= deepest / 2)])),
         depth_largest_m=float(depth[inner].max()),
         volume_m3=float(depth[whole].sum()) * gsd**2,
         volume_std_m3=float(np.sqrt((noise * pixels) ** 2 + rough[0] ** 2 + rough[1] ** 2)) * gsd**2,
@@ -243,7 +247,7 @@ def _with_gaps_filled(mask: NDArray[np.bool_], depth: NDArray[np.float64]) -> tu
 
 
 def _marks(mask: NDArray[np.bool_], window: tuple[slice, slice], sign: float, change: Change) -> tuple[str, ...]:
-    """What may have feigned the change."""
+    """Name what else may explain the change."""
     marks = []
     edge = np.zeros(mask.shape, dtype=bool)
     rough = []

@@ -12,6 +12,7 @@ from pipeline.monitoring.products import Result
 from pipeline.monitoring.reading import epoch_files
 from pipeline.monitoring.run import monitor_paths
 from pipeline.report.progress import Progress
+from pipeline.report.words import counted
 from scene.common.errors import InputError
 
 _EVERY_S = 5.0
@@ -77,7 +78,7 @@ def follow(
                 told(f"left out: {error}")
                 continue
             used.append(file)
-            told(f"{file.name}: {len(result.epochs[-1].regions)} events")
+            told(f"{file.name}: {counted(len(result.epochs[-1].regions), 'event')}")
         before = now
         time.sleep(every_s)
     if result is None:

@@ -38,7 +38,7 @@ def towards_sensor(data: EpochData, options: MonitorOptions, name: str) -> tuple
     if options.direction is not None:
         return data.points.mean(axis=0) + options.direction, "by --direction"
     try:
-        station = find_station(RawScan(name, PointCloud(data.points)))
+        station = find_station(RawScan(name, PointCloud(data.in_order)))
     except InputError:
         raise InputError(
             "does not say from which side the wall was measured",
@@ -56,13 +56,15 @@ def wall_frame(points: FloatArray, towards: FloatArray, direction: FloatArray | 
     return WallFrame.along(direction / np.linalg.norm(direction), few)
 
 
-def raster_of(points: FloatArray, gsd_m: float | None) -> Grid:
+def raster_of(points: FloatArray, gsd_m: float | None, count: int | None = None) -> Grid:
     """Return the raster over points (n, 3), wall frame, m; the pixel is chosen by their density where `gsd_m` is None.
+
+    count: number of points in the files, of which `points` are a sample; None: all.
 
     Raises InputError for a pixel that gives no raster, or too large a one.
     """
     bounds = np.array([points.min(axis=0), points.max(axis=0)])
-    gsd = gsd_m if gsd_m is not None else _usual_gsd(points)
+    gsd = gsd_m if gsd_m is not None else _usual_gsd(points, count or len(points))
     width, height = (bounds[1] - bounds[0])[:2]
     coarsest, finest = min(width, height) / 10, float(np.sqrt(width * height / _MOST_PIXELS))
     if not finest <= gsd <= coarsest:
@@ -75,14 +77,14 @@ def raster_of(points: FloatArray, gsd_m: float | None) -> Grid:
     return Grid.over(bounds, gsd)
 
 
-def _usual_gsd(points: FloatArray) -> float:
+def _usual_gsd(points: FloatArray, count: int) -> float:
     """A round number of metres somewhat above the mean distance of neighbouring points."""
     few = points[:: len(points) // _MOST_COUNTED + 1, :2]
     apart, cell = _CELL_M, _CELL_M
     for _ in range(_ROUNDS):
         cells = len(np.unique(np.floor(few / cell).astype(np.int64), axis=0))
-        apart = float(np.sqrt(cells * cell**2 / len(points)))
-        cell = _POINTS_A_CELL * apart * float(np.sqrt(len(points) / len(few)))
+        apart = float(np.sqrt(cells * cell**2 / count))
+        cell = _POINTS_A_CELL * apart * float(np.sqrt(count / len(few)))
     spacing = _POINTS_APART * apart
     power = 10.0 ** np.floor(np.log10(max(spacing, _FINEST_M)))
     return float(power * _ROUND[np.searchsorted(_ROUND, max(spacing, _FINEST_M) / power - 1e-9)])

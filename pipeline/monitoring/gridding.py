@@ -11,6 +11,7 @@ the points of each pixel are all that is kept, so that memory depends on the ras
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,8 +26,10 @@ _MOST_LEVERAGE = 1.0
 """Largest q: a pixel whose height is known worse than from a single point at its centre has no data."""
 _PRIOR_POINTS = 4.0
 """Weight of the raster's median variance in that of a pixel, in points: few points tell little of their own scatter."""
-_CHUNK = 2_000_000
-"""Points of which sums are taken at a time; as many as the raster has pixels, where that is more."""
+_CHUNK = 4_000_000
+"""Points of which sums are taken at a time."""
+_BAND = 64
+"""Rows to which planes are fitted at a time, so that the sums stay in the processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -65,30 +68,82 @@ class HeightRaster:
         return np.asarray(np.hypot(self.slope_x, self.slope_y))
 
 
-def gridded(points: FloatArray, grid: Grid) -> HeightRaster:
-    """Fit a plane about each pixel to points (n, 3), wall frame, m; points outside the grid are left out."""
-    return _fitted(_moments(points, grid), grid)
+@dataclass(frozen=True)
+class WallPoints:
+    """Points of an epoch, wall frame, m, that need not fit into memory.
+
+    Attributes
+    ----------
+    sample : (n, 3) array
+        Points spread over all of the epoch.
+    chunks : callable
+        Gives all points, chunk by chunk, each time it is called.
+    """
+
+    sample: FloatArray
+    chunks: Callable[[], Iterable[FloatArray]]
+
+    @classmethod
+    def of(cls, points: FloatArray) -> WallPoints:
+        """Points (n, 3) that are in memory."""
+        return cls(points, lambda: [points])
 
 
-def _moments(points: FloatArray, grid: Grid) -> FloatArray:
-    """(10, h, w) sums over the points of each pixel: 1, u, v, z, uu, uv, vv, uz, vz, zz; u and v in pixels from its centre."""
+def gridded(points: FloatArray | Iterable[FloatArray], grid: Grid) -> HeightRaster:
+    """Fit a plane about each pixel to points (n, 3), wall frame, m, or to chunks of them.
+
+    Points outside the grid are left out.
+    """
+    chunks = [points] if isinstance(points, np.ndarray) else points
     sums = np.zeros((10, grid.height * grid.width))
-    chunk = max(_CHUNK, sums.shape[1])
-    for start in range(0, len(points), chunk):
-        x, y, z = points[start : start + chunk].T
-        column, row = (x - grid.x_min) / grid.gsd, (grid.y_max - y) / grid.gsd
-        inside = (column >= 0) & (column < grid.width) & (row >= 0) & (row < grid.height)
+    for chunk in chunks:
+        for start in range(0, len(chunk), _CHUNK):
+            _add_moments(sums, chunk[start : start + _CHUNK], grid)
+    return _fitted(sums.reshape(10, grid.height, grid.width), grid)
+
+
+def _add_moments(sums: FloatArray, points: FloatArray, grid: Grid) -> None:
+    """Add to (10, h w) the sums over points: 1, u, v, z, uu, uv, vv, uz, vz, zz; u and v in pixels from the pixel's centre."""
+    x, y, z = points.T
+    column, row = (x - grid.x_min) / grid.gsd, (grid.y_max - y) / grid.gsd
+    inside = (column >= 0) & (column < grid.width) & (row >= 0) & (row < grid.height)
+    if not inside.all():
         column, row, z = column[inside], row[inside], z[inside]
-        pixel = np.floor(row).astype(np.int64) * grid.width + np.floor(column).astype(np.int64)
-        u, v = column - np.floor(column) - 0.5, 0.5 - (row - np.floor(row))
-        for place, value in enumerate((None, u, v, z, u * u, u * v, v * v, u * z, v * z, z * z)):
-            sums[place] += np.bincount(pixel, value, minlength=sums.shape[1])
-    return sums.reshape(10, grid.height, grid.width)
+    if not len(z):
+        return
+    whole_column, whole_row = np.floor(column), np.floor(row)
+    pixel = (whole_row * grid.width + whole_column).astype(np.int64)
+    first = int(pixel.min())
+    pixel -= first
+    u, v = column - whole_column - 0.5, 0.5 - (row - whole_row)
+    for place, value in enumerate((None, u, v, z, u * u, u * v, v * v, u * z, v * z, z * z)):
+        found = np.bincount(pixel, value)
+        sums[place, first : first + len(found)] += found
 
 
 def _fitted(sums: FloatArray, grid: Grid) -> HeightRaster:
-    count = sums[0].astype(np.int32)
-    around = _about_each_pixel(sums)
+    """Fit planes band by band of rows; the variance that a pixel's is drawn to is the median of its raster."""
+    height, scatter, slope_x, slope_y, leverage = np.full((5, *grid.shape), np.nan, dtype=np.float32)
+    freedom = np.zeros(grid.shape, dtype=np.float32)
+    for start in range(0, grid.height, _BAND):
+        stop = min(start + _BAND, grid.height)
+        low = max(start - 1, 0)
+        around = _about_each_pixel(sums[:, low : stop + 1])[:, start - low : stop - low]
+        band = slice(start, stop)
+        freedom[band] = around[0] - 3
+        height[band], scatter[band], slope_x[band], slope_y[band], leverage[band] = _planes(around)
+    known = np.isfinite(height)
+    usual = float(np.median(scatter[known] / freedom[known])) if known.any() else 0.0
+    scatter = np.sqrt((scatter + np.float32(_PRIOR_POINTS * usual)) / (freedom + np.float32(_PRIOR_POINTS)))
+    slopes = slope_x / np.float32(grid.gsd), slope_y / np.float32(grid.gsd)
+    return HeightRaster(grid, height, scatter * np.sqrt(leverage), scatter, *slopes, sums[0].astype(np.int32))
+
+
+def _planes(around: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Height, squared residuals, slopes along u and v, and leverage at the centre of planes; NaN where there is none.
+
+    around: (10, h, w) the sums over the points of each plane.
+    """
     n, su, sv, sz, suu, suv, svv, suz, svz, szz = around
     # Cofactors of the symmetric normal matrix [[n, su, sv], [su, suu, suv], [sv, suv, svv]].
     c00, c01, c02 = suu * svv - suv**2, sv * suv - su * svv, su * suv - sv * suu
@@ -101,12 +156,10 @@ def _fitted(sums: FloatArray, grid: Grid) -> HeightRaster:
         leverage = c00 / determinant
         squares = np.maximum(szz - height * sz - slope_u * suz - slope_v * svz, 0.0)
         known = (n >= _FEWEST) & (determinant > 0) & (leverage <= _MOST_LEVERAGE)
-        usual = float(np.median(squares[known] / (n[known] - 3))) if known.any() else 0.0
-        variance = (squares + _PRIOR_POINTS * usual) / (n - 3 + _PRIOR_POINTS)
-        sigma, scatter = np.sqrt(variance * leverage), np.sqrt(variance)
-    layers = (height, sigma, scatter, slope_u / grid.gsd, slope_v / grid.gsd)
-    height, sigma, scatter, slope_x, slope_y = (np.where(known, each, np.nan).astype(np.float32) for each in layers)
-    return HeightRaster(grid, height, sigma, scatter, slope_x, slope_y, count)
+    height, squares, slope_u, slope_v, leverage = (
+        np.where(known, each, np.nan) for each in (height, squares, slope_u, slope_v, leverage)
+    )
+    return height, squares, slope_u, slope_v, leverage
 
 
 def _about_each_pixel(sums: FloatArray) -> FloatArray:

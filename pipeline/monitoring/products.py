@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pipeline.change.annotate import BLOCK_CATEGORY, run_length_encoding
 from pipeline.formats.files.atomic import write_json, write_text
 from pipeline.formats.files.plain_json import without_nan
-from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.laz import LazHeader, write_laz
+from pipeline.formats.points.laz import LazHeader
+from pipeline.formats.points.laz_chunks import write_chunks
 from pipeline.formats.rasters.geotiff import read_geotiff, write_geotiff
 from pipeline.formats.records.geopackage import write_geopackage
 from pipeline.monitoring.events import ChangedRegion
@@ -26,6 +26,7 @@ from pipeline.monitoring.reading import EpochData, EpochSource
 from pipeline.monitoring.records import EpochRecord
 from pipeline.monitoring.site import ReferenceSite
 from pipeline.report.provenance import versions
+from scene.geometry.mesh import FloatArray
 
 SCHEMA = 1
 COLUMNS: dict[str, type] = {
@@ -89,15 +90,17 @@ class Result:
 
 def write_points(epoch: Followed, data: EpochData, site: ReferenceSite, out: Path) -> None:
     """Write an epoch's points, registered, in survey coordinates, with what the maps say at each."""
-    wall = epoch.record.transform.apply(site.frame.to_wall(data.points))
-    event = event_raster(epoch.regions, site.grid.shape)
-    extra = {
-        "distance_m": _at(read_geotiff(out / f"difference_{epoch.number:03d}.tif")[0], wall, site),
-        "lod_m": _at(read_geotiff(out / f"lod_{epoch.number:03d}.tif")[0], wall, site),
-        "event": np.nan_to_num(_at(event.astype(np.float32), wall, site)).astype(np.uint32),
-    }
-    cloud = PointCloud(site.frame.to_world(wall), extra=extra)
-    write_laz(out / f"epoch_{epoch.number:03d}.laz", cloud, header=LazHeader(scale_m=_SCALE_M, wkt=data.crs))
+    maps = [read_geotiff(out / f"{kind}_{epoch.number:03d}.tif")[0] for kind in ("difference", "lod")]
+    maps.append(event_raster(epoch.regions, site.grid.shape).astype(np.float32))
+
+    def registered(points: FloatArray) -> tuple[FloatArray, dict[str, NDArray[Any]]]:
+        wall = epoch.record.transform.apply(site.frame.to_wall(points))
+        distance, level, event = _at(maps, wall, site)
+        extra = {"distance_m": distance, "lod_m": level, "event": np.nan_to_num(event).astype(np.uint32)}
+        return site.frame.to_world(wall), extra
+
+    header = LazHeader(scale_m=_SCALE_M, wkt=data.crs)
+    write_chunks(out / f"epoch_{epoch.number:03d}.laz", data.bounds, map(registered, data.chunks()), header)
 
 
 def write_results(result: Result) -> None:
@@ -123,15 +126,17 @@ def event_raster(regions: Sequence[ChangedRegion], shape: tuple[int, ...]) -> ND
     return raster
 
 
-def _at(raster: NDArray[np.float32], wall: NDArray[np.float64], site: ReferenceSite) -> NDArray[np.float32]:
-    """(n,) a raster's values at points of the wall frame, NaN beside the map."""
+def _at(rasters: Sequence[NDArray[np.float32]], wall: FloatArray, site: ReferenceSite) -> list[NDArray[np.float32]]:
+    """(n,) each raster's values at points (n, 3) of the wall frame, NaN beside the map."""
     grid = site.grid
-    column = np.floor((wall[:, 0] - grid.x_min) / grid.gsd).astype(np.int64)
-    row = np.floor((grid.y_max - wall[:, 1]) / grid.gsd).astype(np.int64)
+    column = np.floor((wall[:, 0] - grid.x_min) / grid.gsd)
+    row = np.floor((grid.y_max - wall[:, 1]) / grid.gsd)
     inside = (column >= 0) & (column < grid.width) & (row >= 0) & (row < grid.height)
-    values = np.full(len(wall), np.nan, dtype=np.float32)
-    values[inside] = raster[row[inside], column[inside]]
-    return values
+    pixel = (row[inside] * grid.width + column[inside]).astype(np.int64)
+    found = np.full((len(rasters), len(wall)), np.nan, dtype=np.float32)
+    for values, raster in zip(found, rasters, strict=True):
+        values[inside] = raster.ravel()[pixel]
+    return list(found)
 
 
 def _write_table(path: Path, rows: Sequence[dict[str, Any]]) -> None:

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.formats.files.checksum import sha256
+from pipeline.formats.points.laz_chunks import CHUNK, count_points, read_chunks
 from pipeline.formats.points.points import SUFFIXES
 from pipeline.formats.records.result_records import RUN_FILE, read_run
 from pipeline.measurement.reference import DEMS, is_cloud, reference_from_dem
 from pipeline.measurement.scans import read_scans
+from pipeline.monitoring.gridding import WallPoints
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.times import EpochTime, check_order, time_of
 from scene.common.errors import InputError
@@ -25,6 +28,13 @@ from scene.walls.imported import read_mesh
 
 _BEFORE_M = 100.0
 """How far before the wall of a run the sensor is taken to stand: only the side counts."""
+WHOLE_POINTS = 4_000_000
+"""Points of an epoch up to which LAS and LAZ files are read at once."""
+_SAMPLE = 1_000_000
+"""Points of larger ones that are kept for the frame, the pixel and ICP."""
+_KEPT_POINTS, _STEP_M = 50_000_000, 1e-5
+"""Points of an epoch up to which they stay in memory, as integers in steps of so many metres (600 MB)."""
+_LAS = (".las", ".laz")
 _ANY = (*SUFFIXES, *DEMS, ".obj", ".stl", ".glb", ".off")
 
 
@@ -59,13 +69,46 @@ class EpochSource:
 
 
 @dataclass(frozen=True)
+class LargeFiles:
+    """LAS and LAZ files of one epoch that are read chunk by chunk.
+
+    Attributes
+    ----------
+    files : tuple of Path
+    unit : str or None
+        As the user gives it.
+    count : int
+        Points that are in use.
+    first : (n, 3) array
+        The first points, survey coordinates, m.
+    bounds : (2, 3) array
+        Corners of the box about all points, survey coordinates, m.
+    kept : tuple of (n, 3) int32 arrays
+        All points in steps of 0.01 mm from the first one, where they fit into memory easily; else none.
+    """
+
+    files: tuple[Path, ...]
+    unit: str | None
+    count: int
+    first: FloatArray
+    bounds: FloatArray
+    kept: tuple[NDArray[np.int32], ...] = ()
+
+    def chunks(self) -> Iterator[FloatArray]:
+        """All points (n, 3), survey coordinates, m, chunk by chunk."""
+        if self.kept:
+            return (steps * _STEP_M + self.first[0] for steps in self.kept)
+        return itertools.chain.from_iterable(read_chunks(file, self.unit) for file in self.files)
+
+
+@dataclass(frozen=True)
 class EpochData:
     """What an epoch's files hold.
 
     Attributes
     ----------
     points : (n, 3) array
-        Survey coordinates, m; the vertices of a mesh.
+        Survey coordinates, m; the vertices of a mesh. For large files a sample, spread over the files.
     mesh : TriangleMesh or None
         The surface, where the files hold one.
     position : (3,) array or None
@@ -73,6 +116,8 @@ class EpochData:
     crs : str
         WKT of the coordinate system, empty where it is not stated.
     notes : tuple of str
+    large : LargeFiles or None
+        Where the points are read from again, chunk by chunk.
     """
 
     points: FloatArray
@@ -80,11 +125,31 @@ class EpochData:
     position: FloatArray | None = None
     crs: str = ""
     notes: tuple[str, ...] = ()
+    large: LargeFiles | None = None
 
-    def wall_points(self, frame: WallFrame, gsd_m: float) -> FloatArray:
-        """(m, 3) points in the wall frame, m; those of a mesh lie on it, four to a pixel."""
+    @property
+    def count(self) -> int:
+        """Number of points in the files."""
+        return len(self.points) if self.large is None else self.large.count
+
+    @property
+    def in_order(self) -> FloatArray:
+        """(n, 3) points in the order of the file; of large files the first ones."""
+        return self.points if self.large is None else self.large.first
+
+    @property
+    def bounds(self) -> FloatArray:
+        """(2, 3) corners of the box about all points, survey coordinates, m."""
+        return np.array([self.points.min(axis=0), self.points.max(axis=0)]) if self.large is None else self.large.bounds
+
+    def chunks(self) -> Iterator[FloatArray]:
+        """All points (n, 3), survey coordinates, m, chunk by chunk."""
+        return iter(np.array_split(self.points, -(-len(self.points) // CHUNK))) if self.large is None else self.large.chunks()
+
+    def wall_points(self, frame: WallFrame, gsd_m: float) -> WallPoints:
+        """Points in the wall frame, m; those of a mesh lie on it, four to a pixel."""
         if self.mesh is None:
-            return frame.to_wall(self.points)
+            return WallPoints(frame.to_wall(self.points), lambda: map(frame.to_wall, self.chunks()))
         from pipeline.change.difference import surface_raster
 
         mesh = self.mesh.with_vertices(frame.to_wall(self.mesh.vertices))
@@ -92,7 +157,7 @@ class EpochData:
         heights = surface_raster(mesh, grid).heights
         row, column = np.nonzero(np.isfinite(heights))
         x, y = grid.x_min + (column + 0.5) * grid.gsd, grid.y_max - (row + 0.5) * grid.gsd
-        return np.stack([x, y, heights[row, column]], axis=1).astype(np.float64)
+        return WallPoints.of(np.stack([x, y, heights[row, column]], axis=1).astype(np.float64))
 
 
 def find_epochs(paths: Sequence[Path], times: Sequence[str] = ()) -> list[EpochSource]:
@@ -129,7 +194,7 @@ def find_epochs(paths: Sequence[Path], times: Sequence[str] = ()) -> list[EpochS
                 raise InputError("is given twice", where=str(file), remedy="name each epoch once")
             seen[real] = source.name
     timed = [
-        EpochSource(source.path, source.files, time_of(source.path, given), source.run)
+        EpochSource(source.path, source.files, time_of(source.path if source.run is None else source.files[0], given), source.run)
         for source, given in zip(found, times or itertools.repeat(None, len(found)), strict=True)
     ]
     check_order([source.time for source in timed], [source.name for source in timed])
@@ -140,6 +205,8 @@ def read_epoch(source: EpochSource, options: MonitorOptions) -> EpochData:
     """Read an epoch. Raises InputError for whatever is wrong in its files."""
     if source.run is not None:
         return _of_run(source, source.run)
+    if all(file.suffix.lower() in _LAS for file in source.files) and sum(map(count_points, source.files)) > WHOLE_POINTS:
+        return _sampled(source.files, options.unit)
     parts = [_read_file(file, options) for file in source.files]
     if len(parts) == 1:
         return parts[0]
@@ -153,6 +220,29 @@ def read_epoch(source: EpochSource, options: MonitorOptions) -> EpochData:
     positions = [part.position for part in parts if part.position is not None]
     position = np.mean(positions, axis=0) if positions else None
     return EpochData(np.concatenate([part.points for part in parts]), None, position, parts[0].crs, notes)
+
+
+def _sampled(files: tuple[Path, ...], unit: str | None) -> EpochData:
+    """Read large files once, for a sample of their points and what they state."""
+    stated = sum(map(count_points, files))
+    step, count = -(-stated // _SAMPLE), 0
+    sample, kept, lows, highs, first = [], [], [], [], None
+    for chunk in itertools.chain.from_iterable(read_chunks(file, unit) for file in files):
+        if not len(chunk):
+            continue
+        first = chunk[:_SAMPLE].copy() if first is None else first
+        sample.append(chunk[-count % step :: step].copy())
+        if stated <= _KEPT_POINTS:
+            kept.append(np.rint((chunk - first[0]) / _STEP_M).astype(np.int32))
+        lows.append(chunk.min(axis=0))
+        highs.append(chunk.max(axis=0))
+        count += len(chunk)
+    if first is None:
+        raise InputError("contains no point that is in use", where=str(files[0]), remedy="export it again, with its points")
+    bounds = np.array([np.min(lows, axis=0), np.max(highs, axis=0)])
+    large = LargeFiles(files, unit, count, first, bounds, tuple(kept))
+    note = f"its {count:,} points were read in chunks: memory depends on the maps alone"
+    return EpochData(np.concatenate(sample), None, None, _crs_of(files[0]), (note,), large)
 
 
 def epoch_files(folder: Path) -> list[Path]:
@@ -219,7 +309,7 @@ def _before(mesh: TriangleMesh) -> FloatArray:
 
 def _crs_of(path: Path) -> str:
     """WKT of the coordinate system of a LAS file, empty where it states none that is understood."""
-    if path.suffix.lower() not in (".las", ".laz"):
+    if path.suffix.lower() not in _LAS:
         return ""
     import laspy
 

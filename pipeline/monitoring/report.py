@@ -16,6 +16,7 @@ from pipeline.monitoring.significance import NORMAL_95
 from pipeline.report.figures import blocks_figure, difference_figure, hillshade_figure, label_axes, png_bytes
 from pipeline.report.map_styles import difference_style, quantity_style
 from pipeline.report.page import template
+from pipeline.report.words import counted
 
 _SIGMAS_SHOWN = 6.0
 _LARGEST_SHOWN = 24
@@ -59,10 +60,10 @@ def headline(result: Result) -> list[str]:
         parts = [_kind_in_words(epoch, kind) for kind in ("missing", "added")]
         found = "; ".join(part for part in parts if part) or "no change beyond the level of detection"
         marked = sum(bool(region.marks) for region in epoch.regions)
-        doubtful = f" {marked} of them have a mark: something else may have feigned the change." if marked else ""
+        doubtful = f" Edges, vegetation or noise may explain {marked} of {len(epoch.regions)} events (marked)." if marked else ""
         told.append(
-            f"Epoch {epoch.number}, {epoch.source.name}{when}: {found}. A pixel shows changes from "
-            f"{1e3 * epoch.record.level_m:.1f} mm on (95 %).{doubtful}"
+            f"Epoch {epoch.number}, {epoch.source.name}{when}: {found}. The level of detection of "
+            f"a single pixel is {1e3 * epoch.record.level_m:.1f} mm (95 %, median).{doubtful}"
         )
     return told
 
@@ -82,7 +83,7 @@ def _kind_in_words(epoch: Followed, kind: str) -> str:
     volume = sum(region.volume_m3 for region in regions)
     sigma = float(np.sqrt(sum(region.volume_std_m3**2 for region in regions)))
     what = "of missing rock" if kind == "missing" else "of added material"
-    places = "1 place" if len(regions) == 1 else f"{len(regions)} places"
+    places = counted(len(regions), "place")
     return f"{volume:.3g} ± {NORMAL_95 * sigma:.2g} m³ {what} in {places}"
 
 

@@ -176,7 +176,7 @@ def processed(
     record = EpochRecord(
         number=number,
         inputs=source.checksums(),
-        points=len(data.points),
+        points=data.count,
         notes=(*notes, *found.alignment.notes),
         transform=found.transform,
         registration={**found.alignment.to_dict(), **found.transform.to_dict()},
@@ -218,8 +218,8 @@ def _check_same_site(data: EpochData, site: ReferenceSite, source: EpochSource) 
         raise InputError(
             "is in another coordinate system than the reference", where=source.name, remedy="transform one of the two"
         )
-    if len(data.points) < _TENTH * site.points:
-        return [f"has {len(data.points):,} points where the reference has {site.points:,}: small changes do not show"]
+    if data.count < _TENTH * site.points:
+        return [f"has {data.count:,} points where the reference has {site.points:,}: small changes do not show"]
     return []
 
 

@@ -35,7 +35,7 @@ _SIDES = (1, 2, 3, 5, 7, 11, 15, 23, 31, 47, 63)
 """Sides of the squares, pixels, over which means are taken."""
 _FEWEST_SQUARES = 12
 _QUANTILES = (0.5, 0.9, 0.99, 0.999)
-_FILLED = 0.7
+_FILLED = 0.5
 """Share of a square that needs data."""
 
 

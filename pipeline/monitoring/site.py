@@ -55,7 +55,7 @@ def prepared(source: EpochSource, options: MonitorOptions) -> ReferenceSite:
     data = read_epoch(source, options)
     towards, how = towards_sensor(data, options, source.name)
     frame = wall_frame(data.points, towards, options.direction)
-    grid = raster_of(frame.to_wall(data.points), options.gsd_m or _gsd_of_mesh(data))
+    grid = raster_of(frame.to_wall(data.points), options.gsd_m or _gsd_of_mesh(data), data.count)
     points = data.wall_points(frame, grid.gsd)
     reference = ReferenceHeights.of(points, grid)
     seen = float(reference.raster.known.mean())
@@ -68,7 +68,7 @@ def prepared(source: EpochSource, options: MonitorOptions) -> ReferenceSite:
         )
     if seen < _TENTH:
         notes.append(f"only {100 * seen:.0f} % of the map has data: a larger --gsd has fewer gaps")
-    return ReferenceSite(source, frame, frame.to_wall(towards), reference, len(data.points), data.crs, tuple(notes))
+    return ReferenceSite(source, frame, frame.to_wall(towards), reference, data.count, data.crs, tuple(notes))
 
 
 def _gsd_of_mesh(data: EpochData) -> float | None:

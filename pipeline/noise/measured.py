@@ -32,7 +32,7 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class MeasuredMaps:
-    """Difference maps of real epochs.
+    """Difference maps of real epochs, on one grid.
 
     Attributes
     ----------
@@ -41,13 +41,13 @@ class MeasuredMaps:
     grid : Grid
         Pixels of the maps.
     maps : (e, h, w) float32 array
-        Differences, m; NaN without data.
+        Differences of e epochs, reference minus epoch, m; NaN without data.
     stable : (h, w) bool array or None
-        Where nothing has changed, if the measurement states it.
+        True where nothing has changed, if the measurement states it.
     points : tuple of int
         Number of points of each epoch; empty for maps from files.
     registrations : tuple of Registration
-        Of each epoch; empty without registration.
+        Registration of each epoch to the reference; empty if none was computed.
     """
 
     name: str
@@ -59,20 +59,22 @@ class MeasuredMaps:
 
 
 def read_measured(folder: Path, config: DifferenceConfig, icp: IcpConfig | None, random: KeyedRandom) -> MeasuredMaps:
-    """Read the difference maps of a folder.
+    """Read the difference maps of real epochs from a folder.
 
-    The folder contains measurement.yaml, or GeoTIFFs difference_*.tif (all *.tif if none has such a name) that share a grid.
+    The folder contains measurement.yaml with points, or GeoTIFFs difference_*.tif (all *.tif if none has such a name) that share
+    a grid.
 
     Parameters
     ----------
     folder : Path
         The folder.
     config : DifferenceConfig
-        Smallest side of the pixels. For points it is at least their spacing, because most pixels would be empty otherwise.
+        Its pixel size is the smallest one that is used. For points, pixels are at least as large as the point spacing, because
+        most would be empty otherwise.
     icp : IcpConfig or None
-        Registration of each epoch's points to the reference; None: they are registered.
+        Settings for registering each epoch's points to the reference; None: the points are registered already.
     random : KeyedRandom
-        Source of the registration's subsamples.
+        Source of the registration's random subsamples.
 
     Raises
     ------
@@ -84,13 +86,15 @@ def read_measured(folder: Path, config: DifferenceConfig, icp: IcpConfig | None,
     files = sorted(folder.glob("difference_*.tif")) or sorted(folder.glob("*.tif"))
     if not files:
         raise InputError(
-            "contains no measured epochs", where=str(folder), remedy=f"name a folder with {FILE} or with difference maps (*.tif)"
+            "the folder contains no measured epochs",
+            where=str(folder),
+            remedy=f"name a folder with {FILE} or with difference maps (*.tif)",
         )
     maps, grids = zip(*map(read_geotiff, files), strict=True)
     for file, grid in zip(files, grids, strict=True):
         if grid != grids[0]:
             raise InputError(
-                f"its grid {grid} differs from {grids[0]} of {files[0].name}",
+                f"the map's grid {grid} differs from {grids[0]} of {files[0].name}",
                 where=str(file),
                 remedy="bring the maps to one grid",
             )
@@ -121,9 +125,21 @@ def _spacing(points: FloatArray) -> float:
 
 
 def point_differences(reference: RayCaster, points: FloatArray, grid: Grid) -> NDArray[np.float32]:
-    """Return the mean of reference minus point in z over each pixel, (h, w), m; NaN without points.
+    """Return the mean distance of points from a reference surface in each pixel: reference minus point, along z.
 
-    points: (n, 3), wall frame, m.
+    Parameters
+    ----------
+    reference : RayCaster
+        The surface.
+    points : (n, 3) array
+        Points, wall frame, m.
+    grid : Grid
+        The pixels.
+
+    Returns
+    -------
+    (h, w) float32 array
+        Differences, m; NaN without points.
     """
     top = float(reference.mesh.bounds[1, 2]) + 1.0
     x, y = (on_device(mi.Float64, np.ascontiguousarray(points[:, axis])) for axis in (0, 1))
@@ -138,7 +154,7 @@ def point_differences(reference: RayCaster, points: FloatArray, grid: Grid) -> N
 
 
 def area_mask(areas: Iterable[Area], grid: Grid) -> BoolArray:
-    """Return the pixels (h, w) whose centre lies in one of the areas."""
+    """Return (h, w) true for the pixels of a grid whose centre lies in one of the areas (polygons or boxes in the wall frame)."""
     x = grid.x_min + (np.arange(grid.width) + 0.5) * grid.gsd
     y = grid.y_max - (np.arange(grid.height) + 0.5) * grid.gsd
     return in_areas(areas, *np.meshgrid(x.astype(np.float64), y.astype(np.float64)))

@@ -29,18 +29,18 @@ _MOST_SAMPLE = 5000
 
 @dataclass(frozen=True)
 class TailFigures:
-    """Description of the tails of differences, m.
+    """Quantiles, skewness and kurtosis of differences, which describe how far their distribution is from a normal one.
 
     Attributes
     ----------
     quantile_025_m, quantile_250_m, quantile_750_m, quantile_975_m : float
-        Quantiles at 2.5, 25, 75 and 97.5 %.
+        Quantiles at 2.5, 25, 75 and 97.5 %, m.
     skewness, excess_kurtosis : float
-        0 for a normal distribution.
+        Both are 0 for a normal distribution.
     beyond_3_nmad : float
-        Share farther than three NMAD from the median (normal: 0.0027).
+        Share of the differences farther than three NMAD from the median (normal: 0.0027).
     largest_m : float
-        Largest absolute difference.
+        Largest absolute difference, m.
     """
 
     quantile_025_m: float
@@ -57,8 +57,8 @@ class TailFigures:
         return {name: None if np.isnan(value) else value for name, value in dataclasses.asdict(self).items()}
 
 
-def tails(values: NDArray[np.floating]) -> TailFigures:
-    """Describe the tails of the values (any shape, m) that are not NaN; all NaN if there are none."""
+def tail_figures(values: NDArray[np.floating]) -> TailFigures:
+    """Compute quantiles, skewness and kurtosis of values of any shape, m; NaN is ignored. All are NaN if no value is left."""
     known = values[~np.isnan(values)].astype(np.float64)
     if known.size == 0:
         return TailFigures(*[float("nan")] * 8)
@@ -73,9 +73,16 @@ def tails(values: NDArray[np.floating]) -> TailFigures:
 
 @dataclass(frozen=True)
 class Normality:
-    """D'Agostino and Pearson's (1973) test of a sample: K2 of skewness and kurtosis, chi-squared with 2 degrees of freedom.
+    """Result of D'Agostino and Pearson's (1973) test whether a sample is normally distributed.
 
-    sample: number of values drawn. The other attributes are None if there are too few.
+    Attributes
+    ----------
+    statistic : float or None
+        K2 of skewness and kurtosis, chi-squared with 2 degrees of freedom under normality; None if there are too few values.
+    p_value : float or None
+        p-value of the test; None if there are too few values.
+    sample : int
+        Number of values that were drawn for the test.
     """
 
     statistic: float | None
@@ -93,12 +100,12 @@ def normality(values: NDArray[np.floating], effective: float, random: KeyedRando
     Parameters
     ----------
     values : array of any shape
-        NaN is ignored.
+        The values; NaN is ignored.
     effective : float
-        Number of independent values (`variogram.effective_sample_size`). At most so many, and at most 5,000, are drawn at
-        random, because neighbours are correlated and a test of all pixels would reject every real map.
+        Number of independent values (`variogram.effective_sample_size`). At most so many, and at most 5,000, are drawn at random,
+        because neighbours are correlated and a test of all pixels would reject every real map.
     random : KeyedRandom
-        Source of the draw.
+        Source of the random draw.
     """
     known = values[~np.isnan(values)]
     size = int(min(effective, known.size, _MOST_SAMPLE))
@@ -110,30 +117,38 @@ def normality(values: NDArray[np.floating], effective: float, random: KeyedRando
 
 
 @dataclass(frozen=True)
-class Bin:
-    """Statistics of the differences where a covariate lies in [low, high)."""
+class BinStatistics:
+    """Statistics of the differences in one bin of a covariate.
+
+    Attributes
+    ----------
+    low, high : float
+        The bin [low, high), in the unit of the covariate.
+    statistics : DifferenceStatistics
+        Statistics of the differences in it, m.
+    """
 
     low: float
     high: float
-    of: DifferenceStatistics
+    statistics: DifferenceStatistics
 
     def to_dict(self) -> dict[str, Any]:
         """Return the values for JSON; an infinite end becomes null."""
         low, high = (end if np.isfinite(end) else None for end in (self.low, self.high))
-        return {"low": low, "high": high, **self.of.to_dict()}
+        return {"low": low, "high": high, **self.statistics.to_dict()}
 
 
 def statistics_by_bin(
     values: NDArray[np.floating], covariate: NDArray[np.floating], edges: Sequence[float] | FloatArray
-) -> list[Bin]:
-    """Compute statistics of the values, m, in each bin of a covariate; pixels where either is NaN are ignored.
+) -> list[BinStatistics]:
+    """Compute statistics of differences in each bin of a covariate; pixels where either is NaN are ignored.
 
     Parameters
     ----------
     values, covariate : arrays of equal shape
-        Differences, m, and covariate.
+        Differences, m, and the covariate of each.
     edges : sequence of float
-        Ascending, one more than bins. The last bin includes its upper edge.
+        Edges of the bins, ascending. The last bin includes its upper edge.
     """
     if values.shape != covariate.shape:
         raise ValueError(f"expected a covariate of shape {values.shape}, got {covariate.shape}")
@@ -144,11 +159,21 @@ def statistics_by_bin(
     order = np.argsort(number, kind="stable")
     starts = np.searchsorted(number[order], np.arange(len(edges)))
     parts = (found[order[start:end]] for start, end in pairwise(starts))
-    return [Bin(float(low), float(high), statistics(part)) for (low, high), part in zip(pairwise(edges), parts, strict=True)]
+    return [
+        BinStatistics(float(low), float(high), statistics(part)) for (low, high), part in zip(pairwise(edges), parts, strict=True)
+    ]
 
 
 def quantile_edges(covariate: NDArray[np.floating], bins: int = 8) -> FloatArray:
-    """Return edges of bins with equally many of the covariate's values (NaN ignored); fewer bins if many values are equal."""
+    """Return edges of bins that hold equally many values of a covariate; NaN is ignored.
+
+    Parameters
+    ----------
+    covariate : array of any shape
+        The values.
+    bins : int
+        Number of bins; fewer are made if many values are equal.
+    """
     known = covariate[~np.isnan(covariate)]
     if known.size == 0:
         return np.array([0.0, 1.0])
@@ -158,9 +183,16 @@ def quantile_edges(covariate: NDArray[np.floating], bins: int = 8) -> FloatArray
 
 @dataclass(frozen=True)
 class DensityHistogram:
-    """Counts in bins of equal width, and the expected counts of a normal distribution with the same median and NMAD.
+    """Histogram of differences, with what a normal distribution of the same median and NMAD would give.
 
-    edges: (k + 1,), m; counts, normal: (k,).
+    Attributes
+    ----------
+    edges : (k + 1,) array
+        Edges of bins of equal width, m.
+    counts : (k,) array
+        Counts.
+    normal : (k,) array
+        Expected counts of the normal distribution.
     """
 
     edges: FloatArray
@@ -169,7 +201,17 @@ class DensityHistogram:
 
 
 def histogram(values: NDArray[np.floating], bins: int = 100, half_width_nmads: float = 6.0) -> DensityHistogram:
-    """Compute the histogram of the values (NaN ignored) within some NMADs of their median."""
+    """Compute the histogram of differences around their median; NaN is ignored.
+
+    Parameters
+    ----------
+    values : array of any shape
+        Differences, m.
+    bins : int
+        Number of bins.
+    half_width_nmads : float
+        Distance of the outermost edges from the median, in NMADs.
+    """
     known = values[~np.isnan(values)]
     size = statistics(known)
     centre, sigma = (size.median, size.nmad or 1e-6) if size.count else (0.0, 1e-3)
@@ -179,6 +221,6 @@ def histogram(values: NDArray[np.floating], bins: int = 100, half_width_nmads: f
 
 
 def without_outliers(values: NDArray[np.floating], nmads: float = 5.0) -> NDArray[np.floating]:
-    """Return the values with NaN in place of those farther than some NMADs from the median."""
+    """Return the values with NaN in place of those farther than `nmads` NMADs from the median."""
     size = statistics(values)
     return np.where(np.abs(values - size.median) <= nmads * size.nmad, values, np.nan)

@@ -50,7 +50,17 @@ _GOOD_ENOUGH = 0.01
 
 @dataclass(frozen=True)
 class Variogram:
-    """An empirical variogram: mean distance and semivariance of the pairs in each bin, and their number, (k,) each."""
+    """An empirical variogram: how different two pixels are on average, by their distance.
+
+    Attributes
+    ----------
+    lag_m : (k,) array
+        Mean distance of the pairs in each bin, m.
+    semivariance_m2 : (k,) array
+        Half of the mean squared difference of the pairs in each bin, m2.
+    pairs : (k,) array
+        Number of pairs in each bin.
+    """
 
     lag_m: FloatArray
     semivariance_m2: FloatArray
@@ -73,7 +83,7 @@ def variogram(
     gsd_m : float
         Side of a pixel, m.
     largest_lag_m : float, optional
-        Largest distance; by default half of the raster's larger side. Bins grow geometrically from one pixel.
+        Largest distance of a pair, m; by default half of the raster's larger side. Bins grow geometrically from one pixel.
     direction : str
         "all", or only pairs along "x" (rows) or "y" (columns), within 22.5 degrees.
 
@@ -84,7 +94,9 @@ def variogram(
     """
     rasters = values[None] if values.ndim == 2 else values
     if np.isfinite(rasters).sum(axis=(1, 2)).max(initial=0) < 2:
-        raise InputError("fewer than two pixels have data", where="variogram")
+        raise InputError(
+            "fewer than two pixels have data, which determines no variogram", where="variogram", remedy="give maps with data"
+        )
     size = rasters.shape[1:]
     reach = largest_lag_m or gsd_m * max(size) / 2
     steps = tuple(int(min(np.ceil(reach / gsd_m), extent - 1)) for extent in size)
@@ -125,7 +137,11 @@ def _averaged(
         along, across = (np.abs(column), row) if direction == "x" else (row, np.abs(column))
         wanted &= across <= _SECTOR * along
     if not wanted.any():
-        raise InputError(f"no two pixels with data lie within {reach:g} m", where="variogram", remedy="raise the largest lag")
+        raise InputError(
+            f"no two pixels with data lie within {reach:g} m of each other, which determines no variogram",
+            where="variogram",
+            remedy="use a larger lag, or maps with more data",
+        )
     edges = np.geomspace(0.5, max(reach / gsd_m, 1.0) * (1 + 1e-6), _LAGS + 1) * gsd_m
     number = np.clip(np.searchsorted(edges, distance[wanted], side="right") - 1, 0, _LAGS - 1)
     count = np.bincount(number, pairs[wanted], _LAGS).astype(np.float64)
@@ -136,14 +152,24 @@ def _averaged(
 
 @dataclass(frozen=True)
 class Structure:
-    """A part of a variogram model: its family, its sill, m2, and its effective range, m."""
+    """One part of a variogram model, which rises with distance from 0 to its sill.
+
+    Attributes
+    ----------
+    family : str
+        Form of the curve, such as spherical or Gaussian.
+    sill_m2 : float
+        Semivariance at large distances, m2.
+    range_m : float
+        Effective range, m: distance at which (almost) all of the sill is reached.
+    """
 
     family: Family
     sill_m2: float
     range_m: float
 
     def share(self, distance: FloatArray) -> FloatArray:
-        """Return the share of the sill that is reached at a distance, m."""
+        """Return the share of the sill that is reached at distances (any shape), m."""
         t = np.asarray(distance) / self.range_m
         if self.family == "spherical":
             return np.where(t < 1, 1.5 * t - 0.5 * t**3, 1.0)
@@ -152,9 +178,16 @@ class Structure:
 
 @dataclass(frozen=True)
 class VariogramModel:
-    """A nugget, m2, and nested structures by ascending range.
+    """A variogram model: uncorrelated noise (nugget) plus nested structures.
 
-    relative_misfit: RMS of model over empirical minus one, if fitted.
+    Attributes
+    ----------
+    nugget_m2 : float
+        Variance of the uncorrelated noise of single pixels, m2.
+    structures : tuple of Structure
+        The correlated parts, by ascending range.
+    relative_misfit : float
+        RMS of model over empirical semivariance minus one; 0 if the model was not fitted.
     """
 
     nugget_m2: float
@@ -163,18 +196,18 @@ class VariogramModel:
 
     @property
     def sill_m2(self) -> float:
-        """Variance of a pixel, m2."""
+        """Variance of a pixel, m2: the nugget plus the sills of all structures."""
         return self.nugget_m2 + sum(part.sill_m2 for part in self.structures)
 
     def semivariance(self, distance: FloatArray) -> FloatArray:
-        """Return the semivariance, m2, at distances, m; 0 at 0."""
+        """Return the semivariance, m2, at distances (any shape), m; it is 0 at distance 0."""
         total = self.nugget_m2 + sum(
             (part.sill_m2 * part.share(distance) for part in self.structures), np.zeros(np.shape(distance))
         )
         return np.where(np.asarray(distance) > 0, total, 0.0)
 
     def covariance(self, distance: FloatArray) -> FloatArray:
-        """Return the covariance, m2, at distances, m; the nugget only contributes at 0."""
+        """Return the covariance of two pixels, m2, at distances (any shape), m; the nugget only contributes at distance 0."""
         return self.sill_m2 - self.semivariance(distance)
 
     def to_dict(self) -> dict[str, Any]:
@@ -182,16 +215,17 @@ class VariogramModel:
         return {**dataclasses.asdict(self), "sill_m2": self.sill_m2}
 
     def summary(self) -> str:
-        """Describe the model on one line, in millimetres (standard deviations) and metres (ranges)."""
+        """Describe the model on one line: standard deviations in millimetres, ranges in metres."""
         parts = [f"nugget {np.sqrt(self.nugget_m2) * 1e3:.1f} mm"]
         parts += [f"{part.family} {np.sqrt(part.sill_m2) * 1e3:.1f} mm over {part.range_m:.2g} m" for part in self.structures]
         return ", ".join(parts)
 
 
 def fit_variogram(found: Variogram) -> VariogramModel:
-    """Fit the model with the smallest relative misfit over all bins. A first or a second structure is only added if it pays.
+    """Fit a variogram model with a nugget and up to two structures to an empirical variogram.
 
-    All bins have equal weight except those with few pairs: the model is assumed accurate to 3 %, and n pairs determine a
+    The model has the smallest relative misfit over all bins. A first or a second structure is only added if it reduces the misfit
+    enough. All bins have equal weight except those with few pairs: the model is assumed accurate to 3 %, and n pairs determine a
     semivariance to sqrt(2 / n).
     """
     if not found.semivariance_m2.max() > 0:
@@ -236,7 +270,22 @@ def _fitted(found: Variogram, families: tuple[Family, ...]) -> VariogramModel:
 
 
 def variance_of_mean(model: VariogramModel, mask: NDArray[np.bool_], gsd_m: float) -> float:
-    """Return the variance, m2, of the mean over the pixels of a mask (h, w). Raises ValueError for an empty mask."""
+    """Return the variance, m2, of the mean of correlated noise over the pixels of a mask.
+
+    Parameters
+    ----------
+    model : VariogramModel
+        Variogram model of the noise.
+    mask : (h, w) bool array
+        The pixels.
+    gsd_m : float
+        Side of a pixel, m.
+
+    Raises
+    ------
+    ValueError
+        If the mask is empty.
+    """
     count = int(np.count_nonzero(mask))
     if count == 0:
         raise ValueError("the mask is empty")
@@ -249,9 +298,21 @@ def variance_of_mean(model: VariogramModel, mask: NDArray[np.bool_], gsd_m: floa
 
 
 def effective_sample_size(model: VariogramModel, mask: NDArray[np.bool_], gsd_m: float) -> float:
-    """Return how many independent pixels would give the mean over a mask (h, w) the same variance.
+    """Return how many independent pixels would give a mean with the same variance as the correlated pixels of a mask.
 
-    It is from 1 to the number of the mask's pixels.
+    Parameters
+    ----------
+    model : VariogramModel
+        Variogram model of the noise.
+    mask : (h, w) bool array
+        The pixels.
+    gsd_m : float
+        Side of a pixel, m.
+
+    Returns
+    -------
+    float
+        The number, from 1 to the number of the mask's pixels.
     """
     variance = variance_of_mean(model, mask, gsd_m)
     return (

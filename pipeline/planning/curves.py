@@ -27,9 +27,9 @@ _LARGEST_INCIDENCE_RAD = np.radians(85)
 
 @dataclass(frozen=True)
 class Curve:
-    """Detection probability against one quantity, in the middle of the wall.
+    """Detection probability of a fallen block as a function of one quantity, such as the range.
 
-    It is the median over the places there; all else is as it is there.
+    It is the median over places in the middle of the wall. All other quantities are as they are there.
 
     Attributes
     ----------
@@ -38,9 +38,9 @@ class Curve:
     x : (k,) array
         Its values.
     at : float
-        The set-up's own value, one of x.
+        Its value in the planned set-up, one of x.
     probability : dict of (k,) arrays
-        Detection probability, by the side of the block, m.
+        Detection probability at each value, by the side of the block, m.
     """
 
     label: str
@@ -50,9 +50,19 @@ class Curve:
 
 
 def middle_places(raster: WallRaster, seen: BoolArray) -> BoolArray:
-    """Select the places (n,) that represent the middle of the wall.
+    """Select places that represent the middle of the wall: at most some hundred that the sensor sees there, evenly spread.
 
-    They are those that are seen there; at most some hundred, evenly chosen.
+    Parameters
+    ----------
+    raster : WallRaster
+        The wall with its n places.
+    seen : (n,) bool array
+        Places that the sensor sees.
+
+    Returns
+    -------
+    (n,) bool array
+        The selected places.
     """
     points = raster.places.points[:, :2]
     low, high = points.min(axis=0), points.max(axis=0)
@@ -70,13 +80,13 @@ class Views:
     Attributes
     ----------
     viewpoint : (3,) array
-        Position of the sensor, m.
+        Position of the sensor, wall frame, m.
     places : Places
         The k places.
     aside : (k, 3) array
-        Unit vectors across the lines of sight, towards which the normals lean.
+        Unit vectors perpendicular to the lines of sight, towards which the normals lean.
     range_m, incidence_rad : (k,) arrays
-        Range and angle of incidence.
+        Range, m, and angle of incidence, rad.
     """
 
     viewpoint: FloatArray
@@ -87,9 +97,16 @@ class Views:
 
     @classmethod
     def of(cls, places: Places, viewpoint: FloatArray, upright: FloatArray) -> Views:
-        """Describe places as seen from a viewpoint (3,), m.
+        """Describe places as seen from a viewpoint.
 
-        upright: (3,) axis about which a surface is rotated that is seen at normal incidence.
+        Parameters
+        ----------
+        places : Places
+            The k places.
+        viewpoint : (3,) array
+            Position of the sensor, wall frame, m.
+        upright : (3,) array
+            Axis about which a surface is rotated that is seen at normal incidence.
         """
         sight = places.points - viewpoint
         distance = np.linalg.norm(sight, axis=1)
@@ -103,7 +120,15 @@ class Views:
         return cls(viewpoint, places, aside, distance, np.arccos(cosine))
 
     def seen_at(self, ratio: float = 1.0, turn_rad: float = 0.0) -> Places:
-        """Return the places at `ratio` times their range, with their angles of incidence increased by `turn_rad`."""
+        """Return the places moved along their lines of sight and rotated.
+
+        Parameters
+        ----------
+        ratio : float
+            New range over the present one.
+        turn_rad : float
+            Increase of the angles of incidence, rad.
+        """
         sight = self.places.points - self.viewpoint
         if turn_rad == 0:
             return replace(self.places, points=self.viewpoint + ratio * sight)
@@ -115,18 +140,18 @@ class Views:
 def probability_curves(
     sampling_of: Callable[[Places], tuple[Sampling, BoolArray]], views: Views, config: PlanningConfig, step: tuple[str, float]
 ) -> list[Curve]:
-    """Compute the median detection probability against range, step and angle of incidence.
+    """Compute the detection probability of fallen blocks against range, sampling step and angle of incidence.
 
     Parameters
     ----------
     sampling_of : callable
-        Returns the sampling of places, and whether the sensor reaches each.
+        Function from places to their sampling and a mask of those that the sensor reaches.
     views : Views
         The places in the middle of the wall.
     config : PlanningConfig
         Sizes of the blocks and the level of detection.
     step : (str, float)
-        Label of the step's axis and the set-up's own value there.
+        Label of the sampling step with its unit, and its value in the planned set-up.
 
     Returns
     -------

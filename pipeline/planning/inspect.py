@@ -23,7 +23,22 @@ _WALL_S, _MAPS_S = 2.0, 4.0
 
 
 def inspect(config: SimulationConfig, sensors: Sequence[SensorName], progress: Progress | None = None) -> list[Plan]:
-    """Predict what each sensor achieves on the config's wall. Nothing is simulated."""
+    """Predict what each sensor of a config achieves on its wall, with equations instead of a simulation.
+
+    Parameters
+    ----------
+    config : SimulationConfig
+        The wall, the sensors' places and the settings of the plan.
+    sensors : sequence of str
+        Any of "stereo" and "tls".
+    progress : Progress, optional
+        Receives the progress.
+
+    Returns
+    -------
+    list of Plan
+        One plan for each sensor; a scanner with several stations has one for all together and one for each.
+    """
     progress = progress or Progress()
     progress.plan(
         {f"{sensor}: {stage}": seconds for sensor in sensors for stage, seconds in (("wall", _WALL_S), ("maps", _MAPS_S))}
@@ -38,10 +53,29 @@ def inspect(config: SimulationConfig, sensors: Sequence[SensorName], progress: P
 
 
 def write_plans(out: Path, config: SimulationConfig, found: Sequence[Plan]) -> Path:
-    """Write maps, plan.json and report.html; return the report's path.
+    """Write the maps, plan.json and report.html of plans into a folder, which appears when everything has been written.
 
-    Maps are named <sensor>_<map>.tif, or <sensor>_station_<n>_<map>.tif for one of several stations; SI, wall frame. The
-    folder appears when everything has been written. Raises InputError if it is in use.
+    Maps are named <sensor>_<map>.tif, or <sensor>_station_<n>_<map>.tif for one of several stations; values are SI, in the wall
+    frame.
+
+    Parameters
+    ----------
+    out : Path
+        Folder to write.
+    config : SimulationConfig
+        The config of the plans.
+    found : sequence of Plan
+        The plans.
+
+    Returns
+    -------
+    Path
+        Path of the report.
+
+    Raises
+    ------
+    InputError
+        If the folder is in use.
     """
     with filling(out) as folder:
         _write(folder, config, found)

@@ -19,7 +19,7 @@ from pipeline.precision.detectability import (
     smallest_block,
     smallest_clear_block,
 )
-from pipeline.precision.surface import BoolArray, Places, WallRaster, seen_from, wall_raster
+from pipeline.precision.surface import BoolArray, Places, WallRaster, visible_from, wall_raster
 from pipeline.run.site import SensorSite
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
@@ -34,16 +34,18 @@ _FACES = {1: "", 2: "mean of two faces"}
 
 @dataclass(frozen=True)
 class PlanMap:
-    """One quantity over the wall.
+    """A map of one predicted quantity over the wall.
 
     Attributes
     ----------
     name : str
-        Name of its file, with the SI unit.
-    title, unit, factor
-        How to show it, with unit = factor * SI.
+        Name of its file without ending; it ends with the SI unit.
+    title : str
+        The quantity, in words.
     values : (n,) array
-        Values at the raster's places, SI; NaN where there is none.
+        Values at the raster's n places, SI; NaN where there is none.
+    unit, factor : str, float
+        Unit in which reports show it, and the factor from SI to that unit.
     """
 
     name: str
@@ -54,14 +56,23 @@ class PlanMap:
 
     @property
     def si_unit(self) -> str:
-        """Unit of the values, as given by the end of the name."""
+        """SI unit of the values, taken from the end of the name."""
         return next((unit for unit in ("m", "rad") if self.name.endswith(f"_{unit}")), "1")
 
     def summary(self, middle: BoolArray) -> dict[str, float | None]:
-        """Summarise the map: median in the middle of the wall, and median and 5 and 95 % quantiles over all of it, SI.
+        """Summarise the map by its median in the middle of the wall, and its median and 5 and 95 % quantiles over all of it, SI.
 
-        middle: (n,) the places in the middle. A place without a value counts as infinite there, because no block is large
-        enough for it. None means no value.
+        A place without a value counts as infinite in the middle of the wall, because no block is large enough there.
+
+        Parameters
+        ----------
+        middle : (n,) bool array
+            The places in the middle of the wall.
+
+        Returns
+        -------
+        dict
+            The figures by name; None where there is no value.
         """
         values, centre = self.values[np.isfinite(self.values)], np.nan_to_num(self.values[middle], nan=np.inf)
         there = float(np.median(centre)) if centre.size else np.nan
@@ -76,30 +87,30 @@ class PlanMap:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a sensor achieves on a wall.
+    """What a sensor is predicted to achieve on a wall.
 
     Attributes
     ----------
     sensor, instrument : str
-        "stereo" or "tls", and a description.
+        "stereo" or "tls", and a description of the instrument.
     station : int or None
         Number of the station if a scanner has several; None for the only one and for all together.
     wall : str
         Name of the wall.
     raster : WallRaster
-        The places.
+        The n places on the wall.
     maps : list of PlanMap
-        The maps.
+        Maps of the predicted quantities.
     figures : dict of float
         Single numbers by name, SI.
     curves : list of Curve
-        Detection probability.
+        Detection probability against range, step and incidence.
     ignored : list of str
-        Effects of the model that a plan does not take into account.
+        Effects of the sensor model that a plan does not take into account.
     config : PlanningConfig
-        Its settings.
+        Settings of the plan.
     in_middle : (n,) bool array
-        The places that statements about the middle of the wall refer to.
+        The places to which statements about the middle of the wall refer.
     """
 
     sensor: str
@@ -116,11 +127,11 @@ class Plan:
 
     @property
     def prefix(self) -> str:
-        """Beginning of the names of its files."""
+        """Beginning of the names of the plan's files."""
         return self.sensor if self.station is None else f"{self.sensor}_station_{self.station}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return everything except the maps' pixels, for JSON."""
+        """Return everything except the maps' pixels, as plan.json holds it."""
         middle = self.in_middle
         return {
             "sensor": self.sensor,
@@ -144,9 +155,19 @@ class Plan:
 
 
 def plans(config: SimulationConfig, site: SensorSite) -> list[Plan]:
-    """Compute the plan of the sensor of `site`; for several stations, that of all together and then of each.
+    """Compute the plan of a sensor; for a scanner with several stations, the plan of all together and then of each.
 
-    The rock is as wet as the config says. Raises InputError if the sensor, or one of its stations, sees nothing of the wall.
+    Parameters
+    ----------
+    config : SimulationConfig
+        Settings of the plan, and how wet the rock is.
+    site : SensorSite
+        The sensor in front of the wall.
+
+    Raises
+    ------
+    InputError
+        If the sensor, or one of its stations, sees nothing of the wall.
     """
     caster = RayCaster(site.mesh if config.wetness is None else config.wetness.with_wet_patches(site.mesh))
     raster = wall_raster(caster, config.planning.gsd_m)
@@ -167,8 +188,8 @@ def _stereo_plan(wall: str, pair: StereoPair, caster: RayCaster, raster: WallRas
     """Compute the plan of a stereo pair."""
     places, nominal = raster.places, pair.cameras.in_wall_frame(pair.frame)
     found = stereo.stereo_geometry(pair, places, config.image_sigma_px)
-    left = found.in_left & seen_from(caster, places, nominal.left.position)
-    right = found.in_right & seen_from(caster, places, nominal.right.position)
+    left = found.in_left & visible_from(caster, places, nominal.left.position)
+    right = found.in_right & visible_from(caster, places, nominal.right.position)
     both = left & right
     _require_seen(both, "no part of the wall is seen by both cameras", "cameras")
     middle = middle_places(raster, both)
@@ -218,7 +239,7 @@ def _tls_plan(
     """Compute the plan of one station of a laser scanner."""
     places = raster.places
     found = tls.tls_geometry(scanner, places)
-    in_sight = seen_from(caster, places, scanner.position)
+    in_sight = visible_from(caster, places, scanner.position)
     seen = in_sight & found.reached
     _require_seen(
         seen, "no part of the wall is seen by the scanner", "station" if station is None else f"station, number {station}"

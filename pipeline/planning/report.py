@@ -67,7 +67,7 @@ class _Part:
 
 
 def summary(plan: Plan) -> str:
-    """Describe a plan as aligned lines of text."""
+    """Describe a plan as aligned lines of text for the terminal."""
     lines = [f"{plan.instrument}, wall {plan.wall}", f"  {answer(plan)}"]
     lines += [f"  {title:<52}{value:>12}" for title, value in _figures(plan)]
     lines.append(f"  {'map':<52}{'middle':>12}{'median':>10}{'5 %':>10}{'95 %':>10}")
@@ -76,7 +76,7 @@ def summary(plan: Plan) -> str:
 
 
 def answer(plan: Plan) -> str:
-    """State the main result in words: the smallest block that is seen."""
+    """State the main result of a plan in words: the smallest block that the sensor detects in the middle of the wall."""
     share = percent(plan.config.probability, 0)
     middle, least = (_in_the_middle(plan, name) for name in ("smallest_block_m", "smallest_findable_m"))
     name = plan.instrument
@@ -97,7 +97,17 @@ def _in_the_middle(plan: Plan, name: str) -> float | None:
 
 
 def write_plan_report(path: Path, plans: Sequence[Plan], config: Mapping[str, Any]) -> None:
-    """Write report.html completely or not at all. Equal arguments give equal bytes."""
+    """Write report.html of some plans, completely or not at all. Equal arguments give equal bytes.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    plans : sequence of Plan
+        The plans.
+    config : mapping
+        The resolved config, which the page lists.
+    """
     page = template("planning/report.html.jinja").render(
         title=f"{plans[0].wall.replace('_', ' ').capitalize()}: a plan",
         parts=[_part(plan) for plan in plans],
@@ -138,7 +148,7 @@ def _values(found: PlanMap, figures: Mapping[str, float | None]) -> list[str]:
 
 
 def map_picture(plan: Plan, found: PlanMap) -> bytes:
-    """Draw a map as PNG in the unit in which it is shown."""
+    """Draw a map of a plan as PNG, in the unit in which reports show it."""
     return map_figure(plan.raster.image(found.values * found.factor), plan.raster.grid, found.unit or "ratio", found.title)
 
 

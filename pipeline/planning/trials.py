@@ -30,23 +30,24 @@ _ON_SURFACE_M = 1e-4
 
 @dataclass(frozen=True)
 class Trials:
-    """Results for k blocks: predicted detection probability and simulated detection.
+    """Results for k simulated blocks: the predicted detection probability, and whether each was detected.
 
     Attributes
     ----------
     predicted : (k,) array
-        Detection probability by the closed form.
-    detected : (k,) array
-        Whether the simulated change exceeded its LoD.
+        Detection probability by the equations of `detectability`.
+    detected : (k,) bool array
+        Whether the simulated change exceeded its level of detection.
     """
 
     predicted: FloatArray
     detected: BoolArray
 
     def score(self) -> float:
-        """Return observed minus expected detections over their standard deviation.
+        """Return observed minus expected number of detections, over its standard deviation.
 
-        It is that of a sum of independent draws (Poisson binomial).
+        Values beyond about 3 in magnitude mean that the prediction is wrong. The standard deviation is that of a sum of
+        independent draws with different probabilities (Poisson binomial).
         """
         variance = (self.predicted * (1 - self.predicted)).sum()
         return float((self.detected.sum() - self.predicted.sum()) / np.sqrt(max(variance, 1e-12)))
@@ -61,10 +62,10 @@ def detection_trials(
     count: int = 40,
     apart_m: float = 0.1,
 ) -> Trials:
-    """Carve cubes out of a flat wall, observe it before and after, and test each niche's floor for change.
+    """Check predicted detection probabilities by simulation: carve cubes out of a flat wall and test for a change at each.
 
-    Half of each cube is in the rock. The test is that of `detectability`. A noiseless copy of the sensor tells which cells see
-    the part of the floor that every viewpoint sees.
+    Half of each cube is in the rock. The wall is observed before and after, and the floor of each niche is tested as in
+    `detectability`. A noiseless copy of the sensor tells which cells see the part of the floor that every viewpoint sees.
 
     Parameters
     ----------

@@ -56,7 +56,7 @@ _SMALLEST_M, _LARGEST_M, _HALVINGS = 1e-3, 30.0, 13
 
 
 class PlanningConfig(Config):
-    """What `scarpsim inspect` maps, and when a block counts as seen."""
+    """Settings of `scarpsim inspect`: which maps it makes, and when a fallen block counts as detected."""
 
     gsd_m: float | None = Field(None, gt=0, description="side of a map's pixel; none: about 100,000 pixels for the wall [m]")
     image_sigma_px: float = Field(
@@ -78,24 +78,27 @@ class PlanningConfig(Config):
 
 @dataclass(frozen=True)
 class Sampling:
-    """How a sensor samples a surface at n places; all attributes are (n,) or numbers.
+    """How densely and how precisely a sensor samples a surface at n places; all attributes are (n,) arrays or numbers.
+
+    The sensor's rays meet the surface in a lattice of points. Directions a and b are two perpendicular ones on the surface. A
+    niche is the hole that a fallen block leaves.
 
     Attributes
     ----------
     step_a, step_b
-        Steps of the lattice of points on the surface, along two perpendicular directions, m.
+        Steps of the lattice along a and b, m.
     shadow_a, shadow_b
-        Hidden width of a niche's floor over its depth.
+        Width of the niche's floor that its rim hides along a and b, divided by the niche's depth.
     white
-        Standard deviation of a point along the normal, white part, m.
+        Standard deviation of a point's independent error along the normal, m.
     slope_a, slope_b
-        Tangents of the rays that make the lattice, against the normal.
+        Tangents along a and b of the angle between the rays and the normal.
     blur_a, blur_b
-        Standard deviation of a point's true position on the surface, m.
+        Standard deviation of a point's true position along a and b, m.
     smooth
         Standard deviation of the grid-correlated error along the normal, averaged over positions, m.
     grain_a, grain_b
-        Distance between the nodes of the grid-correlated error, m.
+        Distance between the nodes of the grid-correlated error along a and b, m.
     """
 
     step_a: FloatArray
@@ -115,18 +118,17 @@ class Sampling:
 def lattice(step_a: FloatArray, step_b: FloatArray, normals: FloatArray, sights: Sequence[FloatArray]) -> dict[str, FloatArray]:
     """Compute the steps, shadows and slopes of a `Sampling`, by name.
 
-    The lattice is replaced by the rectangle of equal area along step_b, the scan lines or the image's columns. On a steep wall
-    these run upright, and so does the block. Seen from aside and from below, the other step is oblique, and the rim of a niche
-    along it would hide another part of the floor than that of an upright niche.
+    An oblique lattice is replaced by the rectangular one of equal area along step_b, the direction of the scan lines or of the
+    image's columns. On a steep wall these run upright, as the sides of the block do.
 
     Parameters
     ----------
     step_a, step_b : (n, 3) arrays
         Steps of the lattice on the surface, m.
     normals : (n, 3) array
-        Unit normals.
+        Unit normals of the surface.
     sights : sequence of (n, 3) arrays
-        From each viewpoint to the places, of any length. The first viewpoint makes the lattice.
+        Vectors from each viewpoint to the places, of any length. The rays of the first viewpoint make the lattice.
     """
     length = np.linalg.norm(step_b, axis=1)
     width = np.linalg.norm(np.cross(step_a, step_b), axis=1) / length
@@ -144,7 +146,24 @@ def lattice(step_a: FloatArray, step_b: FloatArray, normals: FloatArray, sights:
 
 
 def detection_probability(sampling: Sampling, side_m: FloatArray | float, config: PlanningConfig) -> FloatArray:
-    """Return the probability (n,) that the fall of a block with side `side_m` exceeds the level of detection (see the module)."""
+    """Return the probability that the fall of a block is detected: its change exceeds the level of detection.
+
+    The module's docstring has the equations.
+
+    Parameters
+    ----------
+    sampling : Sampling
+        How the sensor samples the surface at n places.
+    side_m : (n,) array or float
+        Side of the cube that fell, m.
+    config : PlanningConfig
+        The test.
+
+    Returns
+    -------
+    (n,) array
+        Probabilities.
+    """
     depth = config.depth_ratio * np.asarray(side_m)
     width_a, width_b = (np.maximum(side_m - depth * shadow, 0.0) for shadow in (sampling.shadow_a, sampling.shadow_b))
     kept = sampling.smooth**2 * _kept(width_a / sampling.grain_a) * _kept(width_b / sampling.grain_b)
@@ -161,26 +180,60 @@ def detection_probability(sampling: Sampling, side_m: FloatArray | float, config
 
 
 def smallest_block(sampling: Sampling, config: PlanningConfig) -> FloatArray:
-    """Return the side (n,) of the smallest block that is seen with `config.probability`, m.
+    """Return the side of the smallest block that is detected with the probability `config.probability`.
 
-    NaN if a block of 30 m is not seen, or no floor is visible.
+    Parameters
+    ----------
+    sampling : Sampling
+        How the sensor samples the surface at n places.
+    config : PlanningConfig
+        The test.
+
+    Returns
+    -------
+    (n,) array
+        Sides, m; NaN if not even a block of 30 m is detected or no floor of its niche is visible.
     """
     return _smallest(sampling, lambda side: detection_probability(sampling, side, config) >= config.probability)
 
 
 def smallest_clear_block(sampling: Sampling, config: PlanningConfig) -> FloatArray:
-    """Return the side (n,) of the smallest block whose signal-to-noise ratio is CLEAR_SNR, m; NaN as in `smallest_block`.
+    """Return the side of the smallest block that stands out from the noise of the whole wall.
 
-    Any detector that does not know place and shape of the block needs at least this ratio: below it, noise somewhere else on
-    the wall looks as much like a block.
+    Its change has a signal-to-noise ratio of CLEAR_SNR. A detector that does not know place and shape of the block needs at least
+    this ratio. Below it, noise somewhere else on the wall looks as much like a block.
+
+    Parameters
+    ----------
+    sampling : Sampling
+        How the sensor samples the surface at n places.
+    config : PlanningConfig
+        The test.
+
+    Returns
+    -------
+    (n,) array
+        Sides, m; NaN as in `smallest_block`.
     """
     return _smallest(sampling, lambda side: signal_to_noise(sampling, side, config) >= CLEAR_SNR)
 
 
 def signal_to_noise(sampling: Sampling, side_m: FloatArray | float, config: PlanningConfig) -> FloatArray:
-    """Return f h / tau (n,), steps 2 and 3 of the module, at the mean number of points on the floor.
+    """Return the mean change that a fallen block causes, divided by its standard deviation (f h / tau in the module's docstring).
 
-    It is 0 if that number is less than one.
+    Parameters
+    ----------
+    sampling : Sampling
+        How the sensor samples the surface at n places.
+    side_m : (n,) array or float
+        Side of the cube that fell, m.
+    config : PlanningConfig
+        The test.
+
+    Returns
+    -------
+    (n,) array
+        Ratios, at the mean number of points on the niche's floor; 0 if that number is less than one.
     """
     depth = config.depth_ratio * np.asarray(side_m)
     width_a, width_b = (np.maximum(side_m - depth * shadow, 0.0) for shadow in (sampling.shadow_a, sampling.shadow_b))

@@ -23,30 +23,33 @@ from sensors.stereo.stereo_pair import REDUCTION, StereoPair
 
 @dataclass(frozen=True)
 class StereoGeometry:
-    """A pair's figures at n places, (n,) each, as if nothing obstructed the view.
+    """Resolution and precision of a stereo pair at n places, as if nothing obstructed the view.
+
+    All attributes are (n,) arrays unless noted.
 
     Attributes
     ----------
     distance_m
         Distance from the middle of the base, m.
     gsd_m
-        Side of the square with the area that a frame pixel of the left image covers on the surface, m.
+        Ground sampling distance: side of the square that has the area of a pixel of the left image on the surface, m.
     cell_m
         The same for a cell of the depth map, m.
     base_to_distance
         Base over distance.
     convergence_rad
-        Angle between the two rays.
+        Angle between the two rays, rad.
     incidence_rad
-        Angle of incidence of the more oblique ray.
+        Angle of incidence of the more oblique ray, rad.
     covariance : (n, 3, 3)
-        From matching and image noise, wall frame, m2.
+        Covariance of a point from matching and image noise, wall frame, m2.
     orientation_covariance : (n, 3, 3)
-        From the noise of the orientation, m2. It is common to the whole observation and largely removed by the registration.
+        Covariance of a point from the noise of the cameras' orientation, wall frame, m2. It is common to the whole observation
+        and largely removed by the registration.
     normal_sigma_m
-        Standard deviation along the surface's normal, m.
+        Standard deviation along the surface's normal from matching and image noise, m.
     in_left, in_right
-        Whether the place is within the frame.
+        Whether the place is within the frame of the left and of the right image.
     sampling : Sampling
         Input of the detection probability.
     """
@@ -67,16 +70,16 @@ class StereoGeometry:
 
 @dataclass(frozen=True)
 class DisparityNoise:
-    """Noise of the disparity, as standard deviations.
+    """Noise of the disparities of a stereo pair, as standard deviations.
 
     Attributes
     ----------
     white : float
-        White noise, px.
+        Noise that is independent from pixel to pixel, px.
     smooth : float
         Grid-correlated noise, averaged over positions, px.
     step : float
-        Distance between nodes, px.
+        Distance between the nodes of the grid-correlated noise, px.
     """
 
     white: float
@@ -85,7 +88,7 @@ class DisparityNoise:
 
     @classmethod
     def of(cls, model: StereoModel) -> DisparityNoise:
-        """Combine the model's sources of noise in quadrature; of several grids, the coarsest step is used."""
+        """Combine all noise of a sensor model in quadrature; of several grids, the coarsest step is used."""
         noise = [effect for effect in model.matching_noise if not effect.is_null]
         white, smooth = (sum(each.total_variance for each in noise if each.shared == shared) for shared in (False, True))
         step = max((each.step_px for each in noise if isinstance(each, NodeNoise)), default=np.inf)
@@ -93,9 +96,16 @@ class DisparityNoise:
 
 
 def stereo_geometry(pair: StereoPair, places: Places, image_sigma_px: float = 0.0) -> StereoGeometry:
-    """Compute the figures of `pair` at `places` (wall frame).
+    """Compute resolution and precision of a stereo pair at some places of a wall.
 
-    image_sigma_px: noise of each coordinate of measured image points, in addition to the sensor model's matching noise.
+    Parameters
+    ----------
+    pair : StereoPair
+        The pair with its sensor model.
+    places : Places
+        n places, wall frame.
+    image_sigma_px : float
+        Noise of each coordinate of measured image points, in addition to the sensor model's matching noise, px.
     """
     nominal = pair.cameras.in_wall_frame(pair.frame)
     noise = DisparityNoise.of(pair.model)
@@ -177,10 +187,22 @@ def _intersection(nominal: CameraPair, points: FloatArray) -> _Derivatives:
 
 
 def orientation_covariance(pair: StereoPair, points: FloatArray) -> FloatArray:
-    """Compute the covariance (n, 3, 3) of points from the noise of both cameras' orientation, m2.
+    """Compute the covariance of points from the noise of both cameras' orientation, to first order.
 
-    It is in the wall frame, to first order. Each of the parameters is changed by its standard deviation alone, in each camera or
-    in both alike. The real cameras see the point with the change, the nominal ones intersect without it.
+    Each orientation parameter is changed by its standard deviation alone, in each camera or in both alike. The real cameras see
+    the point with the change, the nominal ones intersect its rays without it.
+
+    Parameters
+    ----------
+    pair : StereoPair
+        The pair with its sensor model.
+    points : (n, 3) array
+        Points, wall frame, m.
+
+    Returns
+    -------
+    (n, 3, 3) array
+        Covariances, wall frame, m2.
     """
     covariance = np.zeros((len(points), 3, 3))
     noise, nominal = pair.model.noise.orientation, pair.cameras.in_wall_frame(pair.frame)

@@ -25,29 +25,39 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Places:
-    """n places on a surface, wall frame: points (n, 3), m; outward unit normals (n, 3); albedo (n,)."""
+    """n places on a surface, wall frame.
+
+    Attributes
+    ----------
+    points : (n, 3) array
+        Positions, m.
+    normals : (n, 3) array
+        Outward unit normals.
+    albedo : (n,) array
+        Albedo.
+    """
 
     points: FloatArray
     normals: FloatArray
     albedo: FloatArray
 
     def at(self, chosen: BoolArray) -> Places:
-        """Return some of the places, selected by a mask (n,)."""
+        """Return the places that a mask (n,) selects."""
         return Places(self.points[chosen], self.normals[chosen], self.albedo[chosen])
 
 
 @dataclass(frozen=True)
 class WallRaster:
-    """The wall seen along -z.
+    """A wall sampled on a grid, as seen along -z of the wall frame.
 
     Attributes
     ----------
     grid : Grid
-        Its pixels.
+        The pixels.
     found : (height, width) bool array
-        Where there is a surface.
+        True where there is a surface.
     places : Places
-        The places of those n pixels, row by row.
+        The n places on the surface at those pixels, row by row.
     """
 
     grid: Grid
@@ -55,16 +65,26 @@ class WallRaster:
     places: Places
 
     def image(self, values: NDArray[np.generic]) -> FloatArray:
-        """Return n values at their pixels, (height, width), NaN where there is no surface."""
+        """Arrange n values of the places as an image (height, width), with NaN where there is no surface."""
         result = np.full(self.grid.shape, np.nan)
         result[self.found] = values
         return result
 
 
 def wall_raster(caster: RayCaster, gsd_m: float | None = None) -> WallRaster:
-    """Sample a wall (wall frame) at the pixels of a grid; without `gsd_m` it has about 100,000 pixels.
+    """Sample a wall at the pixels of a grid, looking along -z of the wall frame.
 
-    Raises InputError if the GSD is larger than the wall, or so small that the maps would have more than 20 million pixels.
+    Parameters
+    ----------
+    caster : RayCaster
+        The wall, wall frame.
+    gsd_m : float, optional
+        Side of a pixel, m; by default chosen for about 100,000 pixels.
+
+    Raises
+    ------
+    InputError
+        If the pixels are larger than the wall or more than 20 million, or if no surface is found.
     """
     bounds = caster.mesh.bounds
     extent = bounds[1, :2] - bounds[0, :2]
@@ -90,8 +110,23 @@ def wall_raster(caster: RayCaster, gsd_m: float | None = None) -> WallRaster:
     return WallRaster(grid, found.reshape(grid.shape), places)
 
 
-def seen_from(caster: RayCaster, places: Places, viewpoint: FloatArray) -> BoolArray:
-    """Return whether each place (n,) faces `viewpoint` (3,), m, with nothing in between."""
+def visible_from(caster: RayCaster, places: Places, viewpoint: FloatArray) -> BoolArray:
+    """Return whether each place faces a viewpoint with nothing in between.
+
+    Parameters
+    ----------
+    caster : RayCaster
+        The surface, for tests of visibility.
+    places : Places
+        n places on it.
+    viewpoint : (3,) array
+        The viewpoint, wall frame, m.
+
+    Returns
+    -------
+    (n,) bool array
+        True for visible places.
+    """
     facing = np.einsum("ni,ni->n", places.normals, places.points - viewpoint) < 0
     origin = vector(viewpoint)
     sight = vectors_on_device(places.points) - origin
@@ -100,23 +135,28 @@ def seen_from(caster: RayCaster, places: Places, viewpoint: FloatArray) -> BoolA
 
 
 def rotate_vectors(matrix: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Multiply a matrix (3, 3) with each of the vectors (n, 3)."""
+    """Multiply each of the vectors (n, 3) by a matrix (3, 3)."""
     return np.einsum("ij,nj->ni", matrix, vectors)
 
 
 def surface_shift(ray: FloatArray, turn: FloatArray, normals: FloatArray) -> FloatArray:
-    """Return how far (n, 3) the point where a ray hits a tangent plane moves when the ray changes.
+    """Return how far the point where a ray hits a plane moves when the direction of the ray changes a little.
 
     With the ray c + t r and the plane's normal n: dp = t (dr - r (n . dr) / (n . r)).
 
     Parameters
     ----------
     ray : (n, 3) array
-        t r, from the centre to the surface, m.
+        t r, from the origin c of the ray to the plane, m.
     turn : (n, 3) array
-        t dr, m.
+        t dr, the change of the direction times t, m.
     normals : (n, 3) array
-        Unit normals.
+        Unit normals n of the planes.
+
+    Returns
+    -------
+    (n, 3) array
+        Shifts dp, m.
     """
     along = np.einsum("ni,ni->n", normals, turn) / np.einsum("ni,ni->n", normals, ray)
     return turn - ray * along[:, None]

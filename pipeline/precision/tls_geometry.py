@@ -22,7 +22,7 @@ _OFTEN = 0.5
 
 @dataclass(frozen=True)
 class TlsGeometry:
-    """A station's figures at n places, (n,) each, as if nothing obstructed the view.
+    """Resolution and precision of a scanner station at n places, as if nothing obstructed the view. All are (n,) unless noted.
 
     Attributes
     ----------
@@ -31,17 +31,18 @@ class TlsGeometry:
     spacing_line_m, spacing_pulse_m
         Point spacing on the surface, from scan line to scan line (azimuth) and from pulse to pulse (zenith), m.
     footprint_m, footprint_long_m
-        Diameter of the beam across itself, and its longest extent on the surface, m; 0 if no divergence is given.
+        Diameter of the beam across its direction, and longest extent of its footprint on the surface, m; 0 if no divergence is
+        given.
     range_sigma_m, azimuth_sigma_m, zenith_sigma_m
-        Semi-axes of the error ellipsoid, along the beam and across it, m.
+        Standard deviations of a point along the beam, and across it towards azimuth and zenith, m.
     covariance : (n, 3, 3)
-        Of a point, wall frame, m2.
+        Covariance of a point, wall frame, m2.
     normal_sigma_m
-        Standard deviation along the surface's normal, m.
+        Standard deviation of a point along the surface's normal, m.
     power
         Received power, relative to that of albedo 1 at 100 m and normal incidence.
     reached
-        Whether the place is within window, range limits and detection limit.
+        Whether the place is within the scan window, the range limits and the detection limit.
     sampling : Sampling
         Input of the detection probability.
     """
@@ -63,12 +64,19 @@ class TlsGeometry:
 
 
 def tls_geometry(scanner: LaserScanner, places: Places) -> TlsGeometry:
-    """Compute the figures of `scanner` at `places` (wall frame).
+    """Compute resolution and precision of a laser scanner at some places of a wall.
 
-    With u the beam's direction, e_az and e_ze the unit vectors towards increasing azimuth and zenith, and white noise of range
-    (R) and angles, the covariance is s_R^2 u u' + (R sin z s_az)^2 e_az e_az' + (R s_ze)^2 e_ze e_ze'. On a plane, a beam that
-    leaves in another direction than recorded causes the same error along the normal as a point moved across the beam. The mean
-    of two faces has half of these variances; each of its beams misses a niche's floor as often as a single one.
+    With u the beam's direction, e_az and e_ze the unit vectors towards increasing azimuth and zenith, and independent noise of
+    range R and angles, the covariance is s_R^2 u u' + (R sin z s_az)^2 e_az e_az' + (R s_ze)^2 e_ze e_ze'. On a plane, a beam
+    that leaves in another direction than recorded causes the same error along the normal as a point moved across the beam. If two
+    faces are averaged, the mean has half of these variances; each of its beams misses a niche's floor as often as a single one.
+
+    Parameters
+    ----------
+    scanner : LaserScanner
+        The scanner with its sensor model.
+    places : Places
+        n places, wall frame.
     """
     effects = scanner.model.chain()
     local = rotate_vectors(scanner.rotation.T, places.points - scanner.position)

@@ -34,7 +34,7 @@ Map = Callable[[Callable[[FloatArray], FloatArray], Iterable[FloatArray]], Itera
 
 @dataclass(frozen=True)
 class ReferenceSurface:
-    """The points of the reference with a search tree.
+    """Points of a reference surface with a search tree, to which other points are registered.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class ReferenceSurface:
     points : (m, 3) array
         Points relative to `origin`, m.
     normals : (m, 3) array, optional
-        Unit normals.
+        Unit normals; None if they are not known.
     tree : scipy.spatial.cKDTree
         Search tree of the points.
     """
@@ -55,14 +55,14 @@ class ReferenceSurface:
 
     @classmethod
     def build(cls, points: FloatArray, normals: FloatArray | None = None) -> ReferenceSurface:
-        """Index a reference once, for any number of registrations.
+        """Index the points of a reference once, for any number of registrations to it.
 
         Parameters
         ----------
         points : (m, 3) array
             Points, m.
         normals : (m, 3) array, optional
-            Normals of any length and sign.
+            Normals of any length and sign; only point_to_plane needs them.
 
         Raises
         ------
@@ -82,17 +82,18 @@ class ReferenceSurface:
     def moments(
         self, blocks: list[FloatArray], pose: RigidTransform, gate: float, normals: FloatArray | None, map_blocks: Map
     ) -> FloatArray:
-        """Sum u u^T over all pairs of a point p and its nearest reference point q that are closer than `gate`.
+        """Pair points with their nearest reference points and sum the products u u^T over the pairs, for normal equations of ICP.
 
-        u is the column vector of one pair, with g the pose's translation:
+        Pairs farther apart than `gate` are left out. u is the column vector of one pair of a point p and a reference point q,
+        with g the pose's translation:
         with normals n:  ((p - g) x n, n, n . (p - q), 1), so that the result is (8, 8);
         without:         (p - g, q - p, 1), so that it is (7, 7).
-        The last element is the number of pairs.
+        The last element of the result is the number of pairs.
 
         Parameters
         ----------
         blocks : list of (k, 3) arrays
-            The moving points, m.
+            The moving points, m, in blocks that are processed separately.
         pose : RigidTransform
             Moves them to coordinates relative to `origin`.
         gate : float
@@ -100,7 +101,7 @@ class ReferenceSurface:
         normals : (m, 3) array, optional
             The reference's normals, for point_to_plane.
         map_blocks : Map
-            Applies a function to all blocks.
+            Function that applies another one to all blocks, possibly in threads.
         """
 
         def block_moments(block: FloatArray) -> FloatArray:
@@ -131,14 +132,14 @@ def _plane_columns(arm: FloatArray, offset: FloatArray, normal: FloatArray) -> F
 
 
 def blocks_of(points: FloatArray) -> list[FloatArray]:
-    """Divide the points into blocks of a fixed size; the last one is shorter."""
+    """Divide points (n, 3) into blocks of a fixed size, which are processed separately; the last block is shorter."""
     return [points[start : start + _BLOCK] for start in range(0, len(points), _BLOCK)]
 
 
 def scan_order(points: FloatArray) -> NDArray[np.intp] | slice:
-    """Return an index that makes neighbours in space neighbours in memory.
+    """Return an index that sorts points (n, 3) so that neighbours in space are neighbours in memory.
 
-    It is the points' own order (a sensor's rows), or Morton's curve.
+    If the points already are in the order of a sensor's rows, that order is kept; else it is Morton's space-filling curve.
     """
     stride = max(len(points) // _BLOCK, 1)
     steps = np.abs(points[1::stride] - points[:-1:stride]).max(axis=1)
@@ -158,7 +159,20 @@ def _spread_bits(number: NDArray[np.uint32]) -> NDArray[np.uint32]:
 
 
 def checked_cloud(points: FloatArray, name: str) -> FloatArray:
-    """Return points (n, 3) unchanged. Raises InputError if they cannot determine a pose."""
+    """Return points (n, 3) unchanged after checking that they can determine a pose.
+
+    Parameters
+    ----------
+    points : (n, 3) array
+        Points, m.
+    name : str
+        What the points are, for the error message.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than six points, values that are not finite, or points on one line.
+    """
     points = np.ascontiguousarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"expected shape (n, 3), got {points.shape}", where=name)
@@ -171,7 +185,9 @@ def checked_cloud(points: FloatArray, name: str) -> FloatArray:
     if _on_a_line(points[:: max(len(points) // _BLOCK, 1)]) and _on_a_line(
         points
     ):  # the sample alone may be one column of a grid
-        raise InputError("the points lie on one line, which determines no pose", where=name)
+        raise InputError(
+            "the points lie on one line, which determines no pose", where=name, remedy="use points that cover a surface"
+        )
     return points
 
 

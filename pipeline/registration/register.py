@@ -49,14 +49,14 @@ estimated. A wall whose normals vary by less than 1 mrad is a plane.
 
 
 class IcpConfig(Config):
-    """The iterative closest point algorithm: the eight parameters of the thesis (3.6), and the error that is minimised.
+    """Settings of the iterative closest point algorithm (ICP): eight parameters (thesis, 3.6) and the error to minimise.
 
     `threshold` and `delta_threshold` both end the search, whichever is met first. `threshold` applies to the error of the fit.
     Near the minimum this changes with the square of the motion, so it tells when further iterations no longer pay.
-    `delta_threshold` applies to the change of the points' residuals in the last step. This is proportional to the motion, so
-    it tells when the pose is stationary. Neither is checked before the outlier threshold has reached its final value. The
-    error counts outliers at the outlier threshold, because the RMS of the inliers alone stays constant, or rises, when a
-    better pose turns outliers into inliers.
+    `delta_threshold` applies to the change of the points' residuals in the last step. This is proportional to the motion, so it
+    tells when the pose is stationary. Neither is checked before the outlier threshold has reached its final value. The error
+    counts outliers at the outlier threshold, because the RMS of the inliers alone stays constant, or rises, when a better pose
+    turns outliers into inliers.
     """
 
     method: Literal["point_to_plane", "point_to_point"] = Field(
@@ -92,9 +92,10 @@ class IcpConfig(Config):
     subsample_ratio: float = Field(0.9, ge=0, lt=1, description="share of the moving points that subsampling leaves out")
 
     def outlier_threshold_m(self, iteration: int) -> float:
-        """Return the outlier threshold, m, at an iteration counted from 1: T 2^max(k - i, 0).
+        """Return the outlier threshold of an iteration, m: T 2^max(k - i, 0).
 
-        It is infinite without outlier removal.
+        T is `outlier_distance_threshold`, k is `outlier_threshold_decay_iteration`, and i is the number of the iteration, from 1.
+        Without outlier removal the threshold is infinite.
         """
         if not self.remove_outlier:
             return float("inf")
@@ -103,14 +104,12 @@ class IcpConfig(Config):
 
 @dataclass(frozen=True)
 class IcpIteration:
-    """One iteration: the pairs that it found and the step that it took.
+    """One iteration of ICP: the pairs of closest points that it found, and the step that it took.
 
     Attributes
     ----------
-    points : int
-        Moving points in use.
-    inliers : int
-        Those closer to the reference than the outlier threshold.
+    points, inliers : int
+        Number of moving points in use, and of those closer to the reference than the outlier threshold.
     outlier_threshold_m : float
         Outlier threshold of this iteration, m.
     rms_m : float
@@ -123,7 +122,7 @@ class IcpIteration:
     step_m : float
         RMS over all points of the distance that the step moved them, m.
     undetermined : int
-        Number of motions, of six, that were not estimated.
+        How many of the six components of the motion were not estimated, because the surface does not determine them.
     """
 
     points: int
@@ -143,18 +142,16 @@ class IcpIteration:
 
 @dataclass(frozen=True)
 class Registration:
-    """The transform that brings moving points to the reference, x_reference = R x + t, and how it was found.
+    """Result of a registration: the transform x_reference = R x_moving + t, and how it was found.
 
     Attributes
     ----------
     transform : RigidTransform
-        Moving to reference coordinates.
-    converged : bool
-        Whether a threshold was met.
-    reason : str
-        Why the search stopped, in words.
+        Transform from moving to reference coordinates.
+    converged, reason : bool, str
+        Whether a convergence threshold was met, and why the search stopped, in words.
     history : tuple of IcpIteration
-        Every iteration.
+        All iterations in order.
     """
 
     transform: RigidTransform
@@ -164,7 +161,7 @@ class Registration:
 
     @property
     def rotation(self) -> FloatArray:
-        """(3, 3) rotation R."""
+        """(3, 3) rotation matrix R from moving to reference coordinates."""
         return self.transform.rotation
 
     @property
@@ -194,7 +191,10 @@ class Registration:
 
     @property
     def undetermined(self) -> int:
-        """How many of the six motions the surface does not determine: 0 for a rough wall, 3 for a plane with point_to_plane."""
+        """How many of the six components of the motion the surface does not determine.
+
+        It is 0 for a rough wall, and 3 for a plane with point_to_plane.
+        """
         return self.history[-1].undetermined
 
     def apply(self, points: FloatArray) -> FloatArray:
@@ -202,7 +202,7 @@ class Registration:
         return self.transform.apply(points)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the values for JSON."""
+        """Return the transform, the outcome and all iterations for JSON."""
         names = ("rms_m", "iterations", "points", "inliers", "undetermined", "converged", "reason")
         return (
             self.transform.to_dict()
@@ -211,7 +211,7 @@ class Registration:
         )
 
     def summary(self) -> str:
-        """Describe the result on one line, in millimetres."""
+        """Describe the result on one line for the terminal: residuals, inliers and iterations."""
         end = "converged" if self.converged else "not converged"
         return (
             f"{end} after {self.iterations} iterations ({self.reason}), RMS {self.rms_m * 1e3:.2f} mm, "
@@ -220,15 +220,13 @@ class Registration:
 
 
 @dataclass(frozen=True)
-class Fit:
-    """How well points fit a reference.
+class FitQuality:
+    """How well points fit a reference surface without being moved.
 
     Attributes
     ----------
-    points : int
-        Number of points.
-    inliers : int
-        Number of points within the outlier threshold.
+    points, inliers : int
+        Number of points, and of those within the outlier threshold.
     rms_m : float
         RMS of the inliers' residuals, m; NaN if there are none.
     """
@@ -247,18 +245,18 @@ def register(
     *,
     threads: int | None = None,
 ) -> Registration:
-    """Find the rigid transform that brings `moving` to `reference`.
+    """Find the rigid transform that brings a cloud to a reference cloud, by the iterative closest point algorithm (ICP).
 
     Parameters
     ----------
     moving, reference : (n, 3) and (m, 3) arrays
-        Points in the same frame, m, without NaN.
+        Points in the same frame, roughly aligned, m, without NaN.
     reference_normals : (m, 3) array or None
         Normals of any length and sign; may be None for point_to_point.
     config : IcpConfig
         Settings of the algorithm.
     random : KeyedRandom
-        Source of the subsamples.
+        Source of the random subsample.
     threads : int, optional
         Number of threads, by default one per core. It does not affect the result.
 
@@ -274,9 +272,14 @@ def register(
 def register_to(
     surface: ReferenceSurface, moving: FloatArray, config: IcpConfig, random: KeyedRandom, *, threads: int | None = None
 ) -> Registration:
-    """Register points to a reference that is already indexed.
+    """Register a cloud to a reference that is already indexed, which saves time for many registrations to one reference.
 
-    This saves time for many registrations to one reference. Arguments are as in `register`.
+    Parameters
+    ----------
+    surface : ReferenceSurface
+        The reference.
+    moving, config, random, threads
+        As in `register`, which also lists the errors.
     """
     normals = _normals(surface, config)
     moving = checked_cloud(moving, "moving points")
@@ -286,10 +289,19 @@ def register_to(
         return _Alignment(surface, normals, moving, config, pool.map).run(random)
 
 
-def fit(surface: ReferenceSurface, points: FloatArray, config: IcpConfig, *, threads: int | None = None) -> Fit:
-    """Measure how well points (n, 3), m, fit the reference without moving them.
+def measure_fit(surface: ReferenceSurface, points: FloatArray, config: IcpConfig, *, threads: int | None = None) -> FitQuality:
+    """Measure how well points fit a reference surface without moving them.
 
-    Residuals are defined by `config.method`, inliers by its final outlier threshold.
+    Parameters
+    ----------
+    surface : ReferenceSurface
+        The reference.
+    points : (n, 3) array
+        Points in the frame of the reference, m.
+    config : IcpConfig
+        Its `method` defines the residuals, its final outlier threshold the inliers.
+    threads : int, optional
+        Number of threads; it does not affect the result.
     """
     normals = _normals(surface, config)
     local = checked_cloud(points, "points") - surface.origin
@@ -299,7 +311,7 @@ def fit(surface: ReferenceSurface, points: FloatArray, config: IcpConfig, *, thr
         moments = surface.moments(blocks, RigidTransform.identity(), gate, normals, pool.map)
     squares = np.trace(moments[3:6, 3:6]) if normals is None else moments[6, 6]
     inliers = int(moments[-1, -1])
-    return Fit(len(local), inliers, float(np.sqrt(squares / inliers)) if inliers else float("nan"))
+    return FitQuality(len(local), inliers, float(np.sqrt(squares / inliers)) if inliers else float("nan"))
 
 
 def _normals(surface: ReferenceSurface, config: IcpConfig) -> FloatArray | None:
@@ -455,7 +467,9 @@ def _point_step(moments: FloatArray) -> _Step:
     cross = moments[:3, 3:6] / count - np.outer(mean_p, mean_d)
     u, singular, vt = np.linalg.svd(spread + cross)
     if not singular[1] > ON_A_LINE * singular[0]:
-        raise InputError("the pairs left within the outlier threshold lie on one line", where="icp.outlier_distance_threshold")
+        raise InputError(
+            "the points within the outlier threshold lie on one line", where="icp.outlier_distance_threshold", remedy="raise it"
+        )
     rotation = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
     turn = rotation - np.eye(3)
     shift = mean_d - turn @ mean_p

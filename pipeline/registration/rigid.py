@@ -12,7 +12,15 @@ from scene.geometry.mesh import FloatArray
 
 @dataclass(frozen=True)
 class RigidTransform:
-    """x' = R x + t, with a proper rotation R (3, 3) and t (3,), m."""
+    """Rigid transform x' = R x + t of points.
+
+    Attributes
+    ----------
+    rotation : (3, 3) array
+        Proper rotation matrix R.
+    translation : (3,) array
+        Translation t, m.
+    """
 
     rotation: FloatArray
     translation: FloatArray
@@ -24,14 +32,14 @@ class RigidTransform:
 
     @classmethod
     def about(cls, centre: FloatArray, rotation_vector: FloatArray, translation: FloatArray) -> RigidTransform:
-        """Make x' = exp(w) (x - centre) + centre + t.
+        """Return the transform that rotates about a centre and then shifts: x' = exp(w) (x - centre) + centre + t.
 
         Parameters
         ----------
         centre : (3,) array
             Centre of the rotation, m.
         rotation_vector : (3,) array
-            w, rad; the rotation is counter-clockwise seen against its direction (right-handed).
+            w: axis times angle, rad; the rotation is counter-clockwise seen against the axis (right-handed).
         translation : (3,) array
             t, m.
         """
@@ -45,7 +53,7 @@ class RigidTransform:
         return np.stack([row[0] * x + row[1] * y + row[2] * z + shift for row, shift in rows], axis=-1)
 
     def after(self, first: RigidTransform) -> RigidTransform:
-        """Return the transform that applies `first`, then this one."""
+        """Return the transform that applies `first` and then this one."""
         return RigidTransform(self.rotation @ first.rotation, self.rotation @ first.translation + self.translation)
 
     def inverse(self) -> RigidTransform:
@@ -54,7 +62,7 @@ class RigidTransform:
 
     @property
     def rotation_vector(self) -> FloatArray:
-        """(3,) axis times angle, rad, for a rotation by less than pi."""
+        """(3,) rotation axis times angle, rad, for a rotation by less than pi."""
         sine = np.array([self.rotation[i, j] - self.rotation[j, i] for i, j in ((2, 1), (0, 2), (1, 0))]) / 2
         norm = float(np.linalg.norm(sine))
         angle = float(np.arctan2(norm, (np.trace(self.rotation) - 1) / 2))
@@ -70,9 +78,9 @@ class RigidTransform:
 
 
 def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:
-    """Return the matrix exponential (3, 3) of a rotation vector w (3,), rad.
+    """Return the (3, 3) rotation matrix of a rotation vector w (3,): axis times angle, rad.
 
-    Rodrigues: I + sin(a)/a W + (1 - cos(a))/a^2 W^2, with a = |w|.
+    It is Rodrigues' formula I + sin(a)/a W + (1 - cos(a))/a^2 W^2, with a = |w| and W the cross-product matrix of w.
     """
     x, y, z = rotation_vector
     skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

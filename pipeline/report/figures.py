@@ -205,7 +205,7 @@ def blocks_figure(
         if min(difference[part].shape) > 1:
             axes.contour(block[part] == label, levels=[0.5], colors="black", linewidths=0.8)
         side = difference[part].shape[1] * grid.gsd
-        axes.set_title(f"{label}: {captions[label]}, {side:.2g} m wide", fontsize=8)
+        axes.set_title(f"{label}: {captions[label]}, picture {side:.2g} m wide", fontsize=8)
         axes.set(xticks=[], yticks=[])
     for axes in figure.axes[len(shown) :]:
         axes.set_visible(False)

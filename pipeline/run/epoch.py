@@ -22,7 +22,7 @@ from pipeline.run.site import SensorSite
 from scene.blocks.block import Blocks, place_blocks
 from scene.blocks.carve import Carved, block_records, carve
 from scene.common.keyed_random import KeyedRandom
-from scene.geometry.mesh import WALL, FloatArray, TriangleMesh
+from scene.geometry.mesh import WALL, FloatArray, IntArray, TriangleMesh
 from scene.ray_casting.raycast import RayCaster
 from sensors.models.placement import check_in_front
 
@@ -80,6 +80,10 @@ class LaterEpoch:
         Of the difference map.
     m3c2 : M3c2Map, optional
         Distances of the registered surface's vertices, if the config asks for them.
+    since_last : SinceLast, optional
+        Change since the epoch before, in a series.
+    rockfalls : int
+        Number of rockfalls of a series, from which its block labels follow (scene/series/evolution.py); 0 without a series.
     """
 
     number: int
@@ -93,6 +97,38 @@ class LaterEpoch:
     difference: NDArray[np.float32]
     statistics: BlockStatistics
     m3c2: M3c2Map | None = None
+    since_last: SinceLast | None = None
+    rockfalls: int = 0
+
+
+@dataclass(frozen=True)
+class SinceLast:
+    """Change since the epoch before, (h, w): the one before minus this one, m, and the labels of what is new."""
+
+    difference: NDArray[np.float32]
+    block: IntArray
+
+
+@dataclass(frozen=True)
+class EpochScene:
+    """The wall that a later epoch observes.
+
+    Attributes
+    ----------
+    carved : Carved
+        The wall without the blocks.
+    solids : Blocks
+        The blocks.
+    records : list of dict
+        Their records, by label.
+    labels : int
+        Largest label of a missing block.
+    """
+
+    carved: Carved
+    solids: Blocks
+    records: list[dict[str, Any]]
+    labels: int
 
 
 STAGES = {"carve": 4.0, "observe": 3.0, "mesh": 1.0, "register": 4.0, "difference": 2.0, "write": 8.0}
@@ -136,12 +172,43 @@ def observe_epoch(
     progress : Progress
         Is told the stages.
     """
-    keyed = random.child("epoch", number)
     with progress.stage(f"epoch {number}: carve"):
-        blocks = place_blocks(config.rockfall, site.mesh, keyed.child("blocks"), reference.caster)
+        blocks = place_blocks(config.rockfall, site.mesh, random.child("epoch", number, "blocks"), reference.caster)
         carved = carve(site.mesh, blocks)
-        carved = replace(carved, mesh=with_wetness(config, carved.mesh))
         records = block_records(blocks, carved.removed_volume_m3)
+    return observe_scene(config, site, reference, number, EpochScene(carved, blocks, records, len(records)), random, progress)
+
+
+def observe_scene(
+    config: SimulationConfig,
+    site: SensorSite,
+    reference: ReferenceEpoch,
+    number: int,
+    scene: EpochScene,
+    random: KeyedRandom,
+    progress: Progress,
+) -> LaterEpoch:
+    """Observe a wall at a later epoch and compare it with the reference.
+
+    Parameters
+    ----------
+    config : SimulationConfig
+        Config of the run.
+    site : SensorSite
+        The sensor.
+    reference : ReferenceEpoch
+        The reference epoch.
+    number : int
+        Number of the epoch, from 1.
+    scene : EpochScene
+        The wall, and what is missing from it.
+    random : KeyedRandom
+        The run's source of random numbers.
+    progress : Progress
+        Is told the stages.
+    """
+    keyed, blocks, records = random.child("epoch", number), scene.solids, scene.records
+    carved = replace(scene.carved, mesh=with_wetness(config, scene.carved.mesh))
     with progress.stage(f"epoch {number}: observe"):
         after = RayCaster(carved.mesh)
         seen = acquire(config, site, after, keyed.child("observe"))
@@ -158,14 +225,14 @@ def observe_epoch(
         raster = replace(raster, block=after.labels_down(raster.grid, shift))
         change = difference(reference.raster, raster)
         lost = true_change(reference.caster, after, raster.block, raster.grid, shift)
-        measured = measure_blocks(change, raster, signal_to_noise(change, raster.block, lost, len(records)))
+        measured = measure_blocks(change, raster, signal_to_noise(change, raster.block, lost, scene.labels))
         statistics = block_statistics(change, raster.block)
         clouds = None
         if config.m3c2 is not None:
             clouds = m3c2(reference.surface.vertices, registered.vertices, reference.raster, raster.block, config.m3c2)
     found = [
-        {**record, "world_position_m": to_world(site, record["position_m"]), **values}
-        for record, values in zip(records, measured, strict=True)
+        {**record, "world_position_m": to_world(site, record["position_m"]), **measured[record["label"] - 1]}
+        for record in records
     ]
     return LaterEpoch(number, seen, carved, blocks, found, surface, registration, raster, change, statistics, clouds)
 
@@ -191,7 +258,7 @@ def measure_blocks(change: NDArray[np.float32], raster: SurfaceRaster, ratio: Fl
     """
     count = len(ratio)
     seen = (raster.block != WALL) & ~np.isnan(change)
-    label, depth = raster.block[seen], change[seen].astype(np.float64)
+    label, depth = np.minimum(raster.block[seen], count + 1), change[seen].astype(np.float64)
     pixels = np.bincount(label, minlength=count + 1)[1 : count + 1]
     total = np.bincount(label, depth, minlength=count + 1)[1 : count + 1]
     area = raster.grid.gsd**2

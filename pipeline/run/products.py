@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.change.annotate import LabelledImage, coco
+from pipeline.change.annotate import LabelledImage, by_kind, coco
 from pipeline.change.difference import statistics
 from pipeline.change.m3c2 import M3c2Map
 from pipeline.change.tiles import tiles
@@ -30,7 +30,7 @@ from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points.copc import SUFFIX as COPC
 from pipeline.formats.points.copc import write_copc
 from pipeline.formats.points.e57 import E57Scan, write_e57
-from pipeline.formats.points.laz import LazHeader, PulseChannels, write_laz
+from pipeline.formats.points.laz import LazHeader, PulseChannels, gps_seconds, write_laz
 from pipeline.formats.points.pcd import write_pcd
 from pipeline.formats.points.xyz import write_xyz
 from pipeline.formats.rasters.geotiff import write_geotiff, write_tiff
@@ -47,7 +47,7 @@ from pipeline.report.map_styles import difference_style, quantity_style
 from pipeline.report.page import litres
 from pipeline.run.acquisition import Acquisition
 from pipeline.run.epoch import LaterEpoch, ReferenceEpoch
-from pipeline.run.recorded_points import recorded_points, scans_of
+from pipeline.run.recorded_points import at_time, recorded_points, scans_of
 from pipeline.run.site import SensorSite
 from pipeline.surface.metashape_export import write_metashape_export
 from scene.blocks.block import Blocks
@@ -57,10 +57,13 @@ from scene.walls.imported import ImportedWall
 
 EPOCH_RECORD = "epoch.json"
 """File in an epoch's folder that holds its record."""
+_HEADER = LazHeader()
 Checksums = dict[str, str]
 """SHA-256 of files by their names relative to the run's folder."""
 M3C2_ANNOTATIONS = "annotations_m3c2"
 """Key in an epoch's record, and the name of the run's file."""
+CHANGE_ANNOTATIONS = "annotations_change"
+"""The same for the maps of the change since the epoch before, in a series."""
 
 
 def is_whole(out: Path, checksums: Checksums, where: Path) -> bool:
@@ -77,13 +80,14 @@ def write_reference(
 ) -> Checksums:
     """Write epoch_000, with what the sensor recorded (`seen`), and the hillshade of the reference."""
     with noting() as written, _folder(out, 0) as folder:
-        _write_common(folder, config, site, seen, reference.surface, reference.caster.mesh, [])
+        _write_common(folder, config, site, 0, seen, reference.surface, reference.caster.mesh, [])
         write_bytes(out / "reference.png", hillshade_figure(reference.raster.heights, reference.raster.grid, "Reference"))
         record = {
             "epoch": 0,
             **_seen_record(seen),
             "blocks": [],
-            "annotations": coco([], config.annotation),
+            **_time(config, 0),
+            "annotations": _annotations(config, [], 1 if config.series else 0),
         }
         write_json(folder / EPOCH_RECORD, record)
     return _checksums(out, written)
@@ -94,7 +98,7 @@ def write_epoch(out: Path, config: SimulationConfig, site: SensorSite, reference
     name = f"difference_{epoch.number:03d}"
     grid = reference.raster.grid
     with noting() as written, _folder(out, epoch.number) as folder:
-        _write_common(folder, config, site, epoch.seen, epoch.surface, epoch.carved.mesh, epoch.blocks)
+        _write_common(folder, config, site, epoch.number, epoch.seen, epoch.surface, epoch.carved.mesh, epoch.blocks)
         write_geotiff(
             out / f"{name}.tif", epoch.difference, grid, description="reference minus epoch, m; missing rock is positive"
         )
@@ -102,6 +106,9 @@ def write_epoch(out: Path, config: SimulationConfig, site: SensorSite, reference
             _write_block_meshes(folder / "blocks", site.mesh, epoch.solids)
         if epoch.m3c2 is not None:
             _write_m3c2(out, epoch.number, epoch.m3c2)
+        if epoch.since_last is not None:
+            path, words = out / f"change_{epoch.number:03d}.tif", "epoch before minus epoch, m; missing rock is positive"
+            write_geotiff(path, epoch.since_last.difference, grid, description=words)
         images = list(_images(out, config, epoch, reference, name))
         sigma = max(epoch.statistics.outside.nmad, 1e-4) if epoch.statistics.outside.count else 1e-3
         difference_style(out / f"{name}.tif", SCALE_SIGMAS * sigma)
@@ -142,9 +149,33 @@ def _record(config: SimulationConfig, epoch: LaterEpoch, images: list[LabelledIm
             "sigma_m": sigma,
         },
         "blocks": epoch.blocks,
-        "annotations": coco(images, config.annotation),
+        **_time(config, epoch.number),
+        "annotations": _annotations(config, images, epoch.rockfalls),
+        **_change_record(config, epoch),
         **({} if epoch.m3c2 is None else _m3c2_record(config, epoch.number, epoch.m3c2)),
     }
+
+
+def _annotations(config: SimulationConfig, images: list[LabelledImage], rockfalls: int) -> dict[str, Any]:
+    """Annotate images. In a series, only missing rock is annotated, or all kinds, each as a category of its own."""
+    if config.series is not None and not config.series.kinds and rockfalls:
+        images = [replace(each, block=np.where(each.block <= rockfalls, each.block, WALL).astype(np.int32)) for each in images]
+    found = coco(images, config.annotation)
+    return by_kind(found, rockfalls) if config.series is not None and config.series.kinds and rockfalls else found
+
+
+def _change_record(config: SimulationConfig, epoch: LaterEpoch) -> dict[str, Any]:
+    """Make the part of an epoch's record about the change since the epoch before."""
+    if epoch.since_last is None:
+        return {}
+    labels = np.where(np.isnan(epoch.since_last.difference), WALL, epoch.since_last.block).astype(np.int32)
+    image = LabelledImage(f"change_{epoch.number:03d}.tif", labels, epoch.raster.grid, epoch.number)
+    return {CHANGE_ANNOTATIONS: _annotations(config, [image], epoch.rockfalls)}
+
+
+def _time(config: SimulationConfig, number: int) -> dict[str, str]:
+    """Return the time of an epoch of a series for its record."""
+    return {} if config.series is None else {"time": config.series.when(number).isoformat().replace("+00:00", "Z")}
 
 
 def _m3c2_record(config: SimulationConfig, number: int, found: M3c2Map) -> dict[str, Any]:
@@ -193,6 +224,7 @@ def _write_common(
     folder: Path,
     config: SimulationConfig,
     site: SensorSite,
+    number: int,
     seen: Acquisition,
     surface: TriangleMesh,
     truth: TriangleMesh,
@@ -200,9 +232,12 @@ def _write_common(
 ) -> None:
     """Write what every epoch has: points, depth map, surface, truth, blocks."""
     products = config.products
-    cloud = recorded_points(seen.observations)
-    write_cloud(folder / "points.laz", cloud)
-    _write_formats(folder / "points", products.formats, cloud, partial(scans_of, seen.observations), "")
+    cloud, header = recorded_points(seen.observations), LazHeader()
+    if config.series is not None:
+        cloud = at_time(cloud, gps_seconds(config.series.when(number)))
+        header = LazHeader(date=config.series.when(number).date(), standard_time=True)
+    write_cloud(folder / "points.laz", cloud, header)
+    _write_formats(folder / "points", products.formats, cloud, partial(scans_of, seen.observations), header)
     if seen.observation.sensor == "stereo":
         depth = seen.observation.depth.astype(np.float32)
         write_tiff(folder / "depth_left.tif", depth, description="depth along the left camera's axis, m")
@@ -213,19 +248,21 @@ def _write_common(
     write_json(folder / "blocks.json", blocks)
     if products.world or (products.world is None and isinstance(config.wall, ImportedWall)):
         cloud = replace(cloud, points=site.frame.to_world(cloud.points))
-        wkt = wkt_of(products.crs, "products.crs") if products.crs else ""
-        write_cloud(folder / "points_world.laz", cloud, wkt)
-        _write_formats(folder / "points_world", products.formats, cloud, partial(scans_of, seen.observations, site.frame), wkt)
+        header = replace(header, wkt=wkt_of(products.crs, "products.crs") if products.crs else "")
+        write_cloud(folder / "points_world.laz", cloud, header)
+        _write_formats(folder / "points_world", products.formats, cloud, partial(scans_of, seen.observations, site.frame), header)
         if products.surface:
             write_ply(folder / "surface_world.ply", _in_world(surface, site))
     if products.metashape and seen.depth_maps is not None:
         write_metashape_export(folder / "metashape", *seen.depth_maps)
 
 
-def _write_formats(stem: Path, formats: Sequence[str], cloud: PointCloud, scans: Callable[[], list[E57Scan]], wkt: str) -> None:
+def _write_formats(
+    stem: Path, formats: Sequence[str], cloud: PointCloud, scans: Callable[[], list[E57Scan]], header: LazHeader
+) -> None:
     """Write points in the formats besides LAZ, all with the same stem."""
     if "copc" in formats:
-        write_cloud(stem.with_suffix(COPC), cloud, wkt)
+        write_cloud(stem.with_suffix(COPC), cloud, header)
     if "ply" in formats:
         write_ply_points(stem.with_suffix(".ply"), cloud)
     if "xyz" in formats:
@@ -236,17 +273,17 @@ def _write_formats(stem: Path, formats: Sequence[str], cloud: PointCloud, scans:
         write_e57(stem.with_suffix(".e57"), scans())
 
 
-def write_cloud(path: Path, cloud: PointCloud, wkt: str = "") -> None:
+def write_cloud(path: Path, cloud: PointCloud, header: LazHeader = _HEADER) -> None:
     """Write a point cloud as LAZ, or as COPC if `path` ends in .copc.laz.
 
     Channels with a field of their own in the format go there.
 
-    wkt: coordinate system of the points. Raises InputError as `write_laz` and `write_copc` do.
+    header: coordinate system and time. Raises InputError as `write_laz` and `write_copc` do.
     """
     extra = dict(cloud.extra)
     pulses = PulseChannels(*(extra.pop(name, None) for name in ("return_number", "number_of_returns", "scan_angle_rad")))
     write = write_copc if path.name.lower().endswith(COPC) else write_laz
-    write(path, replace(cloud, extra=extra), pulses, LazHeader(wkt=wkt))
+    write(path, replace(cloud, extra=extra), pulses, header)
 
 
 def _write_block_meshes(folder: Path, wall: TriangleMesh, blocks: Blocks) -> None:

@@ -36,6 +36,12 @@ def recorded_points(observations: Sequence[Observation]) -> PointCloud:
     )
 
 
+def at_time(cloud: PointCloud, start_s: float) -> PointCloud:
+    """Return a cloud whose times begin at `start_s`, s; those of a sensor that records everything at once are equal."""
+    time = np.zeros(len(cloud.points)) if cloud.gps_time is None else cloud.gps_time
+    return replace(cloud, gps_time=start_s + time)
+
+
 def scans_of(observations: Sequence[Observation], frame: WallFrame | None = None) -> list[E57Scan]:
     """Convert each observation to an E57 scan, with its grid as `row` and `column`.
 

@@ -13,6 +13,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pipeline.change.annotate import merge
 from pipeline.config.simulation import CamerasFile, SensorName, SimulationConfig
 from pipeline.formats.cameras.crs import wkt_of
@@ -24,8 +27,9 @@ from pipeline.formats.records.result_records import RUN_FILE, read_run
 from pipeline.formats.records.run_files import epoch_folder
 from pipeline.report.progress import Progress
 from pipeline.report.provenance import versions
-from pipeline.run.epoch import STAGES, observe_epoch, observe_reference
+from pipeline.run.epoch import STAGES, ReferenceEpoch, observe_epoch, observe_reference
 from pipeline.run.products import (
+    CHANGE_ANNOTATIONS,
     EPOCH_RECORD,
     M3C2_ANNOTATIONS,
     Checksums,
@@ -34,6 +38,7 @@ from pipeline.run.products import (
     write_reference,
 )
 from pipeline.run.report import write_run_report
+from pipeline.run.series import SERIES_FILE, Series, SeriesScene, SeriesTruth, observe_series_epoch
 from pipeline.run.site import SensorSite, prepare_site
 from scene.common.backend import VARIANT
 from scene.common.errors import InputError
@@ -69,6 +74,8 @@ class _Run:
         Checksums by epoch folder, as in run.json.
     site : SensorSite, optional
         Wall and sensor, once they are set up.
+    truth : SeriesTruth, optional
+        Truth of a series, as far as it has been followed.
     """
 
     out: Path
@@ -76,6 +83,7 @@ class _Run:
     progress: Progress
     products: dict[str, Checksums] = field(default_factory=dict)
     site: SensorSite | None = None
+    truth: SeriesTruth | None = None
 
     def has(self, number: int) -> bool:
         """Return whether an epoch is finished."""
@@ -143,11 +151,15 @@ def _make_epochs(run: _Run, config: SimulationConfig, sensor: SensorName) -> Sen
     out, progress, random = run.out, run.progress, KeyedRandom(config.seed)
     with progress.stage("wall"):
         site = run.site = prepare_site(config, sensor, random)
-    reference = observe_reference(config, site, random, progress)
+        series = None if config.series is None else Series.of(config, config.series, site, random)
+    reference = observe_reference(config, site if series is None else series.site_at(0), random, progress)
     if reference.seen is not None and not run.has(0):
         with progress.stage("epoch 0: write"):
             run.note(0, write_reference(out, config, site, reference, reference.seen))
     reference = replace(reference, seen=None)
+    if series is not None:
+        _make_series(run, series, reference)
+        return site
     for number in range(1, config.epochs + 1):
         if not run.has(number):
             epoch = observe_epoch(config, site, reference, number, random, progress)
@@ -156,10 +168,36 @@ def _make_epochs(run: _Run, config: SimulationConfig, sensor: SensorName) -> Sen
     return site
 
 
+def _make_series(run: _Run, series: Series, reference: ReferenceEpoch) -> None:
+    """Make the missing epochs of a series.
+
+    The wall is followed through all epochs. Of a finished epoch only the registered heights may be needed again, for the change
+    to the next one.
+    """
+    progress = run.progress
+    truth = run.truth = SeriesTruth(series)
+    last: SeriesScene | None = None
+    before: NDArray[np.float32] | None = reference.raster.heights
+    scenes = series.scenes()
+    for number in range(1, series.series.count):
+        with progress.stage(f"epoch {number}: carve"):
+            scene = next(scenes)
+        truth.add(scene)
+        if run.has(number):
+            last, before = scene, None
+            continue
+        if before is None and last is not None:
+            before = observe_series_epoch(series, reference, last, None, progress).raster.heights
+        epoch = observe_series_epoch(series, reference, scene, before, progress)
+        with progress.stage(f"epoch {number}: write"):
+            run.note(number, write_epoch(run.out, series.config, series.site, reference, epoch))
+        last, before = scene, epoch.raster.heights
+
+
 def _plan(config: SimulationConfig) -> dict[str, float]:
     """Return the stages of the run and their weights."""
     stages = {f"epoch 0: {name}": STAGES[name] for name in ("observe", "mesh", "difference", "write")}
-    stages |= {f"epoch {number}: {name}": weight for number in range(1, config.epochs + 1) for name, weight in STAGES.items()}
+    stages |= {f"epoch {number}: {name}": weight for number in range(1, config.last_epoch + 1) for name, weight in STAGES.items()}
     return {"wall": 3.0, **stages, "report": 1.0}
 
 
@@ -169,6 +207,7 @@ def _inputs(config: SimulationConfig) -> dict[str, str]:
     Missing files are left out; reading them raises the error.
     """
     named = [*config.wall.files] if isinstance(config.wall, ImportedWall) else []
+    named += [] if config.series is None else [*config.series.surfaces]
     named += [config.cameras.file] if isinstance(config.cameras, CamerasFile) else []
     files = [file for path in named for file in (sorted(path.glob("*.txt")) if path.is_dir() else [path]) if file.is_file()]
     return {str(path): sha256(path) for path in files}
@@ -242,9 +281,12 @@ def _finish(run: _Run, site: SensorSite, *, complete: bool) -> RunSummary:
     report = write_run_report(out, identity, site, records, complete=complete)
     annotations = [record.pop("annotations") for record in records]
     write_json(out / "annotations.json", merge(annotations))
-    if any(M3C2_ANNOTATIONS in record for record in records):
-        beside = [record.pop(M3C2_ANNOTATIONS) for record in records if M3C2_ANNOTATIONS in record]
-        write_json(out / f"{M3C2_ANNOTATIONS}.json", merge(beside))
+    for name in (M3C2_ANNOTATIONS, CHANGE_ANNOTATIONS):
+        beside = [record.pop(name) for record in records if name in record]
+        if beside:
+            write_json(out / f"{name}.json", merge(beside))
+    if run.truth is not None:
+        write_json(out / SERIES_FILE, run.truth.to_dict())
     record = {
         **identity,
         "complete": complete,

@@ -73,7 +73,7 @@ class RockfallConfig(Config):
     maximum_attempts: int = Field(2000, ge=1, description="positions tried for a block before giving up")
 
 
-_HEIGHTS = {"relief": highest_under, "highest_vertex": highest_vertex_under, "mean_surface": median_under}
+HEIGHTS = {"relief": highest_under, "highest_vertex": highest_vertex_under, "mean_surface": median_under}
 """Function that returns the wall's height within contours, for each kind of placement."""
 
 
@@ -134,7 +134,7 @@ class Blocks:
 
 
 @dataclass(frozen=True)
-class _Solid:
+class BlockShape:
     """A block around the origin, before placement. The middle of its z range is 0."""
 
     shape: str
@@ -175,11 +175,11 @@ def place_blocks(config: RockfallConfig, mesh: TriangleMesh, random: KeyedRandom
     """
     caster = caster or RayCaster(mesh)
     with np.errstate(over="ignore", invalid="ignore"):  # implausible sizes are reported by _require_fit
-        solids = [_draw_block(config, random.child("block", index)) for index in range(config.count)]
+        solids = [draw_shape(config, random.child("block", index)) for index in range(config.count)]
     _require_fit(solids, mesh)
     zone = safe_zone(caster, config.safe_zone_offset_m)
     search = _PositionSearch(config, zone, solids, random)
-    surface_under = _HEIGHTS[config.placement]
+    surface_under = HEIGHTS[config.placement]
     position = np.zeros((len(solids), 3))
     area = np.array([np.ptp(solid.bbox[:, :2], axis=0).prod() for solid in solids])
     _require_room(area, zone)
@@ -189,9 +189,9 @@ def place_blocks(config: RockfallConfig, mesh: TriangleMesh, random: KeyedRandom
             position[index, :2] = search.place(int(index))
         outlines = [solids[index].vertices[:, :2] + position[index, :2] for index in pending]
         position[pending, 2] = surface_under(caster, outlines)
-        pending = pending[~_reach_rock([solids[index] for index in pending], position[pending], caster)]
+        pending = pending[~reach_rock([solids[index] for index in pending], position[pending], caster)]
         search.release(pending)
-    return _packed(solids, position)
+    return pack_blocks(solids, position)
 
 
 def make_regular_blocks(
@@ -214,10 +214,10 @@ def make_regular_blocks(
 
     unit, faces = _primitive(shape, subdivisions)
     found = [
-        _Solid(shape, size, Rotation.from_euler("xyz", turn).apply(unit * size), faces)
+        BlockShape(shape, size, Rotation.from_euler("xyz", turn).apply(unit * size), faces)
         for size, turn in zip(size_m, rotation_rad, strict=True)
     ]
-    return _packed(found, position_m)
+    return pack_blocks(found, position_m)
 
 
 class _PositionSearch:
@@ -229,7 +229,7 @@ class _PositionSearch:
         Range in x and y, m, of the blocks that are placed so far; NaN for the others.
     """
 
-    def __init__(self, config: RockfallConfig, zone: SafeZone, solids: Sequence[_Solid], random: KeyedRandom) -> None:
+    def __init__(self, config: RockfallConfig, zone: SafeZone, solids: Sequence[BlockShape], random: KeyedRandom) -> None:
         self._config, self._zone, self._solids = config, zone, solids
         self._generators = [random.child("block", index, "position").generator() for index in range(len(solids))]
         self._attempts = np.zeros(len(solids), dtype=int)
@@ -283,7 +283,7 @@ def _require_room(area: FloatArray, zone: SafeZone) -> None:
         )
 
 
-def _draw_block(config: RockfallConfig, random: KeyedRandom) -> _Solid:
+def draw_shape(config: RockfallConfig, random: KeyedRandom) -> BlockShape:
     """Draw a block at random: scale a primitive along its axes, rotate it and roughen its surface.
 
     The primitive has unit size. Roughness is a radial offset of each vertex.
@@ -300,7 +300,7 @@ def _draw_block(config: RockfallConfig, random: KeyedRandom) -> _Solid:
     factor = np.clip(1 + config.irregularity.sample(generator, len(vertices)), *_RADIAL_LIMITS)
     vertices = vertices * factor[:, None]
     vertices[:, 2] -= (vertices[:, 2].max() + vertices[:, 2].min()) / 2
-    return _Solid(shape, size, vertices, faces)
+    return BlockShape(shape, size, vertices, faces)
 
 
 def _draw_per_axis(distributions: AxisDistributions, generator: np.random.Generator) -> FloatArray:
@@ -337,7 +337,7 @@ def _cube(segments: int) -> tuple[FloatArray, IntArray]:
     return corners / segments - 0.5, faces
 
 
-def _require_fit(solids: Sequence[_Solid], mesh: TriangleMesh) -> None:
+def _require_fit(solids: Sequence[BlockShape], mesh: TriangleMesh) -> None:
     """Raise InputError if a block's bounding box is larger than the wall's."""
     wall = np.ptp(mesh.bounds[:, :2], axis=0)
     extents = np.array([np.ptp(solid.bbox[:, :2], axis=0) for solid in solids])
@@ -352,7 +352,7 @@ def _require_fit(solids: Sequence[_Solid], mesh: TriangleMesh) -> None:
         )
 
 
-def _reach_rock(solids: Sequence[_Solid], position: FloatArray, caster: RayCaster) -> NDArray[np.bool_]:
+def reach_rock(solids: Sequence[BlockShape], position: FloatArray, caster: RayCaster) -> NDArray[np.bool_]:
     """Return whether each block (k,), at its position, has a vertex at least the required depth below the surface."""
     counts = np.array([len(solid.vertices) for solid in solids])
     points = np.concatenate([solid.vertices for solid in solids]) + np.repeat(position, counts, axis=0)
@@ -365,7 +365,7 @@ def _reach_rock(solids: Sequence[_Solid], position: FloatArray, caster: RayCaste
     return deepest >= _LEAST_DEPTH * height
 
 
-def _packed(solids: Sequence[_Solid], position: FloatArray) -> Blocks:
+def pack_blocks(solids: Sequence[BlockShape], position: FloatArray) -> Blocks:
     """Store solids, moved to their positions, one after the other."""
     vertex_start = _starts([len(solid.vertices) for solid in solids])
     face_start = _starts([len(solid.faces) for solid in solids])

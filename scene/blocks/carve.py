@@ -77,6 +77,8 @@ class _Surface:
 
     Attributes
     ----------
+    label : (m,) array
+        Block label of each face: up to `earlier` those of the wall before this carving, above it those of the new niches.
     origin : (n,) array
         Index of the wall's vertex that each vertex comes from; -1 for a new one.
     """
@@ -86,19 +88,28 @@ class _Surface:
     label: IntArray
     origin: IntArray
     albedo: NDArray[np.float32] | None
+    earlier: int = WALL
+
+    @property
+    def is_niche(self) -> NDArray[np.bool_]:
+        """(m,) whether a face belongs to a new niche."""
+        return np.asarray(self.label > self.earlier)
 
 
-def carve(mesh: TriangleMesh, blocks: Blocks, fresh_albedo: float = FRESH_ALBEDO) -> Carved:
+def carve(mesh: TriangleMesh, blocks: Blocks, fresh_albedo: float = FRESH_ALBEDO, first_label: int | None = None) -> Carved:
     """Carve all blocks out of a wall, open or closed. An open wall keeps its boundary loops.
 
     Parameters
     ----------
     mesh : TriangleMesh
-        The wall, wall frame. Block labels from an earlier carving count as wall.
+        The wall, wall frame.
     blocks : Blocks
         Disjoint blocks.
     fresh_albedo : float
         Albedo of the niches, if the wall has an albedo.
+    first_label : int, optional
+        Label of the first block; the others follow. Smaller labels from earlier carvings are then kept. None: labels from 1
+        on, and earlier labels become WALL.
 
     Raises
     ------
@@ -108,9 +119,10 @@ def carve(mesh: TriangleMesh, blocks: Blocks, fresh_albedo: float = FRESH_ALBEDO
     rows = faces_under_boxes(mesh, blocks.bbox, _HALO_M)
     wall, corners = close_patch(mesh, rows, float(blocks.bbox[:, 0, 2].min()))
     removed, left = split_wall(wall, solid_of(blocks.vertices, blocks.faces, "blocks"))
-    surface, gain = _without_slivers(_surface(mesh, rows, corners, left, blocks, fresh_albedo))
-    volumes = _removed_volumes(removed, blocks) - gain[1:]
-    carved = _put_back(mesh, rows, surface)
+    kept = mesh if first_label is not None else replace(mesh, vertex_block=None, face_block=None)
+    surface, gain = _without_slivers(_surface(kept, rows, corners, left, blocks, fresh_albedo, (first_label or 1) - 1))
+    volumes = _removed_volumes(removed, blocks) - gain[surface.earlier + 1 :]
+    carved = _put_back(kept, rows, surface)
     low = float(mesh.vertices[:, 2].min())
     before = _volume(mesh.vertices, mesh.faces, low)
     return Carved(carved, volumes, before, before - _volume(carved.vertices, carved.faces, low) - float(volumes.sum()))
@@ -192,17 +204,25 @@ def _containing(blocks: Blocks, removed: Piece, component: IntArray, wanted: NDA
 
 
 def _surface(
-    mesh: TriangleMesh, rows: IntArray, corners: FloatArray, left: Piece, blocks: Blocks, fresh_albedo: float
+    mesh: TriangleMesh,
+    rows: IntArray,
+    corners: FloatArray,
+    left: Piece,
+    blocks: Blocks,
+    fresh_albedo: float,
+    earlier: int,
 ) -> _Surface:
     """Collect the remaining patches and the niches, and find the wall's vertices by their source faces.
 
-    The closure at the back of the patch is left out.
+    The closure at the back of the patch is left out. Arguments as in `carve`; `earlier` is the largest label before it.
     """
     is_wall = left.first & (left.source < len(rows))
     chosen = is_wall | ~left.first
     faces, source, is_wall = left.faces[chosen], left.source[chosen], is_wall[chosen]
     label = np.full(len(faces), WALL, dtype=np.int32)
-    label[~is_wall] = blocks.face_label[source[~is_wall]]
+    label[~is_wall] = earlier + blocks.face_label[source[~is_wall]]
+    if mesh.face_block is not None:
+        label[is_wall] = mesh.face_block[rows[source[is_wall]]]
     wall_faces, source = faces[is_wall], source[is_wall]
     position = left.vertices[wall_faces]
     origin = np.full(len(left.vertices), -1, dtype=np.int32)
@@ -210,12 +230,12 @@ def _surface(
         face, corner = np.nonzero(np.all(position == corners[source, None, number], axis=2))
         origin[wall_faces[face, corner]] = mesh.faces[rows[source[face]], number]
     if mesh.vertex_albedo is None:
-        return _Surface(left.vertices, faces, label, origin, None)
+        return _Surface(left.vertices, faces, label, origin, None, earlier)
     albedo = np.full(len(origin), fresh_albedo, dtype=np.float32)
     face, corner = np.nonzero(origin[wall_faces] < 0)
     weights = _barycentric(corners[source[face]], position[face, corner])
     albedo[wall_faces[face, corner]] = np.einsum("ni,ni->n", weights, mesh.vertex_albedo[mesh.faces[rows[source[face]]]])
-    return _Surface(left.vertices, faces, label, origin, albedo)
+    return _Surface(left.vertices, faces, label, origin, albedo, earlier)
 
 
 def _barycentric(corners: FloatArray, points: FloatArray) -> FloatArray:
@@ -243,7 +263,7 @@ def _without_slivers(surface: _Surface) -> tuple[_Surface, FloatArray]:
 def _used(surface: _Surface, is_wall: bool) -> NDArray[np.bool_]:
     """Return which vertices (n,) belong to wall faces, or to niche faces."""
     used = np.zeros(len(surface.vertices), dtype=bool)
-    used[surface.faces[(surface.label == WALL) == is_wall].ravel()] = True
+    used[surface.faces[surface.is_niche != is_wall].ravel()] = True
     return used
 
 
@@ -257,11 +277,15 @@ def _put_back(mesh: TriangleMesh, rows: IntArray, surface: _Surface) -> Triangle
     number[new] = len(mesh.vertices) + np.arange(len(new), dtype=np.int32)
     faces = np.concatenate([mesh.faces[untouched], number[surface.faces]])
     face_block = np.full(len(faces), WALL, dtype=np.int32)
+    if mesh.face_block is not None:
+        face_block[: len(faces) - len(surface.faces)] = mesh.face_block[untouched]
     face_block[len(faces) - len(surface.faces) :] = surface.label
     vertex_block = np.full(len(mesh.vertices) + len(new), WALL, dtype=np.int32)
-    niche = surface.label != WALL
+    if mesh.vertex_block is not None:
+        vertex_block[: len(mesh.vertices)] = mesh.vertex_block
+    niche = surface.is_niche
     vertex_block[number[surface.faces[niche]]] = surface.label[niche, None]
-    vertex_block[number[on_wall]] = WALL  # the rims
+    vertex_block[number[on_wall & on_niche]] = WALL  # the rims
     vertices, albedo = np.concatenate([mesh.vertices, surface.vertices[new]]), None
     if surface.albedo is not None and mesh.vertex_albedo is not None:
         albedo = np.concatenate([mesh.vertex_albedo, surface.albedo[new]])

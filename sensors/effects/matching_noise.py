@@ -42,4 +42,4 @@ class NodeNoise(MatchingNoise):
     """Grid-correlated noise: random numbers on the nodes of a grid, interpolated between them."""
 
     shared = True
-    step_px: float = parameter("distance of the nodes", unit="px", source="empirical", null=None, default=32.0, gt=0)
+    step_px: float = parameter("distance between nodes", unit="px", source="empirical", null=None, default=32.0, gt=0)

@@ -13,7 +13,7 @@ from sensors.signal_chain.pulses import PulseGeometry, slant
 class RangeIncidenceBias(RangeEffect):
     """The range error grows with the incidence angle, because the stretched echo of an inclined surface is timed late or early.
 
-    dR = k (1 / cos i - 1) (TLS against laser tracker).
+    dR = k (1 / cos i - 1) (from comparisons of scanners with laser trackers).
     """
 
     name: Literal["range_incidence_bias"] = "range_incidence_bias"

@@ -19,8 +19,9 @@ from sensors.signal_chain.node_grid import node_semivariogram, smooth_field
 class RegularizationNoise(NodeNoise):
     """Neighbouring disparities share errors: Gaussian values on the nodes of a grid over the image, interpolated bilinearly.
 
-    dd(u, v) = sum_ij w_ij(u, v) g_ij, g_ij ~ N(0, sigma), with nodes at multiples of the step (thesis 3.4). The variance is
-    sigma^2 / 4 midway between nodes, and 4 sigma^2 / 9 on average over the image.
+    dd(u, v) = sum_ij w_ij(u, v) g_ij, with g_ij ~ N(0, sigma) at node (i, j), bilinear weights w_ij, and column u and row v of
+    the pixel. Nodes lie at multiples of the step. The variance is sigma^2 / 4 midway between nodes, and 4 sigma^2 / 9 on
+    average over the image.
     """
 
     name: Literal["regularization_noise"] = "regularization_noise"

@@ -13,9 +13,10 @@ from sensors.signal_chain.pulses import PulseGeometry
 class TiltDrift(AimEffect):
     """The scanner tilts during the scan, so that directions are rotated by angles that grow from 0 to the given rates.
 
-    With w = s (rate_x, rate_y, 0), s the elapsed share of the scan's duration, and right-handed rotations about the scanner's
-    axes: recorded - true = w x u, that is daz = -cot z (w_x cos az + w_y sin az) and dz = w_y cos az - w_x sin az. The scanner
-    itself then tilts by -w. First order in the angles: 60 arcsec leave an error below 0.01 mm at 100 m.
+    w = s (rate_x, rate_y, 0) is the rotation vector, with s the elapsed share of the scan's duration. The rotations are
+    right-handed about the scanner's axes. A direction u is recorded as u + w x u, that is
+    daz = -cot z (w_x cos az + w_y sin az) and dz = w_y cos az - w_x sin az. The scanner itself tilts by -w. The equations are
+    of first order in the angles: for a tilt of 60 arcsec their error is below 0.01 mm at 100 m.
     """
 
     name: Literal["tilt_drift"] = "tilt_drift"

@@ -144,6 +144,10 @@ class LaserScanner:
         Whether to keep error-free channels.
     pose_sigma : PoseSigma
         Standard deviations of the surveyed pose.
+    shift_m : (3,) array, optional
+        Real minus surveyed position, wall frame, m, before `pose_sigma`; None: none.
+    turn : (3, 3) array, optional
+        Rotation of the real against the surveyed pose, in the wall frame; None: none.
     """
 
     position: FloatArray
@@ -153,6 +157,8 @@ class LaserScanner:
     model: TlsModel
     truth: bool = False
     pose_sigma: PoseSigma = EXACT_POSE
+    shift_m: FloatArray | None = None
+    turn: FloatArray | None = None
 
     @classmethod
     def aimed(
@@ -205,9 +211,11 @@ class LaserScanner:
     def observe(self, scene: RayCaster, random: KeyedRandom) -> Observation:
         """Scan the scene once. Rows are scan lines (azimuth), columns the pulses of a line (zenith).
 
-        Points are computed with the surveyed pose; pulses leave from the real one, which is drawn with `pose_sigma`.
+        Points are computed with the surveyed pose; pulses leave from the real one: shifted, turned, and drawn with `pose_sigma`.
         """
-        position, rotation = self.pose_sigma.displaced(self.position, self.rotation, random.child("pose"))
+        moved = self.position if self.shift_m is None else self.position + self.shift_m
+        rotated = self.rotation if self.turn is None else self.turn @ self.rotation
+        position, rotation = self.pose_sigma.displaced(moved, rotated, random.child("pose"))
         real = replace(self, position=position, rotation=rotation)
         seen = self._scan(real, scene, random)
         if self.config.faces == 1:

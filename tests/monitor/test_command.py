@@ -15,10 +15,13 @@ from pycocotools.coco import COCO
 from pipeline import monitor
 from pipeline.cli import main as cli
 from pipeline.formats.meshes.ply import write_ply
+from pipeline.formats.points import laz_chunks
 from pipeline.formats.points.laz import read_laz
 from pipeline.formats.rasters.geotiff import read_geotiff
+from pipeline.monitoring import reading
 from pipeline.monitoring.follow import follow
 from pipeline.monitoring.options import MonitorOptions
+from pipeline.monitoring.run import monitor_paths
 from pipeline.surface.raster_mesh import mesh_of_raster
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
@@ -219,3 +222,35 @@ def test_mistakes(name: str, scans: Path, tmp_path: Path, capsys: pytest.Capture
     assert problem in told
     assert told.count("\n") == 1
     assert "Traceback" not in told
+
+
+def test_large_files_are_read_in_chunks_with_the_same_result(
+    scans: Path, result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Files above the limit, kept in memory or not: what is found agrees with the files read at once, to the sample of ICP."""
+    first, second, _ = sorted(scans.glob("*.las"))
+    options = MonitorOptions(position=np.array([float(each) for each in STATION.split()]))
+    monkeypatch.setattr(reading, "WHOLE_POINTS", 10_000)
+    monkeypatch.setattr(laz_chunks, "CHUNK", 7_000)
+    found = {}
+    for kept in (0, 10**9):
+        monkeypatch.setattr(reading, "_KEPT_POINTS", kept)
+        found[kept] = monitor_paths([first, second], tmp_path / str(kept), options)
+        (epoch,) = found[kept].epochs
+        assert sum(region.volume_m3 for region in epoch.regions) == pytest.approx(VOLUME, rel=0.1)
+        assert any("in chunks" in note for note in epoch.record.notes)
+        whole = read_geotiff(result / "difference_001.tif")[0]
+        chunked = read_geotiff(tmp_path / str(kept) / "difference_001.tif")[0]
+        assert chunked.shape == whole.shape
+        assert np.nanquantile(np.abs(chunked - whole), 0.99) < 5e-4
+        points = read_laz(tmp_path / str(kept) / "epoch_001.laz")
+        assert len(points.points) == COUNT
+        np.testing.assert_allclose(points.points, read_laz(result / "epoch_001.laz").points, atol=2e-3)
+
+
+def test_a_large_file_that_is_cut_off_is_refused(scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reading, "WHOLE_POINTS", 10_000)
+    first, second, _ = sorted(scans.glob("*.las"))
+    (tmp_path / "cut.las").write_bytes(second.read_bytes()[:-100_000])
+    with pytest.raises(InputError, match=r"cut\.las"):
+        monitor_paths([first, tmp_path / "cut.las"], tmp_path / "out", MonitorOptions(position=np.zeros(3)))

@@ -9,7 +9,7 @@ from monitor_cases import HEIGHT_M, WIDTH_M, depth
 from pipeline.monitoring.alignment import applied, refine
 from pipeline.monitoring.comparison import ReferenceHeights, compare_epoch
 from pipeline.monitoring.events import Catalogue
-from pipeline.monitoring.gridding import gridded
+from pipeline.monitoring.gridding import WallPoints, gridded
 from pipeline.monitoring.magnitude import fit_power_law
 from pipeline.monitoring.significance import significance
 from pipeline.registration.rigid import RigidTransform
@@ -29,6 +29,11 @@ def wall(seed: int, noise_m: float = 0.003, missing: tuple[tuple[float, float, f
     for at_x, at_y, side, deep in missing:
         z = np.where((np.abs(x - at_x) < side / 2) & (np.abs(y - at_y) < side / 2), z - deep, z)
     return np.column_stack([x, y, z + noise_m * random.normal(size=COUNT)])
+
+
+def cloud(seed: int, missing: tuple[tuple[float, float, float, float], ...] = ()) -> WallPoints:
+    """The same, as an epoch."""
+    return WallPoints.of(wall(seed, missing=missing))
 
 
 def test_a_motion_is_found_within_its_own_uncertainty() -> None:
@@ -73,7 +78,7 @@ def test_five_percent_of_stable_rock_exceed_the_level() -> None:
 
 def test_blocks_are_found_with_their_volumes_and_nothing_else() -> None:
     blocks = ((3.0, 3.0, 0.6, 0.15), (10.0, 6.0, 0.8, 0.08), (13.0, 2.5, 0.4, 0.3))
-    found = compare_epoch(ReferenceHeights.of(wall(1), GRID), wall(2, missing=blocks), (), 1)
+    found = compare_epoch(ReferenceHeights.of(cloud(1), GRID), cloud(2, missing=blocks), (), 1)
     assert len(found.regions) == len(blocks)
     for x, y, side, deep in blocks:
         (region,) = (each for each in found.regions if np.hypot(each.x_m - x, each.y_m - y) < 0.15)
@@ -86,7 +91,7 @@ def test_blocks_are_found_with_their_volumes_and_nothing_else() -> None:
 
 
 def test_added_rock_has_the_other_sign() -> None:
-    found = compare_epoch(ReferenceHeights.of(wall(1), GRID), wall(2, missing=((8.0, 5.0, 1.0, -0.1),)), (), 1)
+    found = compare_epoch(ReferenceHeights.of(cloud(1), GRID), cloud(2, missing=((8.0, 5.0, 1.0, -0.1),)), (), 1)
     (region,) = found.regions
     assert region.kind == "added"
     assert region.volume_m3 == pytest.approx(0.1, abs=3 * region.volume_std_m3)
@@ -94,20 +99,20 @@ def test_added_rock_has_the_other_sign() -> None:
 
 def test_nothing_is_found_where_nothing_fell() -> None:
     """Five pairs of 160 m2; the aim is one false event in 1,000 m2."""
-    reference = ReferenceHeights.of(wall(1), GRID)
-    assert sum(len(compare_epoch(reference, wall(seed), (), 1).regions) for seed in range(2, 7)) <= 1
+    reference = ReferenceHeights.of(cloud(1), GRID)
+    assert sum(len(compare_epoch(reference, cloud(seed), (), 1).regions) for seed in range(2, 7)) <= 1
 
 
 def test_epochs_that_do_not_overlap_are_refused() -> None:
-    reference = ReferenceHeights.of(wall(1), GRID)
+    reference = ReferenceHeights.of(cloud(1), GRID)
     with pytest.raises(InputError):
-        compare_epoch(reference, wall(2) + np.array([200.0, 0.0, 0.0]), (), 1)
+        compare_epoch(reference, WallPoints.of(wall(2) + np.array([200.0, 0.0, 0.0])), (), 1)
 
 
 def test_an_event_keeps_its_number_and_a_new_one_gets_the_next() -> None:
-    reference = ReferenceHeights.of(wall(1), GRID)
-    first = compare_epoch(reference, wall(2, missing=((3.0, 3.0, 0.6, 0.2),)), (), 1)
-    second = compare_epoch(reference, wall(3, missing=((3.0, 3.0, 0.7, 0.2), (10.0, 6.0, 1.2, 0.3))), (), 1)
+    reference = ReferenceHeights.of(cloud(1), GRID)
+    first = compare_epoch(reference, cloud(2, missing=((3.0, 3.0, 0.6, 0.2),)), (), 1)
+    second = compare_epoch(reference, cloud(3, missing=((3.0, 3.0, 0.7, 0.2), (10.0, 6.0, 1.2, 0.3))), (), 1)
     catalogue = Catalogue()
     assert [region.identity for region in catalogue.identified(first.regions)] == [1]
     numbers = {round(region.x_m): region.identity for region in catalogue.identified(second.regions)}

@@ -92,7 +92,7 @@ def test_the_text_loads_into_the_same_config_with_the_same_live_keys(own: dict[s
 def test_each_key_is_explained() -> None:
     lines = commented_yaml(CONFIG, OWN).splitlines()
     found = {line.strip().lstrip("#").partition(":")[0]: line.partition("  # ")[2] for line in reversed(lines) if "  # " in line}
-    assert lines[0] == "# A simulation."
+    assert lines[0] == "# A config: a simulation."
     assert found["seed"] == "seed of all random numbers; from 0; default 1"
     assert found["sigma_px"] == "noise of the image points; pixels; above 0 up to 2; default 1.0e-05"
     assert found["mode"] == "one of fast, fine"

@@ -159,7 +159,7 @@ def test_where_much_of_the_wall_moved_nothing_is_said_of_the_sensor(tmp_path: Pa
     write_scan(tmp_path, seed, blocks=fallen, step_rad=0.009)
     found = diagnose(read_measurement(tmp_path))
     assert found.verdict == "insufficient_data"
-    assert found.evidence.moved > 0.3
+    assert found.evidence.moved_share > 0.3
     assert found.effects == ()
     assert found.remaining["note"].index("name stable_areas") < 400
     assert "stable_areas in measurement.yaml" in summarise(found)

@@ -80,8 +80,8 @@ def test_survival_and_noise_are_those_of_a_rigid_fit_of_points(found: Identifiab
     left = signature - rigid @ np.linalg.lstsq(rigid, signature, rcond=None)[0]
     row = found.names.index(f"tls.{name}")
     assert found.survival[row] == pytest.approx(np.linalg.norm(left) / np.linalg.norm(signature), rel=0.12)
-    assert found.seen_from_noise[row] == pytest.approx(5 * SIGMA / np.linalg.norm(left), rel=0.12)
-    assert found.seen_from[row] > found.seen_from_noise[row]
+    assert found.detectable_size_without_reference_error[row] == pytest.approx(5 * SIGMA / np.linalg.norm(left), rel=0.12)
+    assert found.detectable_size[row] > found.detectable_size_without_reference_error[row]
 
 
 def test_axis_errors_change_sign_in_the_second_face_and_part_from_the_pose(found: Identifiability) -> None:
@@ -89,8 +89,8 @@ def test_axis_errors_change_sign_in_the_second_face_and_part_from_the_pose(found
     second = next(each for each in found.extensions if "second face" in each.name)
     for name in ("vertical_index", "collimation", "trunnion_tilt"):
         row = found.names.index(f"tls.{name}")
-        whole = found.seen_from_noise[row] * found.survival[row]
-        assert second.seen_from[row] == pytest.approx(whole / np.sqrt(2), rel=0.05)
+        whole = found.detectable_size_without_reference_error[row] * found.survival[row]
+        assert second.detectable_size[row] == pytest.approx(whole / np.sqrt(2), rel=0.05)
     drift, tilt = (found.names.index(f"tls.{name}") for name in ("tilt_drift", "trunnion_tilt"))
     assert second.cosines[drift, tilt] < 1e-6
 

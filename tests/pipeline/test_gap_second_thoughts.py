@@ -22,12 +22,11 @@ from pipeline.gap.naming import workflow
 from pipeline.gap.naming.effect_selection import NONPARAMETRIC_TERMS, _note_most_similar
 from pipeline.gap.naming.gap_score import simulate_errors
 from pipeline.gap.naming.named_effects import NamedEffect, with_effects
-from pipeline.gap.naming.search_residuals import at_points_of
 from pipeline.gap.naming.selection_passes import PassInput, PassInputs, SelectionPass, best_pass
 from pipeline.gap.naming.validation_scores import ValidatedEffects
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
-from pipeline.gap.residuals.alignment import align, compute_residuals
+from pipeline.gap.residuals.alignment import align, at_points_of, compute_residuals
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
 from pipeline.gap.residuals.nominal_pair import NominalPair
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals

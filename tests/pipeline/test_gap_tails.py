@@ -11,9 +11,8 @@ import pytest
 from pipeline.gap.mean.selection import SelectedEffect
 from pipeline.gap.naming import effect_selection
 from pipeline.gap.naming.effect_selection import keep_implausible_in_class
-from pipeline.gap.naming.named_effects import NamedEffect
-from pipeline.gap.naming.nonlinear_refit import absorbed_by_registration
-from pipeline.gap.noise_and_edges.variance_model import find_heavy_tails
+from pipeline.gap.naming.named_effects import NamedEffect, absorbed_by_registration
+from pipeline.gap.noise_and_edges.heavy_tails import find_heavy_tails
 
 POINTS, BLOCKS = 30_000, 100
 
@@ -61,7 +60,7 @@ def test_what_far_points_gain_is_a_log_likelihood_and_not_their_number() -> None
 
 def _estimate(monkeypatch: pytest.MonkeyPatch, amplitude: float) -> Any:
     entry = {"name": "horizontal_eccentricity", "amplitude_rad": amplitude, "phase_rad": 0.0}
-    monkeypatch.setattr("pipeline.gap.naming.nonlinear_refit.effect_from_estimate", lambda *_: SimpleNamespace(entry=entry))
+    monkeypatch.setattr("pipeline.gap.naming.named_effects.effect_from_estimate", lambda *_: SimpleNamespace(entry=entry))
     return SimpleNamespace(candidate=SimpleNamespace(name="horizontal_eccentricity", empirical=False))
 
 

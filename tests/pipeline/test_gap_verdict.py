@@ -77,8 +77,8 @@ class _Found:
 
     @property
     def remaining(self) -> dict[str, Any]:
-        lower = reduced_noise(TlsModel(), self.evidence.spread)
-        note = "; ".join(note_excess_noise(self.evidence.spread, lower))
+        lower = reduced_noise(TlsModel(), self.evidence.noise_ratio)
+        note = "; ".join(note_excess_noise(self.evidence.noise_ratio, lower))
         return {"p_value": self.evidence.p_value, "note": note, "lower_noise": lower}
 
     @property
@@ -93,7 +93,7 @@ def _every() -> Iterator[tuple[Any, Evidence, str]]:
             continue
         if wide > 1.5 and spread < 1.0:
             continue
-        found: Any = _Found(named, Evidence(gap, p_value, spread, far, wide=wide))
+        found: Any = _Found(named, Evidence(gap, p_value, spread, far, overdispersion=wide))
         for row in ROWS:
             yield found, found.evidence, f"{title(found)}. {paragraph(found, [row])} {summarise(found)}"
 
@@ -102,15 +102,15 @@ def test_no_gap_needs_a_gap_at_the_floor_and_a_p_value_that_does_not_reject() ->
     for found, evidence, said in _every():
         gap, p_value = evidence.gap, evidence.p_value
         near = gap is not None and gap.before - gap.floor <= 2 * ERROR
-        agrees = not found.effects and near and p_value is not None and p_value > 0.01 and not evidence.far
-        agrees = agrees and evidence.wide < 1.5
+        agrees = not found.effects and near and p_value is not None and p_value > 0.01 and not evidence.outlier_share
+        agrees = agrees and evidence.overdispersion < 1.5
         assert (found.verdict == "no_gap") == agrees
         assert not agrees or not found.remaining["note"] or f"note: {found.remaining['note']}" in said
 
 
 def test_nothing_is_said_to_agree_that_does_not() -> None:
     for found, evidence, said in _every():
-        agrees = found.verdict == "no_gap" and evidence.spread == 1.0
+        agrees = found.verdict == "no_gap" and evidence.noise_ratio == 1.0
         assert ("The measurement agrees" in said) == agrees
         assert ("No effect is missing" in said) == agrees
 
@@ -130,7 +130,9 @@ def test_what_is_rejected_without_a_description_says_where_and_how_much() -> Non
     for found, evidence, said in _every():
         bare = found.verdict == "unknown" and not found.effects
         left_open = found.gap is not None and found.gap.left_open
-        only_too_noisy = evidence.spread < 1.0 and not (evidence.rejects or evidence.far or left_open)
+        only_too_noisy = evidence.noise_ratio < 1.0 and not (
+            evidence.misfit_is_significant or evidence.outlier_share or left_open
+        )
         assert ("noise is too large" in said) >= (bare and only_too_noisy)
         assert ("nothing that was tried describes the misfit" in said) == (bare and not only_too_noisy)
         assert ("The disagreement is largest in the mean against range, from 10 to 20: 2.1 mm there" in said) == bare
@@ -144,10 +146,10 @@ def test_effects_that_leave_most_of_the_gap_open_are_not_the_answer() -> None:
         gap = evidence.gap
         physical = bool(found.effects) and all(effect.kind == "physical" for effect in found.effects)
         little = gap is not None and gap.closed is not None and gap.closed < 0.5 and gap.after - gap.floor > 2 * ERROR
-        little |= gap is not None and gap.after > gap.before and evidence.rejects
-        rejected = gap is not None and gap.closed is None and evidence.rejects
+        little |= gap is not None and gap.after > gap.before and evidence.misfit_is_significant
+        rejected = gap is not None and gap.closed is None and evidence.misfit_is_significant
         for_nothing = gap is not None and gap.after > gap.before and evidence.p_value is None
-        unsaid = little or for_nothing or rejected or evidence.wide > 1.5
+        unsaid = little or for_nothing or rejected or evidence.overdispersion > 1.5
         assert (physical and found.verdict == "unknown") == (physical and unsaid)
         assert ("nothing supports them" in said) == (physical and for_nothing and not little)
         assert ("does not make the gap smaller" in said) == (physical and for_nothing and not little)
@@ -155,7 +157,7 @@ def test_effects_that_leave_most_of_the_gap_open_are_not_the_answer() -> None:
         assert ("closes little of the gap" in said) == (physical and little)
         assert ("too small to show that they close any of it" in said) == (physical and rejected and not little)
         assert ("leaves a misfit larger than chance would" in said) == (physical and rejected and not little)
-        wide = physical and not (little or for_nothing or rejected) and evidence.wide > 1.5
+        wide = physical and not (little or for_nothing or rejected) and evidence.overdispersion > 1.5
         assert ("still vary far more than the model predicts" in said) == wide
 
 
@@ -174,8 +176,8 @@ def test_what_an_effect_leaves_over_is_said() -> None:
 
 def test_too_much_noise_is_said_with_less_that_would_do() -> None:
     for found, evidence, said in _every():
-        assert ("the residuals have 11 % of the predicted standard deviation" in said) == (evidence.spread < 1.0)
-        if evidence.spread < 1.0:
+        assert ("the residuals have 11 % of the predicted standard deviation" in said) == (evidence.noise_ratio < 1.0)
+        if evidence.noise_ratio < 1.0:
             assert "range_sigma_m 0.00033" in said
             assert "too noisy" in said or found.verdict != "no_gap"
 
@@ -184,14 +186,14 @@ def test_too_much_noise_is_said_with_less_that_would_do() -> None:
 @pytest.mark.parametrize("p_value", P_VALUES)
 def test_a_wall_much_of_which_moved_says_nothing_of_the_sensor(gap: Gap | None, p_value: float | None) -> None:
     """If 30 % of the wall moved, no effect is named."""
-    found: Any = _Found((), Evidence(gap, p_value, moved=0.41))
+    found: Any = _Found((), Evidence(gap, p_value, moved_share=0.41))
     said = f"{title(found)}. {paragraph(found, ROWS[:1])} {summarise(found)} {'; '.join(note_moved_wall(found.evidence, False))}"
     assert found.verdict == "insufficient_data"
     assert "41 % of the points lie off the reference together with their neighbours" in said
     assert "add stable_areas" in said
     assert "too few" not in said.lower()
-    assert verdict_of((), Evidence(gap, p_value, moved=0.29)) == verdict_of((), Evidence(gap, p_value))
-    assert note_moved_wall(Evidence(gap, p_value, moved=0.29), False) == []
+    assert verdict_of((), Evidence(gap, p_value, moved_share=0.29)) == verdict_of((), Evidence(gap, p_value))
+    assert note_moved_wall(Evidence(gap, p_value, moved_share=0.29), False) == []
     assert "are not stable" in note_moved_wall(found.evidence, True)[0]
 
 
@@ -220,7 +222,7 @@ def test_a_gap_stays_open_only_beyond_its_uncertainty(error: float, open_still: 
     Rare edges may decide the score of few validation patches: 8.9 mm before and 10.9 mm after, uncertain by some millimetres.
     """
     gap = Gap(before=0.0089, after=0.0109, floor=0.0006, error=error, floor_error=0.003, points=100)
-    assert Evidence(gap, 0.3).stays_open == open_still
+    assert Evidence(gap, 0.3).gap_stays_open == open_still
 
 
 @pytest.mark.parametrize(("p_value", "open_still", "unsaid"), [(0.002, True, True), (0.3, False, False), (None, False, True)])
@@ -232,5 +234,5 @@ def test_names_with_which_the_gap_grows_while_nothing_says_that_chance_is_left_a
     On real photographs a principal point wrong by 3 px was named as a focal length wrong by 58 px, later as 47 px and noise.
     """
     evidence = Evidence(Gap(before=0.0101, after=0.0122, floor=0.0102, error=0.002, floor_error=0.002, points=1000), p_value)
-    assert evidence.stays_open is open_still
+    assert evidence.gap_stays_open is open_still
     assert (verdict_of([_effect("tls.wobble")], evidence) == "unknown") is unsaid

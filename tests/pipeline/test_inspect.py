@@ -22,7 +22,7 @@ from pipeline.planning.inspect import write_plans
 from pipeline.planning.maps import plans
 from pipeline.planning.report import answer
 from pipeline.precision.stereo_geometry import stereo_geometry
-from pipeline.precision.surface import Places, seen_from, wall_raster
+from pipeline.precision.surface import Places, visible_from, wall_raster
 from pipeline.precision.tls_geometry import TlsGeometry, tls_geometry
 from pipeline.report import figures
 from pipeline.report.figures import map_figure
@@ -211,7 +211,7 @@ def test_a_step_hides_a_strip_of_the_closed_form_width() -> None:
     """The near plane (x > 0, z = 2) hides from (x_v, Z) the far one's strip -x_v 2 / (Z - 2) < x < 0."""
     raster = wall_raster(RayCaster(step(2.0, 0.0)), gsd_m=0.05)
     viewpoint = np.array([12.0, 1.0, 50.0])
-    seen = seen_from(RayCaster(step(2.0, 0.0)), raster.places, viewpoint)
+    seen = visible_from(RayCaster(step(2.0, 0.0)), raster.places, viewpoint)
     hidden = raster.image(~seen)
     widths = 0.05 * np.nansum(hidden, axis=1)
     np.testing.assert_allclose(widths, 12.0 * 2.0 / 48.0, atol=0.051)

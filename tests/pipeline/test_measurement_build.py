@@ -339,11 +339,11 @@ def test_a_cloud_from_photographs_with_a_dem(kind: str, tmp_path: Path) -> None:
 
 
 PHOTOGRAPHS: dict[str, tuple[list[str], str]] = {
-    "half": (["--reference", "half"], "neighbours in a matched cloud share their errors"),
+    "half": (["--reference", "half"], "neighbouring points of a photogrammetric cloud share their errors"),
     "behind": (["--reference", "dem.tif"], "lie behind a camera"),
     "elsewhere": (["--reference", "dem.tif"], "both cameras see"),
     "no cameras": (["--reference", "dem.tif", "--cameras", "no.xml"], "there is no such file"),
-    "one label": (["--reference", "dem.tif", "--pair", "a"], "two cameras' labels"),
+    "one label": (["--reference", "dem.tif", "--pair", "a"], "the labels of two cameras"),
 }
 
 
@@ -389,7 +389,7 @@ def asked(*more: str, reference: str = "wall.ply", scanner: str = "riegl_vz400i"
 
 
 BAD: dict[str, tuple[Callable[[Case, Path], list[str]], str]] = {
-    "no reference": (lambda case, folder: [str(as_laz(case, folder)), "--scanner", "x"], "a mesh, a cloud or another epoch"),
+    "no reference": (lambda case, folder: [str(as_laz(case, folder)), "--scanner", "x"], "a mesh, a cloud, another epoch"),
     "no such reference": (asked(reference="no.ply"), "no.ply: there is no such file"),
     "no such scanner": (asked(scanner="riegl_vz400j"), "riegl_vz400i"),
     "millimetres": (move(lambda points: 1000 * points), "add --unit mm"),
@@ -400,7 +400,7 @@ BAD: dict[str, tuple[Callable[[Case, Path], list[str]], str]] = {
     "no order": (move(lambda points: np.random.default_rng(1).permutation(points)), "give --position X,Y,Z"),
     "another place": (move(lambda points: points + UTM), "export both in one coordinate system"),
     "behind the scanner": (move(lambda points: 2 * POSITION - points), "export both|in directions in which"),
-    "position of two numbers": (asked("--position", "1,2"), "3 numbers between commas"),
+    "position of two numbers": (asked("--position", "1,2"), "3 numbers separated by commas"),
     "no such unit": (asked("--unit", "inch"), "allowed: m, cm, mm, ft, us-ft"),
     "columns": (asked("--columns", "x,y"), "has 4 columns, named x, y"),
     "second scan of one": (asked("--scan", "2"), "allowed: 1 to 1"),

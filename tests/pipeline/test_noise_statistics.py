@@ -11,7 +11,7 @@ from pipeline.noise.statistics import (
     normality,
     quantile_edges,
     statistics_by_bin,
-    tails,
+    tail_figures,
     without_outliers,
 )
 from scene.common.keyed_random import KeyedRandom
@@ -21,7 +21,7 @@ NORMAL = KeyedRandom(5).generator().normal(0.002, 0.01, 200_000)
 
 def test_tails_of_a_normal_distribution() -> None:
     """Standard errors of n = 200,000: skewness 0.0055, kurtosis 0.011, share 0.00012; limits four of them."""
-    found = tails(NORMAL)
+    found = tail_figures(NORMAL)
     assert found.skewness == pytest.approx(0, abs=0.022)
     assert found.excess_kurtosis == pytest.approx(0, abs=0.044)
     assert found.beyond_3_nmad == pytest.approx(NORMAL_BEYOND_3, abs=0.0005)
@@ -30,11 +30,11 @@ def test_tails_of_a_normal_distribution() -> None:
 
 def test_tails_of_a_uniform_distribution() -> None:
     """Excess kurtosis -6/5 exactly; nothing lies beyond three NMAD, which are 1.11 half widths."""
-    found = tails(np.linspace(-1, 1, 100_001))
+    found = tail_figures(np.linspace(-1, 1, 100_001))
     assert found.excess_kurtosis == pytest.approx(-1.2, abs=1e-3)
     assert found.beyond_3_nmad == 0
     assert found.quantile_250_m == pytest.approx(-0.5)
-    assert tails(np.array([np.nan])).to_dict()["largest_m"] is None
+    assert tail_figures(np.array([np.nan])).to_dict()["largest_m"] is None
 
 
 def test_normality_holds_its_level_and_sees_a_heavy_tail() -> None:
@@ -53,15 +53,15 @@ def test_bins_hold_what_lies_in_them() -> None:
     covariate = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 9.0, np.nan])
     values = np.array([1.0, 3.0, 10.0, np.nan, 20.0, 7.0, 8.0])
     first, second = statistics_by_bin(values, covariate, [0, 1, 2])
-    assert (first.of.count, first.of.median) == (2, 2.0)
-    assert (second.of.count, second.of.median) == (2, 15.0)
+    assert (first.statistics.count, first.statistics.median) == (2, 2.0)
+    assert (second.statistics.count, second.statistics.median) == (2, 15.0)
     with pytest.raises(ValueError, match="shape"):
         statistics_by_bin(values, covariate[:3], [0, 1])
 
 
 def test_edges_share_the_values_out() -> None:
     edges = quantile_edges(np.arange(1000.0), 4)
-    assert [item.of.count for item in statistics_by_bin(np.zeros(1000), np.arange(1000.0), edges)] == [250, 250, 250, 250]
+    assert [item.statistics.count for item in statistics_by_bin(np.zeros(1000), np.arange(1000.0), edges)] == [250, 250, 250, 250]
     assert len(quantile_edges(np.zeros(10))) == 2
 
 

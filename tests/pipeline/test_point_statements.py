@@ -129,7 +129,7 @@ def test_a_coordinate_system_that_is_not_understood_is_said(tmp_path: Path, poin
 
     found = read_points(las(tmp_path / "a.las", points, of("our own grid")))
     assert any("not understood: 'our own grid'" in note for note in found.notes)
-    with pytest.raises(InputError, match=r"not understood.*which mentions 'feet'"):
+    with pytest.raises(InputError, match=r"not understood.*names the unit 'feet'"):
         read_points(las(tmp_path / "b.las", points, of("our own grid, feet")))
 
 

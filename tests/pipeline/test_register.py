@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, norm
 
 from pipeline.registration.closest_points import ReferenceSurface, scan_order
-from pipeline.registration.register import IcpConfig, Registration, _point_step, fit, register, register_to
+from pipeline.registration.register import IcpConfig, Registration, _point_step, measure_fit, register, register_to
 from pipeline.registration.rigid import RigidTransform, rotation_matrix
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
@@ -199,11 +199,11 @@ def test_no_reflection() -> None:
 
 def test_fit_counts_and_measures(reference: ReferenceSurface, cloud: tuple[FloatArray, FloatArray]) -> None:
     points = cloud[0] + [0, 0, 1.0] * (np.arange(len(cloud[0])) % 4 == 0)[:, None]
-    result = fit(reference, points, IcpConfig())
+    result = measure_fit(reference, points, IcpConfig())
     assert result.points == len(points)
     assert result.inliers == len(points) * 3 // 4
     assert result.rms_m == pytest.approx(SIGMA, rel=0.03)
-    assert np.isnan(fit(reference, points + np.array([0, 0, 9.0]), IcpConfig()).rms_m)
+    assert np.isnan(measure_fit(reference, points + np.array([0, 0, 9.0]), IcpConfig()).rms_m)
 
 
 # --- outliers and degenerate surfaces ---
@@ -323,7 +323,13 @@ def test_errors_name_what_is_wrong(reference: ReferenceSurface) -> None:
         (points, points, normals[:-1], {}, r"reference normals: expected shape \(240, 3\)"),
         (points, points, normals * 0, {}, "reference normals: 240 of 240 are zero"),
         (points, points, None, {}, "icp.method: point_to_plane needs"),
-        (points, points, normals, {"subsample_points": True, "subsample_ratio": 0.99}, "icp.subsample_ratio: leaves 2 of 240"),
+        (
+            points,
+            points,
+            normals,
+            {"subsample_points": True, "subsample_ratio": 0.99},
+            "icp.subsample_ratio: the subsample would leave only 2 of 240",
+        ),
         (points + 0.4, points, normals, {"outlier_distance_threshold": 1e-4}, "icp.outlier_distance_threshold: only"),
     ]
     for moving, target, directions, values, message in cases:

@@ -157,8 +157,8 @@ ROW |= {"depth_m": "0.1", "mean_depth_m": "0.05", "volume_m3": "0.015", "score":
 @pytest.mark.parametrize(
     ("name", "row", "said"),
     [
-        ("events_all.csv", ROW, "no name of a table"),
-        ("events_nan.csv", ROW, "no name of a table"),
+        ("events_all.csv", ROW, "is not the name of a table"),
+        ("events_nan.csv", ROW, "is not the name of a table"),
         ("events_0.9.csv", {**ROW, "x_m": "left"}, "line 2: 'x_m' is 'left'"),
         ("events_0.9.csv", {**ROW, "x_m": "nan"}, "finite numbers"),
         ("events_0.9.csv", {"image": "a.tif"}, "not a table of events"),
@@ -287,7 +287,7 @@ def test_two_runs_of_one_wall_stand_side_by_side(run: Path, gap: Path, tmp_path:
     half = drawn.shape[1] // 2
     np.testing.assert_array_equal(drawn[:, : half - 1], plain[:, : half - 1])
     assert not np.array_equal(drawn[:, half + 1 :], plain[:, half + 1 :], equal_nan=True)
-    with pytest.raises(InputError, match="allowed: two runs of one wall"):
+    with pytest.raises(InputError, match="only two runs of one wall"):
         open_second(gap, first)
     shutil.copytree(run, tmp_path / "moved")
     record = json.loads((run / "run.json").read_text())

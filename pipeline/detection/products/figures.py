@@ -21,6 +21,7 @@ from pipeline.detection.evaluation.reliability import Reliability
 from pipeline.detection.network.normalisation import nmad
 from pipeline.formats.files.atomic import writing
 from pipeline.report.plain_text import plain_text
+from pipeline.report.words import counted
 from scene.geometry.grid import Grid
 
 _PANELS = {"Total": ("loss",), "Class": ("class", "proposal_class"), "Box": ("box", "proposal_box"), "Mask": ("mask",)}
@@ -97,7 +98,7 @@ def write_overlay(difference: NDArray[np.float32], grid: Grid, found: Sequence[D
     axes.set(
         xlabel="x along the wall, m",
         ylabel="y up the wall, m",
-        title=title or f"{len(found)} blocks detected, numbered as in the table",
+        title=title or f"{counted(len(found), 'block')} detected, numbered as in the table",
     )
     _write(figure, path)
 

@@ -160,9 +160,9 @@ def check_counts(header: laspy.LasHeader, path: Path) -> None:
 
 def flagged(las: Any) -> tuple[np.ndarray[Any, np.dtype[np.bool_]], tuple[str, ...]]:
     """Return the (n,) mask of points that the file takes out of use (withheld, synthetic, classified as noise), and notes."""
-    out = np.zeros(len(las.points), dtype=bool)
-    notes = []
     classes = np.asarray(las.classification)
+    out = np.zeros(len(classes), dtype=bool)
+    notes = []
     for what, rows in (
         ("flagged as withheld", np.asarray(las.withheld, dtype=bool)),
         ("flagged as synthetic", np.asarray(las.synthetic, dtype=bool)),

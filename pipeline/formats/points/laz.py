@@ -7,7 +7,7 @@ import math
 import os
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -67,14 +67,36 @@ class PulseChannels:
 
 @dataclass(frozen=True)
 class LazHeader:
-    """Header values. scale_m: step of the stored coordinates; date: of the file; wkt: coordinate system, if known."""
+    """Header values.
+
+    Attributes
+    ----------
+    scale_m : float
+        Step of the stored coordinates, m.
+    date : datetime.date
+        Date of the file.
+    wkt : str
+        Coordinate system, if known.
+    standard_time : bool
+        Whether the points' times are GPS seconds since 1980-01-06 minus 1e9, as `gps_seconds` gives; else seconds from any
+        moment.
+    """
 
     scale_m: float = 1e-6
     date: datetime.date = datetime.date(2000, 1, 1)
     wkt: str = ""
+    standard_time: bool = False
 
 
 _PLAIN, _USUAL = PulseChannels(), LazHeader()
+_GPS_START = datetime.datetime(1980, 1, 6, tzinfo=datetime.UTC)
+_LEAP_SECONDS, _ADJUSTED_S = 18, 1e9
+"""GPS time minus UTC since 2017, and what LAS subtracts from GPS seconds (LAS 1.4, global encoding)."""
+
+
+def gps_seconds(time: datetime.datetime) -> float:
+    """Return a time in UTC as LAS stores standard GPS time, s."""
+    return (time - _GPS_START).total_seconds() + _LEAP_SECONDS - _ADJUSTED_S
 
 
 @dataclass(frozen=True)
@@ -99,6 +121,10 @@ class StoredCloud:
         las = _header(cloud, header, full_scale)
         present = {name: values for name, values in fields.items() if values is not None}
         return cls(las, cloud, present | dict(cloud.extra), full_scale)
+
+    def with_points(self, cloud: PointCloud) -> StoredCloud:
+        """Return other points with the same header and the same extra dimensions, without intensity and time."""
+        return replace(self, cloud=cloud, fields={"bit_fields": self.fields["bit_fields"], **cloud.extra})
 
     def steps(self) -> NDArray[np.int64]:
         """Return the (n, 3) coordinates as stored: in steps of the header's scale from its offset."""
@@ -132,9 +158,9 @@ def write_laz(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, hea
     header : Header values.
     """
     stored = StoredCloud.of(cloud, pulses, header)
-    with writing(path) as temporary, temporary.open("wb") as file, _writer(file, stored.header, path.suffix != ".las") as writer:
+    with writing(path) as temporary, temporary.open("wb") as file, writer(file, stored.header, path.suffix != ".las") as las:
         for start in range(0, len(cloud.points), _CHUNK):
-            writer.write_points(stored.records(slice(start, start + _CHUNK)))
+            las.write_points(stored.records(slice(start, start + _CHUNK)))
 
 
 def read_laz(path: Path) -> PointCloud:
@@ -149,19 +175,19 @@ def read_laz(path: Path) -> PointCloud:
     """
     where = str(check_file(path))
     try:
-        _check_extent(path)
+        check_extent(path)
         las = laspy.read(path)
     except InputError:
         raise
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", where=where, remedy="check the path") from None
     except (laspy.LaspyException, LazrsError, ValueError, struct.error, MemoryError, OverflowError) as error:
-        raise _damaged(path, error) from None
+        raise damaged(path, error) from None
     if len(las.points) < las.header.point_count:
         raise InputError(
             f"has {len(las.points):,} of the {las.header.point_count:,} points that it states", where=where, remedy=_COPY
         )
-    _check_quantisation(las.header, path)
+    check_quantisation(las.header, path)
     units, notes = stated_units(las.header, where)
     extra = {name: np.array(las[name]) for name in las.point_format.extra_dimension_names} | _standard_channels(las)
     counts = las.points.array["intensity"]
@@ -180,7 +206,7 @@ def read_laz(path: Path) -> PointCloud:
     return cloud.part(~left_out) if left_out.any() else cloud
 
 
-def _damaged(path: Path, error: BaseException) -> InputError:
+def damaged(path: Path, error: BaseException) -> InputError:
     """Return the error for a file that laspy or lazrs cannot read, in our own words."""
     with path.open("rb") as file:
         start = file.read(4)
@@ -192,7 +218,7 @@ def _damaged(path: Path, error: BaseException) -> InputError:
     return InputError(problem, where=str(path), remedy=_COPY)
 
 
-def _check_quantisation(header: laspy.LasHeader, path: Path) -> None:
+def check_quantisation(header: laspy.LasHeader, path: Path) -> None:
     """Raise InputError for scales and offsets that cannot give coordinates."""
     scales, offsets = np.asarray(header.scales), np.asarray(header.offsets)
     if not (np.isfinite(scales).all() and (scales > 0).all() and np.isfinite(offsets).all()):
@@ -218,7 +244,7 @@ def _standard_channels(las: Any) -> dict[str, NDArray[Any]]:
     return channels | ({"scan_angle_rad": angle * step} if np.any(angle) else {})
 
 
-def _check_extent(path: Path) -> None:
+def check_extent(path: Path) -> None:
     """Raise ValueError for a file cut off in its header, or with an absurd LAZ chunk table, at which lazrs would abort."""
     with path.open("rb") as file:
         _check_records(file.read(_HEADER_BYTES), path.stat().st_size)
@@ -267,6 +293,8 @@ def _header(cloud: PointCloud, given: LazHeader, full_scale: float) -> laspy.Las
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.generating_software, header.system_identifier, header.creation_date = "scarpsim", "scarpsim", given.date
     header.global_encoding.wkt = True  # required for point formats from 6
+    if given.standard_time:
+        header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     header.add_extra_dims([laspy.ExtraBytesParams(name, channel.dtype) for name, channel in cloud.extra.items()])
     for record in header.vlrs.get("ExtraBytesVlr"):
         for dimension in record.extra_bytes_structs:  # without extremes, which laspy takes from the first point of each piece
@@ -279,7 +307,7 @@ def _header(cloud: PointCloud, given: LazHeader, full_scale: float) -> laspy.Las
     return header
 
 
-def _writer(file: BinaryIO, header: laspy.LasHeader, compress: bool) -> laspy.LasWriter:
+def writer(file: BinaryIO, header: laspy.LasHeader, compress: bool) -> laspy.LasWriter:
     """Return a writer; the parallel back end gives the same bytes as the serial one, with any number of threads."""
     return laspy.LasWriter(file, header, do_compress=compress, laz_backend=laspy.LazBackend.LazrsParallel, closefd=False)
 

@@ -53,14 +53,17 @@ _DIRECTIONS = (30, 60, 120, 150)
 
 @dataclass(frozen=True)
 class Wave:
-    """A sine of one quantity with unknown period: columns factor * sin and factor * cos of 2 pi x / period.
+    """A sinusoidal effect along one quantity x, whose period has to be searched.
+
+    Its two design columns are factor * sin(2 pi x / period) and factor * cos(2 pi x / period), so that amplitude and phase are
+    linear coefficients.
 
     Attributes
     ----------
-    key : Name of the effect's parameter that holds the period.
-    factor : (n,) observable per unit of the sine.
-    x : (n,) the quantity along which the sine runs.
-    least : Lowest frequency that is tried, below which a sine cannot be distinguished from a linear trend.
+    key : Name of the effect's parameter that holds the period, such as `period_px`.
+    factor : (n,) change of the observable (range, disparity or distance) for a sine of amplitude 1.
+    x : (n,) quantity along which the sine runs, such as an angle in rad.
+    least : Lowest frequency 1 / period to try; a slower sine cannot be distinguished from a linear trend.
     """
 
     key: str
@@ -69,12 +72,15 @@ class Wave:
     least: float = 0.0
 
     def columns(self, period: float) -> FloatArray:
-        """Return the (n, 2) sine and cosine columns at one period."""
+        """Return the (n, 2) sine and cosine columns for one period, which is in the unit of x."""
         angle = 2 * np.pi / period * self.x
         return self.factor[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=1)
 
     def stepped_period(self, period: float, change: float) -> float:
-        """Change the frequency of a period, by at most 0.3 of the resolution that the extent of x gives.
+        """Take one step of the period search: add `change` to the frequency and return the new period.
+
+        The step is limited to 0.3 / (extent of x), the resolution of the frequency, so that the search cannot jump past a
+        maximum.
 
         Parameters
         ----------
@@ -83,18 +89,20 @@ class Wave:
 
         Returns
         -------
-        The new period; its frequency is at least `least`.
+        The new period, unit of x. Its frequency is at least `least`.
         """
         step = 0.3 / float(np.ptp(self.x))
         return 1 / max(1 / period + float(np.clip(change, -step, step)), self.least)
 
     def with_frequency_derivative(self, period: float, coefficients: FloatArray) -> FloatArray:
-        """Return the sine and cosine columns, and the derivative of the fitted wave by its frequency 1 / period.
+        """Return the sine and cosine columns, and a third column with which a fit can correct the frequency.
+
+        The third column is the derivative of the fitted wave with respect to its frequency 1 / period.
 
         Parameters
         ----------
         period : Period, unit of x.
-        coefficients : (2,) present coefficients of sine and cosine.
+        coefficients : (2,) present coefficients of the sine and the cosine column.
 
         Returns
         -------
@@ -105,26 +113,30 @@ class Wave:
         return np.stack([sine, cosine, derivative], axis=1)
 
     def part(self, rows: Rows) -> Wave:
-        """Return the wave on some of the points."""
+        """Return the wave at a subset of the n points, given as row numbers, a mask or a slice."""
         return Wave(self.key, self.factor[rows], self.x[rows], self.least)
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One explanation of the residuals, linear in k coefficients.
+    """One possible explanation of the residuals at n points: a regression term with k linear coefficients.
+
+    It is an effect of the catalogue, such as a range offset, or a non-parametric term of a covariate. Residuals are explained as
+    `columns` times coefficients.
 
     Attributes
     ----------
-    name : Tag of the effect, or name of the covariate of a non-parametric term.
-    matrix : (n, k) change of the observable per unit of each coefficient; None for a sine, whose columns follow from its period.
-    parameters : Function from coefficients to the effect's parameter values.
+    name : Tag of the effect, such as "range_offset", or name of the covariate of a non-parametric term.
+    matrix : (n, k) change of the observable (range, disparity or distance) per unit of each coefficient; None for a sine, whose
+        columns follow from its period.
+    parameters : Function from the (k,) coefficients to the effect's parameter values by name.
     names : Parameters that the coefficients stand for.
-    fixed : Searched or chosen values of this variant, such as the camera.
-    empirical : Whether it is a non-parametric term instead of an effect of the catalogue.
+    fixed : Parameter values of this variant of the effect that are not fitted linearly, such as the camera or a period.
+    empirical : True for a non-parametric term, false for an effect of the catalogue.
     form : Form of a non-parametric term, such as "line" or "wave".
-    wave, period : The wave of a sine, and its period; overtones have a period too.
-    prior_precision : (k,) prior inverse variance of the coefficients, from typical sizes of the effect; None if nothing is known.
-    angle : Recorded angle of which a non-parametric term is the error; "" for the observable itself.
+    wave, period : For a sine, its wave and its period; overtones have a period too.
+    prior_precision : (k,) prior inverse variances of the coefficients, from typical sizes of the effect; None without a prior.
+    angle : For a non-parametric term that is an error of a recorded angle, the name of that angle; else "".
     """
 
     name: str
@@ -141,39 +153,43 @@ class Candidate:
 
     @cached_property
     def columns(self) -> FloatArray:
-        """(n, k) design columns."""
+        """(n, k) design columns: change of the observable per unit of each coefficient."""
         if self.matrix is not None:
             return self.matrix
         return self.sine.columns(self.period)
 
     @property
     def sine(self) -> Wave:
-        """The wave of a sine. Raises TypeError if the candidate is no sine."""
+        """The wave of a sinusoidal candidate. Raises TypeError if the candidate is not a sine."""
         if self.wave is None:
             raise TypeError(f"candidate {self.name} is not a sine")
         return self.wave
 
     def part(self, rows: Rows) -> Candidate:
-        """Return the candidate on some of the points."""
+        """Return the candidate at a subset of the n points, given as row numbers, a mask or a slice."""
         matrix = None if self.matrix is None else self.matrix[rows]
         return replace(self, matrix=matrix, wave=None if self.wave is None else self.wave.part(rows))
 
     @property
     def family(self) -> str:
-        """Name of the family. The variants of a family differ only in searched or chosen values; the best one represents it."""
+        """Name that all variants of one explanation share.
+
+        Variants differ only in searched or chosen values, such as the period or the camera. The search compares families by their
+        best variants.
+        """
         return f"free {self.name} {self.form} {self.angle}" if self.empirical else self.name
 
 
 @dataclass(frozen=True, eq=False)
 class SineGrid:
-    """A sine that is tried at evenly spaced frequencies.
+    """A sinusoidal effect that is tried at f evenly spaced frequencies; each frequency is a candidate.
 
     Attributes
     ----------
     name, fixed, empirical, angle : As in `Candidate`, the same for all frequencies.
-    amplitude : Name of the amplitude parameter.
-    wave : The sine.
-    frequencies : (f,) frequencies that are tried, per unit of the wave's x.
+    amplitude : Name of the effect's parameter that holds the amplitude.
+    wave : The sine, with its values at n points.
+    frequencies : (f,) frequencies to try, cycles per unit of the wave's x.
     """
 
     name: str
@@ -185,13 +201,13 @@ class SineGrid:
     angle: str = ""
 
     def candidate(self, index: int) -> Candidate:
-        """Return the candidate at one of the frequencies, by its number."""
+        """Return the candidate at the frequency with this index, from 0."""
         return self.at_period(1 / float(self.frequencies[index]))
 
     def at_period(self, period: float) -> Candidate:
-        """Return the candidate with any period.
+        """Return the candidate with the given period, which need not lie on the grid.
 
-        Its coefficients are those of sine and cosine and, as an optional third one, a change of the frequency.
+        Its coefficients are those of the sine and the cosine. A third coefficient, if present, is a change of the frequency.
         """
         amplitude, key = self.amplitude, self.wave.key
 
@@ -206,14 +222,22 @@ class SineGrid:
 
     @property
     def chunks(self) -> list[SineGrid]:
-        """The same grid in parts of a few frequencies."""
+        """The grid divided into grids of at most 32 frequencies, so that their columns fit into memory."""
         starts = range(0, len(self.frequencies), _CHUNK)
         return [replace(self, frequencies=self.frequencies[start : start + _CHUNK]) for start in starts]
 
     def columns(self, rows: FloatArray) -> FloatArray:
-        """Return the (n, 2 f) columns, sine and cosine of each frequency in turn, each multiplied by `rows` (n,).
+        """Compute the design columns of all frequencies at once, each multiplied by a weight per point.
 
-        Frequencies are evenly spaced, so each column pair is the preceding one turned by the same angle.
+        Frequencies are evenly spaced, so each pair of columns is the preceding pair rotated by the same phase angle.
+
+        Parameters
+        ----------
+        rows : (n,) factor for each row, such as the inverse standard deviation.
+
+        Returns
+        -------
+        (n, 2 f) columns: sine and cosine of the first frequency, then of the second one, and so on.
         """
         count = len(self.frequencies)
         spacing = float(self.frequencies[1] - self.frequencies[0]) if count > 1 else 0.0
@@ -226,12 +250,12 @@ class SineGrid:
         return columns.T
 
     def part(self, rows: Rows) -> SineGrid:
-        """Return the grid on some of the points."""
+        """Return the grid at a subset of the n points, given as row numbers, a mask or a slice."""
         return replace(self, wave=self.wave.part(rows))
 
 
 def expand_grids(families: list[Candidate | SineGrid]) -> list[Candidate]:
-    """List all candidates; sines at each of their frequencies."""
+    """Return a flat list of candidates, in which each sine grid is replaced by one candidate per frequency."""
     return [
         candidate
         for family in families
@@ -242,29 +266,42 @@ def expand_grids(families: list[Candidate | SineGrid]) -> list[Candidate]:
 
 
 def amplitude_and_phase(values: FloatArray, amplitude: str) -> dict[str, float]:
-    """Convert a sin x + b cos x, `values` = (a, b), to the parameters amplitude (under the given name) and phase_rad."""
+    """Convert the coefficients of sine and cosine to amplitude and phase: a sin x + b cos x = A sin(x + phase).
+
+    Parameters
+    ----------
+    values : (2,) coefficients a and b.
+    amplitude : Name under which A is returned.
+
+    Returns
+    -------
+    A under the given name, and `phase_rad`.
+    """
     return {amplitude: float(np.hypot(*values)), "phase_rad": float(np.arctan2(values[1], values[0]))}
 
 
 def frequency_grid(low: float, high: float, step: float, most: int = 200) -> FloatArray:
-    """Return evenly spaced frequencies.
+    """Return evenly spaced frequencies from `low` to `high`, for a search of a period.
 
     Parameters
     ----------
-    low, high : First and last frequency.
-    step : Approximate spacing.
-    most : Most frequencies.
+    low, high : First and last frequency, in any unit.
+    step : Approximate spacing, same unit.
+    most : Largest number of frequencies; the spacing is widened to keep it.
     """
     return np.linspace(low, high, int(np.clip(np.ceil((high - low) / step), 2, most)))
 
 
 def disparity_frequencies(cycles: float, reach: float) -> FloatArray:
-    """Return frequencies to try for a sine of the disparity whose period in pixels is known up to the scale of the rectification.
+    """Return the frequencies at which pixel locking is searched, in cycles per pixel of disparity.
+
+    The matcher's rectification may have another scale than the nominal one. The nominal frequency is therefore known only to
+    about 3 %.
 
     Parameters
     ----------
-    cycles : Nominal cycles per pixel.
-    reach : Extent of the disparities, px.
+    cycles : Nominal frequency, cycles per pixel.
+    reach : Difference of the largest and smallest disparity, px; it determines the spacing of the frequencies.
     """
     return frequency_grid(cycles * (1 - _SCALE_UNKNOWN), cycles * (1 + _SCALE_UNKNOWN), 0.3 / max(reach, 1.0), _MOST_SCALES)
 
@@ -272,16 +309,17 @@ def disparity_frequencies(cycles: float, reach: float) -> FloatArray:
 def nonparametric_terms(
     covariate: str, values: FloatArray, highest: float = np.inf, most_cycles: float = MOST_CYCLES
 ) -> list[Candidate | SineGrid]:
-    """Make the non-parametric terms of one covariate: line, parabola, spline, steps and waves.
+    """Make regression terms of one covariate that name no cause: line, parabola, spline, steps and waves.
 
-    They describe errors that the catalogue lacks, without naming a cause.
+    They describe errors for which the catalogue has no effect.
 
     Parameters
     ----------
-    covariate : Its name.
-    values : (n,) its values.
-    highest : Frequency, per unit of the values, from which a wave belongs to an effect of the catalogue instead.
-    most_cycles : Most cycles of a wave over the extent of the values.
+    covariate : Name of the covariate.
+    values : (n,) covariate of each point.
+    highest : Waves from this frequency on, in cycles per unit of the values, are left out because an effect of the catalogue has
+        them.
+    most_cycles : Largest number of cycles of a wave over the extent of the values.
     """
     x = _standardised(values)
     smooth = _spline_columns(x)
@@ -297,16 +335,16 @@ def nonparametric_terms(
 
 
 def angle_error_terms(angle: str, covariate: str, values: FloatArray, lever: FloatArray) -> list[Candidate | SineGrid]:
-    """Make the non-parametric terms of an error of a recorded angle: line, spline and, along the angle itself, waves.
+    """Make regression terms for an error of a recorded angle that varies with a covariate: line, spline and waves.
 
-    An unevenly divided circle may have many cycles in a field of view. Waves of the zenith angle along the azimuth are left out,
-    because they are the wobble of the catalogue.
+    Waves are made only along the angle itself: an unevenly divided circle may have many cycles in a field of view. Waves of the
+    zenith angle along the azimuth are left out, because the catalogue's wobble effect has them.
 
     Parameters
     ----------
-    angle : Name of the angle that has the error.
+    angle : Name of the recorded angle that has the error.
     covariate : Name of the covariate along which the error varies.
-    values : (n,) its values.
+    values : (n,) covariate of each point.
     lever : (n,) change of the observable per radian of the angle.
     """
     x = _standardised(values)
@@ -330,7 +368,10 @@ def _spline_columns(x: FloatArray) -> FloatArray:
 
 
 def robust_extent(x: FloatArray) -> float:
-    """Return the extent of values without the outermost 0.5 % on either side; cycles of a wave are counted over it."""
+    """Return the extent of values (n,), without the outermost 0.5 % at either end.
+
+    The cycles of a wave are counted over this extent.
+    """
     return float(np.ptp(np.quantile(x, [0.005, 0.995])))
 
 
@@ -350,7 +391,7 @@ def _wave(factor: FloatArray, x: FloatArray, tried: FloatArray) -> Wave:
 
 
 def with_period(candidate: Candidate, period: float) -> Candidate:
-    """Return the same sine with another period."""
+    """Return the same sinusoidal candidate with another period, in the unit of the wave's x."""
     sine, fixed = candidate.sine, candidate.fixed
     return SineGrid(candidate.name, candidate.names[0], sine, np.empty(0), fixed, candidate.empirical, candidate.angle).at_period(
         period
@@ -358,32 +399,42 @@ def with_period(candidate: Candidate, period: float) -> Candidate:
 
 
 def prior_precision(candidate: Candidate, width: int) -> FloatArray:
-    """Return the (width,) prior inverse variances of a candidate's coefficients; 0 where nothing is known."""
+    """Return the prior inverse variances of a candidate's coefficients, padded with 0 (no prior) to `width`.
+
+    Parameters
+    ----------
+    candidate : The candidate.
+    width : Number of columns that are fitted; one more than the candidate's own if its frequency is fitted too.
+
+    Returns
+    -------
+    (width,) prior inverse variances.
+    """
     return np.zeros(width) if candidate.prior_precision is None else candidate.prior_precision
 
 
 def harmonics(covariate: str, sine: Candidate, last: int) -> Candidate:
-    """Make a candidate of the overtones that a periodic error has beside a sine, to describe a non-sinusoidal shape.
+    """Make one candidate of all overtones of a sine, which describe a periodic error that is not sinusoidal.
 
     Parameters
     ----------
     covariate : Covariate along which the error repeats.
     sine : The fundamental.
-    last : Highest overtone.
+    last : Order of the highest overtone, such as 5 for a fifth of the period.
     """
     columns = np.concatenate([sine.sine.columns(sine.period / overtone) for overtone in range(2, last + 1)], axis=1)
     return replace(_nonparametric(covariate, HARMONICS, columns), period=sine.period, angle=sine.angle)
 
 
 def line_pattern_terms(covariate: str, number: FloatArray, step: float) -> list[Candidate]:
-    """Make terms with free values for each of a few lines, which repeat along the covariate.
+    """Make regression terms for errors that repeat every 2 to 8 scan lines, columns or rows, with a free value for each line.
 
-    Lines are scan lines, columns or rows. Such patterns come from the facets of a mirror or a read-out in blocks.
+    Such patterns come from the facets of a mirror, or from a sensor that is read out in blocks.
 
     Parameters
     ----------
-    covariate : Covariate that counts the lines.
-    number : (n,) line of each point.
+    covariate : Name of the covariate that counts the lines.
+    number : (n,) number of the line on which each point lies.
     step : Difference of the covariate from one line to the next.
     """
     found = []
@@ -397,7 +448,7 @@ def line_pattern_terms(covariate: str, number: FloatArray, step: float) -> list[
 
 
 def half_pixel_sine(covariate: str, disparity: FloatArray) -> list[SineGrid]:
-    """Make a sine with two cycles per pixel of the disparity: an interpolation error that repeats at each half pixel.
+    """Make a sine with two cycles per pixel of disparity, for interpolation errors that repeat every half pixel.
 
     One cycle per pixel is an effect of the catalogue (pixel locking).
 
@@ -412,12 +463,12 @@ def half_pixel_sine(covariate: str, disparity: FloatArray) -> list[SineGrid]:
 
 
 def polynomial_term(first: str, second: str, x: FloatArray, y: FloatArray) -> Candidate:
-    """Make a polynomial of two covariates, as a non-parametric term.
+    """Make a polynomial of degree 4 in two covariates, as a non-parametric term.
 
     Parameters
     ----------
     first, second : Names of the covariates.
-    x, y : (n,) their values.
+    x, y : (n,) values of the first and of the second covariate.
     """
     s, t = _standardised(x), _standardised(y)
     powers = [(a, degree - a) for degree in range(1, _DEGREE + 1) for a in range(degree + 1)]
@@ -426,10 +477,14 @@ def polynomial_term(first: str, second: str, x: FloatArray, y: FloatArray) -> Ca
 
 
 def spatial_null_candidates(at: FloatArray) -> list[Candidate | SineGrid]:
-    """Make non-parametric terms along oblique directions on the wall, where no sensor has an axis.
+    """Make regression terms along oblique directions on the wall, as a control for errors of the reference surface.
 
-    They show how much the error of the reference can imitate: what they explain is most likely due to the reference, so a
-    covariate that varies along the wall must explain more. `at`: (n, 2) points, wall frame, m.
+    No sensor has an axis along these directions, so what the terms explain is most likely the reference's error. A term of a
+    covariate that varies along the wall must explain more than they do.
+
+    Parameters
+    ----------
+    at : (n, 2) points, wall frame, m.
     """
     turned = [(angle, at @ np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])) for angle in _DIRECTIONS]
     return [form for angle, x in turned for form in nonparametric_terms(f"{SPATIAL_NULL} {angle}", x)]

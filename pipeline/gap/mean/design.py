@@ -31,12 +31,12 @@ _NULL_ROWS = 8_000
 
 @dataclass(frozen=True, eq=False)
 class CandidateFamilies:
-    """Candidates with fixed columns, and sines whose period is searched on a grid.
+    """All candidates of a search, divided into those with fixed design columns and sines whose period is searched.
 
     Attributes
     ----------
-    plain : Candidates with fixed columns; effects of the catalogue come first.
-    grids : Grids of sines.
+    plain : Candidates with fixed columns; effects of the catalogue come before non-parametric terms.
+    grids : Sines, each with a grid of frequencies.
     """
 
     plain: list[Candidate]
@@ -44,13 +44,13 @@ class CandidateFamilies:
 
     @classmethod
     def of(cls, families: list[Candidate | SineGrid]) -> CandidateFamilies:
-        """Sort a list of both kinds."""
+        """Divide a list of candidates and sine grids into the two kinds."""
         plain = sorted((family for family in families if isinstance(family, Candidate)), key=lambda each: each.empirical)
         return cls(plain, [family for family in families if isinstance(family, SineGrid)])
 
     @cached_property
     def by_name(self) -> dict[str, tuple[list[int], list[int]]]:
-        """For each family the numbers of its plain candidates and of its sines."""
+        """For each family, the indices of its members in `plain`, and the indices of its sines counted over all grids."""
         families: dict[str, tuple[list[int], list[int]]] = {}
         for row, candidate in enumerate(self.plain):
             families.setdefault(candidate.family, ([], []))[0].append(row)
@@ -62,7 +62,7 @@ class CandidateFamilies:
         return families
 
     def sine(self, number: int) -> Candidate:
-        """Return a sine by its number over all grids."""
+        """Return the sinusoidal candidate with this index, counted over the frequencies of all grids."""
         for grid in self.grids:
             if number < len(grid.frequencies):
                 return grid.candidate(number)
@@ -72,25 +72,28 @@ class CandidateFamilies:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """All candidates on one set of points.
+    """The regression problem of one search: residuals at n points, with the columns of the pose and of all candidates.
+
+    Columns are divided by the predicted standard deviation and projected into two parts: deviations within cells of the wall, and
+    cell means (see `ProjectedColumns`). Designs are immutable.
 
     Attributes
     ----------
-    residuals : Residuals of the points.
+    residuals : The residuals.
     families : The candidates.
-    cells : Cells of the wall.
-    model : The mean model.
-    pose_basis : (n, p) orthonormal columns of the pose over sigma, in the model's rows.
-    pose_transform : (p, p) matrix from these columns to those of the residuals.
-    pose_precision : (p,) prior inverse variances of the pose's coefficients.
-    grids : The sine grids in the model's rows.
+    cells : The cells into which the wall is divided.
+    model : The mean model, with the covariances of reference error and noise.
+    pose_basis : (n, p) orthonormal basis of the pose Jacobian over sigma; rows as in `model.rows`.
+    pose_transform : (p, p) matrix R with pose Jacobian over sigma = pose_basis R.
+    pose_precision : (p,) prior inverse variances of the pose parameters.
+    grids : The sine grids; rows as in `model.rows`.
     value : The residuals over sigma, projected.
-    fixed : All fixed columns, projected, those of the pose first.
-    sine_columns : Columns of sines that became fixed; they are numbered after the others. None without any.
+    fixed : The columns of the pose, then of the candidates with fixed columns, projected.
+    sine_columns : Projected columns of sines that are held at one period, numbered after those of `fixed`; None without any.
     column_numbers : For each candidate the numbers of its columns.
-    sine_products : Products of the searched sines.
-    noise_products : (k, NULL_DRAWS) products of the fixed columns with draws of the noise within cells.
-    equations : Normal equations under every likely covariance.
+    sine_products : Inner products of the columns of the searched sines.
+    noise_products : (k, NULL_DRAWS) inner products of the fixed columns with simulated noise within cells.
+    equations : Normal equations under each covariance that the residuals allow.
     """
 
     residuals: Residuals
@@ -117,14 +120,14 @@ class Design:
         random: KeyedRandom,
         pose_precision: FloatArray | None = None,
     ) -> Design:
-        """Set up a design.
+        """Build the design of a search.
 
         Parameters
         ----------
         residuals : Residuals of the points.
-        families : Candidates and sine grids.
-        random : Source of the random numbers for the noise.
-        pose_precision : (p,) prior inverse variances of the coefficients of the pose Jacobian; 0 by default.
+        families : Candidates and sine grids to try.
+        random : Source of the random numbers for the simulated noise.
+        pose_precision : (p,) prior inverse variances of the pose parameters; None: no prior.
         """
         chosen = CandidateFamilies.of(families)
         cells = WallCells.over(residuals.wall_xy)
@@ -155,26 +158,29 @@ class Design:
 
     @cached_property
     def pose_columns(self) -> list[int]:
-        """Numbers of the pose's columns."""
+        """Numbers of the columns of the pose, which come first."""
         return list(range(self.pose_basis.shape[1]))
 
     @cached_property
     def ranked_covariances(self) -> list[int]:
-        """Numbers of the covariances, by the likelihood of the fit of the pose alone; the most likely first."""
+        """Indices into `equations.covariances`, by the likelihood of a fit of the pose alone, the most likely first."""
         return [int(row) for row in np.argsort(-self.equations.log_likelihood(self.pose_columns)[:, 0], kind="stable")]
 
     @property
     def null_covariance(self) -> CellCovariance:
-        """The most likely covariance if there is no effect."""
+        """The covariance of the cell means that is most likely if only the pose is fitted."""
         return self.equations.covariances[self.ranked_covariances[0]]
 
     @property
     def plain_columns(self) -> list[list[int]]:
-        """Numbers of the columns of each plain candidate."""
+        """For each candidate of `families.plain`, the numbers of its columns."""
         return [self.column_numbers[candidate] for candidate in self.families.plain]
 
     def conditioned_on(self, candidate: Candidate) -> Design:
-        """Return the design in which others can be fitted beside a candidate; a sine is held at its refined period."""
+        """Return the design that can score further candidates beside the given one.
+
+        A sine is held at its period, refined to the maximum of the likelihood.
+        """
         design = self if candidate in self.column_numbers else self._with_sine(candidate)
         return design._with_products(design.column_numbers[candidate])
 
@@ -208,22 +214,33 @@ class Design:
         )
 
     def columns(self, candidates: Sequence[Candidate]) -> list[int]:
-        """Return the numbers of the columns of the pose and of held candidates."""
+        """Return the column numbers of the pose and of candidates on which this design is conditioned."""
         return [*self.pose_columns, *(column for each in candidates for column in self.column_numbers[each])]
 
     def log_likelihood(self, value: FloatArray, candidate: Candidate) -> float:
-        """Return the log-likelihood of other residuals (n,) of the same points with the pose and a candidate fitted."""
+        """Return the log-likelihood of a fit of the pose and one candidate to other residuals of the same points.
+
+        Parameters
+        ----------
+        value : (n,) residuals, in the unit of the observable.
+        candidate : The candidate.
+        """
         columns = self._projected_pose.append(self.model.project(_projected(self.pose_basis, self._matrix([candidate], None))))
         projected = self.model.project(value[self.model.rows, None] * self.model.inverse_sigma[:, None])
         return fit_reml(self.model.covariances, columns, projected).log_likelihood
 
     def fit(self, candidates: list[Candidate], wave_coefficients: list[FloatArray | None] | None = None) -> MeanFit:
-        """Fit the pose (coefficients of `Residuals.pose_jacobian`) and some candidates, under their most likely covariance.
+        """Fit the pose and some candidates jointly, under the covariance of the reference error that is most likely for them.
 
         Parameters
         ----------
         candidates : Candidates to fit.
-        wave_coefficients : For each sine its coefficients (2,), to also fit a change of its frequency; None for no such column.
+        wave_coefficients : For each candidate, the present (2,) coefficients of its sine, if a change of its frequency is to be
+            fitted too, else None. None altogether: no frequency is fitted.
+
+        Returns
+        -------
+        The fit. Its coefficients are those of `Residuals.pose_jacobian`, then those of each candidate.
         """
         turned = np.linalg.inv(self.pose_transform)
         if not candidates:
@@ -249,17 +266,19 @@ class Design:
         return replace(found, coefficients=back @ found.coefficients, covariance=back @ found.covariance @ back.T)
 
     def fit_refined(self, candidates: list[Candidate], rounds: int = 4) -> tuple[list[Candidate], MeanFit]:
-        """Fit candidates with their periods refined to the maximum of the likelihood, by Gauss-Newton.
+        """Fit the pose and some candidates jointly, with the periods of sines refined to the maximum of the likelihood.
+
+        Periods are refined by Gauss-Newton.
 
         Parameters
         ----------
-        candidates : Candidates to fit, with periods from the grid.
-        rounds : Most Gauss-Newton steps.
+        candidates : Candidates to fit; sines have a period from the search grid.
+        rounds : Largest number of Gauss-Newton steps.
 
         Returns
         -------
-        The candidates with refined periods, and the joint fit with the pose. Each sine has three columns in that fit: sine,
-        cosine and change of the frequency.
+        The candidates with refined periods, and the joint fit. In it each sine has three coefficients: sine, cosine and change of
+        the frequency.
         """
         found = list(candidates)
         wave_coefficients: list[FloatArray | None] = [None] * len(found)
@@ -278,25 +297,25 @@ class Design:
         return found, self.fit(found, wave_coefficients)
 
     def split_coefficients(self, values: NDArray[Any], candidates: list[Candidate]) -> list[NDArray[Any]]:
-        """Split the coefficients of a refined fit by candidate, without those of the pose.
+        """Divide the coefficients of `fit_refined` by candidate, and drop those of the pose.
 
         Parameters
         ----------
-        values : (k,) coefficients or numbers of `fit_refined`.
-        candidates : The fitted candidates.
+        values : (k,) coefficients, or any other array with one value for each coefficient.
+        candidates : The fitted candidates, in their order.
         """
         widths = [candidate.columns.shape[1] + (candidate.wave is not None) for candidate in candidates]
         return np.split(values[len(self.pose_columns) :], np.cumsum(widths)[:-1]) if candidates else []
 
     def reference_sigma(self, candidates: list[Candidate]) -> float:
-        """Return the standard deviation of the reference's correlated error beside some candidates.
+        """Return the standard deviation of the reference's correlated error, estimated with some candidates in the model.
 
-        It is in the unit of the observable.
+        It is in the unit of the observable (m, or px of disparity).
         """
         return float(np.sqrt(self.fit(candidates).cell_covariance.variance_ratio)) * self.model.typical_sigma
 
     def residuals_after(self, chosen: list[Candidate]) -> FloatArray:
-        """Return the (n,) residuals after the fitted pose and candidates are subtracted."""
+        """Return the (n,) residuals minus the fitted pose and the fitted candidates, in the unit of the observable."""
         candidates, fit = self.fit_refined(chosen)
         value = self.residuals.value - self.residuals.pose_jacobian @ fit.coefficients[: len(self.pose_columns)]
         for candidate, coefficients in zip(candidates, self.split_coefficients(fit.coefficients, candidates), strict=True):
@@ -304,11 +323,15 @@ class Design:
         return np.asarray(value)
 
     def identifiability(self) -> tuple[list[str], FloatArray, FloatArray]:
-        """Compare the signatures of the effects, after the pose is fitted.
+        """Compare the signatures of the effects with each other and with the pose.
+
+        Two effects with a cosine near 1 in magnitude cannot be told apart; an effect with a share near 0 cannot be told from the
+        pose.
 
         Returns
         -------
-        Names of the families; cosines (f, f) between their signatures; and the share (f,) of each signature that the pose leaves.
+        Names (f) of the families; (f, f) cosines between their signatures after the pose is projected out; and (f,) the share of
+        each signature that is left then.
         """
         row = self.ranked_covariances[0]
         names, matrices = [], []

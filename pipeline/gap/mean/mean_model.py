@@ -58,13 +58,15 @@ _NOTHING = 1e-14
 
 @dataclass(frozen=True, eq=False)
 class CellCovariance:
-    """One covariance of the cells' means.
+    """One trial covariance of the m cell means: correlated error of the reference plus noise.
+
+    It is held by its eigenvalues, in units in which the noise of a cell mean is independent with variance 1.
 
     Attributes
     ----------
-    basis : Number of the correlation, and of its eigenvectors.
-    variance_ratio : Variance of the reference's error relative to the median variance of a cell's mean.
-    weight : (m,) inverse eigenvalues of the whitened covariance.
+    basis : Index of the correlation function of the reference error, and so of its eigenvectors.
+    variance_ratio : Variance of the reference error relative to the median noise variance of a cell mean.
+    weight : (m,) inverse eigenvalues.
     """
 
     basis: int
@@ -74,14 +76,14 @@ class CellCovariance:
 
 @dataclass(frozen=True)
 class MeanFit:
-    """A fit of k design columns.
+    """Result of a generalised least-squares fit of k design columns.
 
     Attributes
     ----------
     coefficients : (k,) estimates.
-    covariance : (k, k) their covariance.
-    log_likelihood : At the estimates.
-    cell_covariance : The most likely covariance of the cells' means.
+    covariance : (k, k) covariance of the estimates.
+    log_likelihood : Log-likelihood at the estimates.
+    cell_covariance : The most likely covariance of the cell means.
     """
 
     coefficients: FloatArray
@@ -91,16 +93,17 @@ class MeanFit:
 
 
 class MeanModel:
-    """Linear algebra of the mean model on one set of points.
+    """Generalised least squares for residuals with independent noise and a reference error that is correlated over metres.
 
-    Arrays over points are in the order of `rows`: the points that lie in cells, cell by cell.
+    Points are gathered in m cells of the wall. The class divides any column over the points into cell means, which follow the
+    correlated error, and deviations within cells, which are nearly independent. Arrays over points are in the order of `rows`.
 
     Attributes
     ----------
-    rows : (n,) rows of those points.
+    rows : (n,) rows of the points that lie in cells, cell by cell.
     inverse_sigma : (n,) inverse predicted standard deviations.
     within_noise : Covariance of the deviations within cells.
-    typical_sigma : Median standard deviation of a cell's mean.
+    typical_sigma : Median standard deviation of a cell mean, in the unit of the observable.
     """
 
     def __init__(
@@ -158,18 +161,18 @@ class MeanModel:
     def restrict(
         self, designs: list[ProjectedColumns], value: ProjectedColumns, most_sigma: float = np.inf
     ) -> tuple[MeanModel, list[CellCovariance], list[int]]:
-        """Keep only covariances under which the residuals are likely, whichever of the designs is fitted.
+        """Drop covariances under which the residuals are unlikely with each of the given designs, to save time later.
 
         Parameters
         ----------
-        designs : The designs to fit: the smallest and the largest one.
+        designs : Sets of columns to fit: the smallest and the largest one.
         value : The residuals, as one column.
         most_sigma : Largest standard deviation of the reference's error, in the unit of the observable.
 
         Returns
         -------
-        The model with only the correlations that are kept; the covariances; and the numbers of the kept correlations, for
-        `ProjectedColumns.in_bases`.
+        The model with the remaining correlation functions, the remaining covariances, and the indices of the remaining
+        correlation functions (for `ProjectedColumns.in_bases`).
         """
         ratios = [ratio for ratio in self._ratios if ratio <= (most_sigma / self.typical_sigma) ** 2]
         normals = [_NormalEquations.of(design, value) for design in designs]
@@ -193,7 +196,7 @@ class MeanModel:
 
     @property
     def covariances(self) -> list[CellCovariance]:
-        """Every covariance with the correlations that are kept."""
+        """Every combination of a remaining correlation function and an amplitude of the reference error."""
         return [self._covariance(basis, float(ratio)) for basis in range(len(self._bases)) for ratio in self._ratios]
 
     def _orthonormal_planes(self, offsets: list[FloatArray]) -> sparse.csr_array:
@@ -216,32 +219,42 @@ class MeanModel:
         return np.asarray(np.add.reduceat(column, self._starts))
 
     def plane_coefficients(self, weighted: FloatArray, rows: slice = slice(None)) -> FloatArray:
-        """Fit a plane to columns in each cell.
+        """Fit a plane in each cell to some columns.
 
         Parameters
         ----------
         weighted : (n', k) columns over sigma.
-        rows : The rows to which they belong.
+        rows : Slice of the n points to which they belong.
 
         Returns
         -------
-        (3 m, k) means and slopes over their standard deviations; only (m, k) means where neighbours share noise.
+        (3 m, k) mean and two slopes of each cell, over their standard deviations; only (m, k) means if neighbouring points share
+        noise.
         """
         return np.asarray((self._planes if rows == slice(None) else self._planes[:, rows]) @ weighted)
 
     def deviations(self, weighted: FloatArray, planes: FloatArray, rows: slice = slice(None)) -> FloatArray:
-        """Return the deviations from the cells' planes (or means).
+        """Subtract the planes (or means) of the cells from some columns.
 
         Parameters
         ----------
         weighted : (n, k) columns over sigma.
-        planes : Their plane coefficients.
-        rows : The rows to return.
+        planes : Coefficients from `plane_coefficients`.
+        rows : Slice of the n points to return.
         """
         return np.asarray(weighted[rows] - self._across[rows] @ planes)
 
     def in_bases(self, means: FloatArray) -> list[FloatArray]:
-        """Transform cell means (m, k) to the eigenvectors of each correlation."""
+        """Transform cell means to the eigenvectors of each correlation function, in which their covariance is diagonal.
+
+        Parameters
+        ----------
+        means : (m, k) cell means over their standard deviations.
+
+        Returns
+        -------
+        One (m, k) array for each correlation function.
+        """
         white = self._whitened(means)
         return [vectors.T @ white for _, vectors in self._bases]
 
@@ -250,7 +263,7 @@ class MeanModel:
         return means if self.within_noise.is_white else np.asarray(solve_triangular(self._root, means, lower=True))
 
     def project(self, weighted: FloatArray) -> ProjectedColumns:
-        """Split columns (n, k) over sigma into deviations within cells and cell means in each basis."""
+        """Divide columns (n, k) over sigma into deviations within cells and transformed cell means, for fits."""
         within = np.empty(weighted.shape)
         weighed = within if self.within_noise.is_white else np.empty(weighted.shape)
         between = [np.empty((self.cells, weighted.shape[1])) for _ in self._bases]
@@ -274,17 +287,17 @@ class MeanModel:
         return np.asarray((within - self.deviations(shared, self.plane_coefficients(shared))) / self.within_noise.white)
 
     def null_draws(self, at: CellCovariance, count: int, random: KeyedRandom) -> list[FloatArray]:
-        """Draw cell means under a covariance.
+        """Simulate cell means that contain only noise and the reference's error.
 
         Parameters
         ----------
-        at : The covariance.
+        at : Covariance of the cell means.
         count : Number of draws.
         random : Source of the random numbers.
 
         Returns
         -------
-        (m, count) draws in each basis.
+        For each correlation function, the (m, count) draws in its eigenvectors.
         """
         draws = random.generator().standard_normal((len(self._total), count)) / np.sqrt(at.weight)[:, None]
         vectors = self._bases[at.basis][1]
@@ -292,7 +305,7 @@ class MeanModel:
 
 
 def column_chunks(count: int) -> list[slice]:
-    """Split `count` columns into chunks that are processed together."""
+    """Divide `count` columns into slices of 32, the number that is processed at once."""
     return [slice(start, start + _AT_ONCE) for start in range(0, count, _AT_ONCE)]
 
 
@@ -323,14 +336,14 @@ _CORRELATIONS: list[Callable[[FloatArray], FloatArray]] = [
 
 @dataclass(frozen=True)
 class ProjectedColumns:
-    """Columns in both parts of the data.
+    """k design columns (or residuals), divided into their parts within and between the m cells of the wall.
 
     Attributes
     ----------
     within : (n, k) deviations within cells.
-    within_weighted : (n, k) the same times the inverse covariance of the noise: a.within.T @ b.within_weighted is a product of
-        two.
-    between : (m, k) cell means in each basis.
+    within_weighted : (n, k) deviations times the inverse covariance of their noise, so that a.within.T @ b.within_weighted are
+        the inner products of two sets of columns.
+    between : For each correlation function of the reference error, the (m, k) cell means in its eigenvectors.
     """
 
     within: FloatArray
@@ -339,7 +352,7 @@ class ProjectedColumns:
 
     @classmethod
     def concatenate(cls, parts: Sequence[ProjectedColumns]) -> ProjectedColumns:
-        """Join the columns of several parts."""
+        """Join the columns of several sets, in their order."""
         if len(parts) == 1:
             return parts[0]
         within = np.concatenate([each.within for each in parts], axis=1)
@@ -349,17 +362,17 @@ class ProjectedColumns:
         return cls(within, weighed, [np.concatenate(basis, axis=1) for basis in bases])
 
     def select(self, columns: list[int]) -> ProjectedColumns:
-        """Return some of the columns."""
+        """Return the columns with these numbers."""
         within = self.within[:, columns]
         weighed = within if self.within_weighted is self.within else self.within_weighted[:, columns]
         return ProjectedColumns(within, weighed, [part[:, columns] for part in self.between])
 
     def in_bases(self, bases: list[int]) -> ProjectedColumns:
-        """Keep only some of the bases."""
+        """Keep the cell means for only some of the correlation functions, given by their indices."""
         return ProjectedColumns(self.within, self.within_weighted, [self.between[basis] for basis in bases])
 
     def append(self, other: ProjectedColumns) -> ProjectedColumns:
-        """Append the columns of another one."""
+        """Return these columns followed by those of another set."""
         return ProjectedColumns.concatenate([self, other])
 
 
@@ -412,21 +425,18 @@ class _NormalEquations:
 def fit_reml(
     covariances: list[CellCovariance], columns: ProjectedColumns, value: ProjectedColumns, precision: FloatArray | None = None
 ) -> MeanFit:
-    """Fit all columns to the residuals, under the most likely covariance of the cells' means.
+    """Fit design columns to residuals by generalised least squares, under the most likely covariance of the cell means.
 
-    Covariances are compared by their restricted likelihood (REML, Patterson & Thompson 1971). Since the true one is not known,
-    the coefficients' covariance is averaged over all, weighted by that likelihood, and includes the differences of the estimates.
+    Covariances are compared by their restricted likelihood (REML, Patterson & Thompson 1971). The covariance of the coefficients
+    is an average over all of them, weighted by that likelihood. It includes the differences of the estimates, because the true
+    covariance is not known.
 
     Parameters
     ----------
-    covariances : Covariances to compare.
-    columns : Design columns.
+    covariances : Covariances of the cell means to compare.
+    columns : The k design columns.
     value : The residuals, as one column.
-    precision : (k, k) prior inverse covariance of the coefficients.
-
-    Returns
-    -------
-    The fit.
+    precision : (k, k) prior inverse covariance of the coefficients; None: no prior.
     """
     normal = _NormalEquations.of(columns, value)
     fits = [normal.at(each, precision) for each in covariances]

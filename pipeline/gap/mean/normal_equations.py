@@ -31,17 +31,18 @@ _AT_ONCE = 8
 
 @dataclass(frozen=True)
 class SineProducts:
-    """Products of w sines (2 w columns) with other columns.
+    """Inner products of w searched sines (2 w columns) with other columns, of which normal equations are made.
 
-    Within cells they are weighted by the inverse covariance; between cells they are means.
+    The part within cells is weighted by the inverse covariance of the noise. The part between cells depends on the covariance of
+    the cell means and is added by `at`.
 
     Attributes
     ----------
-    fixed : (2 w, k) products with the first k of the fixed columns.
-    own : (w, 2, 2) products of each sine with itself.
-    right : (2 w, v) products with v columns of values.
-    noise : (2 w, d) products with d draws of noise.
-    between : (m, 2 w) cell means in each basis.
+    fixed : (2 w, k) products with the first k fixed columns, within cells.
+    own : (w, 2, 2) products of each sine's two columns with each other, within cells.
+    right : (2 w, v) products with v columns of residuals, within cells.
+    noise : (2 w, d) products with d draws of noise, within cells.
+    between : For each correlation function of the reference error, the (m, 2 w) cell means in its eigenvectors.
     """
 
     fixed: FloatArray
@@ -59,10 +60,10 @@ class SineProducts:
         Parameters
         ----------
         model : The mean model.
-        grids : The sines.
-        fixed : (n, k) weighted deviations of fixed columns.
-        value : Columns of values.
-        noise : Draws of the noise within cells.
+        grids : Grids with w sines in all.
+        fixed : (n, k) deviations of the fixed columns within cells, times the inverse covariance of the noise.
+        value : v columns of residuals.
+        noise : d draws of the noise within cells.
         """
         beside = np.concatenate([fixed, value.within_weighted], axis=1)
 
@@ -86,13 +87,13 @@ class SineProducts:
         return cls(products[:, :count], own, products[:, count:], drawn, model.in_bases(means.T))
 
     def at(self, covariances: list[CellCovariance], within: FloatArray, between: list[FloatArray]) -> FloatArray:
-        """Return the products with some columns under each covariance.
+        """Return inner products with other columns under each of C covariances: within cells plus between cells.
 
         Parameters
         ----------
-        covariances : C covariances.
-        within : (2 w, a) products within cells.
-        between : (m, a) cell means of the columns in each basis.
+        covariances : The C covariances of the cell means.
+        within : (2 w, a) products with a other columns within cells.
+        between : For each correlation function, the (m, a) cell means of the other columns.
 
         Returns
         -------
@@ -106,7 +107,7 @@ class SineProducts:
         return found
 
     def own_at(self, covariances: list[CellCovariance]) -> FloatArray:
-        """Return the (C, w, 2, 2) products of each sine with itself under each covariance."""
+        """Return the (C, w, 2, 2) products of each sine's two columns with each other, under each of C covariances."""
         found = np.empty((len(covariances), *self.own.shape))
         for basis, rows in _by_basis(covariances).items():
             weights = np.stack([covariances[row].weight for row in rows])
@@ -126,13 +127,13 @@ def _by_basis(covariances: list[CellCovariance]) -> dict[int, list[int]]:
 
 @dataclass(frozen=True, eq=False)
 class NoiseDraws:
-    """Draws of the noise within cells, which represents its effect on any column.
+    """Simulated noise within cells, from which the noise of any design column's coefficient is computed.
 
     Attributes
     ----------
-    rows : The n' points on which white noise is drawn.
-    white : (n', d) white noise, in single precision, which is enough for draws.
-    on_nodes : (q, d) part of the grid-correlated noise (see `WithinCellNoise.draw`).
+    rows : Slice of n' of the points on which white noise is drawn.
+    white : (n', d) white noise of d draws, in single precision, which is enough here.
+    on_nodes : (q, d) contribution of grid-correlated noise at its q nodes (see `WithinCellNoise.draw`).
     """
 
     rows: slice
@@ -143,13 +144,13 @@ class NoiseDraws:
     def of(cls, model: MeanModel, count: int, most_rows: int, random: KeyedRandom) -> NoiseDraws:
         """Draw the noise.
 
-        White noise on a subsample of the points, scaled up, represents that on all.
+        To save time, white noise is drawn on a subsample of the points and scaled up to the weight of all points.
 
         Parameters
         ----------
-        model : The mean model.
+        model : The mean model, which has the covariance of the noise.
         count : Number d of draws.
-        most_rows : Most points n'.
+        most_rows : Approximate largest number n' of points in the subsample.
         random : Source of the random numbers.
         """
         rows = slice(None, None, max(len(model) // most_rows, 1))
@@ -161,12 +162,12 @@ class NoiseDraws:
         return cls(rows, (white / np.sqrt(model.within_noise.white)).astype(np.float32), on_nodes)
 
     def products(self, within: FloatArray, on_nodes: FloatArray) -> FloatArray:
-        """Return the (k, d) products of columns with the draws, weighted by the inverse covariance.
+        """Return the (k, d) inner products of k design columns with the draws, weighted by the inverse covariance of the noise.
 
         Parameters
         ----------
-        within : (n', k) deviations of the columns within cells, on `rows`.
-        on_nodes : (q, k) their products with the nodes.
+        within : (n', k) deviations of the columns within cells, on the points of `rows`.
+        on_nodes : (q, k) products of the columns with the nodes' weights (see `WithinCellNoise.to_nodes`).
         """
         return np.asarray(within.astype(np.float32).T @ self.white + on_nodes.T @ self.on_nodes)
 
@@ -178,13 +179,13 @@ def _squares(columns: FloatArray) -> FloatArray:
 
 
 def sine_products(grids: list[SineGrid], weighed: FloatArray, root: FloatArray) -> FloatArray:
-    """Compute the products of all sines with further columns.
+    """Compute the inner products within cells of all searched sines with other columns.
 
     Parameters
     ----------
-    grids : w sines in all.
-    weighed : (n, k) weighted deviations of the columns within cells.
-    root : (n,) inverse standard deviations.
+    grids : Grids with w sines in all.
+    weighed : (n, k) deviations of the other columns within cells, times the inverse covariance of the noise.
+    root : (n,) inverse standard deviations of the points.
 
     Returns
     -------
@@ -196,18 +197,21 @@ def sine_products(grids: list[SineGrid], weighed: FloatArray, root: FloatArray) 
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Normal equations of all candidates under each of C covariances.
+    """Normal equations X' V^-1 X b = X' V^-1 y of pose and all candidates, under each of C covariances V.
+
+    From them, any set of candidates is scored without returning to the points. Searched sines have products only with themselves
+    and with the h held columns: those of the pose and of effects beside which others are scored.
 
     Attributes
     ----------
-    covariances : The covariances.
-    fixed : (C, k, k) products of the fixed columns.
-    right : (C, k, v) products of these with v columns of values.
-    constant : (C, v) log-likelihood without any column.
-    wave_fixed : (C, 2 w, h) products of the sines with the h held columns.
-    wave_own : (C, w, 2, 2) products of each sine with itself.
-    wave_right : (C, 2 w, v) products of the sines with the values.
-    held_columns : Numbers of the h held ones among the fixed columns.
+    covariances : The C covariances of the cell means.
+    fixed : (C, k, k) inner products of the k fixed columns.
+    right : (C, k, v) inner products of the fixed columns with v columns of residuals.
+    constant : (C, v) log-likelihood of the residuals without any column.
+    wave_fixed : (C, 2 w, h) inner products of w sines with the held columns.
+    wave_own : (C, w, 2, 2) inner products of each sine's two columns with each other.
+    wave_right : (C, 2 w, v) inner products of the sines with the residuals.
+    held_columns : Numbers of the held columns.
     """
 
     covariances: list[CellCovariance]
@@ -220,28 +224,34 @@ class NormalEquations:
     held_columns: tuple[int, ...] = ()
 
     def with_precision(self, precision: FloatArray) -> NormalEquations:
-        """Add prior inverse variances (k,) of the fixed columns' coefficients, around 0."""
+        """Add (k,) prior inverse variances of the fixed columns' coefficients, for priors with mean 0."""
         return replace(self, fixed=self.fixed + np.diag(precision))
 
     def with_values(self, right: FloatArray, constant: FloatArray, wave_right: FloatArray) -> NormalEquations:
-        """Replace the values whose log-likelihoods are computed.
+        """Replace the residuals by other ones, such as simulated ones.
 
         Parameters
         ----------
-        right : (C, k, v) products of the new values with the fixed columns.
+        right : (C, k, v) inner products of the new residuals with the fixed columns.
         constant : (C, v) their log-likelihood without any column.
-        wave_right : (C, 2 w, v) their products with the sines.
+        wave_right : (C, 2 w, v) their inner products with the sines.
         """
         return replace(self, right=right, constant=constant, wave_right=wave_right)
 
     def with_sine_products(self, columns: list[int], products: FloatArray) -> NormalEquations:
-        """Hold some more of the fixed columns, given their products (C, 2 w, a) with the sines."""
+        """Hold `a` more fixed columns, so that sines can be scored beside them.
+
+        Parameters
+        ----------
+        columns : Numbers of the columns.
+        products : (C, 2 w, a) their inner products with the sines.
+        """
         return replace(
             self, wave_fixed=np.concatenate([self.wave_fixed, products], axis=2), held_columns=(*self.held_columns, *columns)
         )
 
     def at_covariances(self, chosen: list[int]) -> NormalEquations:
-        """Keep only some of the covariances."""
+        """Return the equations under only some of the covariances, given by their indices."""
         return self._of([self.covariances[index] for index in chosen], chosen)
 
     def _part(self, rows: slice) -> NormalEquations:
@@ -254,7 +264,7 @@ class NormalEquations:
         return replace(self, covariances=at, **{name: getattr(self, name)[rows] for name in names})
 
     def log_likelihood(self, base: list[int]) -> FloatArray:
-        """Return the (C, v) log-likelihoods with the fixed columns `base`."""
+        """Return the (C, v) log-likelihoods of fits of the fixed columns with the numbers `base`."""
         right = self.right[:, base]
         return np.asarray(self.constant + 0.5 * np.einsum("ckv,ckv->cv", right, self.solved(base, right)))
 
@@ -266,16 +276,16 @@ class NormalEquations:
         return np.asarray(np.linalg.solve(regular, right * scale[:, :, None]) * scale[:, :, None])
 
     def profile_log_likelihood(self, base: list[int], fixed: list[list[int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Maximise the log-likelihoods over the covariances.
+        """Compute the profile log-likelihood of each candidate beside a base: the maximum over the C covariances.
 
         Parameters
         ----------
-        base : Columns that are always fitted; all of them are held.
-        fixed : Lists of columns, each of which is added in turn.
+        base : Numbers of the columns that every fit contains; they must be held.
+        fixed : For each of f candidates the numbers of its columns.
 
         Returns
         -------
-        (v,) log-likelihood of the base, (f, v) with each list added, and (w, v) with each sine added.
+        (v,) values for the base alone, (f, v) with each candidate added, and (w, v) with each sine added.
         """
         parts = [self._part(slice(start, start + _AT_ONCE)) for start in range(0, len(self.covariances), _AT_ONCE)]
         found = map_in_threads(lambda part: part._profile_chunk(base, fixed), parts)
@@ -330,15 +340,15 @@ def _explained(rest: FloatArray, own: FloatArray, left: FloatArray) -> FloatArra
 def assemble(
     model: MeanModel, at: list[CellCovariance], fixed: ProjectedColumns, value: ProjectedColumns, waves: SineProducts
 ) -> NormalEquations:
-    """Assemble the normal equations, without held columns.
+    """Build the normal equations of pose and candidates; no column is held yet.
 
     Parameters
     ----------
     model : The mean model.
-    at : Covariances of the cells' means.
-    fixed : Fixed columns.
-    value : Columns of values.
-    waves : Products of the sines.
+    at : The C covariances of the cell means.
+    fixed : The fixed columns.
+    value : Columns of residuals.
+    waves : Inner products of the searched sines.
     """
     gram, right = fixed.within.T @ fixed.within_weighted, fixed.within.T @ value.within_weighted
     square = np.einsum("nv,nv->v", value.within, value.within_weighted)
@@ -357,13 +367,13 @@ def assemble(
 def extend(
     equations: NormalEquations, had: list[ProjectedColumns], value: ProjectedColumns, added: ProjectedColumns
 ) -> NormalEquations:
-    """Append fixed columns to the equations.
+    """Append fixed columns to normal equations.
 
     Parameters
     ----------
     equations : The equations.
-    had : The fixed columns so far, in parts.
-    value : Columns of values.
+    had : The present fixed columns, as one or more sets.
+    value : Columns of residuals.
     added : Columns to append.
     """
     cross, own = np.concatenate([each.within.T @ added.within_weighted for each in had]), added.within.T @ added.within_weighted

@@ -19,25 +19,27 @@ _NEAR_NULL = 8
 
 @dataclass(frozen=True)
 class NullDistribution:
-    """Log-likelihood ratios of every family in simulations of pose, correlated error of the reference and noise alone.
+    """Distribution of the log-likelihood ratios if there is no effect, from simulations.
+
+    The simulations contain pose, correlated reference error and noise only. Penalties and p-values are taken from them.
 
     Attributes
     ----------
-    log_likelihood_ratios : For each family its largest ratio in each draw, (NULL_DRAWS,).
+    log_likelihood_ratios : For each family, the (NULL_DRAWS,) ratio of its best variant in each simulation.
     """
 
     log_likelihood_ratios: Mapping[str, FloatArray]
 
     @classmethod
     def of(cls, design: Design, random: KeyedRandom, ranked: Sequence[int] | None = None) -> NullDistribution:
-        """Simulate the null distribution of a design.
+        """Simulate the null distribution of a search.
 
-        Draws are made under the most likely covariance and fitted at the eight most likely ones; each family takes its best
-        variant.
+        Simulations are drawn under the most likely covariance and fitted under the eight most likely ones. Each family is
+        represented by its best variant in each simulation.
 
         Parameters
         ----------
-        design : The candidates on one set of points.
+        design : The regression problem of the search.
         random : Source of the random numbers.
         ranked : Numbers of the covariances, the most likely first; by default those of the measured residuals.
         """
@@ -62,22 +64,24 @@ class NullDistribution:
         )
 
     def penalty(self, family: str) -> float:
-        """Return the penalty of a family's score.
+        """Return what is subtracted from a family's log-likelihood ratio to give its score.
 
-        It is twice the family's mean log-likelihood ratio under the null (k for k linear coefficients).
+        It is twice the mean ratio of the family under the null: k for k linear coefficients, as in AIC, and more for a searched
+        period.
         """
         return 2 * float(self.log_likelihood_ratios[family].mean())
 
     def p_value(self, score: float, larger: Mapping[str, float] | None = None) -> float:
-        """Return the p-value (1 + b) / (1 + N) of a score.
+        """Return the p-value of a score under the null.
 
-        In b of N simulations the largest score over all families reaches it. The p-value is corrected for multiple testing,
-        because the maximum over all families is the test statistic.
+        It is (1 + b) / (1 + N), if the largest score over all families reaches the given one in b of N simulations. The maximum
+        over all families is the test statistic, which corrects for multiple testing.
 
         Parameters
         ----------
         score : Penalised log-likelihood ratio.
-        larger : Restricts the maximum to these families, whose ratios are multiplied by the given factors.
+        larger : Families over which the maximum is taken, each with a factor that multiplies its simulated ratios; None: all
+            families, with factor 1.
         """
         return float((1 + np.sum(self._largest_scores(larger) >= score)) / (1 + NULL_DRAWS))
 

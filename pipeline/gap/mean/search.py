@@ -34,12 +34,14 @@ _ALIKE = 100.0
 
 
 class MeanSearch:
-    """Scores of all candidates on one set of points, as `ForwardSelection` needs them.
+    """Scores every candidate explanation of some residuals, alone or beside effects that are already selected.
+
+    `select` runs the forward selection with these scores.
 
     Attributes
     ----------
-    design : The candidates' columns and normal equations.
-    single_effect_ratios : Log-likelihood ratio of each explanation alone.
+    design : The regression problem, with the columns of all candidates.
+    single_effect_ratios : Log-likelihood ratio of each explanation alone, by its name and whether it is empirical.
     """
 
     def __init__(
@@ -75,13 +77,27 @@ class MeanSearch:
         }
 
     def select(self) -> tuple[list[SelectedEffect], tuple[FamilyScore, ...]]:
-        """Select the explanations; return them and the scores of all families beside them."""
+        """Run the forward selection.
+
+        Returns
+        -------
+        The selected effects, and the scores that all families have beside them.
+        """
         found = ForwardSelection(self).select()
         self._designs = {(): self.design}  # frees memory: each conditioned design is as large as the search itself
         return found
 
     def score_families(self, members: EffectSet) -> tuple[FamilyScore, ...]:
-        """Return every family's best variant beside some effects, best score first."""
+        """Score every family beside some effects.
+
+        Parameters
+        ----------
+        members : The effects that are in the model already.
+
+        Returns
+        -------
+        For each family the score of its best variant, best score first.
+        """
         return self._score_families(members, self.single_effect_ratios)
 
     def _score_families(self, members: EffectSet, alone: Mapping[ExplanationKey, float]) -> tuple[FamilyScore, ...]:
@@ -113,15 +129,15 @@ class MeanSearch:
         return self._designs[candidates]
 
     def p_value(self, score: float) -> float:
-        """Return the p-value of a score under the null distribution of the largest score over all families."""
+        """Return the p-value of a score, under the simulated null distribution of the largest score over all families."""
         return self._null.p_value(score)
 
     def goodness_of_fit_p_value(self, family_scores: Sequence[FamilyScore]) -> float | None:
-        """Return the p-value of the best remaining score beside the selected effects, without spatial null candidates.
+        """Test whether anything is left to explain: return the p-value of the best score beside the selected effects.
 
-        The null draws have a Gaussian process as the reference's error. A reference with errors of a few waves has larger
-        single waves. How much larger is measured along oblique directions on the wall, where no sensor has an axis. All sines
-        are discounted by that factor, as in genomic control (Devlin & Roeder 1999).
+        The null simulations draw the reference's error from a Gaussian process. A real reference may have larger single waves.
+        How much larger is estimated along oblique directions on the wall, where no sensor has an axis, and all sines are
+        discounted by that factor. This is genomic control (Devlin & Roeder 1999).
 
         Parameters
         ----------
@@ -129,7 +145,7 @@ class MeanSearch:
 
         Returns
         -------
-        The p-value; None if nothing remains to be tested.
+        The p-value; None if no candidate remains to be tested.
         """
         scores = [item.score for item in family_scores if not item.name.startswith(SPATIAL_NULL)]
         return self._null.p_value(max(scores), self._discounts(family_scores)) if scores else None
@@ -169,13 +185,25 @@ class MeanSearch:
         return detectable_sizes(self._conditioned_on(tuple(members)), members, needed, random)
 
     def spatial_null_p_value(self, family_scores: Sequence[FamilyScore]) -> float | None:
-        """Return the p-value of the best remaining score among the spatial null candidates; None without any."""
+        """Return the p-value of the best score among the spatial null candidates, which only the reference's error can explain.
+
+        Parameters
+        ----------
+        family_scores : Scores of all families beside the selected effects.
+
+        Returns
+        -------
+        The p-value; None if there are no such candidates.
+        """
         scores = [item.score for item in family_scores if item.name.startswith(SPATIAL_NULL)]
         places = [name for name in self.design.families.by_name if name.startswith(f"free {SPATIAL_NULL}")]
         return self._null.p_value(max(scores), dict.fromkeys(places, 1.0)) if scores else None
 
     def joint_score(self, members: EffectSet) -> float:
-        """Return the score of effects together, with their periods refined: on the grid alone a strong sine would lose some."""
+        """Return the score of some effects together.
+
+        The periods of their sines are refined, because a strong sine loses likelihood on the search grid.
+        """
         candidates = tuple(member.candidate for member in members)
         design = self._conditioned_on(candidates)
         both = (design.equations.log_likelihood(base)[:, 0].max() for base in (design.columns(candidates), design.pose_columns))
@@ -183,7 +211,7 @@ class MeanSearch:
         return float(with_them - without - sum(member.log_likelihood_ratio - member.score for member in members))
 
     def correlated_covariates(self, form: FamilyScore) -> set[str]:
-        """Return the covariates that vary together with that of a non-parametric term, by their correlation."""
+        """Return the covariates that are so highly correlated with that of a non-parametric term that they could replace it."""
         found = self.design.residuals.covariates
         covariates = {name: values for name, values in found.items() if np.ptp(values) > 0}
         parts = form.name.split(" and ")
@@ -191,11 +219,16 @@ class MeanSearch:
         return {name for name, row in zip(covariates, correlation, strict=False) if row.max() > thresholds().mean.same_covariate}
 
     def with_harmonics(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
-        """Return the simplest form of a periodic term beside some effects.
+        """Return the form of a periodic non-parametric term that fits best beside some effects.
 
-        A wave gets overtones if the data require them, because a periodic error need not be a sine. A spline becomes a wave if
-        that fits as well. Of patterns that repeat every few lines the one with the fewest lines is taken, because its
-        multiples fit as well.
+        A wave gets overtones if they fit clearly better, because a periodic error need not be a sine. A spline becomes a wave if
+        that fits as well. Among patterns that repeat every few lines, the one with the fewest lines is taken, because multiples
+        of it fit as well. Other terms are returned unchanged.
+
+        Parameters
+        ----------
+        members : Effects in the model.
+        form : The non-parametric term with its score.
         """
         if form.candidate.form.startswith(LINE_PATTERN):
             return self._of_fewest_lines(members, form)
@@ -243,9 +276,14 @@ class MeanSearch:
         return best if best.score >= form.score + thresholds().mean.nonparametric_margin else form
 
     def may_be_reference_error(self, members: EffectSet, form: FamilyScore) -> bool:
-        """Tell whether a wave is no larger than the reference's error, which may contain just such a wave.
+        """Tell whether a wave is so small that it may be part of the reference's error, which can contain such waves.
 
-        The reference's error is limited to `nodes.reference_error`. More than that would be the inexact part of the wave itself.
+        The size of the reference's error is estimated by a fit, and limited by the threshold `grid_noise.reference_error`.
+
+        Parameters
+        ----------
+        members : Effects in the model.
+        form : A non-parametric term with its score; false for one that is no wave.
         """
         if form.candidate.form != "wave":
             return False
@@ -255,7 +293,10 @@ class MeanSearch:
         return size < thresholds().mean.least_wave_sigmas * error
 
     def fitted_std(self, item: FamilyScore) -> float:
-        """Return the standard deviation of what an explanation alone describes, in the unit of the observable."""
+        """Fit one explanation alone and return the standard deviation of its fitted values over the points.
+
+        It is in the unit of the observable (m, or px of disparity).
+        """
         return self._fitted_std_and_fit(item, ())[0]
 
     def _fitted_std_and_fit(self, form: FamilyScore, members: EffectSet) -> tuple[float, MeanFit]:
@@ -266,9 +307,9 @@ class MeanSearch:
         return float(np.std(columns @ values)), fit
 
     def leading_effects(self) -> list[Candidate]:
-        """List the effects of the catalogue that explain much alone, with their variants, best first.
+        """List the effects of the catalogue that explain the most on their own, best first, at most eight.
 
-        They are refitted without linearising.
+        These are worth refitting without linearisation.
         """
         plain, fixed, _ = self._profile(())
         ratios = fixed[:, 0] - plain[0]
@@ -278,7 +319,10 @@ class MeanSearch:
         return [each for ratio, each in ranked if ratio >= least][:_MOST_LEADING]
 
     def selected_alone(self, candidate: Candidate) -> SelectedEffect:
-        """Return a candidate as if it had been selected alone, with its equivalence class."""
+        """Describe a candidate as the only selected effect.
+
+        The result has its p-value and the effects that cannot be distinguished from it.
+        """
         best = next(item for item in self.score_families(()) if item.name == candidate.name and not item.empirical)
         item = replace(best, candidate=candidate)
         return ForwardSelection(self).with_equivalents((item,), item, {})

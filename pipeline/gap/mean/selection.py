@@ -24,16 +24,16 @@ _NOT_SPATIAL = ("intensity", "disparity_fraction")
 
 @dataclass(frozen=True)
 class FamilyScore:
-    """How well the best variant of a family of candidates explains the residuals beside a given set of effects.
+    """How well one family of candidates explains the residuals beside given effects, judged by its best variant.
 
     Attributes
     ----------
     name, empirical : As in `Candidate`.
-    score : Penalised log-likelihood ratio: the expected ratio on new data.
-    log_likelihood_ratio : Of the models with and without the candidate.
+    score : Penalised log-likelihood ratio, an estimate of the ratio on new data.
+    log_likelihood_ratio : Log-likelihood with the candidate minus that without it.
     candidate : The best variant.
-    negligible : Whether the ratio is so small a share of what the candidate explains alone that it may only absorb inexact
-        signatures.
+    negligible : Whether the ratio is tiny relative to that of the candidate alone. It may then only absorb the linearisation
+        error of the given effects.
     """
 
     name: str
@@ -52,14 +52,14 @@ SetScores = dict[frozenset[str], float]
 
 @dataclass(frozen=True)
 class SelectedEffect:
-    """An explanation that was selected.
+    """An explanation that the forward selection chose.
 
     Attributes
     ----------
-    candidate : The best variant.
-    indistinguishable : Names of the other effects in its equivalence class: they would score as well in its place.
-    p_value : Of the score, corrected for multiple testing over all families.
-    log_likelihood_ratio : Of the models with and without it, beside the other selected effects.
+    candidate : The best variant of the effect.
+    indistinguishable : Names of the other effects in its equivalence class, which would score as well in its place.
+    p_value : p-value of the score, corrected for multiple testing over all families.
+    log_likelihood_ratio : Log-likelihood with it minus that without it, beside the other selected effects.
     score : Penalised log-likelihood ratio.
     family_scores : Scores of all families beside the other selected effects.
     """
@@ -123,10 +123,10 @@ class _Set:
 
 
 def equivalence_margin(log_likelihood_ratio: float) -> float:
-    """Return the difference of scores within which two effects are indistinguishable.
+    """Return the difference of scores within which two effects count as indistinguishable.
 
-    It is at least `mean.class_margin` and grows with the log-likelihood ratio, because signatures are only exact to a share of
-    it.
+    It is the threshold `mean.class_margin`, or the share `mean.class_share` of the log-likelihood ratio if that is larger,
+    because linearised signatures are inexact by such a share.
     """
     return max(thresholds().mean.class_margin, thresholds().mean.class_share * log_likelihood_ratio)
 
@@ -153,44 +153,44 @@ def _beats_spatial_null(item: FamilyScore, null_score: float) -> bool:
 
 
 class CandidateScorer(Protocol):
-    """Scores that a forward selection needs; `MeanSearch` computes them."""
+    """The scores that `ForwardSelection` needs. `MeanSearch` computes them; tests may use a simple stand-in."""
 
     def score_families(self, members: EffectSet) -> tuple[FamilyScore, ...]:
-        """Return every family's best variant beside some effects, best score first."""
+        """Return the score of every family's best variant beside the effects `members`, best score first."""
 
     def p_value(self, score: float) -> float:
-        """Return the p-value of a score under the null distribution of the largest score over all families."""
+        """Return the p-value of a score, under the null distribution of the largest score over all families."""
 
     def joint_score(self, members: EffectSet) -> float:
-        """Return the score of effects together, with their periods refined."""
+        """Return the score of the effects `members` together, with the periods of their sines refined."""
 
     def correlated_covariates(self, form: FamilyScore) -> set[str]:
-        """Return the covariates that vary together with that of a non-parametric term."""
+        """Return the covariates that are so highly correlated with that of a non-parametric term that they could replace it."""
 
     def with_harmonics(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
-        """Return a wave with its overtones or as a line pattern if that explains the residuals better; else the term itself."""
+        """Return the form of a periodic term that fits best beside the effects `members`; other terms are returned unchanged."""
 
     def may_be_reference_error(self, members: EffectSet, form: FamilyScore) -> bool:
-        """Tell whether a wave is no larger than the reference's error, which may contain just such a wave."""
+        """Tell whether a wave, beside the effects `members`, is so small that it may be part of the reference's error."""
 
 
 @dataclass(frozen=True)
 class ForwardSelection:
-    """Forward selection of effects, with several sets of each size.
+    """Forward selection of effects by their scores. The five best sets of each size are extended (beam search).
 
     Attributes
     ----------
-    search : Scores of the candidates.
+    search : Provides the scores of the candidates.
     """
 
     search: CandidateScorer
 
     def select(self) -> tuple[list[SelectedEffect], tuple[FamilyScore, ...]]:
-        """Select the explanations of the residuals.
+        """Select the effects that explain the residuals.
 
         Returns
         -------
-        The selected effects, with at most one non-parametric term, and the scores of all families beside them.
+        The selected effects, among them at most one non-parametric term, and the scores that all families have beside them.
         """
         empty = _Set((), 0.0, self.search.score_families(()))
         levels, scores = [[empty]], SetScores()
@@ -297,13 +297,13 @@ class ForwardSelection:
         return score > len(state.members) * max([0.0, *second])
 
     def with_equivalents(self, among: EffectSet, item: FamilyScore, scores: SetScores) -> SelectedEffect:
-        """Describe a selected effect, with the effects that cannot be distinguished from it.
+        """Describe one effect of a selected set, with the effects that cannot be distinguished from it.
 
         Parameters
         ----------
         among : The selected set.
-        item : One of its effects.
-        scores : Scores of other sets, which may contain other variants of the other effects, such as another camera.
+        item : The effect, a member of the set.
+        scores : Scores of other sets of effects. They may contain other variants of the other members, such as another camera.
         """
         others = tuple(member for member in among if member is not item)
         beside = [

@@ -43,23 +43,27 @@ _REDUCTIONS = (1.0, 2.0, 4.0, 8.0)
 
 
 def systematic_candidates(residuals: Residuals, measurement: Measurement) -> list[Candidate]:
-    """List every systematic effect that the recorded fields allow, with cameras and searched periods as variants.
+    """List every systematic effect of the catalogue that this kind of measurement can have, as regression terms.
+
+    Each camera and each searched period is a candidate of its own. Effects that need fields which were not recorded are left out.
 
     Parameters
     ----------
-    residuals : Residuals with their geometry.
-    measurement : The measurement.
+    residuals : Residuals with the geometry of their rays or pixels.
+    measurement : The measurement, whose model must be in the state for which the residuals were computed.
     """
     return expand_grids(systematic_families(residuals, measurement))
 
 
 def systematic_families(residuals: Residuals, measurement: Measurement) -> list[Candidate | SineGrid]:
-    """List the systematic effects that the recorded fields allow, with each searched sine as one grid of periods.
+    """List the same effects as `systematic_candidates`, but with all periods of a sine as one grid.
+
+    These are the systematic effects of the catalogue that this kind of measurement can have and whose fields were recorded.
 
     Parameters
     ----------
-    residuals : Residuals with their geometry.
-    measurement : The measurement.
+    residuals : Residuals with the geometry of their rays or pixels.
+    measurement : The measurement, whose model must be in the state for which the residuals were computed.
     """
     geometry = residuals.geometry
     shown = [effect for effect in residuals.candidates if effect.shows_in == ShowsIn.MEAN and effect.known(geometry)]

@@ -24,13 +24,16 @@ _LEAST_WHITE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class WithinCellNoise:
-    """Covariance of the deviations within cells, in factored form.
+    """Covariance of the noise in deviations within cells, in a form in which its inverse is cheap to apply.
+
+    The covariance of n deviations over sigma is R = w I + Z C Z': white noise, and noise with covariance C at q grid nodes. Z are
+    the bilinear weights on the nodes over sigma, minus their cell means. Then R^-1 = (I - Z K^-1 Z') / w with K = w C^-1 + Z'Z.
 
     Attributes
     ----------
-    white : Share w of white noise.
-    nodes : (n, q) weights on the nodes over sigma, before the cells' means are subtracted.
-    means : (m, q) means of these in cells, over the standard deviation that white noise gives a mean.
+    white : Share w of white noise in the variance.
+    nodes : (n, q) weights on the nodes over sigma, before cell means are subtracted.
+    means : (m, q) cell means of these weights, over the standard deviation that white noise gives a cell mean.
     prior, root : (q, q) lower Cholesky factors of C and of K.
     """
 
@@ -42,13 +45,13 @@ class WithinCellNoise:
 
     @classmethod
     def of(cls, field: NodeField, inverse_sigma: FloatArray, gathered: sparse.csr_array) -> WithinCellNoise:
-        """Factor the covariance.
+        """Compute the factors of the covariance.
 
         Parameters
         ----------
-        field : The grid-correlated noise of n points.
+        field : The grid-correlated noise at n points.
         inverse_sigma : (n,) inverse standard deviations.
-        gathered : (m, n) matrix from columns over sigma to the cells' means.
+        gathered : (m, n) matrix that maps columns over sigma to cell means.
         """
         nodes = sparse.csr_array(field.weights.multiply(inverse_sigma[:, None]))
         means = (gathered @ nodes).toarray()
@@ -60,7 +63,7 @@ class WithinCellNoise:
         return cls(white, nodes, means, prior, cholesky(matrix, lower=True))
 
     def mean_covariance(self) -> FloatArray:
-        """Return the (m, m) covariance of the cells' means."""
+        """Return the (m, m) noise covariance of the cell means, in units of the variance that white noise alone gives them."""
         shared = self.means @ self.prior
         return np.asarray(self.white * np.eye(len(shared)) + shared @ shared.T)
 
@@ -70,12 +73,12 @@ class WithinCellNoise:
         return self.nodes.shape[1] == 0
 
     def to_nodes(self, columns: FloatArray, means: FloatArray | None = None) -> FloatArray:
-        """Return Z' times columns.
+        """Return the product Z' times k columns, with Z as in the class.
 
         Parameters
         ----------
         columns : (n, k) columns over sigma.
-        means : (m, k) their cell means; None if the columns are deviations already.
+        means : (m, k) their cell means; None if cell means are subtracted from the columns already.
 
         Returns
         -------
@@ -85,28 +88,32 @@ class WithinCellNoise:
         return found if means is None else found - self.means.T @ means
 
     def solve(self, on_nodes: FloatArray) -> FloatArray:
-        """Return K^-1 times columns (q, k)."""
+        """Return K^-1 times (q, k) columns, with K as in the class."""
         return np.asarray(cho_solve((self.root, True), on_nodes)) if len(self.root) else on_nodes
 
     def whiten(self, on_nodes: FloatArray) -> FloatArray:
-        """Return L^-1 times columns (q, k), with K = L L': products of the results are products with K^-1."""
+        """Return L^-1 times (q, k) columns, with K = L L' as in the class.
+
+        Inner products of the results are inner products weighted by K^-1.
+        """
         return np.asarray(solve_triangular(self.root, on_nodes, lower=True)) if len(self.root) else on_nodes
 
     def draw(self, white: FloatArray, rows: slice, cell_sums: FloatArray, random: KeyedRandom) -> FloatArray:
-        """Draw the node part of products of columns with noise, beside the white part.
+        """Draw the part of simulated noise that depends on the nodes, for inner products c' R^-1 r of columns c with noise r.
 
-        For noise r = root w e + Z n, c' R^-1 r = c' e / root w + (Z' c)' K^-1 (C^-1 n - Z' e / root w).
+        With white noise e and node values n, the noise is r = sqrt(w) e + Z n. Its product with a column is c' R^-1 r = c' e /
+        sqrt(w) + (Z' c)' K^-1 (C^-1 n - Z' e / sqrt(w)). Returned is the factor behind (Z' c)'.
 
         Parameters
         ----------
-        white : (n', d) draws of white noise e at some rows.
-        rows : Those rows.
-        cell_sums : (m, d) sums of the draws over cells, as in `means`.
+        white : (n', d) draws of the white noise e at some points.
+        rows : Slice of the n points at which they are drawn.
+        cell_sums : (m, d) sums of the draws over cells, scaled like `means`.
         random : Source of the random numbers.
 
         Returns
         -------
-        (q, d) the factor of (Z' c)'.
+        (q, d) factor of each draw.
         """
         own = random.generator().standard_normal((len(self.root), white.shape[1]))
         if not self.is_white:
@@ -116,6 +123,6 @@ class WithinCellNoise:
 
 
 def inverse_from_cholesky(root: FloatArray) -> FloatArray:
-    """Return the inverse of a matrix (q, q) from its lower Cholesky factor."""
+    """Return the inverse of a symmetric (q, q) matrix, given its lower Cholesky factor."""
     half = np.tril(dpotri(root, lower=True)[0])
     return np.asarray(half + np.tril(half, -1).T)

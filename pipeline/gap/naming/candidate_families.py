@@ -41,19 +41,33 @@ _MOST_POINTS = 5_000
 
 
 def model_has(measurement: Measurement, name: str) -> bool:
-    """Whether the model contains an effect already."""
+    """Whether the measurement's model already contains the effect with this tag, such as "range_offset"."""
     return any(effect.name == name for effect in measurement.model.effects)
 
 
 def catalogue_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
-    """Return the effects of the catalogue that the recorded fields allow, with a Gaussian prior of their size."""
+    """List the systematic effects of the catalogue that the recorded fields allow and the model lacks.
+
+    Each has a Gaussian prior of its size, from the typical sizes in the catalogue.
+
+    Parameters
+    ----------
+    measurement : measurement with its model.
+    part : residuals of its points.
+    """
     return [_with_prior(each) for each in systematic_families(part, measurement)]
 
 
 def candidate_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
-    """Return every candidate explanation of the mean that the measurement's recorded fields allow.
+    """List everything that may explain the mean of the residuals, as candidates for the search.
 
-    They are the effects of the catalogue, non-parametric terms and spatial null candidates.
+    These are effects of the catalogue that the model lacks, non-parametric terms of the covariates, and spatial null candidates
+    as a control.
+
+    Parameters
+    ----------
+    measurement : measurement with its model.
+    part : residuals of its points.
     """
     named = catalogue_families(measurement, part)
     lowest = {PERIODIC[each.name]: each.frequencies[0] for each in named if isinstance(each, SineGrid) and each.name in PERIODIC}

@@ -18,28 +18,28 @@ from pipeline.gap.naming.candidate_families import candidate_families, model_has
 from pipeline.gap.naming.named_effects import (
     Estimate,
     NamedEffect,
+    absorbed_by_registration,
     aligned_with,
     effect_from_estimate,
     effect_from_locking,
     effect_from_range_step,
     effect_from_variance,
     merge_angle_curves,
+    out_of_bounds,
     within_bounds,
 )
 from pipeline.gap.naming.nonlinear_refit import (
     SearchInput,
     SearchOutcome,
-    absorbed_by_registration,
-    out_of_bounds,
     select_and_refit,
 )
-from pipeline.gap.naming.search_residuals import at_points_of, with_added_variance, with_fitted_variance
+from pipeline.gap.naming.search_residuals import with_added_variance, with_fitted_variance
 from pipeline.gap.noise_and_edges.grid_noise import find_grid_noise, separate_white_and_grid_noise
 from pipeline.gap.noise_and_edges.noise_power import detectable_noise
 from pipeline.gap.noise_and_edges.pixel_locking import NoiseBounds, find_locking
 from pipeline.gap.noise_and_edges.rounded_ranges import find_range_step
 from pipeline.gap.noise_and_edges.variance_model import NoiseRatio, VarianceScore, VarianceTerm, fit_variance_model
-from pipeline.gap.residuals.alignment import fit_pose_robustly
+from pipeline.gap.residuals.alignment import at_points_of, fit_pose_robustly
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
@@ -60,19 +60,20 @@ NONPARAMETRIC_TERMS = ("", True)
 
 @dataclass(frozen=True)
 class SelectionResult:
-    """What a selection leaves beside the effects that it named.
+    """Result of selecting effects, apart from the effects themselves.
 
     Attributes
     ----------
-    tried, variance_tried : systematic effects and noise terms that were tried.
+    tried, variance_tried : scores of all systematic effects and of all noise terms that were tried.
     systematic : names of the selected systematic effects, empirical ones included.
-    p_value : p-value of the misfit beside all of them, None where nothing was tried.
-    p_without_effects : p-value of the misfit without any of them, None where nothing was tried.
-    unexplained_noise : observed over predicted standard deviation within cells; 1 where a noise term explains it.
+    p_value : p-value of the misfit that remains with all of these in the model; None if nothing was left to try.
+    p_without_effects : p-value of the misfit without any of them; None if nothing was tried.
+    unexplained_noise : observed over predicted standard deviation within cells of the wall; 1 if a noise term explains it.
     notes : notes for the report.
-    identifiability : cosines of the signatures, and the share of each that the pose fit leaves.
+    identifiability : names of the effects, cosines between their signatures, and the share of each signature that the pose fit
+        leaves.
     reference_sigma : standard deviation of the reference error, in the observable's unit.
-    noise_ratio : standard deviation of the residuals beside the systematic effects, over the predicted one.
+    noise_ratio : observed over predicted standard deviation of the residuals after the systematic effects.
     detectable : sizes that the effects that were not found would need to show.
     """
 
@@ -89,9 +90,15 @@ class SelectionResult:
     detectable: tuple[DetectableSize, ...]
 
     def p_beside(self, named: Sequence[NamedEffect]) -> float | None:
-        """Return the p-value of the misfit that remains beside the systematic effects that were kept.
+        """Return the p-value of the misfit that remains if only some of the selected effects are kept in the model.
 
-        None if it was not computed for this set of effects.
+        Parameters
+        ----------
+        named : effects that are kept.
+
+        Returns
+        -------
+        float or None : the p-value; None if it was not computed for this set of effects.
         """
         kept = self.systematic & {item.name for item in named}
         if kept == self.systematic:
@@ -109,20 +116,20 @@ def select_effects(
 ) -> tuple[list[NamedEffect], SelectionResult]:
     """Select the systematic effects and noise terms that explain the residuals.
 
-    The effects that the first search finds are put into the model, the residuals are computed again against it, and the search is
-    repeated beside them. Strong effects are refitted without linearising (`nonlinear_refit`). The noise terms are fitted to the
-    residuals of the search and weight the next one.
+    The effects that a linearised search finds are put into the model, residuals are computed again, and the search is repeated
+    beside them. Strong effects are refitted without linearising (`nonlinear_refit`). Noise terms are fitted to the remaining
+    residuals and weight the next search.
 
     Parameters
     ----------
     measurement : measurement of the training points.
     part : residuals of the training points.
-    noise_ratio : their standard deviation over the predicted one.
-    random : source of random numbers of the null distributions.
-    excluded : families (name, empirical) that are not tried, or `NONPARAMETRIC_TERMS`. A family whose best value is out of bounds
-        is added, and the selection is repeated.
-    grid_noise : grid-correlated noise that an earlier selection left. It imitates non-parametric terms and errors of the
-        reference, so the selection is repeated beside it.
+    noise_ratio : observed over predicted standard deviation of these.
+    random : source of random numbers for the null distributions.
+    excluded : families (name, empirical) that are not tried, or `NONPARAMETRIC_TERMS` for all empirical ones. A family whose best
+        value is out of bounds is added, and the selection is repeated.
+    grid_noise : grid-correlated noise that an earlier selection left. The selection is repeated beside it, because such noise
+        imitates non-parametric terms and errors of the reference.
 
     Returns
     -------
@@ -249,17 +256,21 @@ def _explains_everything(found: SearchOutcome) -> bool:
 def keep_implausible_in_class(
     named: list[NamedEffect], chosen: list[SelectedEffect], before: frozenset[str], excluded: frozenset[tuple[str, bool]]
 ) -> list[NamedEffect]:
-    """Add effects that were selected first, but are implausibly large, to the class of the effects named instead.
+    """Report implausibly large effects as alternatives to the effects that were named in their place.
 
-    An effect belongs to the class if the linearised search says so, or if it was named only after the implausible one was
-    excluded.
+    The search selected the implausible effects first and was then repeated without them. An implausible effect joins the
+    equivalence class of an effect that the search could not distinguish from it, or that was named only after its exclusion.
 
     Parameters
     ----------
-    named : effects of the selection without the implausible ones.
+    named : effects of the repeated selection.
     chosen : explanations of the first selection.
     before : names of the systematic effects of the first selection.
-    excluded : families that were excluded as implausible.
+    excluded : families (name, empirical) that were excluded as implausible.
+
+    Returns
+    -------
+    list : the named effects with extended classes.
     """
     implausible = [each for each in chosen if (each.candidate.name, False) in excluded]
     found = []

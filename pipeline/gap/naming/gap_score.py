@@ -45,16 +45,17 @@ _FEWEST_POINTS = 8
 
 @dataclass(frozen=True)
 class Gap:
-    """Scores on validation points, in `unit`.
+    """How far model and measurement are apart on validation points, before and after the named effects enter the model.
 
     Attributes
     ----------
-    before, after, floor : mean score of the old model, of the new model, and of draws of the new model.
+    before, after : mean score of the model without and with the named effects; smaller is better.
+    floor : mean score of simulated data of the model with the effects: what noise alone leaves.
     error : standard error of before - after.
     floor_error : standard error of before - floor.
     points : number of points that were scored.
     measure : what the score is, in words.
-    unit : m, or 1 for the Brier score of missing returns.
+    unit : unit of the scores: "m", or "1" for the Brier score of missing returns.
     """
 
     before: float
@@ -68,17 +69,20 @@ class Gap:
 
     @property
     def scores(self) -> dict[str, float]:
-        """The three scores by name."""
+        """The scores before, after and floor, by name."""
         return {"before": self.before, "after": self.after, "floor": self.floor}
 
     @property
     def display_unit(self) -> tuple[float, str]:
-        """The factor by which reports multiply a score, and the unit of the product."""
+        """Factor by which reports multiply a score, and the unit of the product."""
         return (1e3, "mm") if self.unit == "m" else (1.0, "Brier")
 
     @property
     def closed(self) -> float | None:
-        """Share of the gap that the new model closes; None where the gap is within its own uncertainty."""
+        """Share of the gap that the named effects close: (before - after) / (before - floor).
+
+        None if the gap is within its uncertainty.
+        """
         return None if self.uncertain else (self.before - self.after) / (self.before - self.floor)
 
     @property
@@ -97,7 +101,7 @@ class Gap:
         return not self.above_floor and self.before - self.after <= thresholds().verdict.gap_sigmas * self.error
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the gap as gap.json holds it."""
+        """Return the entry `gap` of gap.json."""
         note = "before - floor is within its own uncertainty" if self.uncertain else ""
         return {
             "measure": self.measure,
@@ -115,7 +119,13 @@ class Gap:
 
 @dataclass(frozen=True)
 class RegisteredModel:
-    """A model with the pose (6,) that registers it: shift (m) and rotation (rad) of the sensor against the survey."""
+    """A sensor model with the pose that registers its predictions to the measurement.
+
+    Attributes
+    ----------
+    model : the sensor model.
+    pose : (6,) shift (m) and rotation (rad) of the sensor against the surveyed pose, wall frame.
+    """
 
     model: TlsModel | StereoModel
     pose: FloatArray
@@ -124,14 +134,14 @@ class RegisteredModel:
 def simulate_errors(
     measurement: Measurement, model: TlsModel | StereoModel, residuals: Residuals, randoms: Sequence[KeyedRandom]
 ) -> FloatArray:
-    """Simulate the sensor's errors at the points of some residuals: simulated minus geometric observable.
+    """Simulate the sensor's errors at measured points: simulated minus geometric observable (range, disparity or distance).
 
     Parameters
     ----------
     measurement : measurement with its sensor at the pose to simulate from; `residuals` may be those of another pose.
-    model : model to simulate.
-    residuals : residuals whose points are simulated.
-    randoms : one source of random numbers for each simulation.
+    model : sensor model to simulate.
+    residuals : residuals of the n points.
+    randoms : d sources of random numbers, one for each simulation.
 
     Returns
     -------
@@ -160,20 +170,23 @@ def measure_gap(
     most_sigmas: float,
     random: KeyedRandom,
 ) -> Gap | None:
-    """Score two models on validation residuals, with common random numbers.
+    """Score two sensor models on validation points by simulating the measurement with each.
+
+    The score is the continuous ranked probability score (CRPS) of the mean and standard deviation of patches of the wall. Both
+    models are simulated with the same random numbers, so that their difference is less noisy.
 
     Parameters
     ----------
-    measurement : aligned measurement.
-    before, after : the models to compare.
+    measurement : measurement at its aligned pose.
+    before, after : the models without and with the named effects.
     residuals : residuals of the validation points.
-    reference_sigma : standard deviation of the reference error, in the observable's unit; it is added to every draw.
+    reference_sigma : standard deviation of the reference error, in the observable's unit; it is added to every simulation.
     most_sigmas : points farther than this many predicted standard deviations from both models are left out.
     random : source of random numbers.
 
     Returns
     -------
-    Gap or None : the scores; None where too few points remain.
+    Gap or None : the scores; None if too few points remain.
     """
     patch = wall_blocks_by_points(residuals.wall_xy, _POINTS_PER_PATCH)
     versions = [_draw_ensemble(measurement, version, residuals, random.child("ensemble")) for version in (before, after)]
@@ -213,10 +226,20 @@ def measure_gap(
 
 
 def measure_losses(missing: ExpectedPulses, chance: FloatArray, held_out: BoolArray) -> Gap | None:
-    """Score the predicted probability (m,) of losing pulses on validation pulses; before, it is the share lost of all others.
+    """Score a predicted probability of losing laser pulses on validation pulses (Brier score).
 
-    The floor is the expected score if pulses are lost with exactly that probability. held_out: (m,) validation pulses. Returns
-    None for fewer than 100 of these.
+    The score before is that of one probability for all pulses, taken from the other pulses. The floor is the expected score if
+    pulses are lost with exactly the predicted probability.
+
+    Parameters
+    ----------
+    missing : m pulses that should have returned, and whether they did.
+    chance : (m,) predicted probability of loss.
+    held_out : (m,) true for validation pulses.
+
+    Returns
+    -------
+    Gap or None : the scores; None for fewer than 100 validation pulses.
     """
     if held_out.sum() < 100:
         return None
@@ -278,5 +301,5 @@ def _crps(draws: FloatArray, value: FloatArray) -> FloatArray:
 
 
 def subsampling(count: int) -> slice:
-    """Return the slice that leaves at most about 30,000 of `count` validation points."""
+    """Return a slice that keeps at most about 30,000 of `count` points, evenly spaced."""
     return slice(None, None, max(count // _MOST_POINTS, 1))

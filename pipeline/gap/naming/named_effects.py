@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -45,18 +45,18 @@ _WEAKEST_POWERS = 20
 
 @dataclass(frozen=True)
 class NamedEffect:
-    """One effect of gap.json.
+    """One effect that the diagnosis names, as an entry of `effects` in gap.json.
 
     Attributes
     ----------
     name : name with the sensor's prefix, such as `tls.range_offset`.
-    kind : physical (of the catalogue) or empirical.
-    entry : entry of the model's `effects`: name and parameters.
+    kind : "physical" for an effect of the catalogue, "empirical" for a term without a physical cause.
+    entry : entry for the model's `effects`: name and parameter values.
     std : standard deviations of the parameters, by key.
-    alike : names of the other effects of its equivalence class.
-    p_value : p-value from the simulated null distribution, None where none was simulated.
-    gain : log-likelihood ratio, on validation blocks once it was validated.
-    split_by : further measurement that would separate the class, "" for a class of one.
+    alike : names of the other effects that this measurement cannot distinguish from it.
+    p_value : p-value from the simulated null distribution; None if none was simulated.
+    gain : log-likelihood ratio of the models with and without it; on validation blocks once it was validated.
+    split_by : further measurement that would tell it from those in `alike`; "" without any.
     """
 
     name: str
@@ -70,7 +70,7 @@ class NamedEffect:
 
     @property
     def effect(self) -> type[Effect]:
-        """Class of the effect, which for an empirical term is the effect that carries it."""
+        """Class of the effect. For an empirical term it is the class that represents the term in a model."""
         return effect_of(self.name)
 
     @property
@@ -79,7 +79,7 @@ class NamedEffect:
         return self.effect.shows_in == ShowsIn.SPREAD
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the effect as gap.json holds it."""
+        """Return the effect as an entry of `effects` in gap.json."""
         parameters = {key: {"value": value, "std": self.std.get(key)} for key, value in self.entry.items() if key != "name"}
         return {
             "name": self.name,
@@ -95,13 +95,13 @@ class NamedEffect:
 def with_effects(
     model: TlsModel | StereoModel, entries: list[dict[str, Any]], noise: dict[str, float] | None = None
 ) -> TlsModel | StereoModel:
-    """Return the model with further effects and other noise values, validated like a config.
+    """Return a sensor model with further effects and other noise values, validated like a config.
 
     Parameters
     ----------
     model : model to extend.
-    entries : entries of the effects to append.
-    noise : new values of the model's noise, by key.
+    entries : entries of the effects to append: name and parameter values.
+    noise : new values of the model's noise, by key; None: unchanged.
 
     Raises
     ------
@@ -118,25 +118,25 @@ def aligned_with(
     registration_rows: NDArray[np.int64] | None = None,
     noise: dict[str, float] | None = None,
 ) -> AlignedMeasurement:
-    """Put effects into the model of a measurement, compute its residuals and estimate the pose again.
+    """Put effects into the model of a measurement, compute its residuals, and estimate the pose again.
 
     Parameters
     ----------
     measurement : measurement to start from.
     effects : effects to append to its model.
-    registration_rows : rows of the measurement's points from which the pose is estimated; all where None.
-    noise : new values of the model's noise, by key.
+    registration_rows : rows of the measurement's points from which the pose is estimated; None: all.
+    noise : new values of the model's noise, by key; None: unchanged.
 
     Returns
     -------
-    Settled : the measurement at the estimated pose, its residuals and the pose.
+    AlignedMeasurement : the measurement at the estimated pose, its residuals and the pose.
     """
     model = with_effects(measurement.model, [item.entry for item in effects], noise)
     return align(measurement.changed(model=model), registration_rows)
 
 
 def within_bounds(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
-    """Whether a config accepts the values of an entry."""
+    """Whether the parameter values of an effect's entry are allowed in a config of the model."""
     try:
         with_effects(model, [entry])
     except InputError:
@@ -145,7 +145,12 @@ def within_bounds(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
 
 
 def only_within_bounds(model: TlsModel | StereoModel, named: list[NamedEffect]) -> tuple[list[NamedEffect], list[str]]:
-    """Return the effects whose values a config accepts, and a note for each of the others."""
+    """Keep the effects whose parameter values are allowed in a config.
+
+    Returns
+    -------
+    tuple : the effects that are kept, and a note for the report on each of the others.
+    """
     kept = [item for item in named if within_bounds(model, item.entry)]
     return kept, [
         f"{item.name} left out: its best value is outside the bounds of the effect" for item in named if item not in kept
@@ -153,28 +158,47 @@ def only_within_bounds(model: TlsModel | StereoModel, named: list[NamedEffect]) 
 
 
 def is_plausible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
-    """Whether an entry's values are within the bounds of its effect and below the largest plausible size."""
+    """Whether an effect's parameter values are allowed in a config and below the largest plausible size of the effect.
+
+    Parameters
+    ----------
+    model : model to which the effect would be added.
+    entry : entry of the effect: name and parameter values.
+    """
     if not within_bounds(model, entry):
         return False
     return relative_size(entry) <= thresholds().mean.largest_size
 
 
 def relative_size(entry: dict[str, Any]) -> float:
-    """Return the size of an effect in its typical sizes; 0 for an effect that is not in the catalogue."""
+    """Return the size of an effect relative to its typical size in the catalogue; 0 for an effect that is not in the catalogue.
+
+    Parameters
+    ----------
+    entry : entry of the effect: name and parameter values.
+    """
     effect = effect_of(entry["name"])
     sizes = effect.typical_sizes() if effect.catalogue else {}
     return max((abs(entry.get(key, 0.0) / typical) for key, typical in sizes.items()), default=0.0)
 
 
 def effect_from_range_step(comb: RangeStep, part: Residuals) -> NamedEffect:
-    """Name the rounding of ranges. Its gain is at least one unit of log-likelihood for each range on a multiple of the step."""
+    """Name the rounding of ranges (range quantisation) as an effect.
+
+    Its log-likelihood ratio is set to at least 1 for each range, because rounded ranges leave no doubt.
+
+    Parameters
+    ----------
+    comb : the step that was found.
+    part : residuals of the scan.
+    """
     entry = {"name": RangeQuantization.tag(), "step_m": comb.step_m}
     name, gain = f"tls.{RangeQuantization.tag()}", float(len(part)) * comb.strength
     return NamedEffect(name, "physical", entry, {"step_m": comb.std_m}, (), None, gain)
 
 
 def effect_from_locking(found: Locking) -> NamedEffect:
-    """Name the pixel locking that the measured disparities show."""
+    """Name pixel locking that was found in the measured disparities as an effect."""
     entry = {
         "name": PixelLocking.tag(),
         "amplitude_px": found.amplitude_px,
@@ -186,7 +210,7 @@ def effect_from_locking(found: Locking) -> NamedEffect:
 
 
 def effect_from_variance(found: VarianceTerm, sensor: str) -> NamedEffect:
-    """Name a noise term of laser ranges or disparities."""
+    """Name a fitted noise term as an effect of the sensor ("tls" or "stereo")."""
     alike = tuple(f"{sensor}.{name}" for name in found.alike)
     empirical = found.empirical or effect_of(found.effect).empirical
     entry = {"name": found.effect, **found.parameters}
@@ -195,22 +219,32 @@ def effect_from_variance(found: VarianceTerm, sensor: str) -> NamedEffect:
 
 
 def effect_from_edges(found: EdgeEffect) -> NamedEffect:
-    """Name an edge effect."""
+    """Name an effect that was found at depth steps."""
     entry = {"name": found.name, **found.effect.model_dump(mode="json", exclude_unset=True)}
     return NamedEffect(f"{found.effect.sensor}.{found.name}", "physical", entry, found.std, (), None, found.gain)
 
 
 def effect_from_tails(part: Residuals, sigma: float, gain: float) -> NamedEffect:
-    """Name heavy tails as white noise marked empirical, because the catalogue has no effect for them.
+    """Name heavy tails as additional white noise marked empirical, because the catalogue has no effect for them.
 
-    sigma: standard deviation of that noise, in the observable's unit.
+    Parameters
+    ----------
+    part : residuals with the heavy tails.
+    sigma : standard deviation of the additional noise, in the observable's unit.
+    gain : log-likelihood ratio of the models with and without the tails.
     """
     noise, key = part.white_noise
     return NamedEffect(f"{part.sensor}.{noise.tag()}", "empirical", {"name": noise.tag(), key: sigma}, {}, (), None, gain)
 
 
 def effect_from_losses(found: LossExplanation, intensity: FloatArray | None) -> NamedEffect:
-    """Name an effect on the returns. Where powers were recorded, a detection limit is taken from the weakest ones."""
+    """Name the effect that explains missing returns of laser pulses.
+
+    Parameters
+    ----------
+    found : the explanation.
+    intensity : (n,) recorded powers, from the weakest of which a detection limit is taken; None if no powers were recorded.
+    """
     parameters, std = dict(found.parameters), dict(found.std)
     kind = "empirical" if found.covariate else "physical"
     if found.name == DetectionLimit.tag() and intensity is not None:
@@ -223,9 +257,14 @@ def effect_from_losses(found: LossExplanation, intensity: FloatArray | None) -> 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A systematic effect with estimated coefficients.
+    """A selected systematic effect with its fitted coefficients.
 
-    chosen: the selected explanation; candidate: its columns; values: (k,) coefficients; covariance: (k, k) of the coefficients.
+    Attributes
+    ----------
+    chosen : the effect as selected, with its score and its equivalence class.
+    candidate : its design columns at the fitted model.
+    values : (k,) coefficients.
+    covariance : (k, k) covariance of the coefficients.
     """
 
     chosen: SelectedEffect
@@ -235,7 +274,13 @@ class Estimate:
 
 
 def effect_from_estimate(found: Estimate, part: Residuals) -> NamedEffect:
-    """Name a systematic effect. part: the residuals on whose rows its candidate is defined."""
+    """Convert a fitted systematic effect to a named effect with parameter values and standard deviations.
+
+    Parameters
+    ----------
+    found : the fitted effect.
+    part : residuals of the points at which its design columns are given.
+    """
     if found.candidate.empirical:
         return _empirical_effect(found.candidate, found.values, found.chosen, part)
     return _physical_effect(found.candidate, found.values, found.covariance, found.chosen, part)
@@ -298,11 +343,11 @@ def _angle_term(candidate: Candidate, error: FloatArray, item: SelectedEffect, p
 def merge_angle_curves(
     angles: list[NamedEffect], later: list[NamedEffect], part: Residuals
 ) -> tuple[list[NamedEffect], list[NamedEffect]]:
-    """Add curves of an angle's error that were found later along the same angle and covariate.
+    """Add up curves of the same angle's error that two successive selections found along the same covariate.
 
     Parameters
     ----------
-    angles : curves that were found first.
+    angles : curves of the first selection.
     later : effects that were found with those curves in the model.
     part : residuals, for the range of the covariates.
 
@@ -377,3 +422,43 @@ def _covariate_offset(covariate: str, part: Residuals) -> float:
 def _plain_numbers(entry: dict[str, Any]) -> dict[str, Any]:
     """Convert NumPy numbers of an entry to Python floats."""
     return {key: float(value) if isinstance(value, np.floating) else value for key, value in entry.items()}
+
+
+def out_of_bounds(measurement: Measurement, estimates: list[Estimate], part: Residuals) -> frozenset[tuple[str, bool]]:
+    """Return the families whose fitted values a config would not accept, or that are implausibly large.
+
+    Parameters
+    ----------
+    measurement : measurement to whose model the effects would be added.
+    estimates : fitted effects.
+    part : residuals of the points at which their design columns are given.
+
+    Returns
+    -------
+    frozenset : families (name, empirical).
+    """
+    wrong = [each for each in estimates if not is_plausible(measurement.model, effect_from_estimate(each, part).entry)]
+    return frozenset((each.candidate.name, each.candidate.empirical) for each in wrong)
+
+
+def absorbed_by_registration(
+    estimates: list[Estimate], part: Residuals, survival: Mapping[str, float]
+) -> frozenset[tuple[str, bool]]:
+    """Return the families that are implausibly large and that a fit of the pose absorbs almost completely.
+
+    Their size is hardly determined by the measurement.
+
+    Parameters
+    ----------
+    estimates : fitted effects.
+    part : residuals of the points at which their design columns are given.
+    survival : by effect name, the share of the signature that a fit of the pose leaves.
+
+    Returns
+    -------
+    frozenset : families (name, empirical).
+    """
+    by = thresholds().mean
+    doubtful = [each for each in estimates if not each.candidate.empirical and survival[each.candidate.name] < by.absorbed_share]
+    large = [each for each in doubtful if relative_size(effect_from_estimate(each, part).entry) > by.absorbed_size]
+    return frozenset((each.candidate.name, False) for each in large)

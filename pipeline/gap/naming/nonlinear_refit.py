@@ -20,10 +20,10 @@ from pipeline.gap.mean.candidates import (
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import FamilyScore, SelectedEffect, equivalence_margin
 from pipeline.gap.naming.candidate_families import PERIODIC, candidate_families, catalogue_families
-from pipeline.gap.naming.named_effects import Estimate, aligned_with, effect_from_estimate, is_plausible, relative_size
-from pipeline.gap.naming.search_residuals import at_points_of, with_added_variance, with_fitted_variance
+from pipeline.gap.naming.named_effects import Estimate, aligned_with, effect_from_estimate, out_of_bounds
+from pipeline.gap.naming.search_residuals import with_added_variance, with_fitted_variance
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
-from pipeline.gap.residuals.alignment import AlignedMeasurement, fit_pose_robustly
+from pipeline.gap.residuals.alignment import AlignedMeasurement, at_points_of, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
@@ -39,16 +39,16 @@ _MOST_FITS, _CONVERGED_DECREASE = 10, 0.005
 
 @dataclass(frozen=True)
 class SearchInput:
-    """Input shared by the searches for systematic effects.
+    """Input that all searches for systematic effects in one measurement share.
 
     Attributes
     ----------
     measurement : measurement of the training points.
     part : their residuals.
     families : candidates to search.
-    variance_at : returns the noise terms of residuals against a model with some systematic effects.
+    variance_at : function from residuals, computed with some systematic effects in the model, to their noise terms.
     added : variance to add to the predicted one, in squared units of the observable.
-    random : source of random numbers of the null distributions.
+    random : source of random numbers for the null distributions.
     """
 
     measurement: Measurement
@@ -61,16 +61,18 @@ class SearchInput:
 
 @dataclass(frozen=True)
 class SearchOutcome:
-    """Effects that a search selected, and the search repeated beside them without linearising.
+    """An explanation of the residuals: the effects of one search, and those of a second search beside them.
+
+    In the second search the effects of the first are in the model without linearisation.
 
     Attributes
     ----------
-    chosen : explanations of the first search.
+    chosen : effects that the first search selected.
     estimates : effects of both searches with their coefficients.
-    search : the last search.
-    residuals : residuals of the last search.
-    beside : explanations of the last search alone.
-    tried : candidates that the last search tried.
+    search : the second search.
+    residuals : residuals of the second search.
+    beside : effects that the second search selected.
+    tried : scores of all candidates of the second search, beside the selected effects.
     """
 
     chosen: list[SelectedEffect]
@@ -82,7 +84,7 @@ class SearchOutcome:
 
     @property
     def complexity(self) -> tuple[int, int]:
-        """Number of empirical terms, and number of all effects; smaller is simpler."""
+        """Number of empirical terms, and number of all effects; the smaller pair is the simpler explanation."""
         return sum(each.candidate.empirical for each in self.estimates), len(self.estimates)
 
 
@@ -197,10 +199,18 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
 
 
 def search_at_joint_fit(given: SearchInput) -> SearchOutcome | None:
-    """Select effects with the model linearised at the joint fit of all effects of the catalogue.
+    """Search for effects with the model linearised at the joint fit of all effects of the catalogue.
 
-    There the rays are traced to where they really went, whichever effect turned them, so the Jacobian is right. The fitted part
-    of all effects is added back to the residuals before the selection. Returns None if an effect is out of bounds.
+    There, rays are traced to where they really went, so the Jacobian is right even if an effect is large. The fitted part of all
+    effects is added back to the residuals before the search.
+
+    Parameters
+    ----------
+    given : input of the searches.
+
+    Returns
+    -------
+    SearchOutcome or None : the result; None if a fitted effect is out of bounds.
     """
     plain = [each for each in given.families if isinstance(each, Candidate) and not each.empirical]
     fitted = fit_jointly(given, plain)
@@ -217,10 +227,17 @@ def search_at_joint_fit(given: SearchInput) -> SearchOutcome | None:
 
 
 def fit_jointly(given: SearchInput, candidates: list[Candidate]) -> tuple[Measurement, Residuals, FloatArray] | None:
-    """Fit some effects together by Gauss-Newton.
+    """Fit the sizes of some effects together by Gauss-Newton.
 
-    Returns the measurement with them in its model, the residuals against it, and the effects' linearised part (n,) of the
-    observations; None if an effect is out of bounds or too few points remain.
+    Parameters
+    ----------
+    given : input of the searches.
+    candidates : the effects to fit.
+
+    Returns
+    -------
+    tuple or None : the measurement with the effects in its model, its residuals of n points, and the (n,) part of the
+    observations that the effects explain to first order. None if an effect is out of bounds or too few points remain.
     """
     measurement, at, before = given.measurement, given.part, np.inf
     widths = [each.columns.shape[1] for each in candidates]
@@ -369,25 +386,6 @@ def _search_beside(given: SearchInput, chosen: SearchOutcome) -> SearchOutcome |
         return None
     search, at, estimates, beside, tried = again
     return replace(chosen, estimates=estimates, search=search, residuals=at, beside=beside, tried=tried)
-
-
-def out_of_bounds(measurement: Measurement, estimates: list[Estimate], part: Residuals) -> frozenset[tuple[str, bool]]:
-    """Return the families whose estimate is outside the bounds of the effect, or implausibly large."""
-    wrong = [each for each in estimates if not is_plausible(measurement.model, effect_from_estimate(each, part).entry)]
-    return frozenset((each.candidate.name, each.candidate.empirical) for each in wrong)
-
-
-def absorbed_by_registration(
-    estimates: list[Estimate], part: Residuals, survival: Mapping[str, float]
-) -> frozenset[tuple[str, bool]]:
-    """Return implausibly large effects of which the registration leaves next to nothing.
-
-    survival: share of each signature that the pose fit leaves, by name.
-    """
-    by = thresholds().mean
-    doubtful = [each for each in estimates if not each.candidate.empirical and survival[each.candidate.name] < by.absorbed_share]
-    large = [each for each in doubtful if relative_size(effect_from_estimate(each, part).entry) > by.absorbed_size]
-    return frozenset((each.candidate.name, False) for each in large)
 
 
 def _estimates_of(search: MeanSearch, chosen: list[SelectedEffect]) -> list[Estimate]:

@@ -38,20 +38,20 @@ _MOST_POINTS = 60_000
 class PassInput:
     """Input of one selection pass: the measurement and its residuals after edge effects have been applied.
 
-    Edge effects are edge fattening, smoothing, filled occlusions and the beam footprint.
+    Edge effects act at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint.
 
     Attributes
     ----------
-    edge_effects : effects that were found at depth steps.
+    edge_effects : edge effects that are in the model.
     measurement : the measurement with these effects in its model.
-    residuals : residuals against that model.
-    touched : (n,) points that edge effects move, so that their residuals cannot be predicted to the noise.
+    residuals : residuals of n points against that model.
+    touched : (n,) true for points that edge effects move by an amount that cannot be predicted as well as the noise allows.
     changes : regions where the scene itself changed.
-    changed : (n,) points in these regions.
+    changed : (n,) true for points in these regions.
     registered_residuals : (n,) residuals after a robust pose fit, in the observable's unit.
-    noise_ratio : their standard deviation over the predicted one.
-    cells : cells of the wall in which the mean model averages.
-    held_out : (n,) points kept for validation.
+    noise_ratio : standard deviation of these over the predicted one.
+    cells : cells of the wall, over which the mean model averages.
+    held_out : (n,) true for points that are kept for validation.
     training_rows : (k,) rows of the residuals that the selection may use.
     """
 
@@ -76,14 +76,14 @@ class PassInput:
         edge_effects: list[EdgeEffect],
         realigned: bool = True,
     ) -> PassInput:
-        """Build the input of a pass from the aligned measurement and some edge effects.
+        """Build the input of a pass: put edge effects into the model, register, and find scene changes.
 
         Parameters
         ----------
-        aligned : aligned measurement.
-        plain : its residuals, without edge effects.
-        held_out_points : (N,) points of the measurement that are kept for validation.
-        edge_effects : effects to put into the model; their `touched` refers to the points of the measurement.
+        aligned : measurement of N points at its aligned pose.
+        plain : its residuals without edge effects.
+        held_out_points : (N,) true for points that are kept for validation.
+        edge_effects : effects to put into the model; their `touched` are (N,).
         realigned : whether the pose is estimated again with the edge effects in the model.
         """
         touched = np.any([np.zeros(len(plain), dtype=bool), *(each.touched[plain.index] for each in edge_effects)], axis=0)
@@ -121,19 +121,19 @@ class PassInput:
 
     @property
     def stable(self) -> BoolArray:
-        """(n,) points on smooth surface that did not change."""
+        """(n,) true for points on smooth surface that did not change."""
         return np.asarray(self.residuals.usable & ~self.changed)
 
     @property
     def measurable(self) -> BoolArray:
-        """(n,) points on which the gap may be measured: on smooth surface, or moved by an edge effect, and unchanged."""
+        """(n,) true for points at which the gap may be measured: unchanged, and on smooth surface or moved by an edge effect."""
         return np.asarray((self.residuals.usable | self.touched) & ~self.changed)
 
     @property
     def training_part(self) -> tuple[Measurement, Residuals]:
-        """The measurement and the residuals of the training rows alone.
+        """The measurement and the residuals of the training points alone.
 
-        What edge effects do at these points is kept fixed: it hardly changes while the cameras move by millimetres.
+        What edge effects do at these points is kept fixed, because it hardly changes while the cameras move by millimetres.
         """
         measurement, residuals = self.measurement, self.residuals
         if isinstance(measurement, StereoMeasurement) and isinstance(residuals, StereoResiduals):
@@ -145,7 +145,14 @@ class PassInput:
 
 @dataclass(frozen=True)
 class SelectionPass:
-    """One selection pass: its input, the effects that it named, and the rest of its result."""
+    """One run of the selection.
+
+    Attributes
+    ----------
+    pass_input : the measurement and its residuals, with certain edge effects in the model.
+    named : effects that were selected.
+    selection : the rest of the result.
+    """
 
     pass_input: PassInput
     named: list[NamedEffect]
@@ -153,17 +160,24 @@ class SelectionPass:
 
     @classmethod
     def of(cls, pass_input: PassInput, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]) -> SelectionPass:
-        """Select effects for this input. excluded: families that are not tried, as in `select_effects`."""
+        """Run the selection on one input.
+
+        Parameters
+        ----------
+        pass_input : the input.
+        random : source of random numbers for the null distributions.
+        excluded : families that are not tried, as in `select_effects`.
+        """
         return cls(pass_input, *select_effects(*pass_input.training_part, pass_input.noise_ratio, random, excluded))
 
     @property
     def edge_effect_names(self) -> set[str]:
-        """Names of the edge effects of the input."""
+        """Names of the edge effects in the model of the input."""
         return {each.name for each in self.pass_input.edge_effects}
 
     @property
     def complexity(self) -> tuple[int, int]:
-        """Number of empirical terms, and number of all effects and scene changes; smaller is simpler."""
+        """Number of empirical terms, and number of all effects and scene changes; the smaller pair is the simpler result."""
         given = self.pass_input
         return sum(item.kind == "empirical" for item in self.named), len(self.named) + len(given.edge_effects) + len(
             given.changes
@@ -172,9 +186,13 @@ class SelectionPass:
 
 @dataclass(frozen=True, eq=False)
 class PassInputs:
-    """The inputs that a selection pass may have: with all edge effects, with some, or with none.
+    """Builds the inputs that a selection pass may have: with all edge effects that were found, with some, or with none.
 
-    measurement: the aligned measurement; plain: its residuals; held_out_points: (N,) its points kept for validation.
+    Attributes
+    ----------
+    measurement : measurement of N points at its aligned pose.
+    plain : its residuals without edge effects.
+    held_out_points : (N,) true for points that are kept for validation.
     """
 
     measurement: Measurement
@@ -188,12 +206,12 @@ class PassInputs:
 
     @cached_property
     def with_edge_effects(self) -> PassInput:
-        """The input with the edge effects that show in the plain residuals, and the pose estimated again beside them."""
+        """The input with the edge effects that the residuals show, and the pose estimated again with them."""
         return self.with_these(self._edge_effects)
 
     @cached_property
     def at_initial_pose(self) -> PassInput:
-        """The same edge effects, with the pose that was estimated without them."""
+        """The input with the same edge effects as `with_edge_effects`, at the pose that was estimated without them."""
         return PassInput.of(self.measurement, self.plain, self.held_out_points, self._edge_effects, realigned=False)
 
     @cached_property
@@ -202,12 +220,12 @@ class PassInputs:
         return self.with_these([])
 
     def edge_effects_beside(self, named: list[NamedEffect]) -> list[EdgeEffect]:
-        """Return the edge effects that show once some named effects are in the model."""
+        """Return the edge effects that the residuals show once some named effects are in the model."""
         seen = aligned_with(self.measurement, named, self.plain.index[~self.held_out_points[self.plain.index]])
         return _find_edge_effects(seen.measurement, seen.residuals, self.held_out_points)
 
     def with_these(self, edge_effects: list[EdgeEffect]) -> PassInput:
-        """Return the input with the given edge effects."""
+        """Return the input with the given edge effects, and the pose estimated again with them."""
         return PassInput.of(self.measurement, self.plain, self.held_out_points, edge_effects)
 
 
@@ -215,8 +233,8 @@ def best_pass(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple
     """Run the selection with several inputs and return the simplest pass that explains the residuals.
 
     An effect that moves all rays can hide or imitate an edge effect. Edge effects are therefore searched again beside what was
-    named, and, if some were found, also beside what is named without them. Smoothing can shift the estimated pose. If the first
-    pass needs an empirical term and no single effect explains everything, a pass at the initial pose is tried too.
+    named, and, if some were found, also beside what is named without them. Smoothing can shift the estimated pose, so a pass at
+    the initial pose is tried too if the first pass needs an empirical term and no single effect explains everything.
 
     Among the passes whose noise is close to the lowest, the one of least complexity wins. The noise is compared because enough
     noise can take the place of any effect.
@@ -224,7 +242,7 @@ def best_pass(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple
     Parameters
     ----------
     inputs : inputs to choose from.
-    random : source of random numbers of the null distributions.
+    random : source of random numbers for the null distributions.
     excluded : families that are not tried, as in `select_effects`.
     """
 
@@ -253,7 +271,7 @@ def best_pass(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple
 
 
 def subsample_rows(rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return at most about 60,000 of the rows, evenly spaced."""
+    """Return at most about 60,000 of the given row numbers (k,), evenly spaced."""
     return rows[:: max(len(rows) // _MOST_POINTS, 1)]
 
 
@@ -305,6 +323,13 @@ def _with_edge_effects(
 
 
 def subsample(measurement: Measurement, residuals: Residuals, rows: NDArray[np.int64]) -> tuple[Measurement, Residuals]:
-    """Restrict a measurement and its residuals to some rows of the residuals."""
+    """Restrict a measurement and its residuals to the same points.
+
+    Parameters
+    ----------
+    measurement : measurement.
+    residuals : its residuals.
+    rows : (k,) rows of the residuals to keep.
+    """
     part = residuals.part(rows)
     return measurement.part(part.index), replace(part, index=np.arange(len(rows)), expected_pulses=None)

@@ -18,9 +18,18 @@ _IN_GENERAL = {
 
 
 def with_separating_measurements(measurement: Measurement, named: list[NamedEffect]) -> list[NamedEffect]:
-    """Fill in `split_by` of effects whose class has more than one member.
+    """Fill in, for each effect that cannot be told from others, which further measurement would tell them apart.
 
-    The signatures of the survey are compared with those after one additional measurement.
+    Each of several additional measurements is tried: the signatures of the effects must then differ enough.
+
+    Parameters
+    ----------
+    measurement : measurement as it was taken.
+    named : named effects.
+
+    Returns
+    -------
+    list : the effects with `split_by` filled in.
     """
     if not any(item.alike for item in named):
         return named
@@ -29,7 +38,13 @@ def with_separating_measurements(measurement: Measurement, named: list[NamedEffe
 
 
 def measurement_separating_noises(item: NamedEffect, sensor: str) -> str:
-    """Return what would separate some noise terms, by what they depend on; white noise depends on nothing."""
+    """Return in words what would separate noise terms that cannot be told apart, by the covariates on which they depend.
+
+    Parameters
+    ----------
+    item : a named noise term with its equivalence class.
+    sensor : "tls" or "stereo".
+    """
     told = (effect_of(name).told_by for name in (item.name, *item.alike))
     return " or ".join(filter(None, told)) or _IN_GENERAL[sensor]
 

@@ -24,16 +24,16 @@ _FEWEST_POINTS = 100
 
 @dataclass(frozen=True)
 class ValidationResult:
-    """A model with some effects, and the gap that it leaves.
+    """A sensor model with some effects, and how well it predicts the validation points.
 
     Attributes
     ----------
     named : effects in the model.
-    reduced_noise : lower noise values of the model, by key; empty where its noise was kept.
+    reduced_noise : noise values of the model that were lowered, by key; empty if its noise was kept.
     model : the model.
-    value : (n,) registered residuals against it.
-    pose : (6,) pose of that registration, shift (m) and rotation (rad).
-    gap : scores before and after, None where too few points can be scored.
+    value : (n,) residuals against it after registration, in the observable's unit.
+    pose : (6,) pose of that registration: shift (m) and rotation (rad), wall frame.
+    gap : scores before and after; None if too few points can be scored.
     """
 
     named: list[NamedEffect]
@@ -45,16 +45,17 @@ class ValidationResult:
 
     @property
     def is_worse(self) -> bool:
-        """Whether the model predicts no better with the effects than without them.
+        """Whether the model predicts the validation points worse with the effects than without.
 
-        Missing returns are not judged this way: a shrub before the validation blocks outweighs a few drops.
+        Effects on missing returns are not judged in this way, because a shrub in front of the validation blocks outweighs a few
+        drops.
         """
         gap = self.gap
         return gap is not None and gap.measure != LOSS_MEASURE and gap.after > gap.before
 
     @property
     def is_clearly_worse(self) -> bool:
-        """Whether it predicts worse by more than the uncertainty of the scores."""
+        """Whether the model predicts worse with the effects by more than the uncertainty of the scores."""
         return (
             self.is_worse
             and self.gap is not None
@@ -64,20 +65,20 @@ class ValidationResult:
 
 @dataclass(frozen=True)
 class Validation:
-    """What is needed to measure the gap for any set of effects.
+    """Measures how well the sensor model predicts validation points with any set of effects in it.
 
     Attributes
     ----------
-    measurement : measurement at the estimated pose.
-    residuals : residuals against its model.
+    measurement : measurement at its aligned pose.
+    residuals : residuals of n points against its model.
     registration_rows : rows of the residuals from which the pose is estimated.
-    tested : (n,) validation points, which no step has used.
-    training : (n,) points that the selection may use.
-    losses : explanation of the missing returns and the pulses that it was not fitted to, or None.
+    tested : (n,) true for validation points, which no earlier step has used.
+    training : (n,) true for points that the selection may use.
+    losses : explanation of the missing returns, with a mask of the pulses that it was not fitted to; or None.
     reference_sigma : standard deviation of the reference error, in the observable's unit.
     most_sigmas : points farther than this many predicted standard deviations from the models are not scored.
     random : source of random numbers.
-    reduced_noise : lower noise values to propose because the model's noise is too large, by key.
+    reduced_noise : lower noise values to propose, by key; empty if the model's noise is not too large.
     """
 
     measurement: Measurement
@@ -93,15 +94,19 @@ class Validation:
 
     @property
     def pose(self) -> FloatArray:
-        """(6,) pose that registers the model without effects."""
+        """(6,) pose that registers the model without effects: shift (m) and rotation (rad), wall frame."""
         return fit_pose(self.residuals, self.registration_rows)
 
     def validate(self, named: list[NamedEffect]) -> tuple[ValidationResult, list[str]]:
         """Measure the gap on validation points, and drop effects that make the predictions worse.
 
         While the score is worse with the effects than without, the effect that does most harm on training points is dropped, if
-        that harm exceeds its uncertainty. If the validation score itself is worse by more than its uncertainty, any effect may be
-        dropped; otherwise descriptions of the mean are kept. A lower noise is proposed only if it predicts better.
+        that harm exceeds its uncertainty. Empirical terms on the mean are dropped only if the validation score is worse by more
+        than its uncertainty. Lower noise values are proposed only if they predict better.
+
+        Parameters
+        ----------
+        named : effects that passed the selection.
 
         Returns
         -------

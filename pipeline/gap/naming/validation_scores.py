@@ -28,10 +28,13 @@ _LEAST_WHITE_SHARE = 0.02
 
 @dataclass(frozen=True)
 class ValidatedEffects:
-    """Result of the validation.
+    """Named effects, divided by whether they improve the predictions for the validation blocks.
 
-    named: effects with their validation gains; failed: effects that do not improve the validation blocks; weak: effects that
-    improve them beside others, but too little to be named.
+    Attributes
+    ----------
+    named : effects that improve them, with their log-likelihood ratio on validation blocks.
+    failed : effects that do not.
+    weak : effects that improve them beside the others, but by too little to be named.
     """
 
     named: list[NamedEffect]
@@ -42,15 +45,16 @@ class ValidatedEffects:
 def validate_effects(
     measurement: Measurement, residuals: Residuals, named: list[NamedEffect], training: BoolArray, reference_sigma: float
 ) -> ValidatedEffects:
-    """Score each effect on the validation blocks with all other effects in the model.
+    """Score each effect on the validation blocks, with all other effects in the model.
 
-    Two systematic effects may only compensate each other, and then each seems to be needed. The gain of all of them together is
-    therefore tested first. If that fails, the least important one is removed, an empirical term before any other.
+    Two systematic effects may only compensate each other, and then each seems to be needed. The log-likelihood ratio of all of
+    them together is therefore tested first. If it fails, the least important effect is removed, an empirical term before any
+    other.
 
     Parameters
     ----------
-    measurement : aligned measurement.
-    residuals : its residuals.
+    measurement : measurement at its aligned pose.
+    residuals : its residuals of n points.
     named : effects to validate.
     training : (n,) points from which the pose is estimated; the other points are scored.
     reference_sigma : standard deviation of the reference error, in the observable's unit.
@@ -105,7 +109,7 @@ def _is_weak(item: NamedEffect) -> bool:
 
 
 def describe_weakness(item: NamedEffect) -> str:
-    """Return in words why an effect is mentioned but not named."""
+    """Return in words why an effect of `ValidatedEffects.weak` is mentioned in the report but not named."""
     if _is_consistent_with_zero(item):
         return "its value is within its uncertainty of zero"
     return f"it gains only {item.gain:.1f} in log-likelihood on validation blocks"

@@ -46,95 +46,102 @@ TOO_NOISY = "No missing effect was found, but the model's noise is too large."
 
 @dataclass(frozen=True)
 class Evidence:
-    """The numbers that the verdict is decided by.
+    """The numbers that decide the verdict of a diagnosis.
 
     Attributes
     ----------
-    gap : scores on validation points, None where there are too few.
-    p_value : p-value of the residual misfit (goodness of fit), None where it was not computed.
-    spread : observed over predicted standard deviation where it is clearly below 1, else 1.
-    far : share of outliers if these lie all over the wall, 0 where they are as few as noise makes.
-    moved : share of points that lie off the reference together with their neighbours, 0 where it was not computed.
-    wide : observed over predicted standard deviation where no noise term explains it, else 1.
+    gap : scores on validation points; None if too few could be scored.
+    p_value : p-value of the remaining misfit (goodness of fit); None if it was not computed.
+    noise_ratio : observed over predicted standard deviation if it is clearly below 1, else 1.
+    outlier_share : share of outliers if they lie all over the wall and are more than normal noise makes, else 0.
+    moved_share : share of points that lie off the reference together with their neighbours; 0 if it was not computed.
+    overdispersion : observed over predicted standard deviation that no noise term explains, else 1.
     """
 
     gap: Gap | None
     p_value: float | None
-    spread: float = 1.0
-    far: float = 0.0
-    moved: float = 0.0
-    wide: float = 1.0
+    noise_ratio: float = 1.0
+    outlier_share: float = 0.0
+    moved_share: float = 0.0
+    overdispersion: float = 1.0
 
     @property
     def much_moved(self) -> bool:
-        """Whether too much of the wall moved to say anything about the sensor."""
-        return self.moved >= thresholds().changes.moved_share
+        """Whether so much of the wall moved that nothing can be said about the sensor."""
+        return self.moved_share >= thresholds().changes.moved_share
 
     @property
-    def rejects(self) -> bool:
-        """Whether the residual misfit is larger than chance would give."""
+    def misfit_is_significant(self) -> bool:
+        """Whether the remaining misfit is larger than chance would make it."""
         return self.p_value is not None and self.p_value <= thresholds().verdict.rejection_p
 
     @property
     def is_overdispersed(self) -> bool:
         """Whether the residuals have so much more variance than predicted that the model is rejected in any case."""
-        return self.wide >= thresholds().verdict.overdispersion
+        return self.overdispersion >= thresholds().verdict.overdispersion
 
     @property
-    def agrees(self) -> bool:
-        """Whether the model without any effect is accepted.
+    def model_is_accepted(self) -> bool:
+        """Whether the model without any further effect is accepted.
 
-        Tested are the gap on validation points, the misfit, the outliers and the noise.
+        It must reach the floor of the gap within the uncertainty, and neither misfit, outliers nor variance may be significant.
         """
         measured = self.gap is not None and not self.gap.above_floor and self.p_value is not None
-        return measured and not (self.rejects or self.far or self.is_overdispersed)
+        return measured and not (self.misfit_is_significant or self.outlier_share or self.is_overdispersed)
 
     @property
-    def stays_open(self) -> bool:
+    def gap_stays_open(self) -> bool:
         """Whether the named effects leave most of the gap open.
 
         The score after must exceed the floor, and most of the gap must be left, both by more than their uncertainty. It also
-        counts if the score is no better with the effects and the misfit is larger than chance would give.
+        counts if the score is worse with the effects and the misfit is significant.
         """
         gap = self.gap
-        if gap is not None and gap.after > gap.before and self.rejects:
+        if gap is not None and gap.after > gap.before and self.misfit_is_significant:
             return True
         return gap is not None and gap.closed is not None and gap.left_open and self.closes_little
 
     @property
-    def stays_rejected(self) -> bool:
-        """Whether a misfit is left beside the named effects, and the gap is too small to show what they are worth."""
-        return self.rejects and self.gap is not None and self.gap.closed is None
+    def misfit_stays(self) -> bool:
+        """Whether the misfit stays significant with the named effects, and the gap is too uncertain to show that they help."""
+        return self.misfit_is_significant and self.gap is not None and self.gap.closed is None
 
     @property
-    def supports_nothing(self) -> bool:
-        """Whether the score is no better with the named effects, and the misfit beside them was not computed."""
+    def effects_unsupported(self) -> bool:
+        """Whether the score is worse with the named effects, and no test of the misfit speaks for them."""
         return self.gap is not None and self.gap.after > self.gap.before and self.p_value is None
 
     @property
     def closes_little(self) -> bool:
-        """Whether clearly most of the gap is left with the named effects, or the gap is not known."""
+        """Whether the named effects close clearly less than the required share of the gap, or the gap is uncertain."""
         gap = self.gap
         by = thresholds().verdict
         if gap is None or gap.closed is None:
             return True
         return gap.before - gap.after + by.gap_sigmas * gap.error < by.least_closed * (gap.before - gap.floor)
 
-    def only_too_noisy(self, named: Sequence[NamedEffect]) -> bool:
-        """Whether the only fault of the model is that its noise is too large: with a lower one the floor is reached."""
-        still_open = self.gap is not None and self.gap.left_open and not self.agrees
-        return self.spread < 1.0 and not (named or self.rejects or self.far or self.is_overdispersed or still_open)
+    def only_noise_too_large(self, named: Sequence[NamedEffect]) -> bool:
+        """Whether the only fault of the model is that its noise is too large.
+
+        Parameters
+        ----------
+        named : named effects; with any, the answer is false.
+        """
+        still_open = self.gap is not None and self.gap.left_open and not self.model_is_accepted
+        return self.noise_ratio < 1.0 and not (
+            named or self.misfit_is_significant or self.outlier_share or self.is_overdispersed or still_open
+        )
 
 
 def verdict_of(named: Sequence[NamedEffect], evidence: Evidence) -> str:
-    """Return the verdict for the named effects and the evidence: a key of `VERDICTS`."""
+    """Return the verdict, a key of `VERDICTS`, that follows from the named effects and the evidence."""
     if evidence.much_moved:
         return "insufficient_data"
     if not named:
-        if evidence.gap is None and not evidence.rejects:
+        if evidence.gap is None and not evidence.misfit_is_significant:
             return "insufficient_data"
-        return "no_gap" if evidence.agrees else "unknown"
-    unsupported = evidence.stays_open or evidence.supports_nothing or evidence.stays_rejected or evidence.is_overdispersed
+        return "no_gap" if evidence.model_is_accepted else "unknown"
+    unsupported = evidence.gap_stays_open or evidence.effects_unsupported or evidence.misfit_stays or evidence.is_overdispersed
     if unsupported or any(item.kind == "empirical" for item in named):
         return "unknown"
     if len(named) > 1:
@@ -143,10 +150,17 @@ def verdict_of(named: Sequence[NamedEffect], evidence: Evidence) -> str:
 
 
 def verdict_sentence(verdict: str, named: Sequence[NamedEffect], evidence: Evidence) -> str:
-    """Return the verdict as a sentence."""
+    """Return the verdict as a sentence for the report.
+
+    Parameters
+    ----------
+    verdict : key of `VERDICTS`.
+    named : named effects.
+    evidence : the numbers that decided the verdict.
+    """
     if evidence.much_moved:
         return MUCH_MOVED
-    if verdict in ("no_gap", "unknown") and evidence.only_too_noisy(named):
+    if verdict in ("no_gap", "unknown") and evidence.only_noise_too_large(named):
         return TOO_NOISY
     kinds = {item.kind for item in named}
     if verdict == "unknown" and len(kinds) > 1:
@@ -154,23 +168,29 @@ def verdict_sentence(verdict: str, named: Sequence[NamedEffect], evidence: Evide
     if verdict == "unknown" and "empirical" not in kinds:
         if not named:
             return NOT_DESCRIBED
-        if evidence.stays_open:
+        if evidence.gap_stays_open:
             return STILL_OPEN
-        if evidence.supports_nothing:
+        if evidence.effects_unsupported:
             return UNSUPPORTED
-        return STILL_REJECTED if evidence.stays_rejected else STILL_OVERDISPERSED
+        return STILL_REJECTED if evidence.misfit_stays else STILL_OVERDISPERSED
     return VERDICTS[verdict]
 
 
 def describe_misfit(named: Sequence[NamedEffect], evidence: Evidence) -> str:
-    """Return a sentence on the misfit beside the named effects; "" where it may be chance."""
-    if not named or not evidence.rejects:
+    """Return a sentence on the misfit that remains beside the named effects; "" if it may be chance."""
+    if not named or not evidence.misfit_is_significant:
         return ""
     return f"That does not explain everything: the remaining misfit has a p-value of {evidence.p_value:.2g}."
 
 
 def describe_closing(gap: Gap, model_changed: bool) -> str:
-    """Return in words how much of the gap closes. model_changed: whether the model after differs from the model before."""
+    """Return in words how much of the gap the named effects close.
+
+    Parameters
+    ----------
+    gap : scores before and after, and the floor.
+    model_changed : whether the model after differs from the model before.
+    """
     if gap.closed is None:
         return "before and floor differ by no more than their uncertainty"
     if not model_changed:
@@ -179,24 +199,37 @@ def describe_closing(gap: Gap, model_changed: bool) -> str:
     return f"{share} % of the gap is closed" if share > 0 else "none of the gap is closed"
 
 
-def reduced_noise(model: TlsModel | StereoModel, spread: float) -> dict[str, float]:
-    """Return the noise values that fit the residuals, all lowered by the same factor; empty where the noise fits already.
+def reduced_noise(model: TlsModel | StereoModel, noise_ratio: float) -> dict[str, float]:
+    """Return the model's noise values, all lowered by the same factor to fit the residuals; empty if they are not too large.
 
-    spread: observed over predicted standard deviation.
+    Parameters
+    ----------
+    model : sensor model.
+    noise_ratio : observed over predicted standard deviation of the residuals.
+
+    Returns
+    -------
+    dict : lowered values by key.
     """
-    if spread >= 1.0:
+    if noise_ratio >= 1.0:
         return {}
     values = model.noise.model_dump(include=set(_NOISES))
-    return {key: float(f"{spread * value:.3g}") for key, value in values.items() if value > 0}
+    return {key: float(f"{noise_ratio * value:.3g}") for key, value in values.items() if value > 0}
 
 
 def note_moved_wall(evidence: Evidence, stable_areas: bool) -> list[str]:
-    """Return a note on a wall of which much moved, with the remedy. stable_areas: whether the measurement names some."""
+    """Return a note for the report if much of the wall moved, with what to do about it; else no note.
+
+    Parameters
+    ----------
+    evidence : the numbers that decide the verdict.
+    stable_areas : whether the measurement names stable areas.
+    """
     if not evidence.much_moved:
         return []
     by = thresholds().changes
     said = (
-        f"{100 * evidence.moved:.0f} % of the points lie off the reference together with their neighbours, by more than "
+        f"{100 * evidence.moved_share:.0f} % of the points lie off the reference together with their neighbours, by more than "
         f"{by.moved_sigmas:g} predicted standard deviations and {1e3 * by.smallest_departure:g} mm: rock moved, or the reference "
         "shows another place or time"
     )
@@ -205,20 +238,33 @@ def note_moved_wall(evidence: Evidence, stable_areas: bool) -> list[str]:
 
 
 def note_overdispersion(evidence: Evidence, notes: Sequence[str]) -> list[str]:
-    """Return a note on residuals with more variance than predicted, unless another note says so already."""
+    """Return a note for the report if the residuals have much more variance than predicted and no other note says so.
+
+    Parameters
+    ----------
+    evidence : the numbers that decide the verdict.
+    notes : the other notes.
+    """
     if not evidence.is_overdispersed or any("the predicted standard deviation" in note for note in notes):
         return []
     return [
-        f"the residuals have {evidence.wide:.2g} times the predicted standard deviation, and nothing that was tried explains that"
+        f"the residuals have {evidence.overdispersion:.2g} times the predicted standard deviation, "
+        "and nothing that was tried explains that"
     ]
 
 
-def note_excess_noise(spread: float, lower: dict[str, float]) -> list[str]:
-    """Return a note on a model with too much noise. lower: noise values that would fit."""
-    if spread >= 1.0:
+def note_excess_noise(noise_ratio: float, lower: dict[str, float]) -> list[str]:
+    """Return a note for the report if the model's noise is too large; else no note.
+
+    Parameters
+    ----------
+    noise_ratio : observed over predicted standard deviation of the residuals.
+    lower : noise values that would fit, by key.
+    """
+    if noise_ratio >= 1.0:
         return []
     said = (
-        f"the residuals have {100 * spread:.0f} % of the predicted standard deviation: the model's noise is too large, "
+        f"the residuals have {100 * noise_ratio:.0f} % of the predicted standard deviation: the model's noise is too large, "
         "and no effect lowers it"
     )
     proposed = ", ".join(f"{key} {value:g}" for key, value in lower.items())

@@ -39,13 +39,14 @@ from pipeline.gap.naming.verdict import (
     reduced_noise,
     verdict_of,
 )
+from pipeline.gap.noise_and_edges.heavy_tails import HeavyTails, find_heavy_tails
 from pipeline.gap.noise_and_edges.missing_returns import (
     LOSS_EFFECTS,
     LossExplanation,
     count_isolated_returns,
     explain_missing_returns,
 )
-from pipeline.gap.noise_and_edges.variance_model import HeavyTails, VarianceScore, find_heavy_tails
+from pipeline.gap.noise_and_edges.variance_model import VarianceScore
 from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.scene_changes import SceneChange, moved_share
@@ -70,7 +71,7 @@ _LEAST_MODEL_SHARE = 0.1
 
 @dataclass(frozen=True)
 class GapDiagnosis:
-    """Result of a diagnosis.
+    """Result of a diagnosis: what is wrong with the sensor model, and how much of the disagreement that explains.
 
     Attributes
     ----------
@@ -78,15 +79,15 @@ class GapDiagnosis:
     effects : named effects, sorted by gain.
     changes : regions where the scene itself changed.
     residuals : residuals of the n points that were compared.
-    held_out : (n,) validation points.
-    before, after : (n,) registered residuals without and with the named effects, in the observable's unit.
-    pose : (6 k,) shift (m) and rotation (rad) of the sensor in k set-ups, wall frame.
+    held_out : (n,) true for validation points.
+    before, after : (n,) residuals after registration, without and with the named effects, in the observable's unit.
+    pose : (6 k,) shift (m) and rotation (rad) of the sensor in k set-ups against the surveyed poses, wall frame.
     model_after : model with the named effects.
-    gap : scores before and after, None where too few points could be scored.
-    tried, variance_tried : systematic effects and noise terms that were tried.
+    gap : scores before and after; None if too few points could be scored.
+    tried, variance_tried : scores of all systematic effects and of all noise terms that were tried.
     remaining : entry `remaining` of gap.json.
-    identifiability : cosines of the signatures, and the share of each that the pose fit leaves.
-    seconds, timings : duration in all and of each step, s.
+    identifiability : names of the effects, cosines between their signatures, and the share of each that the pose fit leaves.
+    seconds, timings : duration of the whole diagnosis and of each step, s.
     unseen : effects that were not named, each with the size that would have shown with a probability of 95 %.
     reference_sigma : estimated standard deviation of the reference's correlated error, in the observable's unit.
     thresholds : thresholds that were used.
@@ -114,13 +115,13 @@ class GapDiagnosis:
 
     @property
     def evidence(self) -> Evidence:
-        """The numbers that the verdict is decided by."""
-        numbers = {name: self.remaining[name] for name in ("p_value", "spread", "far", "moved", "wide")}
-        return Evidence(self.gap, **numbers)
+        """The numbers that decided the verdict."""
+        keys = ("p_value", "spread", "far", "moved", "wide")  # in the order of the fields of Evidence
+        return Evidence(self.gap, *(self.remaining[key] for key in keys))
 
     @property
     def model_changed(self) -> bool:
-        """Whether the model after differs from the model before."""
+        """Whether the model after the diagnosis differs from the given one, in its effects or its noise."""
         return bool(self.effects or self.remaining["lower_noise"])
 
 
@@ -130,14 +131,14 @@ def diagnose(
     progress: Callable[[str], None] | None = None,
     thresholds: Thresholds = _DEFAULTS,
 ) -> GapDiagnosis:
-    """Find where a measurement disagrees with its model, name the effects that explain it, and measure the gap before and after.
+    """Find where a measurement disagrees with its sensor model, name the effects that explain it, and measure the gap.
 
     Parameters
     ----------
-    measurement : measurement to diagnose.
-    seed : seed of the null distributions, the ensembles and the subsampling.
+    measurement : measurement to diagnose, with its model.
+    seed : seed of all random numbers.
     progress : called with the name of each step of `STEPS` that is done.
-    thresholds : thresholds to use.
+    thresholds : thresholds of the tests.
 
     Returns
     -------
@@ -190,9 +191,15 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
         *validated.words,
         *harmful,
     ]
-    far = validated.tails.share if validated.tails is not None and validated.tails.uniform else 0.0
-    wide = 1.0 if any(item.adds_variance for item in result.named) else selection.unexplained_noise.value
-    evidence = Evidence(result.gap, selection.p_beside(result.named), selection.unexplained_noise.at_most_one, far, wide=wide)
+    outlier_share = validated.tails.share if validated.tails is not None and validated.tails.uniform else 0.0
+    overdispersion = 1.0 if any(item.adds_variance for item in result.named) else selection.unexplained_noise.value
+    evidence = Evidence(
+        result.gap,
+        selection.p_beside(result.named),
+        selection.unexplained_noise.at_most_one,
+        outlier_share,
+        overdispersion=overdispersion,
+    )
     notes = [*notes, *note_overdispersion(evidence, notes)]
     evidence = _with_moved_share(evidence, aligned, given, result)
     if evidence.much_moved:
@@ -249,7 +256,7 @@ def _with_moved_share(evidence: Evidence, aligned: Measurement, given: PassInput
         sigma = found.values_at(found.sigma, after.index)
         beside = moved_share(replace(after, sigma=np.where(np.isfinite(sigma), sigma, after.sigma)), sight, given.stable)
         moved = moved if beside >= thresholds().changes.moved_share_beside_noise else 0.0
-    return replace(evidence, moved=moved)
+    return replace(evidence, moved_share=moved)
 
 
 def _in_validation_epoch(epochs: NDArray[np.int64]) -> BoolArray:
@@ -387,10 +394,10 @@ def _remaining_entry(evidence: Evidence, notes: list[str], lower_noise: dict[str
     return {
         "p_value": evidence.p_value,
         "note": "; ".join(notes),
-        "spread": evidence.spread,
-        "far": evidence.far,
-        "moved": evidence.moved,
-        "wide": evidence.wide,
+        "spread": evidence.noise_ratio,
+        "far": evidence.outlier_share,
+        "moved": evidence.moved_share,
+        "wide": evidence.overdispersion,
         "lower_noise": lower_noise,
     }
 

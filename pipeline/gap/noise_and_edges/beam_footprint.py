@@ -39,19 +39,22 @@ def find_footprint(
     noise_ratio: float,
     held_out: BoolArray,
 ) -> list[EdgeEffect]:
-    """Find the beam divergence that explains points at edges better than noise of the angles does.
+    """Find the divergence of the laser beam from points at depth steps.
+
+    A wide beam hits both sides of a step and returns a range in between. The divergence is named if it explains these points
+    better than noise of the angles does.
 
     Parameters
     ----------
-    measurement : aligned scan.
-    residuals : its residuals.
+    measurement : scan at its aligned pose.
+    residuals : its residuals of n points, m.
     registered_residuals : (n,) residuals after a robust pose fit, m.
-    noise_ratio : their standard deviation over the predicted one.
-    held_out : (n,) points that must not be used.
+    noise_ratio : standard deviation of these over the predicted one.
+    held_out : (n,) true for validation points, which are not used.
 
     Returns
     -------
-    list : one edge effect, or none.
+    list : one edge effect with the divergence, or none.
     """
     sigma, footprint = noise_ratio * residuals.sigma, _FootprintSimulation(measurement, residuals)
     every = slice(None, None, max(len(residuals) // _MOST_POINTS, 1))

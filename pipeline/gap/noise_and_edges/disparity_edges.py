@@ -132,18 +132,20 @@ _EffectSearch = Callable[[_EdgeData], EdgeEffect | None]
 def find_disparity_edge_effects(
     measurement: StereoMeasurement, residuals: StereoResiduals, registered_residuals: FloatArray, held_out: BoolArray
 ) -> list[EdgeEffect]:
-    """Find the edge effects that the points support, one after another.
+    """Find effects of the stereo matcher at depth steps: edge fattening, smoothing and filled occlusions.
+
+    Effects are searched one after another, each beside those found before.
 
     Parameters
     ----------
-    measurement : aligned measurement.
-    residuals : its residuals.
+    measurement : stereo measurement at its aligned pose.
+    residuals : its residuals of n points, px of disparity.
     registered_residuals : (n,) residuals after a robust pose fit, px.
-    held_out : (n,) points that must not be used.
+    held_out : (n,) true for validation points, which are not used.
 
     Returns
     -------
-    list : effects that the model lacks; empty where the points are on no raster.
+    list : effects that the model lacks and the points support; empty if the points lie on no pixel raster.
     """
     raster = DisparityRaster.of(measurement, residuals.geometry)
     if raster is None:

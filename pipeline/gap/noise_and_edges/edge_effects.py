@@ -23,10 +23,14 @@ _POINTS_PER_BLOCK = 100.0
 
 @dataclass(frozen=True)
 class EdgeEffect:
-    """An edge effect that was found.
+    """An effect at depth steps that was found in the residuals, such as edge fattening or a wide laser beam.
 
-    effect: the effect with its values; std: standard deviations of the parameters; gain: log-likelihood ratio; touched: (n,)
-    points whose residuals cannot be predicted to the noise beside it.
+    Attributes
+    ----------
+    effect : the effect of the catalogue with its estimated values.
+    std : standard deviations of its parameters, by key.
+    gain : log-likelihood ratio of the models with and without it.
+    touched : (n,) true for points that it moves by an amount that cannot be predicted as well as the noise allows.
     """
 
     effect: Effect
@@ -42,26 +46,36 @@ class EdgeEffect:
 
 @dataclass(frozen=True)
 class WallBlocks:
-    """Blocks of the wall of about a hundred points each. number: (n,) block of each point."""
+    """Blocks of the wall with about a hundred points each. An effect is accepted only if they agree on it.
+
+    Residuals are correlated within a block, so blocks and not points count as independent.
+
+    Attributes
+    ----------
+    number : (n,) number of the block in which each point lies.
+    """
 
     number: NDArray[np.int64]
 
     @classmethod
     def over(cls, at: FloatArray) -> WallBlocks:
-        """Divide the wall into blocks. at: (n, 2) places on the wall, m."""
+        """Divide the wall into blocks, given the (n, 2) positions of the points in the wall frame, m."""
         return cls(wall_blocks_by_points(at, _POINTS_PER_BLOCK))
 
     def sums(self, gains: FloatArray) -> FloatArray:
-        """Sum gains (n,) by block."""
+        """Sum the log-likelihood ratios (n,) of the points over each block; return (b,) sums for b blocks."""
         return np.asarray(np.bincount(self.number, gains))
 
     def total_if_agreed(self, gains: FloatArray, least_sigmas: float | None = None, *, by_signs: bool = False) -> float | None:
-        """Return the total gain if it is large enough and the wall blocks agree on it, else None.
+        """Return the total log-likelihood ratio of an effect if it is large enough and the wall blocks agree on it, else None.
+
+        Agreement is the sum of the blocks' ratios over the root of the sum of their squares, like a number of standard
+        deviations.
 
         Parameters
         ----------
         gains : (n,) log-likelihood ratio of each point.
-        least_sigmas : how well the blocks must agree, in root sums of squares of their gains; `edges.block_sigmas` where None.
+        least_sigmas : smallest agreement that is accepted; None: the threshold `edges.block_sigmas`.
         by_signs : whether agreement of the signs alone is enough, for effects of which a few blocks hold most of the points.
         """
         by = thresholds().edges
@@ -75,13 +89,16 @@ class WallBlocks:
         return total
 
     def std(self, gains: Callable[[float], FloatArray], value: float, width: float | None = None) -> float:
-        """Standard deviation of a parameter at its maximum, from the scatter of the blocks' scores (sandwich estimator).
+        """Return the standard deviation of a parameter at its maximum-likelihood value.
+
+        It is computed from the scatter of the blocks' derivatives (sandwich estimator), which is valid if points in a block are
+        correlated.
 
         Parameters
         ----------
-        gains : gains (n,) as a function of the parameter.
-        value : the parameter at its maximum.
-        width : half-width of the finite difference; a twentieth of the value where None.
+        gains : function from the parameter's value to the (n,) log-likelihood ratios of the points.
+        value : maximum-likelihood value of the parameter.
+        width : half-width of the finite differences, unit of the parameter; None: a twentieth of the value.
         """
         width = 0.05 * value if width is None else width
         low, middle, high = (self.sums(gains(each)) for each in (value - width, value, value + width))
@@ -90,7 +107,18 @@ class WallBlocks:
 
 
 def log_density(registered_residuals: FloatArray, shift: FloatArray, sigma: FloatArray) -> FloatArray:
-    """(n,) log density of residuals that an effect shifts: a Gaussian, with outliers that may lie anywhere."""
+    """Return the log density of residuals that an effect shifts: a Gaussian with a constant floor for outliers.
+
+    Parameters
+    ----------
+    registered_residuals : (n,) residuals after a robust pose fit, in the unit of the observable.
+    shift : (n,) shift of each point by the effect, same unit; it counts as uncertain by 15 %.
+    sigma : (n,) standard deviations, same unit.
+
+    Returns
+    -------
+    (n,) log densities, up to a constant.
+    """
     sigma_with_height = np.hypot(sigma, _STEP_HEIGHT_UNCERTAINTY * shift)
     return np.asarray(
         np.log(np.exp(-0.5 * ((registered_residuals - shift) / sigma_with_height) ** 2) / sigma_with_height + _OUTLIER_DENSITY)
@@ -98,13 +126,15 @@ def log_density(registered_residuals: FloatArray, shift: FloatArray, sigma: Floa
 
 
 def maximise_gain(gains: Callable[[float], FloatArray], values: list[float], factors: tuple[float, ...]) -> float:
-    """Return the value of the largest total gain: on a grid, on finer grids around the best, then by a parabola.
+    """Find the value of a positive parameter at which the total log-likelihood ratio is largest.
+
+    The search tries a grid, then finer geometric grids around the best value, and ends with a parabola.
 
     Parameters
     ----------
-    gains : gains (n,) as a function of the value.
-    values : first grid.
-    factors : ratios of the finer grids.
+    gains : function from the parameter's value to the (n,) log-likelihood ratios of the points.
+    values : values of the first grid.
+    factors : ratio of neighbouring values in each finer grid, coarsest first.
     """
     best = max(values, key=lambda each: float(gains(each).sum()))
     step = 0.0

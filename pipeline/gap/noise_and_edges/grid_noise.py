@@ -173,17 +173,21 @@ class _VariogramFit:
 def separate_white_and_grid_noise(
     found: list[VarianceTerm], part: StereoResiduals, value: FloatArray, model: StereoModel
 ) -> list[VarianceTerm]:
-    """Decide by the semivariogram whether noise terms are white or grid-correlated; both become one class where it does not tell.
+    """Decide whether noise that was taken for white is independent from point to point or correlated between grid nodes.
 
-    Grid-correlated noise seems to vary with any covariate, as few nodes have one value of it. It therefore replaces an empirical
-    term.
+    The semivariogram of the residuals decides. If it does not, both kinds are reported as indistinguishable. Noise between nodes
+    also replaces an empirical noise term: few nodes have one value of a covariate, so the noise seems to vary with it.
 
     Parameters
     ----------
-    found : noise terms that were taken for white noise.
-    part : residuals.
+    found : noise terms that were fitted as white noise.
+    part : residuals, px of disparity.
     value : (n,) residuals after the systematic effects, px.
     model : sensor model.
+
+    Returns
+    -------
+    list : the noise terms of the kind that the semivariogram supports.
     """
     named = [_name_noise(replace(each, name=each.effect, empirical=False), part, value, model) for each in found]
     return [old if old.empirical and new.name == old.effect else new for old, new in zip(found, named, strict=True)]
@@ -192,18 +196,20 @@ def separate_white_and_grid_noise(
 def find_grid_noise(
     part: StereoResiduals, value: FloatArray, model: StereoModel, random: KeyedRandom
 ) -> tuple[VarianceTerm | None, str]:
-    """Find grid-correlated noise whose nodes lie so far apart that points around one node do not differ by it.
+    """Find noise that neighbouring points share because the matcher interpolates it between widely spaced grid nodes.
+
+    Points around one node hardly differ by such noise, so it does not show in the deviations within cells of the wall.
 
     Parameters
     ----------
-    part : residuals.
+    part : residuals, px of disparity.
     value : (n,) residuals after the systematic effects, px.
     model : sensor model.
-    random : source of random numbers of the null distribution.
+    random : source of random numbers for the null distribution.
 
     Returns
     -------
-    tuple : the noise term or None, and a note where the reference may be the cause ("" otherwise).
+    tuple : the noise term, or None; and a note if the reference surface may be the cause, else "".
     """
     variogram = _variogram(part, value, model)
     best = None if variogram is None else variogram.best_grid()

@@ -36,16 +36,16 @@ _LARGEST_LOG_POWER = 500.0
 
 @dataclass(frozen=True)
 class LossExplanation:
-    """An effect that explains missing returns.
+    """An explanation of why m laser pulses did or did not return.
 
     Attributes
     ----------
-    name : name of the effect; of a non-parametric explanation the nearest effect of the catalogue.
-    gain : log-likelihood ratio against a constant share of losses.
-    score : the same minus the number of parameters.
-    parameters, std : values of the effect and their standard deviations.
+    name : name of the effect; for a non-parametric explanation the nearest effect of the catalogue.
+    gain : log-likelihood ratio against the same probability of loss for all pulses.
+    score : gain minus the number of parameters.
+    parameters, std : values of the effect's parameters and their standard deviations, by key.
     probability : (m,) probability of losing each pulse.
-    tried : names and scores of the explanations that were tried.
+    tried : names and scores of the explanations that were compared.
     covariate : covariate of a non-parametric explanation, else "".
     """
 
@@ -61,9 +61,13 @@ class LossExplanation:
 
 @dataclass(frozen=True)
 class LossData:
-    """Lost pulses.
+    """Observed losses of m laser pulses, to which models of the probability of loss are fitted.
 
-    lost: (m,) whether each pulse was lost; fit: (m,) pulses that may be used; log_likelihood: of these with one share of losses.
+    Attributes
+    ----------
+    lost : (m,) whether each pulse was lost.
+    fit : (m,) true for pulses that are used for fitting.
+    log_likelihood : log-likelihood of these pulses with one probability of loss for all.
     """
 
     lost: BoolArray
@@ -72,20 +76,30 @@ class LossData:
 
     @classmethod
     def of(cls, lost: BoolArray, fit: BoolArray) -> LossData:
-        """Build it from pulses (m,)."""
+        """Build the data and compute the log-likelihood with one probability of loss for all pulses.
+
+        Parameters
+        ----------
+        lost : (m,) whether each pulse was lost.
+        fit : (m,) true for pulses to use for fitting.
+        """
         share = np.full(int(fit.sum()), np.clip(lost[fit].mean(), 1e-9, 1 - 1e-9))
         return cls(lost, fit, _log_likelihood(lost[fit], share))
 
     def best(
         self, probability: Callable[[FloatArray, FloatArray], FloatArray], x: FloatArray, starts: list[FloatArray]
     ) -> _LossFit:
-        """Maximise the likelihood over the parameters of a probability of loss.
+        """Fit a model of the probability of loss by maximum likelihood.
 
         Parameters
         ----------
-        probability : function of the parameters and of x that returns the probability of loss.
-        x : (m,) covariate of each pulse.
-        starts : parameters to start from; the best start is used.
+        probability : function from the model's parameters and the covariate x to the probability of loss of each pulse.
+        x : (m,) covariate of each pulse, such as its range.
+        starts : parameter vectors; the search begins at the most likely one.
+
+        Returns
+        -------
+        _LossFit : parameters, log-likelihood ratio against one probability for all, and probabilities (m,).
         """
         seen, lost = x[self.fit], self.lost[self.fit]
         every = slice(None, None, max(len(lost) // _MOST_PULSES, 1))
@@ -114,17 +128,18 @@ class _LossFit:
 def explain_missing_returns(
     missing: ExpectedPulses, fit: BoolArray, early: int, points: int, intensity: FloatArray | None
 ) -> LossExplanation | None:
-    """Find the effect that explains the missing returns; None if none gains enough.
+    """Find the effect that explains which laser pulses did not return; None if no explanation improves the likelihood enough.
 
-    Losses come in clusters (shrubs, wet rock), so a likelihood of independent pulses is overconfident. Gains are therefore
-    divided by the overdispersion: how much more the losses of wall patches vary than independent ones under the best explanation.
+    Losses come in clusters (shrubs, wet rock), so a likelihood of independent pulses is overconfident. Log-likelihood ratios are
+    therefore divided by the overdispersion: the variance of the losses in patches of the wall relative to that of independent
+    losses.
 
     Parameters
     ----------
-    missing : lost pulses with their covariates.
-    fit : (m,) pulses that may be used.
-    early : number of returns far before the surface, as from drops.
-    points : number of points among which these were counted.
+    missing : pulses that should have returned, with their covariates.
+    fit : (m,) true for pulses to use for fitting.
+    early : number of returns from far in front of the wall, which may be rain drops or snow flakes.
+    points : number of returns among which `early` were counted.
     intensity : (n,) recorded powers, or None.
     """
     lost = missing.lost
@@ -152,9 +167,14 @@ def explain_missing_returns(
 
 
 def count_isolated_returns(at: FloatArray, early: BoolArray) -> int:
-    """Return the number of early returns if they come from drops, which fall anywhere; 0 if they come from objects.
+    """Return the number of early returns if they are scattered as from drops or flakes, and 0 if they come from objects.
 
-    An object before the wall, or its edge, returns many pulses side by side.
+    An object in front of the wall returns many pulses side by side.
+
+    Parameters
+    ----------
+    at : (n, 2) positions of all returns on the wall, wall frame, m.
+    early : (n,) true for returns from far in front of the wall.
     """
     patch, count = wall_blocks_by_points(at, _PULSES_PER_PATCH), int(early.sum())
     number = int(patch.max()) + 1

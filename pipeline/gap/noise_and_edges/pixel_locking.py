@@ -46,10 +46,15 @@ _MOST_POINTS = 60_000
 
 @dataclass(frozen=True)
 class Locking:
-    """Pixel locking that was found.
+    """Pixel locking that was found: a matcher's systematic error that repeats with each pixel of the disparity.
 
-    amplitude_px, std_px: amplitude and its standard deviation; period_px: size of a matched pixel n; phase_rad: phase of the
-    given disparities; tilt_rad: rotation of the matcher's rectification about the base; gain: log-likelihood ratio.
+    Attributes
+    ----------
+    amplitude_px, std_px : amplitude of the sine and its standard deviation, px.
+    period_px : size of a pixel of the image that was matched, px of the full image.
+    phase_rad : phase of the sine for the given disparities, rad.
+    tilt_rad : rotation of the matcher's rectification about the base, rad.
+    gain : log-likelihood ratio against no locking.
     """
 
     amplitude_px: float
@@ -62,22 +67,34 @@ class Locking:
 
 @dataclass(frozen=True)
 class NoiseBounds:
-    """What is known about the matching noise beside the locking, px.
+    """What is known about the matching noise beside pixel locking, px.
 
-    predicted: standard deviation by the model; measured: standard deviation about the reference, noise and locking together. For
-    small amplitudes only the first multiple shows, and noise changes its size as the amplitude does; so the noise must be
-    bounded.
+    The noise must be bounded, because a small amplitude cannot be told from another amplitude with other noise.
+
+    Attributes
+    ----------
+    predicted : standard deviation of the noise in the model, px.
+    measured : standard deviation of the residuals, which contain noise and locking together, px.
     """
 
     predicted: float
     measured: float
 
     def in_matched_pixels(self, frequency: float) -> NoiseBounds:
-        """Convert to matched pixels. frequency: matched pixels in one px."""
+        """Convert the bounds to pixels of the image that was matched. `frequency` is the number of these in one px."""
         return NoiseBounds(self.predicted * frequency, self.measured * frequency)
 
     def range_beside(self, amplitude: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the lowest and highest standard deviation of the noise beside each amplitude (k,), px."""
+        """Return the lowest and the highest plausible standard deviation of the noise.
+
+        Parameters
+        ----------
+        amplitude : (k,) trial amplitudes of the locking, same unit as the bounds.
+
+        Returns
+        -------
+        tuple : (k,) lowest and (k,) highest standard deviations.
+        """
         left = np.sqrt(np.maximum(self.measured**2 - amplitude**2 / 2, _LEAST_NOISE_SHARE * self.measured**2))
         return (1 - _NOISE_UNCERTAINTY) * np.minimum(left, self.predicted), (1 + _NOISE_UNCERTAINTY) * np.maximum(
             left, self.predicted
@@ -91,17 +108,17 @@ def find_locking(
     infinity: FloatArray | float = 0.0,
     noise: NoiseBounds | None = None,
 ) -> Locking | None:
-    """Find the pixel locking that measured disparities show; None if chance would make as much crowding.
+    """Find pixel locking in measured disparities: they crowd around certain fractions of a pixel. None if it is not significant.
 
-    Without locking, n |R|^2 of the mean phasor R is exponentially distributed (Rayleigh test).
+    Test statistic is the mean phasor R of the fractions. Without locking, n |R|^2 is exponentially distributed (Rayleigh test).
 
     Parameters
     ----------
     disparity : (n,) measured disparities, px.
-    reference : (n,) disparities of the reference, px. What crowds there, beyond chance, is the wall's shape.
-    tangent : (n,) tangent of the angle between a point's rectified row and the axis.
+    reference : (n,) disparities of the reference, px. Crowding in these is due to the shape of the wall.
+    tangent : (n,) tangent of the angle between each point's rectified row and the optical axis.
     infinity : disparity of a point at infinity, px.
-    noise : bounds of the matching noise; None if it may be anything.
+    noise : bounds of the matching noise; None if it is unknown.
     """
     every = slice(None, None, max(len(disparity) // _MOST_POINTS, 1))
     far = np.broadcast_to(infinity, disparity.shape)[every]

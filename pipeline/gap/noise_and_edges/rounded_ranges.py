@@ -16,10 +16,13 @@ _SMALLEST_STEP_M, _LARGEST_STEP_M = 5e-5, 0.05
 
 @dataclass(frozen=True)
 class RangeStep:
-    """Step of the recorded ranges.
+    """The step to which a scanner rounds its ranges, as found in recorded ranges.
 
-    step_m: step; std_m: its standard deviation, from the search grid; strength: mean resultant length of the ranges modulo the
-    step.
+    Attributes
+    ----------
+    step_m : the step, m.
+    std_m : its standard deviation, which follows from the resolution of the search, m.
+    strength : mean resultant length of the ranges modulo the step: 1 if all are exact multiples, 0 if none are rounded.
     """
 
     step_m: float
@@ -28,9 +31,18 @@ class RangeStep:
 
 
 def find_range_step(ranges: FloatArray) -> RangeStep | None:
-    """Find the step to which ranges (n,), m, are rounded, as multiples counted from 0; None if they are not.
+    """Find the step to which recorded ranges are rounded.
 
-    Where a file stores coordinates with a step of its own, the ranges computed from them are smooth again and nothing is found.
+    The step is not found if the file stores coordinates rounded to a step of its own, because ranges computed from them are
+    smooth.
+
+    Parameters
+    ----------
+    ranges : (n,) ranges, m.
+
+    Returns
+    -------
+    RangeStep or None : the step, counted from range 0; None if the ranges are not rounded.
     """
     low, reach = float(ranges.min()), float(np.ptp(ranges))
     if len(ranges) < 200 or reach < 20 * _LARGEST_STEP_M:

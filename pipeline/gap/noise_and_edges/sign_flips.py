@@ -14,16 +14,21 @@ DRAWS = 1999
 
 
 def null_p_value(squares: FloatArray, shapes: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
-    """Return the p-value (1 + b) / (1 + N) of the largest standardised score over the candidates.
+    """Test whether any candidate variance explains the squared deviations.
 
-    The null distribution has the signs flipped by wall block.
+    The test statistic is the largest standardised score over the candidates, which corrects for their number. Its null
+    distribution comes from N random sign flips of the scores of whole wall blocks.
 
     Parameters
     ----------
     squares : (n,) squared deviations over the predicted variance.
-    shapes : (n,) candidate variances over the predicted one.
-    block : (n,) wall block of each point.
+    shapes : for each candidate the (n,) variance that it adds over the predicted one.
+    block : (n,) number of each point's wall block.
     random : source of random numbers.
+
+    Returns
+    -------
+    float : the p-value (1 + b) / (1 + N), if b of the N flips reach the observed statistic.
     """
     observed, largest = _scores_with_flipped_signs(squares, shapes, block, random)
     return float((1 + np.sum(largest >= observed)) / (1 + DRAWS))

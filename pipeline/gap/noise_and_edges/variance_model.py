@@ -36,16 +36,16 @@ _FISHER_ROUNDS = 25
 
 @dataclass(frozen=True)
 class VarianceCandidate:
-    """A candidate noise term.
+    """A noise term to try: a variance at each of n points that k factors theta can scale.
 
     Attributes
     ----------
     name : name of the effect.
-    variance : (n, k) variance at its typical sizes, to be scaled by theta (k,).
-    scale : typical sizes: a parameter is scale * sqrt(theta).
-    names : names of the parameters.
-    cost : number of free parameters.
-    fixed : values that tell variants of the effect apart.
+    variance : (n, k) variance that each of k parameters adds at its typical size, squared unit of the observable.
+    scale : (k,) typical sizes; a parameter is scale * sqrt(theta).
+    names : (k,) names of the parameters.
+    cost : number of free parameters, which is subtracted from the log-likelihood ratio.
+    fixed : values that are not fitted and distinguish variants of the effect.
     """
 
     name: str
@@ -56,11 +56,17 @@ class VarianceCandidate:
     fixed: Mapping[str, float] = field(default_factory=dict)
 
     def parameters(self, theta: FloatArray) -> dict[str, float]:
-        """Return the effect's parameters for theta (k,)."""
+        """Return the effect's parameters by name, given the (k,) factors theta of its variances."""
         return dict(zip(self.names, map(float, np.sqrt(theta) * np.array(self.scale)), strict=True)) | dict(self.fixed)
 
     def standard_deviations(self, theta: FloatArray, error: FloatArray) -> dict[str, float]:
-        """Return standard deviations of the parameters from those of theta; for a parameter of 0 its possible size."""
+        """Return the standard deviations of the effect's parameters by name; for a parameter of 0, the size that it may have.
+
+        Parameters
+        ----------
+        theta : (k,) factors of the variances.
+        error : (k,) standard deviations of theta.
+        """
         root = np.sqrt(theta)
         std = np.where(theta > error, error / np.maximum(2 * root, 1e-300), np.sqrt(error))
         return dict(zip(self.names, map(float, std * np.array(self.scale)), strict=True))
@@ -68,18 +74,18 @@ class VarianceCandidate:
 
 @dataclass(frozen=True)
 class VarianceTerm:
-    """A noise term that was found.
+    """A noise term that explains part of the residuals' variance.
 
     Attributes
     ----------
-    name : name of the effect, or what an empirical term depends on.
-    effect : effect of the catalogue that is nearest, which also carries an empirical term.
-    alike : other effects of its equivalence class.
-    p_value : p-value from the null distribution.
-    gain : log-likelihood ratio.
-    parameters, std : values and their standard deviations, from the curvature of the likelihood.
-    empirical : whether no effect of the catalogue fits.
-    variance : (n,) variance that it adds.
+    name : name of the effect, or of an empirical term with the covariate on which it depends.
+    effect : the effect of the catalogue that represents the term in a model.
+    alike : names of other effects that would explain the variance as well.
+    p_value : p-value from the simulated null distribution.
+    gain : log-likelihood ratio of the models with and without it.
+    parameters, std : values of the effect's parameters and their standard deviations, by key.
+    empirical : whether no effect of the catalogue fits well.
+    variance : (n,) variance that it adds at each point, squared unit of the observable.
     """
 
     name: str
@@ -93,13 +99,21 @@ class VarianceTerm:
     variance: FloatArray
 
     def with_constant_variance(self, count: int) -> VarianceTerm:
-        """Return the term for `count` points with its mean variance, for noise that does not depend on place."""
+        """Return the term for `count` points, each with the mean variance, for noise that is the same everywhere."""
         return replace(self, variance=np.full(count, float(self.variance.mean())))
 
 
 @dataclass(frozen=True)
 class VarianceScore:
-    """Result of one candidate: its log-likelihood ratio `gain`, and `score`, the same minus its number of parameters."""
+    """How well one noise term explains the squared residuals.
+
+    Attributes
+    ----------
+    name : name of the effect, or of the covariate of an empirical term.
+    gain : log-likelihood ratio against the predicted variance.
+    score : gain minus the number of parameters.
+    empirical : whether the term is not in the catalogue.
+    """
 
     name: str
     gain: float
@@ -108,16 +122,19 @@ class VarianceScore:
 
 
 def standardised_deviations(residuals: Residuals, cells: WallCells, value: FloatArray) -> FloatArray:
-    """Return deviations from the cells' planes over the predicted standard deviation, (n,), NaN outside of cells.
+    """Return residuals minus a plane fitted in each cell of the wall, over the predicted standard deviation.
 
-    They have unit variance if the model is right. The plane in each cell removes the reference error, which is correlated over
-    metres.
+    They have variance 1 if the noise model is right. The planes remove the reference error, which is correlated over metres.
 
     Parameters
     ----------
     residuals : residuals with their predicted standard deviations.
     cells : cells of the wall.
-    value : (n,) residuals after the systematic effects.
+    value : (n,) residuals after the systematic effects, in the unit of the observable.
+
+    Returns
+    -------
+    FloatArray : (n,) standardised deviations, NaN outside of cells.
     """
     inside = cells.cell >= 0
     cell = cells.cell[inside]
@@ -142,7 +159,10 @@ def standardised_deviations(residuals: Residuals, cells: WallCells, value: Float
 
 
 def variance_candidates(residuals: Residuals) -> list[VarianceCandidate]:
-    """Return the candidate noise terms that the recorded fields allow, without noise that neighbours share."""
+    """List the noise effects of the catalogue that can be tried with the recorded fields.
+
+    Noise that neighbouring points share is left out, because deviations within cells hardly show it.
+    """
     found = []
     for effect in residuals.candidates:
         if effect.shows_in == ShowsIn.SPREAD and not effect.shared and effect.known(residuals.geometry):
@@ -168,20 +188,19 @@ def _candidate(effect: type[Effect], geometry: Geometry, fixed: dict[str, float]
 def fit_variance_model(
     residuals: Residuals, cells: WallCells, value: FloatArray, random: KeyedRandom, excluded: frozenset[str] = frozenset()
 ) -> tuple[list[VarianceTerm], list[VarianceScore], str]:
-    """Find the noise terms that explain the squared deviations, at most two.
+    """Find at most two noise terms that explain why the residuals scatter more than the model predicts.
 
     Parameters
     ----------
     residuals : residuals with their predicted standard deviations.
-    cells : cells of the wall.
-    value : (n,) residuals after the systematic effects.
-    random : source of random numbers of the null distribution.
+    cells : cells of the wall; deviations within them are used.
+    value : (n,) residuals after the systematic effects, in the unit of the observable.
+    random : source of random numbers for the null distribution.
     excluded : names of effects that are not tried.
 
     Returns
     -------
-    tuple : the noise terms, all candidates that were tried, best first, and a note on variance that no effect explains ("" if
-        none).
+    tuple : the noise terms; the scores of all candidates, best first; and a note on variance that no effect explains, or "".
     """
     candidates = [each for each in variance_candidates(residuals) if each.name not in excluded]
     if not candidates:
@@ -284,9 +303,12 @@ def _unshared_share(residuals: Residuals, value: FloatArray, used: BoolArray, ad
 
 @dataclass(frozen=True)
 class NoiseRatio:
-    """Observed over predicted standard deviation of the residuals within cells.
+    """Observed over predicted standard deviation of the residuals within cells of the wall.
 
-    value: the ratio; clearly_below: whether wall blocks agree that it is below 1.
+    Attributes
+    ----------
+    value : the ratio.
+    clearly_below : whether the ratio is significantly below 1, as judged by wall blocks.
     """
 
     value: float
@@ -294,7 +316,15 @@ class NoiseRatio:
 
     @classmethod
     def of(cls, residuals: Residuals, cells: WallCells, value: FloatArray, random: KeyedRandom) -> NoiseRatio:
-        """Compute it from residuals (n,) after the systematic effects; outliers are clipped."""
+        """Compute the ratio; outliers are clipped.
+
+        Parameters
+        ----------
+        residuals : residuals with their predicted standard deviations.
+        cells : cells of the wall.
+        value : (n,) residuals after the systematic effects, in the unit of the observable.
+        random : source of random numbers, with which correlated noise is simulated.
+        """
         z = standardised_deviations(residuals, cells, value)
         used = np.isfinite(z)
         squares = np.minimum(z[used] ** 2, _CLIP_SIGMAS**2) / _expected_mean_square(residuals, cells, random)
@@ -306,7 +336,10 @@ class NoiseRatio:
 
     @property
     def at_most_one(self) -> float:
-        """The ratio where it is clearly below 1, else 1. No effect removes noise, so the model's own noise is too large there."""
+        """The ratio if it is clearly below 1, else 1.
+
+        A ratio below 1 means that the model's own noise is too large, because no effect removes noise.
+        """
         return self.value if self.clearly_below and self.value < thresholds().variance.excess_noise_ratio else 1.0
 
 
@@ -409,57 +442,6 @@ def _gain_over(squares: FloatArray, first: FloatArray, second: FloatArray, block
 def _log_likelihood_gain(squares: FloatArray, added: FloatArray) -> float:
     """Log-likelihood ratio of an added variance (n,)."""
     return float(0.5 * np.sum(squares * added / (1 + added) - np.log1p(added)))
-
-
-@dataclass(frozen=True)
-class HeavyTails:
-    """Outliers beyond those of normal noise.
-
-    Attributes
-    ----------
-    share : share of all residuals beyond `limit_sigmas` predicted standard deviations.
-    sigma : standard deviation that they add, over the predicted one.
-    gain : log-likelihood ratio of a mixture with this share of wider noise.
-    uniform : whether they lie all over the wall, as the instrument's own do. Edges, plants and moved rock leave them in parts of
-        it.
-    """
-
-    share: float
-    limit_sigmas: float
-    sigma: float
-    gain: float
-    uniform: bool
-
-    @property
-    def note(self) -> str:
-        """The note of the report."""
-        where = "all over the wall" if self.uniform else "in parts of the wall, as at edges, plants or moved rock"
-        return f"{100 * self.share:.2g} % of the points lie beyond {self.limit_sigmas:g} predicted standard deviations, {where}"
-
-
-def find_heavy_tails(z: FloatArray, block: NDArray[np.int64]) -> HeavyTails | None:
-    """Find heavy tails; None where there are no more outliers than normal noise and small faults of a reference leave.
-
-    z: (n,) residuals over the standard deviation that all effects together predict. Of normal noise, 6e-5 lie beyond 4.
-    """
-    by = thresholds().variance
-    outlying = np.abs(z) > by.tail_sigmas
-    share = float(outlying.mean())
-    if share < by.most_tail_share:
-        return None
-    square = np.minimum(z**2, _CLIP_SIGMAS**2)
-    tail_variance = max(float(square[outlying].mean()), 1.0)
-    mixed = np.log(1 - share + share / np.sqrt(tail_variance) * np.exp(0.5 * square * (1 - 1 / tail_variance)))
-    sigma = float(np.sqrt(max(float(square.mean()) - 1, 0.0)))
-    return HeavyTails(share, by.tail_sigmas, sigma, float(mixed.sum()), _unevenness(outlying, block) < by.most_tail_unevenness)
-
-
-def _unevenness(outlying: BoolArray, block: NDArray[np.int64]) -> float:
-    """Standard deviation over mean of the blocks' shares of outliers, beyond chance."""
-    _, number = np.unique(block, return_inverse=True)
-    expected = np.bincount(number) * outlying.mean()
-    beyond_chance = np.sum((np.bincount(number, outlying) - expected) ** 2 - expected * (1 - outlying.mean()))
-    return float(np.sqrt(max(float(beyond_chance), 0.0) / np.sum(expected**2)))
 
 
 def _best_binned_variance(squares: FloatArray, covariates: Mapping[str, FloatArray]) -> tuple[str, float, FloatArray]:

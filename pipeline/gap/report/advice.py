@@ -13,9 +13,12 @@ _ROOT = Path(__file__).parents[3]
 
 @dataclass(frozen=True)
 class Advice:
-    """Advice on one effect, in whole sentences.
+    """What a named effect means and what to do about it, in whole sentences.
 
-    means: what it says about the instrument or the measurement; act: what to do.
+    Attributes
+    ----------
+    means : what the effect says about the instrument or the measurement.
+    act : what to do.
     """
 
     means: str
@@ -37,10 +40,9 @@ _ABOUT_POINT_NOISE = Advice(
 
 
 def advice_on(named: NamedEffect) -> Advice:
-    """Return the advice on a named effect.
+    """Return what a named effect means and what to do about it.
 
-    It is that of the effect's class, or the first paragraph of its docstring where the class has none. Empirical terms have
-    general advice.
+    The text belongs to the effect's class, or is the first paragraph of its docstring. Empirical terms have a general text.
     """
     if named.effect.stage == Stage.POINT:
         return _ABOUT_POINT_NOISE if named.adds_variance else _ABOUT_A_SURFACE_TERM
@@ -58,10 +60,12 @@ def advice_on(named: NamedEffect) -> Advice:
 
 
 def page_of(name: str) -> str:
-    """Return the address of a page of the documentation as a file on this machine; "" where the documentation is not installed.
+    """Return the address (file URI) of a page of the documentation on this machine; "" if it is not installed.
 
-    name: path of the page without ending, such as `reference/effects/tls.wobble`. The built site (`make docs`) is preferred to
-    the source.
+    Parameters
+    ----------
+    name : path of the page without ending, such as `reference/effects/tls.wobble`. The built site (`make docs`) is preferred to
+        the source.
     """
     pages = _ROOT / "site" / f"{name}.html", _ROOT / "docs" / f"{name}.md"
     return next((page.as_uri() for page in pages if page.is_file()), "")

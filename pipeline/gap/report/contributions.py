@@ -14,19 +14,19 @@ from scene.geometry.mesh import FloatArray
 
 
 def contributions(found: GapDiagnosis, measurement: Measurement) -> FloatArray:
-    """Return by how much the residuals fall with each effect alone in the model, each registered separately.
+    """Return by how much each named effect, alone in the model, reduces the residuals.
 
-    Several effects cost one simulation each. Their sum is `before - after`, except for what the registration absorbs of several
-    effects in common.
+    Each model is registered separately. The sum over the effects is `before - after`, except for what the registration absorbs of
+    several effects in common. Each effect costs one simulation.
 
     Parameters
     ----------
-    found : diagnosis.
+    found : diagnosis with k effects and n points.
     measurement : measurement that was diagnosed.
 
     Returns
     -------
-    FloatArray : (k, n) in the observable's unit, for k effects; 0 where a ray misses the reference.
+    FloatArray : (k, n) reductions in the observable's unit; 0 where a ray misses the reference.
     """
     if len(found.effects) < 2:
         return np.array([found.before - found.after for _ in found.effects]).reshape(-1, len(found.before))

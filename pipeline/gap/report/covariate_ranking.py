@@ -28,10 +28,10 @@ _MARGIN_M = 0.3
 
 
 def rank_disagreements(found: GapDiagnosis) -> list[dict[str, Any]]:
-    """Return the entry `where` of gap.json: where along each covariate measurement and model differ.
+    """Return the entry `where` of gap.json: along which covariates, and at which values, measurement and model differ.
 
-    It has the bin of each covariate that differs most, for each statistic, most significant first. `size_m` of a mean is positive
-    where the measured surface lies deeper than the predicted one.
+    For each covariate and statistic (mean, standard deviation, shape, missing returns) it holds the bin that differs most. The
+    most significant entry comes first. The `size_m` of a mean is positive if the measured surface lies deeper than predicted.
     """
     residuals = found.residuals
     rows = [row for name, x, z in standardised_by_covariate(found) for row in _rank_statistics(name, x, z, residuals)]
@@ -46,9 +46,9 @@ def rank_disagreements(found: GapDiagnosis) -> list[dict[str, Any]]:
 
 
 def standardised_by_covariate(found: GapDiagnosis) -> list[tuple[str, FloatArray, FloatArray]]:
-    """Return name and values of each covariate, with the standardised residuals of the inliers.
+    """Return, for each covariate, its name, the (m,) values at the inliers, and the (m,) standardised residuals there.
 
-    They are the residuals before effects are named, over their predicted standard deviation.
+    The residuals are those before effects are named, over their predicted standard deviation.
     """
     residuals = found.residuals
     used = inliers(found)
@@ -57,7 +57,10 @@ def standardised_by_covariate(found: GapDiagnosis) -> list[tuple[str, FloatArray
 
 
 def inliers(found: GapDiagnosis) -> Any:
-    """(n,) points on smooth parts of the surface, outside of scene changes, whose residual before is no outlier."""
+    """Return (n,) true for points on smooth surface and outside of scene changes that are no outliers.
+
+    Outliers are judged by the residuals before effects are named.
+    """
     residuals = found.residuals
     used = residuals.usable & (np.abs(found.before) < _OUTLIER_SIGMAS * residuals.sigma)
     for change in found.changes:
@@ -67,7 +70,17 @@ def inliers(found: GapDiagnosis) -> Any:
 
 
 def quantile_bins(x: FloatArray, count: int) -> tuple[FloatArray, Any]:
-    """Return the edges of bins of about equal numbers, and the bin of each value; fewer than three edges if x hardly varies."""
+    """Divide values (n,) into bins with about equally many values.
+
+    Parameters
+    ----------
+    x : (n,) values.
+    count : number of bins.
+
+    Returns
+    -------
+    tuple : edges of the bins, fewer than three if x hardly varies; and the (n,) number of each value's bin.
+    """
     edges = np.unique(np.quantile(x, np.linspace(0, 1, count + 1)))
     return edges, np.clip(np.searchsorted(edges, x, side="right") - 1, 0, max(len(edges) - 2, 0))
 

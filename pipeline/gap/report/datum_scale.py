@@ -17,14 +17,20 @@ _SIGNIFICANT_SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class DatumScale:
-    """By how much a cloud is larger than the reference, and its standard deviation, ppm."""
+    """How much larger a cloud is than the reference.
+
+    Attributes
+    ----------
+    ppm : difference of the scales, ppm, positive if the cloud is larger.
+    std_ppm : its standard deviation, ppm.
+    """
 
     ppm: float
     std_ppm: float
 
     @property
     def words(self) -> str:
-        """The result as a sentence."""
+        """The result as a sentence for the report."""
         std = f"\N{PLUS-MINUS SIGN} {self.std_ppm:.0f} ppm"
         if abs(self.ppm) < _SIGNIFICANT_SIGMAS * self.std_ppm:
             return f"Its scale agrees with that of the reference, as far as the relief shows ({self.ppm:+.0f} {std})."
@@ -35,12 +41,18 @@ class DatumScale:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the scale as gap.json holds it."""
+        """Return the entry `scale_ppm` of gap.json."""
         return {"value": self.ppm, "std": self.std_ppm}
 
 
 def estimate_scale(found: GapDiagnosis) -> DatumScale | None:
-    """Estimate the scale of a surface without cameras; None for other measurements and where there are too few points."""
+    """Estimate the scale of a cloud without cameras relative to the reference.
+
+    Returns
+    -------
+    DatumScale or None : the scale; None for other measurements, if the relief does not show a scale, and for fewer than 100
+    points.
+    """
     residuals = found.residuals
     if not isinstance(residuals, SurfaceResiduals) or not residuals.datum[6].any():
         return None

@@ -42,7 +42,10 @@ _MANY_DECADES = 300.0
 
 
 def maps_figure(found: GapDiagnosis) -> bytes:
-    """Draw maps of the residuals before and after on one scale: means of small pixels, and their noise over the predicted one."""
+    """Draw maps of the residuals without and with the named effects, as PNG.
+
+    They show means over small pixels on one colour scale, and below them the standard deviation over the predicted one.
+    """
     unit, pixels = 1e3 * found.residuals.depth_m, _PixelGrid(found)
     left, right, low, high = pixels.extent
     figure = Figure(figsize=(11.5, float(np.clip(10.0 * (high - low) / (right - left), 4.0, 12.0)) + 2.2), layout="constrained")
@@ -86,7 +89,7 @@ def _colour_bar(figure: Figure, image: AxesImage, panels: NDArray[np.object_], l
 
 
 def sigma_after(found: GapDiagnosis) -> FloatArray:
-    """(n,) standard deviation that the model with the named effects predicts, in the observable's unit."""
+    """Return (n,) the standard deviation that the model with the named effects predicts, in the observable's unit."""
     match found.model_after, found.residuals:
         case TlsModel() as model, TlsResiduals(geometry=rays) as ranges:
             return np.asarray(np.sqrt(model.variance(rays) + ranges.reference_variance))
@@ -98,7 +101,10 @@ def sigma_after(found: GapDiagnosis) -> FloatArray:
 
 
 def profiles_figure(found: GapDiagnosis) -> bytes:
-    """Draw means and standard deviations against each covariate, with two standard errors, and what the named effects explain."""
+    """Draw mean and standard deviation of the residuals against each covariate, as PNG.
+
+    Bars are two standard errors; a line shows what the named effects explain.
+    """
     names = [name for name, _, _ in standardised_by_covariate(found)]
     rows = max((len(names) + _COLUMNS - 1) // _COLUMNS, 1)
     figure = Figure(figsize=(11.5, 4.0 * rows))
@@ -152,7 +158,7 @@ def _log_axis(panel: Axes) -> None:
 
 
 def gap_figure(gap: Gap) -> bytes:
-    """Draw the gap as one bar, from the floor over the score after to the score before."""
+    """Draw the gap as one bar from the floor over the score after to the score before, as PNG."""
     factor, unit = gap.display_unit
     floor, after, before = (factor * value for value in (gap.floor, gap.after, gap.before))
     figure = Figure(figsize=(9.0, 2.0), layout="constrained")
@@ -178,9 +184,13 @@ def gap_figure(gap: Gap) -> bytes:
 
 
 def matrix_figure(names: list[str], cosines: FloatArray, survival: FloatArray) -> bytes:
-    """Draw how alike the effects' signatures are after the pose fit, and how much of each it leaves.
+    """Draw how similar the effects' signatures are after the pose fit, and how much of each it leaves, as PNG.
 
-    Shown are the absolute cosines of the signatures, and beside them the share of each that the pose fit leaves.
+    Parameters
+    ----------
+    names : names of m effects.
+    cosines : (m, m) absolute cosines of the signatures.
+    survival : (m,) share of each signature that the pose fit leaves.
     """
     short, count = [name.partition(".")[2] for name in names], len(names)
     figure = Figure(figsize=(2.8 + 0.62 * count, 1.9 + 0.44 * count), layout="constrained")

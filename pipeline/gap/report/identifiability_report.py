@@ -33,14 +33,24 @@ class _Row:
     name: str
     parameter: str
     survival: str
-    seen_from: str
-    named_from: str
+    detectable_size: str
+    nameable_size: str
     alike: str
     extension: str
 
 
 def write_identifiability(out: Path, found: Sequence[Identifiability]) -> Path:
-    """Write the files of one analysis per sensor into `out` and return the path of report.html."""
+    """Write report.html, identifiability.json and the figures into a folder.
+
+    Parameters
+    ----------
+    out : folder to write.
+    found : one analysis for each sensor.
+
+    Returns
+    -------
+    Path : path of report.html.
+    """
     record = {"schema": 1, "surveys": [each.to_dict() for each in found], "versions": versions()}
     write_json(out / "identifiability.json", record)
     pictures = {each.sensor: matrix_figure(list(each.names), each.cosines, each.survival) for each in found}
@@ -59,9 +69,9 @@ def write_identifiability(out: Path, found: Sequence[Identifiability]) -> Path:
 
 
 def summarise(found: Identifiability) -> str:
-    """Return what the analysis says, as a paragraph."""
+    """Return the result of an analysis as a paragraph: which effects the pose hides, and which pairs look alike."""
     weak = [name for name, share in zip(found.names, found.survival, strict=True) if share < 0.1]
-    pairs = found.pairs()
+    pairs = found.similar_pairs()
     parts = [f"{_INSTRUMENTS[found.sensor]}, {found.points:,} points on smooth parts of the wall."]
     if weak:
         parts.append(f"A shift or rotation of the sensor absorbs more than 90 % of {join_words(weak)}.")
@@ -90,25 +100,27 @@ def _part(found: Identifiability, picture: bytes) -> dict[str, Any]:
         "extensions": [extension.name for extension in found.extensions],
         "pairs": [
             (found.names[a], found.names[b], found.cosines[a, b], [e.cosines[a, b] for e in found.extensions])
-            for a, b in found.pairs()
+            for a, b in found.similar_pairs()
         ],
-        "others": [(each, _format_value(each.parameter, each.seen_from)) for each in found.others],
+        "others": [(each, _format_value(each.parameter, each.detectable_size)) for each in found.others],
         "reference_error_m": found.reference_error_m,
     }
 
 
 def _row(found: Identifiability, row: int) -> _Row:
     """The table's row of one effect."""
-    best, named = found.best_extension(row), found.named_from[row]
-    helps = best.named_from[row] < _WORTHWHILE_RATIO * named
+    best, named = found.best_extension(row), found.nameable_size[row]
+    helps = best.nameable_size[row] < _WORTHWHILE_RATIO * named
     return _Row(
-        name=found.names[row] + (f" ({found.shown[row]})" if found.shown[row] else ""),
+        name=found.names[row] + (f" ({found.variants[row]})" if found.variants[row] else ""),
         parameter=found.parameters[row],
         survival=f"{100 * found.survival[row]:.1f} %",
-        seen_from=_format_value("", found.seen_from[row]),
-        named_from=_format_value("", named),
-        alike=", ".join(f"{found.names[other].partition('.')[2]} {found.cosines[row, other]:.2f}" for other in found.alike(row)),
-        extension=f"{_format_value('', best.named_from[row])} with {best.name}" if helps else "",
+        detectable_size=_format_value("", found.detectable_size[row]),
+        nameable_size=_format_value("", named),
+        alike=", ".join(
+            f"{found.names[other].partition('.')[2]} {found.cosines[row, other]:.2f}" for other in found.similar_effects(row)
+        ),
+        extension=f"{_format_value('', best.nameable_size[row])} with {best.name}" if helps else "",
     )
 
 

@@ -44,7 +44,7 @@ _MOST_TRIED = 25
 
 
 def to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
-    """Return the content of gap.json."""
+    """Return the content of gap.json for a diagnosis of a measurement."""
     with use_thresholds(found.thresholds):
         return _to_dict(found, measurement)
 
@@ -86,10 +86,20 @@ def _registration(pose: FloatArray, measurement: Measurement) -> dict[str, Any]:
 
 
 def write_report(out: Path, found: GapDiagnosis, measurement: Measurement) -> Path:
-    """Write all files of a diagnosis into `out` and return the path of report.html. Nothing is written if a figure fails.
+    """Write all files of a diagnosis into a folder. Nothing is written if a figure fails.
 
     before.laz and after.laz hold `residual_m`, positive where the measured surface lies deeper than the predicted one. With
     several effects, before.laz also holds what each removes alone, `effect_1_m`, ..., in the order of gap.json.
+
+    Parameters
+    ----------
+    out : folder to write.
+    found : diagnosis.
+    measurement : measurement that was diagnosed.
+
+    Returns
+    -------
+    Path : path of report.html.
     """
     with use_thresholds(found.thresholds):
         parts = contributions(found, measurement) if len(found.effects) > 1 else np.empty((0, len(found.before)))
@@ -111,7 +121,7 @@ def write_report(out: Path, found: GapDiagnosis, measurement: Measurement) -> Pa
 
 
 def summarise(found: GapDiagnosis) -> str:
-    """Return the verdict and the main numbers in a few lines of text."""
+    """Return the verdict and the main numbers as a few lines of text for the terminal."""
     with use_thresholds(found.thresholds):
         return _summary(found)
 

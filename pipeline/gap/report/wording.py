@@ -40,10 +40,10 @@ _COVARIATES = {
 
 
 def title(found: GapDiagnosis) -> str:
-    """Return the outcome as a headline."""
+    """Return the outcome of a diagnosis as a headline."""
     names = [" or ".join([effect.name, *effect.alike]) for effect in found.effects if effect.kind == "physical"]
     match found.verdict:
-        case "no_gap" | "unknown" if found.evidence.only_too_noisy(found.effects):
+        case "no_gap" | "unknown" if found.evidence.only_noise_too_large(found.effects):
             return "No missing effect was found, but the model is too noisy"
         case "no_gap":
             return "No effect is missing"
@@ -54,11 +54,11 @@ def title(found: GapDiagnosis) -> str:
         case "unknown" if not found.effects:
             return "Measurement and model disagree, and nothing that was tried explains it"
         case "unknown" if not any(effect.kind == "empirical" for effect in found.effects):
-            if found.evidence.stays_open:
+            if found.evidence.gap_stays_open:
                 return f"{join_words(names)} closes little of the gap: something else is missing"
-            if found.evidence.supports_nothing:
+            if found.evidence.effects_unsupported:
                 return f"{join_words(names)} does not make the gap smaller: something else may be missing"
-            if found.evidence.stays_rejected:
+            if found.evidence.misfit_stays:
                 return f"{join_words(names)} leaves a misfit larger than chance would: something else is missing"
             return f"{join_words(names)}, and something that adds noise to the residuals"
         case "unknown" if isinstance(found.residuals, SurfaceResiduals):
@@ -70,17 +70,29 @@ def title(found: GapDiagnosis) -> str:
 
 
 def paragraph(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
-    """Return a paragraph: what was compared, what was found, and how far the gap closes. rows: result of `rank_disagreements`."""
+    """Return the outcome of a diagnosis as a paragraph, with the scores before and after.
+
+    Parameters
+    ----------
+    found : diagnosis.
+    rows : where measurement and model differ, from `rank_disagreements`.
+    """
     return " ".join(each for each in (*_findings(found, rows), describe_gap(found), *_side_notes(found)) if each)
 
 
 def answer(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
-    """Return the same without scores, for the top of the report."""
+    """Return the outcome of a diagnosis as a paragraph without scores, for the top of the report.
+
+    Parameters
+    ----------
+    found : diagnosis.
+    rows : where measurement and model differ, from `rank_disagreements`.
+    """
     return " ".join(each for each in (*_findings(found, rows), _describe_closed_gap(found), *_side_notes(found)) if each)
 
 
 def verdict_in_words(found: GapDiagnosis) -> str:
-    """Return the verdict as a sentence. A surface without cameras has sentences of its own."""
+    """Return the verdict of a diagnosis as a sentence. A surface without cameras has sentences of its own."""
     said = verdict_sentence(found.verdict, found.effects, found.evidence)
     return _SURFACE_SENTENCES.get(said, said) if isinstance(found.residuals, SurfaceResiduals) else said
 
@@ -138,9 +150,13 @@ def _largest_disagreement(found: GapDiagnosis, rows: list[dict[str, Any]]) -> st
 
 
 def outcome(found: GapDiagnosis, tried: Sequence[FamilyScore], item: FamilyScore) -> str:
-    """Return what became of an explanation of the mean: named, of the class of a named one, added as empirical, or rejected.
+    """Return what became of an explanation of the mean: named, in the class of a named one, added as empirical, or rejected.
 
-    tried: all explanations, best first; item: one of these.
+    Parameters
+    ----------
+    found : diagnosis.
+    tried : all explanations that were tried, best first.
+    item : one of these.
     """
     if item.empirical:
         added = {effect.entry.get("covariate") for effect in found.effects if effect.kind == "empirical"}
@@ -150,7 +166,13 @@ def outcome(found: GapDiagnosis, tried: Sequence[FamilyScore], item: FamilyScore
 
 
 def variance_outcome(found: GapDiagnosis, item: VarianceScore) -> str:
-    """Return what became of an explanation of the variance."""
+    """Return what became of an explanation of the variance: named, in the class of a named one, added as empirical, or rejected.
+
+    Parameters
+    ----------
+    found : diagnosis.
+    item : one of the explanations that were tried.
+    """
     if item.empirical:
         added = any(effect.kind == "empirical" and effect.adds_variance for effect in found.effects)
         return "added as empirical" if added else "rejected"
@@ -173,18 +195,24 @@ def join_words(words: Sequence[str]) -> str:
 
 
 def covariate_with_unit(covariate: str, sensor: str) -> str:
-    """Return a covariate in words, with the unit of its values."""
+    """Return a covariate in words with its unit, for a table.
+
+    Parameters
+    ----------
+    covariate : name of the covariate.
+    sensor : "tls" or "stereo", for covariates in the unit of the observable.
+    """
     _, unit = _COVARIATES.get(covariate, ("", ""))
     return f"{covariate_name(covariate)}, {unit or ('m' if sensor == 'tls' else 'px')}"
 
 
 def covariate_name(covariate: str) -> str:
-    """Return a covariate in words."""
+    """Return a covariate in words, such as "zenith angle" for "zenith"."""
     return _COVARIATES[covariate][0] if covariate in _COVARIATES else covariate.replace("_", " ")
 
 
 def format_number(value: float, digits: int = 4) -> str:
-    """Format a number with at most `digits` significant digits, without exponent from 0.0001 to a million."""
+    """Format a number with at most `digits` significant digits, without an exponent from 0.0001 to a million."""
     return f"{float(f'{value:.{digits}g}'):g}"
 
 
@@ -194,7 +222,7 @@ def format_decimal(value: float) -> str:
 
 
 def round_entry(value: Any) -> Any:
-    """Round all numbers of an effect's entry to five significant digits."""
+    """Return an effect's entry of the model with all numbers rounded to five significant digits."""
     if isinstance(value, dict):
         return {key: round_entry(each) for key, each in value.items()}
     if isinstance(value, list):
@@ -203,14 +231,22 @@ def round_entry(value: Any) -> Any:
 
 
 def format_parameters(effect: NamedEffect) -> str:
-    """Format the parameters of an effect with their standard deviations."""
+    """Format the parameters of an effect with their standard deviations, separated by commas."""
     return ", ".join(
         f"{key} {format_value(key, value, effect.std.get(key))}" for key, value in effect.entry.items() if key != "name"
     )
 
 
 def format_value(key: str, value: Any, std: float | None) -> str:
-    """Format one value of an effect's entry: a number with its standard deviation, an axis or a table by its range."""
+    """Format one value of an effect's entry of the model.
+
+    Parameters
+    ----------
+    key : key of the value, whose suffix names its unit.
+    value : a number, a text, an axis (dictionary with low and high) or a table (list of lists). Axis and table are given by their
+        range.
+    std : standard deviation of a number; None if it is not known.
+    """
     if isinstance(value, dict):
         cycle = f", repeated every {format_number(value['period'])}" if value.get("period") else ""
         return f"{format_number(value['low'])} to {format_number(value['high'])}{cycle}"
@@ -250,7 +286,7 @@ def _describe_range(effect: NamedEffect) -> str:
 
 
 def describe_gap(found: GapDiagnosis) -> str:
-    """Return a sentence with the scores before and after and the floor; "" where they were not measured."""
+    """Return a sentence with the scores before and after and the floor; "" if they were not measured."""
     if found.gap is None:
         return ""
     gap, model_changed = found.gap, found.model_changed

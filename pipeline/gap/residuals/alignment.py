@@ -40,16 +40,17 @@ change as it moves.
 
 
 def fit_pose_robustly(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
-    """Fit the pose to the residuals of usable points by least squares, and reject outliers in each round.
+    """Fit the pose of the sensor to the residuals by least squares, rejecting outliers in several rounds.
 
     Parameters
     ----------
-    residuals : Residuals of n points with k set-ups.
+    residuals : Residuals of n points with k set-ups; only usable points are fitted.
 
     Returns
     -------
-    (n,) residuals minus the effect of the pose; (6 k,) the pose, shift (m) and small rotation (rad) of each set-up in the wall
-    frame; and the NMAD of the standardised residuals, at least 1, which is above 1 if they are overdispersed.
+    (n,) residuals minus the effect of the pose, in the unit of the observable; (6 k,) the pose, shift (m) and small rotation
+    (rad) of each set-up in the wall frame; and the NMAD of the standardised residuals, at least 1. It is above 1 if they are
+    overdispersed.
     """
     kept, scale = residuals.usable.copy(), 1.0
     value, pose, design = residuals.value, np.zeros(residuals.pose_jacobian.shape[1]), _weighted_design(residuals)
@@ -67,7 +68,7 @@ def fit_pose_robustly(residuals: Residuals) -> tuple[FloatArray, FloatArray, flo
 
 
 def fit_pose(residuals: Residuals, rows: BoolArray | NDArray[np.int64]) -> FloatArray:
-    """Fit the pose to some of the residuals by weighted least squares.
+    """Fit the pose of the sensor to the residuals of some points by weighted least squares.
 
     Parameters
     ----------
@@ -111,7 +112,7 @@ def _qr_factors(blocks: FloatArray) -> FloatArray:
 
 
 def compute_raw_residuals(measurement: Measurement) -> Residuals:
-    """Compute residuals at the surveyed pose, for a laser scan, a stereo pair or a surface without cameras."""
+    """Compute the residuals of a laser scan, a stereo pair or a surface without cameras, with the sensor at its surveyed pose."""
     if isinstance(measurement, SurfaceMeasurement):
         return surface_residuals(measurement)
     if isinstance(measurement, StereoMeasurement):
@@ -120,7 +121,10 @@ def compute_raw_residuals(measurement: Measurement) -> Residuals:
 
 
 def compute_residuals(measurement: Measurement) -> Residuals:
-    """Compute the residuals of a measurement. If it has several epochs, the differences between their poses are removed."""
+    """Compute the residuals of a measurement with the sensor at its surveyed pose.
+
+    If it has several epochs, the differences between their poses are removed.
+    """
     found = compute_raw_residuals(measurement)
     epochs = measurement.epochs[found.index]
     numbers = np.unique(epochs)
@@ -133,13 +137,13 @@ def compute_residuals(measurement: Measurement) -> Residuals:
 
 
 class AlignedMeasurement(NamedTuple):
-    """A measurement with the sensor at its aligned pose.
+    """A measurement with the sensor at the pose that fits the reference best.
 
     Attributes
     ----------
     measurement : The measurement with that pose.
     residuals : Its residuals there.
-    pose : (6 k,) total shift (m) and small rotation (rad) of each set-up from the surveyed pose, wall frame.
+    pose : (6 k,) total shift (m) and small rotation (rad) of each of k set-ups from the surveyed pose, wall frame.
     """
 
     measurement: Measurement
@@ -157,9 +161,9 @@ def align(
 
     Parameters
     ----------
-    measurement : The measurement at its surveyed pose.
+    measurement : The measurement with the sensor at its surveyed pose.
     trusted : Rows of the measurement's points to fit; None for all.
-    found : Residuals at the surveyed pose, if they are already known.
+    found : Residuals at the surveyed pose; None: they are computed.
 
     Returns
     -------
@@ -195,3 +199,21 @@ def _moves_rays_far(pose: FloatArray, residuals: Residuals) -> bool:
         if shift > 0 and np.linalg.norm(own[:3]) + turn / shift * np.linalg.norm(own[3:]) > _RETRACE_FROM_M:
             return True
     return False
+
+
+def at_points_of(found: Residuals, part: Residuals) -> Residuals:
+    """Restrict residuals to the points of other residuals.
+
+    Points that are no longer on smooth surface, or that became outliers, are left out.
+
+    Parameters
+    ----------
+    found : residuals to restrict, for example with other effects in the model.
+    part : residuals of the points to keep.
+    """
+    registered_residuals, _, noise_ratio = fit_pose_robustly(found)
+    good = found.usable & (np.abs(registered_residuals) < thresholds().points.outlier_sigmas * noise_ratio * found.sigma)
+    place = np.full(int(max(found.index.max(initial=-1), part.index.max())) + 1, -1)
+    place[found.index[good]] = np.flatnonzero(good)
+    rows = place[part.index]
+    return found.part(rows[rows >= 0])

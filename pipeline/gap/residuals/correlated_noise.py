@@ -27,11 +27,11 @@ _REACH = 2.5
 
 @dataclass(frozen=True, eq=False)
 class NodeField:
-    """Grid-correlated noise in matrix form.
+    """Grid-correlated noise in matrix form: random values at q nodes, interpolated bilinearly to n points.
 
     Attributes
     ----------
-    weights : (n, q) bilinear weights of n points on q nodes.
+    weights : (n, q) bilinear weights.
     covariance : (q, q) covariance of the nodes' values, px².
     """
 
@@ -47,12 +47,12 @@ class NodeField:
 
 @dataclass(frozen=True)
 class GridCorrelatedNoise:
-    """The part of the predicted noise that neighbouring points share.
+    """The part of a stereo pair's predicted noise that neighbouring points share, because it is interpolated between grid nodes.
 
     Attributes
     ----------
     effects : Effects of the sensor model that make such noise.
-    pixels : (n, 2) columns and rows of the points, px; None without such noise.
+    pixels : (n, 2) columns and rows of the points in the left image, px; None without such noise.
     """
 
     effects: tuple[NodeNoise, ...] = ()
@@ -60,21 +60,21 @@ class GridCorrelatedNoise:
 
     @classmethod
     def of(cls, model: StereoModel, pixels: FloatArray) -> GridCorrelatedNoise:
-        """Take the grid-correlated noise of a sensor model at pixels (n, 2), px."""
+        """Collect the grid-correlated noise of a sensor model at pixels (n, 2), column and row, px."""
         return cls(_grid_correlated(model.matching_noise), pixels)
 
     def part(self, rows: Any) -> GridCorrelatedNoise:
-        """Return the noise of some of the points."""
+        """Return the noise at a subset of the n points, given as row numbers, a mask or a slice."""
         return self if self.pixels is None else replace(self, pixels=self.pixels[rows])
 
     def with_effects(self, effects: Sequence[MatchingNoise]) -> GridCorrelatedNoise:
-        """Add the grid-correlated ones among further effects."""
+        """Return the noise with further effects added; those that are not grid-correlated are ignored."""
         return replace(self, effects=(*self.effects, *_grid_correlated(effects)))
 
     def node_field(self, count: int) -> NodeField:
-        """Return the noise as values at nodes, for `count` points.
+        """Return the noise in matrix form for `count` points.
 
-        Noise on a finer grid than the points' own spacing acts like white noise and is left out.
+        Noise on a grid finer than the points' own spacing acts like white noise and is left out.
         """
         if self.pixels is None or not count:
             return _empty_field(count)

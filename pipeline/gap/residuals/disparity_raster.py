@@ -37,14 +37,14 @@ _STEEP = 0.3
 
 @dataclass(frozen=True)
 class DisparityRaster:
-    """Disparities of the reference on the raster of the matcher.
+    """Disparities of the reference on the stereo matcher's pixel raster, for simulating effects of neighbouring pixels.
 
     Attributes
     ----------
     step : Spacing of the cells, px.
     disparity : (rows, columns) disparity of the reference, px; NaN where nothing can be matched.
-    hidden : (rows, columns) whether the left camera sees the reference and the right one does not.
-    row, column : (n,) cell of each point.
+    hidden : (rows, columns) true where the left camera sees the reference and the right one does not.
+    row, column : (n,) row and column of the cell of each measured point.
     """
 
     step: float
@@ -98,10 +98,10 @@ class DisparityRaster:
         return max(_STEEP * self.step, 1.0)
 
     def search_part(self) -> tuple[DisparityRaster, NDArray[np.int64]]:
-        """Return the part of the raster in which edge effects are searched, and the numbers of its points.
+        """Return the part of the raster in which edge effects are searched, and the (k,) indices of its points.
 
-        This is the whole raster, or some bands of rows if it is large. Bands are separated by as many empty rows as they
-        extend beyond their points; `hidden` is only valid in the rows of points.
+        This is the whole raster, or several bands of rows if it is large. Bands are separated by empty rows so that they do not
+        affect each other; `hidden` is only valid in rows with points.
         """
         from scipy.ndimage import maximum_filter1d
 
@@ -120,11 +120,11 @@ class DisparityRaster:
         return replace(self, disparity=disparity, hidden=hidden, row=place[self.row[points]], column=self.column[points]), points
 
     def at_points(self, raster: NDArray[Any]) -> NDArray[Any]:
-        """Return the (n,) values of a raster at the points."""
+        """Return the (n,) values of a (rows, columns) raster at the points."""
         return np.asarray(raster[self.row, self.column])
 
     def near_border(self, sigma_px: float) -> BoolArray:
-        """Tell for which points a low-pass filter reaches beyond the area that both cameras see, by over 1 % of its weight.
+        """Tell for which points more than 1 % of a low-pass filter's weight lies outside of the area that both cameras see.
 
         Parameters
         ----------
@@ -132,7 +132,7 @@ class DisparityRaster:
 
         Returns
         -------
-        (n,) true near the border.
+        (n,) true for points near the border.
         """
         from scipy.ndimage import gaussian_filter
 
@@ -140,11 +140,20 @@ class DisparityRaster:
         return self.at_points(gaussian_filter(inside, sigma_px / self.step, mode="constant") < 1 - _BEYOND)
 
     def in_filled_occlusions(self, effects: Iterable[Effect]) -> BoolArray:
-        """Return (n,) whether a point lies where only the left camera sees the reference and no effect gives a disparity."""
+        """Tell which points lie where only the left camera sees the reference, and no effect of the model gives a disparity.
+
+        Parameters
+        ----------
+        effects : Effects of the model.
+
+        Returns
+        -------
+        (n,) true for such points.
+        """
         return np.asarray(np.isnan(self.at_points(self.apply(effects))) & self.at_points(self.hidden))
 
     def copied_from_neighbour(self, found: FloatArray, tolerance: float) -> BoolArray:
-        """Tell which measured disparities equal that of a neighbouring cell in the row, as filled occlusions do.
+        """Tell which measured disparities equal the disparity of a neighbouring cell in the row, as filled occlusions do.
 
         Parameters
         ----------
@@ -161,7 +170,16 @@ class DisparityRaster:
         return self.at_points(np.pad(same, ((0, 0), (1, 0))) | np.pad(same, ((0, 0), (0, 1))))
 
     def apply(self, effects: Iterable[Effect]) -> FloatArray:
-        """Apply the effects that use neighbouring pixels; return (rows, columns) disparities, px, NaN without a match."""
+        """Apply effects of neighbouring pixels (edge fattening, smoothing, filled occlusions) to the reference's disparities.
+
+        Parameters
+        ----------
+        effects : Effects of the model; others are ignored.
+
+        Returns
+        -------
+        (rows, columns) disparities, px, NaN without a match.
+        """
         found = self.disparity
         filters = (effect for effect in effects if isinstance(effect, RasterEffect))
         for effect in sorted(filters, key=lambda effect: (effect.stage, effect.order)):
@@ -169,11 +187,11 @@ class DisparityRaster:
         return found
 
     def added_by(self, effects: Iterable[Effect], disparity: FloatArray) -> FloatArray:
-        """Return what effects that use neighbouring pixels add to the disparities at the points.
+        """Return what effects of neighbouring pixels add to the disparities at the points.
 
         Parameters
         ----------
-        effects : The effects; others are ignored.
+        effects : Effects of the model; others are ignored.
         disparity : (n,) disparity of the reference at the points, px, used where the raster has none.
 
         Returns
@@ -185,15 +203,15 @@ class DisparityRaster:
 
 
 def apply_smoothing(effects: Iterable[Effect], geometry: PixelGeometry, columns: FloatArray) -> FloatArray:
-    """Apply the smoothing among the effects to small changes of the disparities, such as columns of a Jacobian.
+    """Apply the smoothing of a stereo matcher to small changes of the disparities, such as columns of a Jacobian.
 
-    A move of the cameras changes disparities in proportion to the rock's relief, which smoothing removes. Edge fattening does not
-    change such columns. Of subsampled points, only their own cells are averaged.
+    A move of the cameras changes disparities in proportion to the rock's relief, which smoothing reduces. If the points are a
+    subsample, only their own cells are averaged.
 
     Parameters
     ----------
     effects : Effects of the model; only smoothing is used.
-    geometry : The pixels.
+    geometry : The pixels of n points.
     columns : (n, k) changes of the disparity at the points, px per unit.
 
     Returns
@@ -219,11 +237,11 @@ def apply_smoothing(effects: Iterable[Effect], geometry: PixelGeometry, columns:
 
 
 def raster_cell_count(u: FloatArray, v: FloatArray, step: float) -> int:
-    """Return the number of cells of a raster that covers pixels.
+    """Return the number of cells of a raster that covers all given pixels.
 
     Parameters
     ----------
-    u, v : (n,) columns and rows, px.
+    u, v : (n,) columns and rows of the pixels, px.
     step : Spacing of the cells, px.
     """
     return int(np.prod([np.rint(np.ptp(x) / step) + 1 for x in (u, v)]))
@@ -253,13 +271,22 @@ def _cell(x: FloatArray, step: float) -> NDArray[np.int64]:
 
 
 def raster_cell_px(u: FloatArray, v: FloatArray) -> float | None:
-    """Return the spacing of a raster of pixels, px: the smaller one of its rows and columns; None if they lie on no raster."""
+    """Return the spacing of the raster on which pixels lie, px: the smaller one of its columns' and its rows' spacings.
+
+    Parameters
+    ----------
+    u, v : (n,) columns and rows of the pixels, px.
+
+    Returns
+    -------
+    The spacing; None if the pixels lie on no raster.
+    """
     steps = [step for step in (raster_spacing_px(u), raster_spacing_px(v)) if step is not None]
     return min(steps, default=None)
 
 
 def raster_spacing_px(u: FloatArray) -> float | None:
-    """Return the spacing of neighbouring columns in a raster of pixels, px.
+    """Return the spacing of neighbouring columns (or rows) in a raster of pixels, px.
 
     It is found even if a registration has shifted the pixels a little.
 

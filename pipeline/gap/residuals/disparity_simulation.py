@@ -30,14 +30,14 @@ def simulate_disparities(
     """Simulate the disparity of each measured pixel, with the depth map whose raster fits the pixels best.
 
     The cells of a depth map are at least two pixels wide. The difference of the reference's disparity between the centre of a
-    cell and the pixel is corrected. Effects of the matcher on neighbouring pixels are applied on the measurement's own raster
-    if its spacing differs from that of the depth map.
+    cell and the pixel is corrected. Effects of the matcher on neighbouring pixels are applied on the measurement's own raster if
+    its spacing differs from that of the depth map.
 
     Parameters
     ----------
     measurement : The pair, with the cameras at their aligned pose.
     model : The sensor model to simulate.
-    residuals : Residuals with the pixels; they may belong to another pose of the cameras.
+    residuals : Residuals with n pixels; they may belong to another pose of the cameras.
     randoms : d sources of random numbers, one for each simulation.
 
     Returns

@@ -29,7 +29,7 @@ _HIDDEN_SHARE = 2e-4
 
 @dataclass(frozen=True)
 class PixelGeometry:
-    """Geometry of n matched pixels as the equations of the effects use it.
+    """Geometry of n pixels that a stereo pair matched, as the equations of the stereo effects use it.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class PixelGeometry:
     radius, radius_right : (n,) distance from the centre of the left and of the right image, px.
     tangent : (n,) tangent of the angle between the rectified row and the rectified axis.
     infinity : (n,) disparity of a point at infinity, px.
-    shaped : (n,) what effects that use neighbouring pixels (edge fattening, smoothing) add to the reference's disparity, px.
+    shaped : (n,) what effects of neighbouring pixels (edge fattening, smoothing) add to the reference's disparity, px.
     """
 
     u: FloatArray
@@ -61,7 +61,7 @@ class PixelGeometry:
         return len(self.u)
 
     def part(self, rows: Rows) -> PixelGeometry:
-        """Return the geometry of some of the points."""
+        """Return the geometry of a subset of the n points, given as row numbers, a mask or a slice."""
         return select_rows(self, rows)
 
     @property
@@ -77,11 +77,11 @@ class PixelGeometry:
 
 @dataclass(frozen=True)
 class NominalPair:
-    """The nominal stereo pair in the wall frame.
+    """A stereo pair with its nominal calibration and pose, in the wall frame, in whose rectification disparities are given.
 
     Attributes
     ----------
-    pair : The cameras.
+    pair : The two cameras.
     geometry : Their rectification.
     """
 
@@ -90,12 +90,21 @@ class NominalPair:
 
     @classmethod
     def of(cls, measurement: StereoMeasurement) -> NominalPair:
-        """Take the nominal pair of a measurement."""
+        """Return the nominal pair of a measurement, transformed to the wall frame."""
         pair = measurement.cameras.in_wall_frame(measurement.frame)
         return cls(pair, rectify(pair))
 
     def disparity(self, left: tuple[FloatArray, FloatArray], right: tuple[FloatArray, FloatArray]) -> FloatArray:
-        """Return the (n,) disparities, px, of matched pixels (column, row) of the left and of the right image."""
+        """Return the disparities of matched pixels.
+
+        Parameters
+        ----------
+        left, right : (n,) column and (n,) row in the left and in the right image, px.
+
+        Returns
+        -------
+        (n,) disparities, px.
+        """
         first, second = ([on_device(mi.Float64, each) for each in pixel] for pixel in (left, right))
         return _on_host(self.left_column(*first) - self.right_column(*second))[0]
 
@@ -117,24 +126,43 @@ class NominalPair:
         return self.disparity((u, v), project(self.pair.right, point))
 
     def left_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
-        """Return the (n,) rectified columns of pixels of the left image, px."""
+        """Return the (n,) rectified columns of pixels (u, v) of the left image, px."""
         rect = self.geometry
         return rectified_pixel(self.pair.left, rect.left, u, v, rect.f, rect.u_left, rect.v)[0]
 
     def tangent(self, u: FloatArray, v: FloatArray) -> FloatArray:
-        """Return the (n,) tangent of the angle between the rectified rows of pixels of the left image and the rectified axis."""
+        """Return the tangent of the angle between the rectified row of pixels and the rectified axis.
+
+        Parameters
+        ----------
+        u, v : (n,) columns and rows in the left image, px.
+
+        Returns
+        -------
+        (n,) tangents.
+        """
         rect = self.geometry
         pixel = on_device(mi.Float64, u), on_device(mi.Float64, v)
         row = rectified_pixel(self.pair.left, rect.left, *pixel, rect.f, rect.u_left, rect.v)[1]
         return _on_host(row_tangent(rect, row))[0]
 
     def right_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
-        """Return the (n,) rectified columns of pixels of the right image, px."""
+        """Return the (n,) rectified columns of pixels (u, v) of the right image, px."""
         rect = self.geometry
         return rectified_pixel(self.pair.right, rect.right, u, v, rect.f, rect.u_right, rect.v)[0]
 
     def right_column_of(self, real: Camera, point: mi.Array3f64) -> mi.Float64:
-        """Return the (n,) nominally rectified columns of the pixels at which a real right camera sees points, px."""
+        """Return the rectified columns of points that a real right camera sees, if its pixels are rectified as nominal ones.
+
+        Parameters
+        ----------
+        real : The real right camera.
+        point : n points, wall frame, m.
+
+        Returns
+        -------
+        (n,) columns, px.
+        """
         x, y = _seen_tangents(real, point)
         if _interior(real) != _interior(self.pair.right):  # else both cameras have the same tangents
             x, y = self.pair.right.on_device().tangents(*real.on_device().pixel(x, y))
@@ -143,13 +171,13 @@ class NominalPair:
 
 
 def project(camera: Camera, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Project points (n, 3), m, into a camera; return columns and rows (n,), px."""
+    """Project points (n, 3), m, in the frame of the camera's pose, into a camera; return columns and rows (n,), px."""
     u, v = _on_host(*_pixel(camera, vectors_on_device(points)))
     return u, v
 
 
 def pixel_rays(camera: Camera, u: FloatArray, v: FloatArray) -> FloatArray:
-    """Return the rays of pixels.
+    """Return the directions of the rays of pixels.
 
     Parameters
     ----------
@@ -158,7 +186,7 @@ def pixel_rays(camera: Camera, u: FloatArray, v: FloatArray) -> FloatArray:
 
     Returns
     -------
-    (n, 3) directions in the frame in which the camera's pose is given, with a component of 1 along its axis.
+    (n, 3) directions in the frame of the camera's pose, with a component of 1 along its axis.
     """
     return np.stack(_on_host(*_ray(camera, on_device(mi.Float64, u), on_device(mi.Float64, v))), axis=1)
 
@@ -192,17 +220,17 @@ def _on_host(*columns: mi.Float64) -> list[FloatArray]:
 
 
 def is_hidden(scene: RayCaster, position: FloatArray, points: FloatArray) -> BoolArray:
-    """Tell which points are hidden behind another surface.
+    """Tell which points are hidden from a camera behind another surface.
 
     Parameters
     ----------
     scene : The surface.
-    position : (3,) position of the camera, m.
-    points : (n, 3) points on the surface, m; NaN counts as not hidden.
+    position : (3,) position of the camera, wall frame, m.
+    points : (n, 3) points on the surface, wall frame, m; NaN counts as not hidden.
 
     Returns
     -------
-    (n,) whether another surface lies in front of each point.
+    (n,) true for hidden points.
     """
     back = np.nan_to_num(points, nan=1e9) - position
     length = np.linalg.norm(back, axis=1)
@@ -210,13 +238,13 @@ def is_hidden(scene: RayCaster, position: FloatArray, points: FloatArray) -> Boo
 
 
 def predict_disparities(nominal: NominalPair, real: Iterable[CameraPair], geometry: PixelGeometry) -> list[FloatArray]:
-    """Predict the disparities that real pairs of cameras measure, linearising the surface by its tangent planes.
+    """Predict the disparities that real pairs of cameras measure, with the surface replaced by its tangent planes.
 
     Parameters
     ----------
     nominal : The nominal pair, in whose rectification disparities are given.
     real : The real pairs.
-    geometry : Pixels with their points on the reference and its normals.
+    geometry : n pixels with their points on the reference and its normals.
 
     Returns
     -------
@@ -247,7 +275,7 @@ def predict_disparities(nominal: NominalPair, real: Iterable[CameraPair], geomet
 
 
 def moved_pair(pair: CameraPair, centre: FloatArray, vector: FloatArray, *, turned: bool) -> CameraPair:
-    """Move both cameras of a pair as one rigid body.
+    """Shift or rotate both cameras of a pair as one rigid body.
 
     Parameters
     ----------
@@ -272,7 +300,7 @@ def moved_pair(pair: CameraPair, centre: FloatArray, vector: FloatArray, *, turn
 
 
 def real_pair(nominal: NominalPair, effects: tuple[Effect, ...], measurement: StereoMeasurement) -> CameraPair:
-    """Return the pair with camera effects applied, in the wall frame.
+    """Return the pair as it really is if the camera effects of a model are true, in the wall frame.
 
     Parameters
     ----------

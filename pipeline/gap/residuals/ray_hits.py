@@ -20,7 +20,7 @@ _LEAST_COSINE = 0.05
 
 @dataclass(frozen=True)
 class RayGeometry(PulseGeometry):
-    """Geometry of n laser rays as the equations of the effects use it, with what the residuals need beside it.
+    """Geometry of n laser rays, as the equations of the laser effects use it, with the measured ranges.
 
     The fields of `PulseGeometry` describe the average direction of the beam under the current model.
 
@@ -42,12 +42,12 @@ class RayGeometry(PulseGeometry):
     plane_normal: FloatArray | None = None
 
     def part(self, rows: Rows) -> RayGeometry:
-        """Return the geometry of some of the rays."""
+        """Return the geometry of a subset of the n rays, given as row numbers, a mask or a slice."""
         return select_rows(self, rows)
 
     @property
     def sensor_coordinates(self) -> FloatArray:
-        """(n, 2) azimuth and zenith angle, rad."""
+        """(n, 2) azimuth and zenith angle, rad, scanner frame."""
         return np.stack([self.azimuth, self.zenith], axis=1)
 
     @property
@@ -60,19 +60,21 @@ class RayGeometry(PulseGeometry):
 class RayHits:
     """Where n rays hit the reference surface.
 
-    For a reference made of points, incidence angles refer to planes through 24 points, because triangles lean with the noise of
-    their corners. That noise is also in the range, so it would imitate every effect that depends on the incidence angle. Where
-    noise dominates the scatter of the points, the normals are those of the planes too.
+    If the reference is made of points, incidence angles refer to planes through 24 points. Its triangles lean with the noise of
+    their corners, which is also in the range, so it would imitate every effect that depends on the incidence angle. Where noise
+    dominates the scatter of the points, the normals are those of the planes too.
 
     Attributes
     ----------
     distance : (n,) range to the surface, m; infinite or NaN without a hit.
-    normal : (n, 3) unit normals, of the triangle or of the plane through the points.
+    normal : (n, 3) unit normals, wall frame, of the triangle or of the plane through the points.
     cos_incidence : (n,) cosine of the incidence angle.
     curvature : (n,) largest deviation of the surface from the triangle's plane within a beam's width, m.
-    bulge : (n,) how much nearer the curved surface lies than the triangle, m; included in `distance`.
-    scatter : (n,) scatter of the reference's points about the planes, relative to its median.
-    corner, weight : As in `RayGeometry`.
+    bulge : (n,) how much nearer the curved surface lies than the triangle, m; included in `distance`. None if the reference is
+        used as it is.
+    scatter : (n,) scatter of the reference's points about the planes, relative to its median; None without planes.
+    corner : (n, 3) vertices of the triangle that was hit; None if the vertices have no errors of their own.
+    weight : (n, 3) barycentric weights of these vertices at the hit; None with `corner`.
     """
 
     distance: FloatArray
@@ -122,7 +124,8 @@ def cast_rays(measurement: TlsMeasurement, axes: list[FloatArray]) -> RayHits:
 def redirect_hits(found: RayHits, nominal: FloatArray, real: FloatArray) -> RayHits:
     """Compute the hits of deflected rays from those of the nominal rays, along the planes that the nominal rays hit.
 
-    This is for a reference whose scatter is mostly noise: there a deflected ray would follow the noise of a triangle.
+    This is used for a reference whose scatter is mostly noise: traced again, a deflected ray would follow the noise of a
+    triangle.
 
     Parameters
     ----------

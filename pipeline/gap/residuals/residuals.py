@@ -26,12 +26,12 @@ _Columns = TypeVar("_Columns", bound="DataclassInstance")
 
 
 class Geometry(Protocol):
-    """Geometry of n measured points as the equations of the effects use it; either sensor has a class of its own."""
+    """Geometry of n measured points, as the equations of the effects use it. Each kind of sensor has a class of its own."""
 
     def __len__(self) -> int: ...
 
     def part(self, rows: Rows) -> Self:
-        """Return the geometry of some of the points."""
+        """Return the geometry of a subset of the n points, given as row numbers, a mask or a slice."""
 
     @property
     def sensor_coordinates(self) -> FloatArray:
@@ -48,17 +48,23 @@ def _order(values: FloatArray) -> NDArray[np.int32]:
 
 
 def select_rows(columns: _Columns, rows: Rows) -> _Columns:
-    """Return the same dataclass with only some rows of its (n, ...) arrays; fields that are None stay None."""
+    """Return the same dataclass with only some rows of its (n, ...) arrays; fields that are None stay None.
+
+    Parameters
+    ----------
+    columns : A dataclass whose fields are arrays with n rows, or None.
+    rows : Row numbers, a mask or a slice.
+    """
     values: dict[str, Any] = {column.name: getattr(columns, column.name) for column in fields(columns)}
     return replace(columns, **{name: value[rows] for name, value in values.items() if value is not None})
 
 
 @dataclass(frozen=True)
 class Residuals(ABC):
-    """Residuals of n points: measured minus predicted observable, with all that later steps need to explain them.
+    """Residuals of n points, measured minus predicted observable, with all that is needed to explain them.
 
-    The observable is a range (m) for a laser scan, a disparity (px) for a stereo pair, or a distance along the normal (m)
-    for a surface without cameras.
+    The observable is a range (m) for a laser scan, a disparity (px) for a stereo pair, or a distance along the normal (m) for a
+    surface without cameras.
 
     Attributes
     ----------
@@ -67,10 +73,9 @@ class Residuals(ABC):
     unit_m : (n,) metres of range or depth per unit of the observable, always positive (`depth_m` has the sign).
     usable : (n,) whether a point is used for fitting: the surface around it is smooth, and it lies on stable ground.
     on_smooth_surface : (n,) whether the surface around a point is smooth, on stable ground or not.
-    pose_jacobian : (n, 6 k) derivatives of the observable by the poses of k set-ups: shift (m) and small rotation (rad) of
-        each in the wall frame. A surface without cameras has up to seven columns (with a scale).
-    wall_xy : (n, 2) x and y of the reference's point in the wall frame, m. It does not move with the noise of the
-        measured point.
+    pose_jacobian : (n, 6 k) derivatives of the observable by the poses of k set-ups: shift (m) and small rotation (rad) of each
+        in the wall frame. A surface without cameras has up to seven columns (with a scale).
+    wall_xy : (n, 2) x and y of the reference's point in the wall frame, m. It does not move with the noise of the measured point.
     covariates : (n,) arrays by name, on which an error may depend.
     index : (n,) rows of the points in the measurement.
     geometry : The rays or pixels behind the points.
@@ -82,10 +87,10 @@ class Residuals(ABC):
     Class attributes
     ----------------
     sensor : Sensor whose catalogue of effects applies.
-    position_covariates : Names of the two covariates of the point's position in the sensor's field of view, along which an
-        error may vary jointly.
-    empirical_term, white_noise : The effect class of an empirical term and of white noise for this observable, each with
-        the name of the field that holds its values.
+    position_covariates : Names of the two covariates of the point's position in the sensor's field of view, along which an error
+        may vary jointly.
+    empirical_term, white_noise : The effect class of an empirical term and of white noise for this observable, each with the name
+        of the field that holds its values.
     label : What the points are, in words for the report.
     """
 
@@ -115,22 +120,26 @@ class Residuals(ABC):
     @property
     @abstractmethod
     def depth_m(self) -> FloatArray:
-        """(n,) change of depth per unit of the observable, m: positive if a larger value means missing rock."""
+        """(n,) signed change of depth per unit of the observable, m: positive if a larger value means missing rock."""
 
     @property
     def with_sigma_of_means(self) -> Self:
-        """Return the residuals with the sigma that counts for means of many neighbours: √n times the sigma of a mean of n.
+        """Return the residuals with the sigma that counts for means over many neighbours: sqrt(n) times the sigma of a mean of n.
 
-        Noise that neighbours share makes it larger than the sigma of single points.
+        It is larger than the sigma of single points if neighbours share noise.
         """
         return self
 
     def reference_covariance_with(self, other: NDArray[np.int64]) -> FloatArray:
-        """Return the covariance of each point's error with that of another point, as far as the reference's errors cause it.
+        """Return the covariance of each point's error with that of another point, as far as errors of the reference cause it.
 
         Parameters
         ----------
         other : (n,) row of the other point.
+
+        Returns
+        -------
+        (n,) covariances, squared unit of the observable.
         """
         return np.zeros(len(other))
 
@@ -141,16 +150,16 @@ class Residuals(ABC):
 
     @property
     def total_departure(self) -> FloatArray:
-        """(n,) measured minus geometric observable without any effect of the model, as if all epochs had one pose."""
+        """(n,) measured minus geometric observable without any effect of the model, with each epoch's own pose removed."""
         return self.geometry.departure if self.epoch_offset is None else self.geometry.departure - self.epoch_offset
 
     @cached_property
     def sort_orders(self) -> dict[str, NDArray[np.int32]]:
-        """(n,) row numbers that sort each covariate, ascending, by its name; equal values keep their order."""
+        """For each covariate, the (n,) row numbers that sort it in ascending order; equal values keep their order."""
         return dict(zip(self.covariates, map_in_threads(_order, self.covariates.values()), strict=True))
 
     def values_at(self, values: FloatArray, index: NDArray[np.int64]) -> FloatArray:
-        """Look values up by the numbers of the measurement's points.
+        """Look values up by the row numbers of points in the measurement.
 
         Parameters
         ----------
@@ -166,7 +175,7 @@ class Residuals(ABC):
         return np.asarray(found[index])
 
     def part(self, rows: Rows) -> Self:
-        """Return the residuals of some of the points."""
+        """Return the residuals of a subset of the n points, given as row numbers, a mask or a slice."""
         return replace(
             self,
             value=self.value[rows],
@@ -188,7 +197,7 @@ class Residuals(ABC):
 
         Parameters
         ----------
-        known : (n,) rows to replace.
+        known : (n,) true for rows to replace.
         other : Residuals of just those points, in the same order.
         """
         names = ("value", "sigma", "unit_m", "pose_jacobian", "wall_xy")
@@ -209,11 +218,11 @@ def _merged(mine: NDArray[Any], theirs: NDArray[Any], known: BoolArray) -> NDArr
 
 @dataclass(frozen=True)
 class ExpectedPulses:
-    """Pulses of the scan pattern that should have hit the wall, and whether each returned.
+    """The m pulses of a scan pattern that should have hit the wall, and whether each returned.
 
     Attributes
     ----------
-    lost : (m,) whether no point was recorded in the pulse's direction.
+    lost : (m,) true for a pulse in whose direction no point was recorded.
     covariates : (m,) arrays by name, on which a loss may depend.
     wall_xy : (m, 2) x and y of the place on the wall that the pulse should have hit, wall frame, m.
     """
@@ -226,11 +235,11 @@ class ExpectedPulses:
 def range_derivative(normal: FloatArray, direction: FloatArray, moved: FloatArray, distance: FloatArray) -> FloatArray:
     """Return how the distance to a plane along a ray changes as the ray turns.
 
-    With t = (p - o)·n / (u·n), the derivative is dt = -t (du·n) / (u·n).
+    With t = (p - o)·n / (u·n), for a plane through p and a ray from o, the derivative is dt = -t (du·n) / (u·n).
 
     Parameters
     ----------
-    normal : (n, 3) normals of the planes.
+    normal : (n, 3) normals n of the planes.
     direction : (n, 3) unit directions u of the rays.
     moved : (n, 3) derivative du of the direction, per unit of the turning angle.
     distance : (n,) distances t, m.

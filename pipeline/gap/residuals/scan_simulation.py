@@ -25,13 +25,14 @@ _NO_NOISE = TlsNoise(range_sigma_m=0.0, range_ppm=0.0, angle_sigma_rad=0.0)
 
 @dataclass(frozen=True)
 class DirectedScanner(LaserScanner):
-    """A scanner whose pulses leave in given directions, one after another.
+    """A simulated laser scanner whose pulses leave in given directions, such as the recorded ones of a measured scan.
 
     Attributes
     ----------
     geometry : Directions of the pulses. Recorded powers, if there are any, replace those that the reference's albedo would give.
     inclined : Whether the geometry's incidence angles replace those to the reference's triangles.
-    between : Correction of the ranges for a reference made of points, and the planes along which deflected pulses are followed.
+    between : Correction of the ranges for a reference made of points, with the planes along which deflected pulses are followed;
+        None without correction.
     """
 
     geometry: PulseGeometry = field(kw_only=True)
@@ -59,21 +60,30 @@ class DirectedScanner(LaserScanner):
         )
 
     def ranges(self, scene: RayCaster, random: KeyedRandom) -> FloatArray:
-        """Simulate the recorded ranges, (n,), m; NaN without a return.
-
-        `scene` is the surface, `random` the source of random numbers.
-        """
-        pulses, beam = self.emitted(self.emit(), random)
-        return self._recorded_ranges(pulses, self.echo(scene, self._traced_pulses(pulses), beam, beam.combine_echoes), random)
-
-    def ranges_by_mode(self, scene: RayCaster, random: KeyedRandom, modes: Sequence[Mode]) -> dict[Mode, FloatArray]:
-        """Simulate the recorded ranges for several modes of the beam; its sub-rays are traced only once.
+        """Simulate the recorded ranges of all pulses.
 
         Parameters
         ----------
         scene : The surface.
         random : Source of the random numbers.
-        modes : Modes in which echoes of a footprint are combined.
+
+        Returns
+        -------
+        (n,) ranges, m; NaN without a return.
+        """
+        pulses, beam = self.emitted(self.emit(), random)
+        return self._recorded_ranges(pulses, self.echo(scene, self._traced_pulses(pulses), beam, beam.combine_echoes), random)
+
+    def ranges_by_mode(self, scene: RayCaster, random: KeyedRandom, modes: Sequence[Mode]) -> dict[Mode, FloatArray]:
+        """Simulate the recorded ranges for several ways in which a scanner combines the echoes of a beam.
+
+        The sub-rays of the beam are traced only once.
+
+        Parameters
+        ----------
+        scene : The surface.
+        random : Source of the random numbers.
+        modes : Ways to combine the echoes of a footprint: strongest, mean or first.
 
         Returns
         -------
@@ -102,7 +112,18 @@ class DirectedScanner(LaserScanner):
         return np.array(dr.select(pulses.returned, pulses.range_m, np.nan))
 
     def measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
-        """Apply the effects on measured values, with the recorded powers, the given incidence angles and the corrected ranges."""
+        """Apply the effects that act on recorded values, with the recorded powers, given incidence angles and corrected ranges.
+
+        Parameters
+        ----------
+        pulses : Pulses as emitted.
+        echo : What returned from the surface.
+        random : Source of the random numbers.
+
+        Returns
+        -------
+        The pulses with their recorded values.
+        """
         known = {"power": self.geometry.power, "cos_incidence": self.geometry.cos_incidence if self.inclined else None}
         known = {name: on_device(mi.Float32, np.maximum(each, 1e-9)) for name, each in known.items() if each is not None}
         echo = replace(echo, **known)
@@ -137,13 +158,13 @@ def _scanner(
 
 
 def simulate_ranges(measurement: TlsMeasurement, model: TlsModel, geometry: RayGeometry, random: KeyedRandom) -> FloatArray:
-    """Simulate the ranges that a model gives along the measured rays, with the scanner simulation.
+    """Simulate the ranges that a sensor model gives along the measured rays.
 
     Parameters
     ----------
     measurement : The scan, with its station and reference.
     model : The sensor model.
-    geometry : The rays.
+    geometry : n rays.
     random : Source of the random numbers.
 
     Returns
@@ -156,12 +177,15 @@ def simulate_ranges(measurement: TlsMeasurement, model: TlsModel, geometry: RayG
 def simulate_ranges_by_mode(
     measurement: TlsMeasurement, model: TlsModel, modes: Sequence[Mode], geometry: RayGeometry, random: KeyedRandom
 ) -> dict[Mode, FloatArray]:
-    """Simulate the ranges of a model whose beam has a footprint, for several modes in which its echoes are combined.
+    """Simulate the ranges of a sensor model with a wide beam, for several ways in which a scanner combines its echoes.
 
     Parameters
     ----------
-    measurement, model, geometry, random : As in `simulate_ranges`.
-    modes : The modes.
+    measurement : The scan, with its station and reference.
+    model : The sensor model.
+    modes : Ways to combine the echoes of a footprint: strongest, mean or first.
+    geometry : n rays.
+    random : Source of the random numbers.
 
     Returns
     -------
@@ -171,7 +195,7 @@ def simulate_ranges_by_mode(
 
 
 def systematic_part(model: TlsModel) -> TlsModel:
-    """Return the model with its systematic and edge effects only: without noise and without lost returns."""
+    """Return a sensor model with its systematic and edge effects only: without noise and without lost returns."""
     kept = tuple(effect for effect in model.effects if effect.shows_in in (ShowsIn.MEAN, ShowsIn.EDGES))
     return model.model_copy(update={"noise": _NO_NOISE, "effects": kept})
 
@@ -182,11 +206,11 @@ def mean_beam_directions(measurement: TlsMeasurement, geometry: PulseGeometry) -
     Parameters
     ----------
     measurement : The scan.
-    geometry : The recorded directions.
+    geometry : n recorded directions.
 
     Returns
     -------
-    (n,) azimuth and zenith angle, rad, scanner frame.
+    (n,) azimuth and (n,) zenith angle, rad, scanner frame.
     """
     scanner = _scanner(measurement, systematic_part(measurement.model), geometry)
     pulses = scanner.emitted(scanner.emit(), KeyedRandom(0, ("gap", "mean")))[0]
@@ -194,5 +218,15 @@ def mean_beam_directions(measurement: TlsMeasurement, geometry: PulseGeometry) -
 
 
 def predict_ranges(measurement: TlsMeasurement, geometry: RayGeometry) -> FloatArray:
-    """Predict the (n,) mean ranges along the rays, m, under the measurement's model: the simulation without noise."""
+    """Predict the ranges along measured rays under the measurement's model, by a simulation without noise.
+
+    Parameters
+    ----------
+    measurement : The scan, with its station, reference and model.
+    geometry : n rays.
+
+    Returns
+    -------
+    (n,) mean ranges, m.
+    """
     return simulate_ranges(measurement, systematic_part(measurement.model), geometry, KeyedRandom(0, ("gap", "mean")))

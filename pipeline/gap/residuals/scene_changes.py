@@ -71,11 +71,11 @@ _SAMPLE, _ALMOST_ALL = 4000, 5.0
 
 @dataclass(frozen=True)
 class SceneChange:
-    """A region where the surface changed.
+    """A region where the surface itself changed between the reference and the measurement.
 
     Attributes
     ----------
-    corners : (k, 3) corners of the rays' prisms on the surfaces before and after, wall frame, m.
+    corners : (k, 3) corners of the prisms that the region's rays span between the surfaces before and after, wall frame, m.
     volume_m3 : Volume of the rock that is missing or was added, m³.
     volume_std_m3 : Its standard deviation, m³.
     offset_m : Median change of range, m, positive where rock is missing.
@@ -88,7 +88,7 @@ class SceneChange:
 
     @property
     def bounds(self) -> FloatArray:
-        """(2, 3) lowest and highest coordinates, wall frame, m."""
+        """(2, 3) lowest and highest coordinates of the region, wall frame, m."""
         return np.stack([self.corners.min(axis=0), self.corners.max(axis=0)])
 
     def to_dict(self, frame: WallFrame) -> dict[str, Any]:
@@ -99,20 +99,20 @@ class SceneChange:
 
 
 def find_scene_changes(residuals: Residuals, view: SensorView, eligible: BoolArray) -> tuple[list[SceneChange], BoolArray]:
-    """Find regions where the surface changed.
+    """Find regions where the surface changed between the reference and the measurement.
 
     The level of the surroundings and the scatter of the residuals are estimated again without the changes found, until no more
     are found.
 
     Parameters
     ----------
-    residuals : Residuals after a rough alignment.
-    view : View of the same points.
-    eligible : (n,) points away from depth steps; only these are evidence of a change.
+    residuals : Residuals of n points after a rough alignment.
+    view : How the sensor saw the same points.
+    eligible : (n,) true for points away from depth steps; only these are evidence of a change.
 
     Returns
     -------
-    The changes, largest first, and (n,) whether each point lies in or beside one.
+    The changes, largest first; and (n,) true for points that lie in or beside one.
     """
     beside = np.zeros(len(residuals), dtype=bool)
     departure, error = np.zeros(len(residuals)), np.zeros((2, len(residuals)))
@@ -139,7 +139,7 @@ def find_scene_changes(residuals: Residuals, view: SensorView, eligible: BoolArr
 
 
 def drop_duplicates(changes: list[SceneChange]) -> list[SceneChange]:
-    """Drop changes that another scan shows too: those whose centre lies in the bounding box of a larger one."""
+    """Drop changes that several scans show: those whose centre lies in the bounding box of a larger one."""
     kept: list[SceneChange] = []
     for change in changes:
         middle = change.bounds.mean(axis=0)
@@ -151,13 +151,13 @@ def drop_duplicates(changes: list[SceneChange]) -> list[SceneChange]:
 def moved_share(residuals: Residuals, view: SensorView, eligible: BoolArray) -> float:
     """Return the share of points that deviate from the reference together with their neighbours, anywhere and by any amount.
 
-    White noise moves a median of nine points by 0.4 sigma only; a wrong pose counts if much of the wall moved.
+    The median of each point and its eight neighbours is tested. White noise moves it by 0.4 sigma only.
 
     Parameters
     ----------
-    residuals : Residuals after alignment.
-    view : View of the same points.
-    eligible : (n,) points that count.
+    residuals : Residuals of n points after alignment.
+    view : How the sensor saw the same points.
+    eligible : (n,) true for points that count.
 
     Returns
     -------

@@ -37,7 +37,7 @@ _FROM_AFAR, _STEEPEST = 1000.0, 0.2
 
 @dataclass(frozen=True)
 class SensorView:
-    """How the sensor saw n points.
+    """How the sensor saw n points: their rays, their neighbours in its field of view, and how a residual moves a point.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class SensorView:
     ray : (n, 3) unit directions of the rays, wall frame.
     reference_m : (n,) range to the reference along the rays, m.
     disparity : (n,) disparity of the reference minus that at infinity, px; None if ranges were measured.
-    slant : (n,) change of range per metre of residual; only for a surface without cameras, which is viewed from far away.
+    slant : (n,) change of range per metre of residual, for a surface without cameras, which is viewed from far away; else None.
     """
 
     coordinates: FloatArray
@@ -60,7 +60,7 @@ class SensorView:
 
     @classmethod
     def of(cls, measurement: Measurement, residuals: Residuals) -> SensorView:
-        """Describe the view of a measurement. A stereo pair views the wall from its left camera.
+        """Describe how the sensor of a measurement saw its points. A stereo pair views the wall from its left camera.
 
         Parameters
         ----------
@@ -93,7 +93,7 @@ class SensorView:
         return cls(plane, epoch, origin, towards / length[:, None], reference, disparity, slant)
 
     def part(self, rows: Rows) -> SensorView:
-        """Return the view of some of the points."""
+        """Return the view of a subset of the n points, given as row numbers, a mask or a slice."""
         return replace(
             self,
             coordinates=self.coordinates[rows],
@@ -124,7 +124,7 @@ class SensorView:
         return np.asarray(self.reference_m[rows] * self.disparity[rows] / (self.disparity[rows] + residual))
 
     def points_at(self, rows: NDArray[np.int64], range_m: FloatArray) -> FloatArray:
-        """Return places on the rays.
+        """Return the places on the rays of some points at given ranges.
 
         Parameters
         ----------
@@ -140,7 +140,7 @@ class SensorView:
 
     @cached_property
     def scaled_coordinates(self) -> FloatArray:
-        """(n, 2) coordinates scaled so that the spacing of neighbouring points is 1 along both axes."""
+        """(n, 2) coordinates in the field of view, scaled so that the spacing of neighbouring points is 1 along both axes."""
         plane = (self.coordinates - self.coordinates.min(axis=0)) / np.maximum(np.ptp(self.coordinates, axis=0), 1e-300)
         rows = np.flatnonzero(self.epoch == self.epoch.min())
         apart = _axis_spacings(plane[rows])
@@ -158,12 +158,12 @@ class SensorView:
         return [(rows, cKDTree(self.scaled_coordinates[rows])) for rows in groups]
 
     def neighbour_pairs(self, rows: NDArray[np.int64], count: int = NEIGHBOURS) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Pair points with their nearest neighbours in the same epoch, and with the point at their place in the next epoch.
+        """Pair points with their nearest neighbours in the same epoch, and with the point at the same place in the next epoch.
 
         Parameters
         ----------
         rows : Rows of the points.
-        count : Neighbours of each point.
+        count : Number of neighbours of each point.
 
         Returns
         -------
@@ -188,7 +188,16 @@ class SensorView:
         return first[first != second], second[first != second]
 
     def neighbour_median(self, z: FloatArray) -> FloatArray:
-        """Return the (n,) median of the values `z` (n,) of each point and its ring of neighbours."""
+        """Return, for each point, the median of values over the point and its ring of eight neighbours.
+
+        Parameters
+        ----------
+        z : (n,) values.
+
+        Returns
+        -------
+        (n,) medians.
+        """
         found = np.empty(len(z))
         for group, near in self._rings:
             own = z[group]
@@ -206,14 +215,24 @@ class SensorView:
         ]
 
     def near(self, rows: NDArray[np.int64], spacings: float) -> NDArray[np.bool_]:
-        """Return (n,) whether each point lies within some point spacings of any of the points `rows`, in any epoch."""
+        """Tell which points lie within some point spacings of any of the points `rows`, in any epoch.
+
+        Parameters
+        ----------
+        rows : Rows of the points.
+        spacings : Distance in the field of view, in point spacings.
+
+        Returns
+        -------
+        (n,) true for points within the distance.
+        """
         distance = cKDTree(self.scaled_coordinates[rows]).query(
             self.scaled_coordinates, distance_upper_bound=spacings, workers=-1
         )[0]
         return np.asarray(np.isfinite(distance))
 
     def solid_angles(self, rows: NDArray[np.int64]) -> FloatArray:
-        """Compute the solid angle of some points: a third of the Delaunay triangles of which each is a corner.
+        """Compute the solid angle that some points represent: a third of the Delaunay triangles of which each is a corner.
 
         The points of one epoch thus share the area between them, including that of lost returns. Triangles across larger gaps
         count at most four times the median area.

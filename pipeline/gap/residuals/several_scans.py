@@ -17,7 +17,7 @@ from sensors.models.sensor_model import TlsModel
 
 
 def residuals_of_scans(measurement: TlsMeasurement) -> TlsResiduals:
-    """Compute the residuals of all scans of a measurement, in the order of its points.
+    """Compute the range residuals of all scans of a measurement, in the order of its points.
 
     The pose Jacobian is (n, 6 k), with six columns for each of k set-ups.
     """
@@ -50,18 +50,18 @@ def _concatenated(parts: Sequence[TlsResiduals]) -> TlsResiduals:
 def simulate_range_errors(
     measurement: TlsMeasurement, model: TlsModel, residuals: TlsResiduals, random: KeyedRandom
 ) -> FloatArray:
-    """Simulate the range errors that a model gives at the residuals' points.
+    """Simulate the range errors that a sensor model gives at measured points: simulated minus geometric range.
 
     Parameters
     ----------
     measurement : One scan or several.
     model : The sensor model.
-    residuals : Residuals with the rays to simulate.
+    residuals : Residuals with the n rays to simulate.
     random : Source of the random numbers.
 
     Returns
     -------
-    (n,) simulated minus geometric range, m; NaN without a return.
+    (n,) errors, m; NaN without a return.
     """
     rays = residuals.geometry
     if not measurement.scans:

@@ -29,17 +29,17 @@ _ENOUGH = 5_000
 
 
 def standardize(residuals: Residuals, view_xy: FloatArray, unchanged: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
-    """Subtract the local median from residuals and divide by their local scatter.
+    """Subtract the local median from residuals and divide by their local scatter, so that a change of the rock stands out.
 
-    The scatter is the predicted sigma times the largest NMAD of the standardised residuals among points with a similar value
-    of one covariate, but at least the predicted sigma. Noise that the model lacks, and misdirected rays on steep surfaces,
-    therefore raise it only where they occur.
+    The scatter is the predicted sigma times the largest NMAD of the standardised residuals among points with a similar value of
+    one covariate, but at least the predicted sigma. Noise that the model lacks, and misdirected rays on steep surfaces, therefore
+    raise it only where they occur.
 
     Parameters
     ----------
     residuals : Residuals of n points.
     view_xy : (n, 2) positions in the sensor's field of view, equally scaled on both axes.
-    unchanged : (n,) points without changes, from which median and scatter are estimated.
+    unchanged : (n,) true for points without changes, from which median and scatter are estimated.
 
     Returns
     -------
@@ -51,13 +51,13 @@ def standardize(residuals: Residuals, view_xy: FloatArray, unchanged: NDArray[np
 
 
 def nmad_along_covariates(residuals: Residuals, z: FloatArray, unchanged: NDArray[np.bool_]) -> FloatArray:
-    """Return how much the points scatter, as the largest NMAD along any covariate.
+    """Return how much the residuals scatter around each point, as the largest NMAD along any covariate.
 
     Parameters
     ----------
     residuals : Residuals with their covariates.
     z : (n,) standardised residuals.
-    unchanged : (n,) points without changes, from which the NMADs are computed.
+    unchanged : (n,) true for points without changes, from which the NMADs are computed.
 
     Returns
     -------

@@ -56,7 +56,7 @@ _ON_RAY = 0.1
 
 @dataclass(frozen=True)
 class StereoResiduals(Residuals):
-    """Residuals of disparities, px."""
+    """Residuals of a stereo pair: measured minus predicted disparities, px. Attributes as in `Residuals`."""
 
     sensor = "stereo"
     position_covariates = ("image_x", "image_y")
@@ -72,11 +72,10 @@ class StereoResiduals(Residuals):
 
 
 def move_onto_rays(left: Camera, points: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
-    """Move points rigidly so that they project into the pixels at which they were matched.
+    """Undo the registration of a stereo reconstruction: move its points rigidly so that they project into their matched pixels.
 
-    A reconstruction lies on the rays of its pixels until it is registered. The registration can be recovered from the points
-    to some micrometres, and is undone. It is found by Gauss-Newton with some thousand points; the points stay if that brings
-    them no nearer.
+    A reconstruction lies on the rays of its pixels until it is registered. The motion is found by Gauss-Newton with some thousand
+    points; the points stay if that brings them no nearer.
 
     Parameters
     ----------
@@ -145,9 +144,10 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
 
 
 def with_surroundings(measurement: StereoMeasurement, found: StereoResiduals) -> StereoMeasurement:
-    """Store the surroundings of the places that pixels see, to avoid detecting them again after small moves of the cameras.
+    """Return the measurement with the surroundings of each pixel's place stored, so that they need not be searched again.
 
-    The visibility from the right camera is stored too. After a large move it is wrong at a few points beside edges.
+    Stored are smoothness, depth steps and visibility from the right camera. They stay valid for small moves of the cameras. After
+    a large move the visibility is wrong at a few points beside edges.
 
     Parameters
     ----------

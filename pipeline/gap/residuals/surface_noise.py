@@ -42,15 +42,15 @@ _DIRECTIONS = np.linspace(0, np.pi / 2, 8, endpoint=False)
 
 @dataclass(frozen=True)
 class SurfaceNoise:
-    """Noise of a point cloud's distances to the reference.
+    """Noise of a point cloud's distances to a reference surface, as estimated from the cloud.
 
     Attributes
     ----------
-    sigma_m : Standard deviation of each point's own noise, m.
-    node_sigma_m : Standard deviation at the nodes of grid-correlated noise, m; 0 without.
+    sigma_m : Standard deviation of each point's own (white) noise, m.
+    node_sigma_m : Standard deviation at the nodes of grid-correlated noise, m; 0 without such noise.
     step_m : Spacing of these nodes, m.
     spacing_m : Typical distance between neighbouring points, m.
-    correlated_share : Share of the variance that is grid-correlated.
+    correlated_share : Share of the variance that is grid-correlated, 0 to 1.
     """
 
     sigma_m: float
@@ -74,7 +74,7 @@ class SurfaceNoise:
 
     @property
     def summary(self) -> str:
-        """One line with the size and the correlation of the noise."""
+        """One line for the terminal with the size and the correlation of the noise."""
         how = "estimated from the semivariogram of the cloud's distances to the reference"
         own = f"{how}: {1e3 * self.sigma_m:.3g} mm of white noise"
         if not self.node_sigma_m:
@@ -105,7 +105,9 @@ def estimate_surface_noise(measurement: SurfaceMeasurement, where: str) -> Surfa
     rows = np.flatnonzero(found.usable)
     if len(rows) < _FEWEST or not isinstance(found, SurfaceResiduals):
         raise InputError(
-            f"{len(rows)} points on smooth parts of the reference", where=where, allowed=f"{_FEWEST} and more",
+            f"{len(rows)} points lie on smooth parts of the reference, too few to estimate their noise",
+            where=where,
+            allowed=f"{_FEWEST} and more",
             remedy="use a denser cloud, or a reference that covers it",
         )  # fmt: skip
     return _fit_noise(found.geometry.point[rows], value[rows])

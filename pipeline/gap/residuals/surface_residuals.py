@@ -51,7 +51,7 @@ _ROUNDING = 1e-6
 
 @dataclass(frozen=True)
 class SurfaceGeometry(SurfacePlaces):
-    """Places on the reference with their surroundings, and the distances of the cloud's points from it.
+    """For each of n points of a cloud, the place on the reference below it, and the distance between the two.
 
     Attributes
     ----------
@@ -66,19 +66,19 @@ class SurfaceGeometry(SurfacePlaces):
         return np.asarray(self.point[:, :2])
 
     def part(self, rows: Rows) -> SurfaceGeometry:
-        """Return the geometry of some of the points."""
+        """Return the geometry of a subset of the n points, given as row numbers, a mask or a slice."""
         return super().part(rows)
 
 
 @dataclass(frozen=True)
 class SurfaceResiduals(Residuals):
-    """Distances along the normal, m, positive out of the rock.
+    """Residuals of a cloud without cameras: distances from the reference along its normal, m, positive out of the rock.
 
     The pose Jacobian is evaluated at the places on the reference, because the noise of the points would bias the scale.
 
     Attributes
     ----------
-    pose_jacobian : (n, k) derivatives by those k combinations of the datum's parameters that the reference can determine.
+    pose_jacobian : (n, k) derivatives by those k combinations of shift, rotation and scale that the reference can determine.
     datum : (7, k) these combinations in terms of shift (m), rotation (rad) and scale.
     """
 
@@ -97,14 +97,14 @@ class SurfaceResiduals(Residuals):
 
     @property
     def candidates(self) -> Effects:
-        """Noise in metres only: the other effects of the catalogue need cameras."""
+        """Classes of the effects that may be named: only noise in metres, because all others need cameras."""
         return (PointNoise,)
 
 
 def surface_residuals(measurement: SurfaceMeasurement) -> SurfaceResiduals:
     """Compute the distances of a cloud from the reference, with predicted sigma, covariates and pose Jacobian.
 
-    Points whose line misses the reference nearby are left out.
+    Points that do not project onto the reference nearby are left out.
     """
     points, model = measurement.cloud.points, measurement.model
     spacing = point_spacing_m(points)
@@ -144,7 +144,7 @@ def _varying_covariates(geometry: SurfaceGeometry, hit: BoolArray, measurement: 
 
 
 def point_spacing_m(points: FloatArray) -> float:
-    """Return the median distance from a point to its nearest neighbour, m. `points`: (n, 3), m."""
+    """Return the median distance from a point to its nearest neighbour, m. `points` are (n, 3), m."""
     from scipy.spatial import cKDTree
 
     if len(points) < 2:
@@ -219,12 +219,12 @@ def _correlated_noise(model: StereoModel, at: FloatArray, spacing: float) -> Gri
 
 
 def simulate_distances(model: StereoModel, residuals: SurfaceResiduals, random: KeyedRandom) -> FloatArray:
-    """Simulate the distances from the reference that a model gives at the residuals' points.
+    """Simulate the distances from the reference that a sensor model gives at the points of a cloud.
 
     Parameters
     ----------
     model : The sensor model.
-    residuals : Residuals with the points' places on the reference.
+    residuals : Residuals of n points with their places on the reference.
     random : Source of the random numbers.
 
     Returns
@@ -236,20 +236,21 @@ def simulate_distances(model: StereoModel, residuals: SurfaceResiduals, random: 
 
 
 def predicted_sigma(model: StereoModel, residuals: SurfaceResiduals) -> FloatArray:
-    """Return the (n,) standard deviation that a model predicts at the residuals' points, m."""
+    """Return the (n,) standard deviation that a sensor model predicts for the distances of the residuals' points, m."""
     return np.sqrt(sum((effect.variance(residuals.geometry) for effect in model.of_points()), np.zeros(len(residuals))))
 
 
 def datum_covariance(residuals: SurfaceResiduals, value: FloatArray, rows: BoolArray) -> FloatArray:
-    """Estimate the covariance of the datum by a jackknife over wall blocks, because errors are correlated within them.
+    """Estimate the covariance of a cloud's datum (shift, rotation and scale) by a jackknife over wall blocks.
 
-    Without block b the datum changes by -(A - A_b)⁻¹ r_b, with A and r the matrix and the right side of the normal equations.
+    Blocks are left out as a whole because errors are correlated within them. Without block b the datum changes by -(A - A_b)⁻¹
+    r_b, with A and r the matrix and the right side of the normal equations.
 
     Parameters
     ----------
     residuals : Residuals of the cloud.
-    value : (n,) residuals after the alignment.
-    rows : (n,) points by which the cloud was aligned.
+    value : (n,) residuals after the alignment, m.
+    rows : (n,) true for points by which the cloud was aligned.
 
     Returns
     -------

@@ -34,7 +34,7 @@ _LEAST_POWER = 1e-9
 
 @dataclass(frozen=True)
 class TlsResiduals(Residuals):
-    """Range residuals of a laser scan, m.
+    """Residuals of a laser scan: measured minus predicted ranges, m.
 
     Attributes
     ----------
@@ -53,14 +53,14 @@ class TlsResiduals(Residuals):
 
     @property
     def reference_variance(self) -> FloatArray:
-        """(n,) variance of the ranges that errors of the reference's vertices cause, m²; it uses the squared weights."""
+        """(n,) variance of the ranges, m², that independent errors of the reference's vertices cause."""
         return _reference_variance(self.reference_error_m, self.geometry)
 
     @property
     def with_sigma_of_means(self) -> Self:
-        """Return the residuals with the sigma that counts for means.
+        """Return the residuals with the sigma that counts for means over many neighbours: sqrt(n) times the sigma of a mean of n.
 
-        It differs because neighbouring rays share the errors of the vertices between them.
+        It differs from the sigma of single points because neighbouring rays share errors of the vertices between them.
         """
         corner, weight = self.geometry.corner, self.geometry.weight
         if not self.reference_error_m or self.error_is_relief or corner is None or weight is None:
@@ -70,7 +70,16 @@ class TlsResiduals(Residuals):
         return replace(self, sigma=np.sqrt(variance))
 
     def reference_covariance_with(self, other: NDArray[np.int64]) -> FloatArray:
-        """Return the covariance of two rays that share vertices of the reference, m². `other`: (n,) row of the other ray."""
+        """Return the covariance of two rays that share vertices of the reference.
+
+        Parameters
+        ----------
+        other : (n,) row of the other ray.
+
+        Returns
+        -------
+        (n,) covariances, m².
+        """
         corner, weight = self.geometry.corner, self.geometry.weight
         if not self.reference_error_m or corner is None or weight is None:
             return super().reference_covariance_with(other)
@@ -78,7 +87,7 @@ class TlsResiduals(Residuals):
         return np.asarray(self.reference_error_m**2 * np.einsum("nab,na,nb->n", same, weight, weight[other]))
 
     def draw_reference_error(self, random: KeyedRandom) -> FloatArray:
-        """Draw the (n,) range errors, m, that errors of the reference's vertices cause."""
+        """Draw random errors of the reference's vertices; return the (n,) range errors that they cause, m."""
         corner, weight = self.geometry.corner, self.geometry.weight
         if not self.reference_error_m or corner is None or weight is None:
             return np.zeros(len(self))
@@ -162,7 +171,7 @@ def _reference_variance(error_m: float, geometry: RayGeometry) -> FloatArray:
 
 
 def with_scan_order(measurement: TlsMeasurement) -> TlsMeasurement:
-    """Determine scan lines and times of all points, so that a subsample keeps them."""
+    """Return the scan with the scan line and the time of each point determined, so that a subsample keeps them."""
     if measurement.scans:
         found = [(rows, with_scan_order(one).order or (None, None)) for _, rows, one in measurement.each_scan() if len(rows)]
         line, share = (_assembled([(rows, order[which]) for rows, order in found], len(measurement.scan_of)) for which in (0, 1))
@@ -181,17 +190,17 @@ def _assembled(parts: list[tuple[NDArray[np.int64], FloatArray | None]], count: 
 
 
 def log_over_median(power: FloatArray) -> FloatArray:
-    """(n,) logarithm of the received power relative to its median."""
+    """Return (n,) the logarithm of received powers (n,) relative to their median."""
     positive = np.maximum(power, 1e-12)
     return np.asarray(np.log(positive / np.median(positive)), dtype=np.float64)
 
 
 def recorded_polar(measurement: TlsMeasurement) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the recorded directions and ranges of a scan.
+    """Return the recorded directions and ranges of a scan's n points.
 
     Returns
     -------
-    (n,) azimuth without jumps and zenith angle, rad, as the face of the instrument counts them, and range, m.
+    (n,) azimuth without jumps and (n,) zenith angle, rad, as the face of the instrument counts them, and (n,) range, m.
     """
     position, rotation = measurement.station
     local = np.einsum("ji,nj->ni", rotation, measurement.cloud.points - position)
@@ -275,7 +284,7 @@ def _notes(measurement: TlsMeasurement) -> tuple[str, ...]:
 
 
 def find_expected_pulses(measurement: TlsMeasurement, residuals: TlsResiduals) -> ExpectedPulses | None:
-    """List every pulse of the pattern that should hit the wall, and whether it returned; epoch after epoch.
+    """List every pulse of the scan pattern that should hit the wall, and whether it returned; epoch after epoch.
 
     Parameters
     ----------
@@ -312,12 +321,12 @@ def find_expected_pulses(measurement: TlsMeasurement, residuals: TlsResiduals) -
 
 
 def pulse_count(pattern: ScanPattern) -> int:
-    """Return the number of pulses of a pattern."""
+    """Return the number of pulses of a scan pattern."""
     return int(np.prod([len(sweep) for sweep in _sweeps(pattern)]))
 
 
 def pulse_number(pattern: ScanPattern, azimuth: FloatArray, zenith: FloatArray) -> NDArray[np.int64]:
-    """Find the pulse of the pattern with the direction nearest to a recorded one.
+    """Find the pulse of a scan pattern whose direction is nearest to a recorded one.
 
     Parameters
     ----------

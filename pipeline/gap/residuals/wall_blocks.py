@@ -23,7 +23,7 @@ BLOCK_CELLS = 3
 
 @dataclass(frozen=True)
 class WallCells:
-    """Square cells of the wall with their points.
+    """Square cells into which the wall is divided, with the points in each.
 
     Attributes
     ----------
@@ -55,12 +55,18 @@ class WallCells:
 
 
 def wall_block_numbers(at: FloatArray, side_m: float) -> NDArray[np.int64]:
-    """Return the (n,) number of the wall block that holds each point.
+    """Return the number of the wall block that holds each point.
+
+    A wall block is a square of BLOCK_CELLS by BLOCK_CELLS cells, within which residuals may be correlated.
 
     Parameters
     ----------
     at : (n, 2) points, wall frame, m.
-    side_m : Side of a cell, m; a wall block is BLOCK_CELLS cells wide.
+    side_m : Side of a cell, m.
+
+    Returns
+    -------
+    (n,) numbers.
     """
     column, row = (np.floor((at[:, axis] - at[:, axis].min()) / (BLOCK_CELLS * side_m)).astype(np.int64) for axis in (0, 1))
     return column + 100_000 * row
@@ -84,9 +90,16 @@ def wall_blocks_by_points(at: FloatArray, points: float) -> NDArray[np.int64]:
 
 
 def in_validation_blocks(at: FloatArray, side_m: float) -> NDArray[np.bool_]:
-    """Return (n,) whether each point lies in a validation block: every fifth wall block, in a knight's-move pattern.
+    """Tell which points are kept for validation: those in every fifth wall block, in a knight's-move pattern. No fit uses them.
 
-    No fit uses these points; validation does. `at` are (n, 2) points in the wall frame, m; `side_m` is the side of a cell, m.
+    Parameters
+    ----------
+    at : (n, 2) points, wall frame, m.
+    side_m : Side of a cell, m.
+
+    Returns
+    -------
+    (n,) true for validation points.
     """
     block = wall_block_numbers(at, side_m)
     return np.asarray((block % 100_000 + 2 * (block // 100_000)) % 5 == 0)

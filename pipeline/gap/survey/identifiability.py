@@ -3,12 +3,12 @@
 The signature S (n, k) of each effect is the one that `gap` uses. The pose columns J, one set for each station, are projected
 out in the metric of the predicted noise, W = diag(1 / sigma²):
 
-    survival    |S_perp| / |S| with S_perp = S - J (J^T W J)^-1 J^T W S, over all phases
-    cosine      largest canonical correlation of two effects' S_perp, over the variants of one of them (such as the camera)
-    seen_from   detectable size: the parameter value with a signal-to-noise ratio of 5, 5 sqrt(C), where C is the variance of its
-                estimate beside the pose
-    named_from  size from which it can be named: the signal-to-noise ratio times the sine of the angle to the nearest other
-                signature is 8
+    survival          |S_perp| / |S| with S_perp = S - J (J^T W J)^-1 J^T W S, over all phases
+    cosine            largest canonical correlation of two effects' S_perp, over the variants of one of them (such as the camera)
+    detectable size   parameter value with a signal-to-noise ratio of 5: 5 sqrt(C), where C is the variance of its estimate
+                      beside the pose
+    nameable size     parameter value at which the signal-to-noise ratio times the sine of the angle to the nearest other
+                      signature is 8
 
 C counts all points of the survey, and a reference error that is correlated over metres (Matern 3/2), which many points do not
 average out. The amplitude of an effect with a phase is given for the phase that is hardest to detect.
@@ -48,40 +48,40 @@ REFERENCE_ERRORS_M = {"tls": 0.001, "stereo": 0.005}
 
 @dataclass(frozen=True)
 class SurveyExtension:
-    """A survey with one additional measurement.
+    """A survey with one additional measurement, and how well it detects and distinguishes m effects.
 
     Attributes
     ----------
     name : The additional measurement, in words.
-    cosines : (m, m) cosines between the signatures of the same m effects.
-    seen_from : Detectable size of each effect.
+    cosines : (m, m) absolute cosines between the effects' signatures.
+    detectable_size : (m,) value of each effect's main parameter at a signal-to-noise ratio of 5.
     """
 
     name: str
     cosines: FloatArray
-    seen_from: tuple[float, ...]
+    detectable_size: tuple[float, ...]
 
     @property
-    def named_from(self) -> tuple[float, ...]:
-        """(m,) parameter value from which each effect can be named."""
-        return _named_from(self.cosines, self.seen_from)
+    def nameable_size(self) -> tuple[float, ...]:
+        """(m,) value of each effect's main parameter from which the effect can be distinguished from all others."""
+        return _nameable_size(self.cosines, self.detectable_size)
 
 
 @dataclass(frozen=True)
 class Identifiability:
-    """Which of m effects a survey can detect and distinguish.
+    """Which of m systematic effects a survey can detect, and which of them it can distinguish.
 
     Attributes
     ----------
-    sensor : The sensor.
-    names : Names of the effects, with the sensor as prefix.
-    survival : (m,) share of each signature that the pose fit leaves.
+    sensor : "tls" or "stereo".
+    names : (m,) names of the effects, with the sensor as prefix.
+    survival : (m,) share of each effect's signature that a fit of the pose leaves.
     cosines : (m, m) absolute cosines between the signatures.
-    parameters : Name of each effect's main parameter.
-    seen_from : Its detectable size (signal-to-noise ratio 5), with the reference error.
-    seen_from_noise : The same without a reference error.
-    shown : Searched or chosen values of the tabulated variant, such as a period or a camera.
-    extensions : The survey with each of some additional measurements.
+    parameters : (m,) name of each effect's main parameter.
+    detectable_size : (m,) its value at a signal-to-noise ratio of 5, with noise and reference error.
+    detectable_size_without_reference_error : (m,) the same with noise alone.
+    variants : (m,) the variant of each effect that the numbers belong to, such as a period or a camera, in words.
+    extensions : The survey with each of several additional measurements.
     points : Number of points of the survey.
     reference_error_m : Standard deviation of the reference's correlated error, m.
     others : Effects on the noise and on missing returns.
@@ -92,35 +92,43 @@ class Identifiability:
     survival: FloatArray
     cosines: FloatArray
     parameters: tuple[str, ...]
-    seen_from: tuple[float, ...]
-    seen_from_noise: tuple[float, ...]
-    shown: tuple[str, ...]
+    detectable_size: tuple[float, ...]
+    detectable_size_without_reference_error: tuple[float, ...]
+    variants: tuple[str, ...]
     extensions: tuple[SurveyExtension, ...]
     points: int
     reference_error_m: float
     others: tuple[NoiseOrLossEffect, ...] = ()
 
     @property
-    def named_from(self) -> tuple[float, ...]:
-        """(m,) parameter value from which each effect can be named."""
-        return _named_from(self.cosines, self.seen_from)
+    def nameable_size(self) -> tuple[float, ...]:
+        """(m,) value of each effect's main parameter from which the effect can be distinguished from all others."""
+        return _nameable_size(self.cosines, self.detectable_size)
 
     def best_extension(self, row: int) -> SurveyExtension:
-        """Return the additional measurement with which the effect in a row can be named from the smallest size on."""
-        return min(self.extensions, key=lambda extension: extension.named_from[row])
+        """Return the additional measurement with which an effect can be named from the smallest size on.
 
-    def alike(self, row: int) -> list[int]:
-        """Return the rows of effects whose signatures are similar to that of `row`, most similar first."""
+        Parameters
+        ----------
+        row : Index of the effect.
+        """
+        return min(self.extensions, key=lambda extension: extension.nameable_size[row])
+
+    def similar_effects(self, row: int) -> list[int]:
+        """Return the indices of effects that can hardly be told from the effect `row`, most similar first.
+
+        Their signatures have a cosine of at least 0.9 with its own.
+        """
         order = np.argsort(-self.cosines[row])
         return [int(other) for other in order if other != row and self.cosines[row, other] >= SIMILAR_COSINE]
 
-    def pairs(self) -> list[tuple[int, int]]:
-        """Return the pairs of rows with similar signatures in the survey as planned, most similar first."""
+    def similar_pairs(self) -> list[tuple[int, int]]:
+        """Return the pairs of effects that this survey can hardly tell apart, as indices, most similar first."""
         found = [(a, b) for a in range(len(self.names)) for b in range(a) if self.cosines[a, b] >= SIMILAR_COSINE]
         return sorted(found, key=lambda pair: -self.cosines[pair])
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of identifiability.json."""
+        """Return the entry of this survey in identifiability.json."""
         return {
             "sensor": self.sensor,
             "points": self.points,
@@ -136,7 +144,7 @@ class Identifiability:
                     "with": {extension.name: float(extension.cosines[a, b]) for extension in self.extensions},
                     "split_by": [e.name for e in self.extensions if e.cosines[a, b] < SIMILAR_COSINE],
                 }
-                for a, b in self.pairs()
+                for a, b in self.similar_pairs()
             ],
             "spread_and_losses": [other.to_dict() for other in self.others],
         }
@@ -146,11 +154,11 @@ class Identifiability:
         return {
             "name": self.names[row],
             "parameter": self.parameters[row],
-            "shown": self.shown[row],
-            "seen_from": _finite(self.seen_from[row]),
-            "seen_from_by_noise_alone": _finite(self.seen_from_noise[row]),
-            "named_from": _finite(self.named_from[row]),
-            "named_from_with": {extension.name: _finite(extension.named_from[row]) for extension in self.extensions},
+            "shown": self.variants[row],
+            "seen_from": _finite(self.detectable_size[row]),
+            "seen_from_by_noise_alone": _finite(self.detectable_size_without_reference_error[row]),
+            "named_from": _finite(self.nameable_size[row]),
+            "named_from_with": {extension.name: _finite(extension.nameable_size[row]) for extension in self.extensions},
         }
 
 
@@ -165,30 +173,30 @@ def _finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _named_from(cosines: FloatArray, seen_from: tuple[float, ...]) -> tuple[float, ...]:
+def _nameable_size(cosines: FloatArray, detectable_size: tuple[float, ...]) -> tuple[float, ...]:
     """Size from which each effect can be named, from its detectable size and the cosine to the nearest other signature."""
     nearest = (cosines - np.eye(len(cosines))).max(axis=1)
     sine = np.sqrt(np.maximum(1 - nearest**2, 1e-300))
-    return tuple(NAMING_SNR / DETECTION_SNR * value / float(s) for value, s in zip(seen_from, sine, strict=True))
+    return tuple(NAMING_SNR / DETECTION_SNR * value / float(s) for value, s in zip(detectable_size, sine, strict=True))
 
 
 def identifiability(survey: Survey, reference_error_m: float | None = None) -> Identifiability:
-    """Analyse a survey, and what each of some additional measurements would add.
+    """Analyse which effects a survey can detect and distinguish, and what each of several additional measurements would add.
 
     Parameters
     ----------
-    survey : The survey.
-    reference_error_m : Standard deviation of the reference's correlated error, m; by default 1 mm for a laser scanner and 5 mm
-        for a stereo pair.
+    survey : The planned or measured survey.
+    reference_error_m : Standard deviation of the reference's correlated error, m; None: 1 mm for a laser scanner and 5 mm for a
+        stereo pair.
     """
     error = REFERENCE_ERRORS_M[survey.sensor] if reference_error_m is None else reference_error_m
     families = group_by_effect(view_signatures(survey.views[0]))
     plain = SurveyDesign.of(survey.views, families)
-    seen, noise = (plain.seen_from(sigma) for sigma in (error, 0.0))
+    seen, noise = (plain.detectable_size(sigma) for sigma in (error, 0.0))
     extensions = []
     for name, views, points in _extended(survey):
         design = SurveyDesign.of(views, families, points)
-        extensions.append(SurveyExtension(name, design.cosines(), design.seen_from(error)))
+        extensions.append(SurveyExtension(name, design.cosines(), design.detectable_size(error)))
     shown = [variants[0] for variants in families.values()]
     return Identifiability(
         sensor=survey.sensor,
@@ -196,9 +204,9 @@ def identifiability(survey: Survey, reference_error_m: float | None = None) -> I
         survival=plain.survival(),
         cosines=plain.cosines(),
         parameters=tuple(parameter_label(candidate) for candidate in shown),
-        seen_from=seen,
-        seen_from_noise=noise,
-        shown=tuple(_shown(candidate) for candidate in shown),
+        detectable_size=seen,
+        detectable_size_without_reference_error=noise,
+        variants=tuple(_shown(candidate) for candidate in shown),
         extensions=tuple(extensions),
         points=sum(view.point_count for view in survey.views),
         reference_error_m=error,
@@ -207,12 +215,15 @@ def identifiability(survey: Survey, reference_error_m: float | None = None) -> I
 
 
 def format_table(found: Identifiability) -> str:
-    """Format a text table: effect, share that the pose fit leaves, detectable size, and the most similar signature."""
+    """Format the result as a text table with a row for each effect.
+
+    The columns are the share of the signature that the pose fit leaves, the detectable size, and the most similar effect.
+    """
     cosines = found.cosines - np.eye(len(found.names))
     lines = [f"{'effect':<32}{'survives pose':>14}  {'seen from (S/N 5)':<32}most alike (cosine)"]
     for row, (name, share) in enumerate(zip(found.names, found.survival, strict=True)):
         other = int(np.argmax(cosines[row]))
-        value = f"{found.parameters[row]} {found.seen_from[row]:.2g}"
+        value = f"{found.parameters[row]} {found.detectable_size[row]:.2g}"
         lines.append(f"{name:<32}{100 * share:>12.1f} %  {value:<32}{found.names[other]} ({cosines[row, other]:.2f})")
     return "\n".join(lines)
 

@@ -38,14 +38,14 @@ _STEP = 0.01
 
 @dataclass(frozen=True)
 class KnownPoints:
-    """Observations of points with known positions.
+    """Additional observations of points with known positions, such as targets, and how effects would show in them.
 
     Attributes
     ----------
-    title : What they are, in words.
-    pose_jacobian : (n, 6) derivatives of the observations by the pose of the first station.
-    sigma : (n,) their standard deviations.
-    columns : Function from candidates to their (n, k) signatures in these observations.
+    title : The points, in words.
+    pose_jacobian : (n, 6) derivatives of the observations by the pose of the first station: shift (m) and rotation (rad).
+    sigma : (n,) standard deviations of the observations, in the unit of the observable.
+    columns : Function from k candidate effects to their (n, k) signatures in these observations.
     """
 
     title: str
@@ -55,7 +55,14 @@ class KnownPoints:
 
 
 def known_points(view: TlsView | StereoView) -> KnownPoints:
-    """Return known points that a survey could add: targets around a scanner, or check points in front of a stereo pair."""
+    """Return observations of known points that a survey could add.
+
+    They are targets around a laser scanner, or check points in front of a stereo pair.
+
+    Parameters
+    ----------
+    view : What the first station or pair sees of the wall.
+    """
     return _targets(view) if isinstance(view, TlsView) else _check_points(view)
 
 

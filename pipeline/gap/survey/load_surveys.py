@@ -12,12 +12,12 @@ from scene.common.errors import InputError
 
 
 def load_surveys(path: Path, overrides: Sequence[str] = (), sensor: SensorName | None = None) -> list[Survey]:
-    """Load the survey of a measurement, or one for each sensor of a config.
+    """Load the survey of a measurement, or simulate one survey for each sensor of a config.
 
     Parameters
     ----------
-    path : Folder with measurement.yaml, that file itself, or a config.
-    overrides : Settings of the config as `key=value`.
+    path : Folder with measurement.yaml, that file itself, or a simulation config.
+    overrides : Settings of the config, each as `key=value`.
     sensor : The sensor of the config to use; None for all.
 
     Raises

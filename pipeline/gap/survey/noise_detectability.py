@@ -25,19 +25,19 @@ _NO_NUMBER = "no closed-form signature: gap tests it, but its detectable size is
 
 @dataclass(frozen=True)
 class NoiseOrLossEffect:
-    """An effect on the noise or on missing returns.
+    """An effect of the catalogue on the noise or on missing returns, and the size from which a survey can detect it.
 
     Attributes
     ----------
     name : Name of the effect, with the sensor as prefix.
     parameter : Name of its main parameter.
-    seen_from : Detectable size: the parameter value at a signal-to-noise ratio of 5; NaN if it is not computed.
-    note : Condition or reason, in words.
+    detectable_size : Value of that parameter at a signal-to-noise ratio of 5; NaN if it cannot be computed.
+    note : Condition for that size, or why there is none, in words.
     """
 
     name: str
     parameter: str
-    seen_from: float
+    detectable_size: float
     note: str
 
     def to_dict(self) -> dict[str, Any]:
@@ -45,13 +45,13 @@ class NoiseOrLossEffect:
         return {
             "name": self.name,
             "parameter": self.parameter,
-            "seen_from": self.seen_from if np.isfinite(self.seen_from) else None,
+            "seen_from": self.detectable_size if np.isfinite(self.detectable_size) else None,
             "note": self.note,
         }
 
 
 def noise_and_loss_effects(survey: Survey) -> tuple[NoiseOrLossEffect, ...]:
-    """List every effect of the catalogue that is not systematic, with its detectable size where that can be computed."""
+    """List every effect of the catalogue that is not systematic, with its detectable size in a survey if that can be computed."""
     view = survey.views[0]
     found = {each.name: each for each in _variance_effects(view)}
     if isinstance(view, TlsView):
@@ -86,7 +86,7 @@ def _variance_effects(view: SurveyView) -> list[NoiseOrLossEffect]:
         note = "" if theta > least else f"smaller ones add less than {100 * excess:.0f} % to the variance and are not named"
         value = candidate.parameters(np.full(len(candidate.names), max(theta, least)))[candidate.names[0]]
         name = f"{residuals.sensor}.{candidate.name}"
-        if name not in found or value < found[name].seen_from:
+        if name not in found or value < found[name].detectable_size:
             found[name] = NoiseOrLossEffect(name, candidate.names[0], float(value), note)
     return list(found.values())
 

@@ -25,15 +25,15 @@ _NULL = 1e-9
 
 
 def view_signatures(view: SurveyView) -> list[Candidate]:
-    """List every systematic effect of the catalogue with its variants, for the measurement of a view."""
+    """List every systematic effect of the catalogue, with its variants, as signatures at the points of one view."""
     return systematic_candidates(view.residuals, view.measurement)
 
 
 def group_by_effect(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
-    """Group candidates by effect.
+    """Group candidates by effect, and keep a few variants of each.
 
-    The first variant of each effect represents it in the table; the others are alternatives to it, such as other cameras. A
-    searched wave is represented by its middle period.
+    The first variant represents the effect in tables. The others, such as other cameras, are alternatives that another effect may
+    be confused with. A wave with searched period is represented by its middle period.
 
     Returns
     -------
@@ -59,9 +59,9 @@ def group_by_effect(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
 
 
 def parameter_label(candidate: Candidate) -> str:
-    """Return the name of the parameter whose detectable size is given.
+    """Return the name of an effect's main parameter, to which its detectable size refers.
 
-    For parameters of one kind these are several names, separated by commas.
+    Several parameters of the same kind are joined by commas.
     """
     hidden = {"phase_rad", "" if candidate.wave is None else candidate.wave.key}
     return ", ".join(name for name in candidate.names if name not in hidden)
@@ -78,19 +78,19 @@ def _scales(candidate: Candidate) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class SurveyDesign:
-    """Signatures of m effects in all views, divided by sigma.
+    """Signatures of m effects at n observations of a survey, divided by their standard deviations, before and after a pose fit.
 
     Attributes
     ----------
-    projected : (n, k) signatures after the pose is projected out.
-    signatures : (n, k) signatures before.
-    pose_basis : (n, p) orthonormal columns of the pose.
-    spans : For each effect the columns of each of its variants.
-    scales : For each effect the parameter value per unit of each coefficient.
-    cells : Cells of the wall, over which the reference's error is correlated.
-    sigma : (n,) standard deviations; they give a subsample of the points the weight of all.
-    unit_m : Median metres per unit of the observable.
-    wall : Number of rows on the wall; rows of known points follow.
+    projected : (n, k) signatures after the pose of each station is projected out.
+    signatures : (n, k) signatures before that.
+    pose_basis : (n, p) orthonormal basis of the pose columns.
+    spans : For each effect, slices of the k columns that belong to each of its variants.
+    scales : For each effect, the parameter value per unit of each coefficient.
+    cells : Cells of the wall, between which the reference's error is correlated.
+    sigma : (n,) standard deviations, reduced so that a subsample has the weight of all points.
+    unit_m : Median metres of range or depth per unit of the observable.
+    wall_rows : Number of rows that are points on the wall; rows of known points follow.
     """
 
     projected: FloatArray
@@ -101,19 +101,19 @@ class SurveyDesign:
     cells: WallCells
     sigma: FloatArray
     unit_m: float
-    wall: int
+    wall_rows: int
 
     @classmethod
     def of(
         cls, views: tuple[SurveyView, ...], families: dict[str, list[Candidate]], points: KnownPoints | None = None
     ) -> SurveyDesign:
-        """Set up the design of a survey.
+        """Compute the signatures of all effects in all views, and project out the pose of each station.
 
         Parameters
         ----------
         views : What each station or pair sees.
         families : The variants of each effect (`group_by_effect`).
-        points : Observations of known points, if the survey has any.
+        points : Observations of known points; None if the survey has none.
         """
         wanted = [variant for variants in families.values() for variant in variants]
         columns = np.concatenate([signature_columns(view, wanted) for view in views])
@@ -144,14 +144,14 @@ class SurveyDesign:
         return cls(left, whole, base, spans, scales, WallCells.over(at), sigma, unit, wall)
 
     def survival(self) -> FloatArray:
-        """Return the (m,) share of each signature that the pose fit leaves, as root mean square over its columns."""
+        """Return the (m,) share of each effect's signature that the pose fit leaves: near 0, the pose hides the effect."""
         sizes = [
             (float(np.linalg.norm(self.projected[:, v[0]])), float(np.linalg.norm(self.signatures[:, v[0]]))) for v in self.spans
         ]
         return np.array([left / max(whole, 1e-300) for left, whole in sizes])
 
     def cosines(self) -> FloatArray:
-        """Return the (m, m) cosines between signatures.
+        """Return the (m, m) absolute cosines between the signatures of the effects, after the pose is projected out.
 
         A cosine is the largest canonical correlation of an effect's first variant with any variant of the other one, made
         symmetric.
@@ -172,8 +172,8 @@ class SurveyDesign:
         kept = columns[:, np.linalg.norm(columns, axis=0) > _NULL * whole]
         return np.asarray(np.linalg.qr(kept)[0]) if kept.shape[1] else np.zeros((len(columns), 1))
 
-    def seen_from(self, reference_error_m: float) -> tuple[float, ...]:
-        """Return the detectable size of each effect: the parameter value at a signal-to-noise ratio of 5.
+    def detectable_size(self, reference_error_m: float) -> tuple[float, ...]:
+        """Return the value of each effect's main parameter at a signal-to-noise ratio of 5.
 
         Parameters
         ----------
@@ -181,7 +181,7 @@ class SurveyDesign:
 
         Returns
         -------
-        The values; infinite if the pose fit leaves nothing of a signature.
+        (m,) values; infinite if the pose fit leaves nothing of a signature.
         """
         first = [list(range(variants[0].start, variants[0].stop)) for variants in self.spans]
         chosen = [column for group in first for column in group]
@@ -201,12 +201,12 @@ class SurveyDesign:
 
     def _information(self, design: FloatArray, error: float) -> FloatArray:
         """(k, k) information matrix of columns over sigma, if the cells' means share a correlated error of the reference."""
-        wall, known = design[: self.wall], design[self.wall :]
+        wall, known = design[: self.wall_rows], design[self.wall_rows :]
         total = wall.T @ wall + known.T @ known
         if error <= 0:
             return np.asarray(total)
         inside = self.cells.cell >= 0
-        cell, root = self.cells.cell[inside], 1 / self.sigma[: self.wall][inside]
+        cell, root = self.cells.cell[inside], 1 / self.sigma[: self.wall_rows][inside]
         weight = np.bincount(cell, root**2, len(self.cells))
         sums = np.stack([np.bincount(cell, root * column, len(self.cells)) for column in wall[inside].T], axis=1)
         reach = np.sqrt(3.0) * cdist(self.cells.centre, self.cells.centre) / REFERENCE_LENGTH_M
@@ -218,9 +218,9 @@ class SurveyDesign:
 
 
 def signature_columns(view: SurveyView, wanted: list[Candidate]) -> FloatArray:
-    """Return the signatures of given variants in a view.
+    """Return the signatures of given variants of effects at the points of one view.
 
-    Searched periods are those of the variants, not those of the view's own grid.
+    Searched periods are those of the variants, so that all views of a survey use the same ones.
 
     Parameters
     ----------
@@ -229,7 +229,7 @@ def signature_columns(view: SurveyView, wanted: list[Candidate]) -> FloatArray:
 
     Returns
     -------
-    (n, k) columns.
+    (n, k) change of the observable per unit of each coefficient.
     """
     own = {_key(each): each for each in view_signatures(view)}
     parts = []

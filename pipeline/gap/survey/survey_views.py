@@ -45,14 +45,14 @@ Pose = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True)
 class SurveyView:
-    """What one station or one stereo pair sees of the wall.
+    """What one scanner station or one stereo pair sees of the wall.
 
     Attributes
     ----------
-    residuals : Geometry of a subsample of the points; the residual values have no meaning.
+    residuals : Geometry of n points, a subsample on smooth parts of the wall; the residual values have no meaning.
     point_count : Number of points of the full view.
-    station : Number of its pose.
-    measurement : A measurement with its pose or cameras.
+    station : Number of its pose; views with the same number share a pose.
+    measurement : A measurement with the pose or the cameras of the view.
     """
 
     residuals: Residuals
@@ -62,7 +62,7 @@ class SurveyView:
 
     @classmethod
     def of(cls, found: Residuals, whole: int, number: int, measurement: Measurement) -> Self:
-        """Make a view of the points on smooth parts of the wall.
+        """Make a view from the subsample's points on smooth parts of the wall.
 
         Parameters
         ----------
@@ -87,13 +87,13 @@ class SurveyView:
 
     @property
     def sigma(self) -> FloatArray:
-        """(n,) predicted sigma, reduced so that the subsample has the weight of all points."""
+        """(n,) predicted standard deviations in the unit of the observable; they give a subsample the weight of all points."""
         return self.residuals.sigma * np.sqrt(len(self.residuals) / max(self.point_count, 1))
 
 
 @dataclass(frozen=True)
 class TlsView(SurveyView):
-    """What one scanner station sees."""
+    """What one scanner station sees of the wall. Attributes as in `SurveyView`."""
 
     residuals: TlsResiduals
     measurement: TlsMeasurement
@@ -101,7 +101,7 @@ class TlsView(SurveyView):
 
 @dataclass(frozen=True)
 class StereoView(SurveyView):
-    """What one stereo pair sees."""
+    """What one stereo pair sees of the wall. Attributes as in `SurveyView`."""
 
     residuals: StereoResiduals
     measurement: StereoMeasurement
@@ -109,13 +109,13 @@ class StereoView(SurveyView):
 
 @dataclass(frozen=True)
 class TlsSurvey:
-    """Views of one wall by a laser scanner.
+    """A survey of one wall by laser scans, from which surveys with additional scans can be made.
 
     Attributes
     ----------
-    views : One for each station.
-    centre : (3,) centre of the wall, m.
-    observe : Function that makes a further view, from a measurement with its pose and a number.
+    views : What each station sees.
+    centre : (3,) centre of the wall, wall frame, m.
+    observe : Function that makes a view from a measurement with its pose and the number of the pose.
     """
 
     views: tuple[TlsView, ...]
@@ -125,12 +125,12 @@ class TlsSurvey:
     place: ClassVar[str] = "station"
 
     def moved(self, scale: float, turn_rad: float, number: int) -> TlsView:
-        """Move the station of the first view.
+        """Return what the first station would see from another place.
 
         Parameters
         ----------
         scale : New distance from the wall's centre, relative to the present one.
-        turn_rad : Rotation about the vertical through the wall's centre, rad.
+        turn_rad : Rotation of the station about the vertical through the wall's centre, rad.
         number : Number of the new pose.
 
         Raises
@@ -144,10 +144,13 @@ class TlsSurvey:
         return self.observe(base.changed(station=(position, turn @ base.station[1])), number)
 
     def repeated(self, number: int) -> tuple[str, TlsView]:
-        """Repeat the first scan in the other face of the instrument.
+        """Return the first scan repeated in the other face of the instrument, at the same pose.
 
-        Azimuths increase by pi, and zenith angles become 2 pi minus themselves. The pose stays that of the first view,
-        whatever `number`.
+        In the second face, azimuths are larger by pi and zenith angles z become 2 pi - z.
+
+        Parameters
+        ----------
+        number : Not used: both faces share the pose of the first view.
 
         Returns
         -------
@@ -161,13 +164,13 @@ class TlsSurvey:
 
 @dataclass(frozen=True)
 class StereoSurvey:
-    """Views of one wall by stereo pairs.
+    """A survey of one wall by stereo pairs, from which surveys with additional pairs can be made.
 
     Attributes
     ----------
-    views : One for each pair.
-    centre : (3,) centre of the wall, m.
-    observe : Function that makes a further view, from a measurement with its cameras and a number.
+    views : What each pair sees.
+    centre : (3,) centre of the wall, wall frame, m.
+    observe : Function that makes a view from a measurement with its cameras and the number of the pose.
     """
 
     views: tuple[StereoView, ...]
@@ -177,12 +180,12 @@ class StereoSurvey:
     place: ClassVar[str] = "pair of exposures"
 
     def moved(self, scale: float, turn_rad: float, number: int) -> StereoView:
-        """Move the pair of the first view.
+        """Return what the first pair would see from another place.
 
         Parameters
         ----------
         scale : New distance from the wall's centre, relative to the present one.
-        turn_rad : Rotation about the vertical through the wall's centre, rad.
+        turn_rad : Rotation of the pair about the vertical through the wall's centre, rad.
         number : Number of the new pose.
 
         Raises
@@ -202,7 +205,11 @@ class StereoSurvey:
         return self.observe(base.changed(cameras=pair), number)
 
     def repeated(self, number: int) -> tuple[str, StereoView]:
-        """Repeat the first pair with its cameras rolled by 45 degrees in opposite directions.
+        """Return the first pair repeated with its cameras rolled by 45 degrees in opposite directions.
+
+        Parameters
+        ----------
+        number : Number of the new pose.
 
         Returns
         -------
@@ -223,8 +230,8 @@ def planned_survey(config: SimulationConfig, sensor: SensorName) -> Survey:
 
     Parameters
     ----------
-    config : The simulation config.
-    sensor : The sensor.
+    config : The simulation config, with the wall and the sensor's places.
+    sensor : "tls" or "stereo".
 
     Raises
     ------
@@ -246,12 +253,12 @@ def planned_survey(config: SimulationConfig, sensor: SensorName) -> Survey:
 
 
 def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Survey:
-    """Describe the survey of an existing measurement; only the positions of its points count.
+    """Describe the survey of an existing measurement. Only the positions of its points count, not their residuals.
 
     Parameters
     ----------
     measurement : The measurement.
-    most : Most points of each view's subsample.
+    most : Largest number of points in the subsample of each view.
 
     Raises
     ------

@@ -1,0 +1,92 @@
+"""Find the pixels that did not change, on which registration and noise are then measured.
+
+Noise has both signs everywhere. Where rock is missing or was added, the differences have one sign over an area. So the scatter of
+means over squares is taken from the quieter sign, to which changes of the other one do not contribute. A square whose mean lies
+far beyond it has changed. Most walls lose rock in many places and gain hardly any: this then works even with little stable rock.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.special import ndtri
+
+_SQUARES_PX = (3, 5, 9)
+"""Sides of the squares over which means are taken: more than the 3 pixels that share points."""
+_CHANGED = 4.0
+"""Standard deviations of a mean over a square beyond which it has changed."""
+_GROWS = 1.5
+"""Standard deviations of a mean over 3 x 3 pixels to which a changed place reaches, along pixels of its sign."""
+_QUANTILES = (0.25, 0.5, 0.9, 0.99)
+_LONGEST_TAIL = 2.0
+"""Times a normal distribution of the same first quartile that a quantile of noise may reach: what is farther out changed."""
+_MARGIN_PX = 2
+_ROUNDS, _SETTLED = 6, 1e-4
+"""Most rounds of the search, and share of the pixels below which a change ends it."""
+_SAMPLE = 400_000
+"""Pixels of which scatter is measured."""
+_FILLED = 0.5
+_FEWEST = 50
+"""Pixels of one sign without which its scatter is not known."""
+
+
+def unchanged_pixels(standard: NDArray[np.floating], candidates: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which of the candidates, (h, w), did not change sign-consistently.
+
+    Parameters
+    ----------
+    standard : (h, w) array
+        Differences over the standard deviation that they should have, with mean zero where nothing changed; NaN without data.
+    candidates : (h, w) bool
+        Pixels that may be stable: all with data, or those in the user's stable areas.
+    """
+    unchanged = candidates & np.isfinite(standard)
+    means = {side: _mean_over_squares(standard, side) for side in _SQUARES_PX}
+    for _ in range(_ROUNDS):
+        before = unchanged
+        changed = _changed(means, unchanged)
+        unchanged = candidates & np.isfinite(standard) & ~ndimage.binary_dilation(changed, np.ones((3, 3)), _MARGIN_PX)
+        if unchanged.sum() < _FEWEST:
+            return before
+        if np.count_nonzero(before != unchanged) <= _SETTLED * before.size:
+            break
+    return np.asarray(unchanged)
+
+
+def quieter_scatter(values: NDArray[np.floating]) -> float:
+    """Return the standard deviation of noise about zero from the values of the sign that scatters less, long tails included."""
+    sides = [side for side in (values[values > 0], -values[values < 0]) if len(side) >= _FEWEST]
+    if not sides:
+        return float(np.sqrt(np.mean(values**2))) if len(values) else np.inf
+    normal = ndtri((1 + np.array(_QUANTILES)) / 2)
+    found = [np.quantile(side, _QUANTILES) / normal for side in sides]
+    return float(min(min(each.max(), _LONGEST_TAIL * each[0]) for each in found))
+
+
+def _changed(means: dict[int, NDArray[np.float32]], unchanged: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(h, w) changed places by the noise of the pixels that are unchanged as far as is known."""
+    scatter = {side: _scatter_on(mean, unchanged) for side, mean in means.items()}
+    changed = np.zeros(unchanged.shape, dtype=bool)
+    for sign in (1.0, -1.0):
+        begun = np.zeros(unchanged.shape, dtype=bool)
+        for side in _SQUARES_PX:
+            begun |= sign * means[side] > _CHANGED * scatter[side]
+        reached = (sign * means[3] > _GROWS * scatter[3]) | begun
+        changed |= ndimage.binary_propagation(begun, mask=reached)
+    return changed
+
+
+def _scatter_on(mean: NDArray[np.float32], unchanged: NDArray[np.bool_]) -> float:
+    """Scatter of means on the pixels that are unchanged, of a subset of evenly spaced ones where they are many."""
+    places = np.flatnonzero(unchanged)
+    values = mean.ravel()[places[:: max(len(places) // _SAMPLE, 1)]]
+    return quieter_scatter(values[np.isfinite(values)])
+
+
+def _mean_over_squares(standard: NDArray[np.floating], side: int) -> NDArray[np.float32]:
+    """(h, w) means over squares about each pixel; NaN where less than half of the square has data."""
+    known = np.isfinite(standard)
+    share = ndimage.uniform_filter(known.astype(np.float32), side)
+    total = ndimage.uniform_filter(np.where(known, standard, 0.0).astype(np.float32), side)
+    return np.where(known & (share > _FILLED), total / np.maximum(share, 1e-9), np.nan)

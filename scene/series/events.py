@@ -1,0 +1,113 @@
+"""Draw the rockfalls of a series: when each happens, how large it is, and whether it moves before."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
+from scene.series.config import EventConfig, Motion, PrecursorConfig, RockfallRate
+
+MOST_EVENTS = 20_000
+"""Most rockfalls in a series."""
+
+
+@dataclass(frozen=True)
+class Rockfall:
+    """A rockfall that is to happen. Times count in hours from the first epoch.
+
+    Attributes
+    ----------
+    number : int
+        Number of the rockfall, from 1, in the order of the first motion.
+    key : str
+        Names the rockfall as the source of random numbers, whatever the others are.
+    falls_h : float
+        When it falls.
+    volume_m3 : float
+        Volume of the rock.
+    position_m : (x, y), optional
+        Where, wall frame, m; None: at random.
+    motion : Motion, optional
+        How it moves before; None: not at all.
+    """
+
+    number: int
+    key: str
+    falls_h: float
+    volume_m3: float
+    position_m: tuple[float, float] | None
+    motion: Motion | None
+
+    @property
+    def starts_h(self) -> float:
+        """When it begins to move, or falls."""
+        return self.falls_h - (0.0 if self.motion is None else self.motion.lead_h)
+
+    def displacement_m(self, time_h: float) -> float | None:
+        """Return how far the block has moved out since the first epoch, m; None once it has fallen."""
+        if time_h >= self.falls_h:
+            return None
+        if self.motion is None:
+            return 0.0
+        return self.motion.displacement(self.falls_h - time_h) - self.motion.displacement(self.falls_h)
+
+
+def drawn_rockfalls(rate: RockfallRate, precursor: PrecursorConfig | None, end_h: float, random: KeyedRandom) -> list[Rockfall]:
+    """Draw rockfalls between the first epoch and the last one, and those later ones that already move by then.
+
+    Parameters
+    ----------
+    rate : RockfallRate
+        How often and how large.
+    precursor : PrecursorConfig, optional
+        How a share of them moves before.
+    end_h : float
+        Time of the last epoch, h.
+    random : KeyedRandom
+        Source of random numbers; each rockfall has its own child.
+
+    Returns
+    -------
+    list of Rockfall
+        Not yet numbered (all have number 0).
+
+    Raises
+    ------
+    InputError
+        If there would be too many.
+    """
+    span = end_h + (0.0 if precursor is None else precursor.lead_h)
+    mean = rate.rate_per_day * span / 24
+    if mean > MOST_EVENTS:
+        raise InputError(
+            f"{rate.rate_per_day:g} rockfalls per day make {mean:,.0f} in this series",
+            where="series.rockfall.rate_per_day",
+            allowed=f"up to {MOST_EVENTS:,} rockfalls",
+        )
+    found = []
+    for index in range(int(random.child("count").generator().poisson(mean))):
+        when, share, moves = random.child("rockfall", index).generator().random(3)
+        motion = precursor if precursor is not None and moves < precursor.share else None
+        rockfall = Rockfall(0, f"drawn {index}", float(when * span), rate.volume_m3.power_law.volume(float(share)), None, motion)
+        if min(rockfall.falls_h, rockfall.starts_h) <= end_h:
+            found.append(rockfall)
+    return found
+
+
+def given_rockfalls(events: Sequence[EventConfig], falls_h: Sequence[float]) -> list[Rockfall]:
+    """Return the rockfalls that a config lists, not yet numbered. falls_h: when each falls, h."""
+    return [
+        Rockfall(0, f"given {index}", when, event.volume_m3, event.position_m, event.precursor)
+        for index, (event, when) in enumerate(zip(events, falls_h, strict=True))
+    ]
+
+
+def numbered(rockfalls: Sequence[Rockfall]) -> tuple[Rockfall, ...]:
+    """Number rockfalls in the order in which they begin."""
+    ordered = sorted(rockfalls, key=lambda each: (each.starts_h, each.falls_h, each.key))
+    return tuple(
+        Rockfall(number, each.key, each.falls_h, each.volume_m3, each.position_m, each.motion)
+        for number, each in enumerate(ordered, start=1)
+    )

@@ -1,0 +1,134 @@
+"""Change a sensor's effects and pose from one epoch of a series to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BeforeValidator, Discriminator, Field, Tag
+
+from scene.common.config import Config, parse
+from scene.common.course import Course
+from scene.common.errors import nearest
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+from sensors.effects import EFFECTS, effect_of
+from sensors.effects.base import Effect
+from sensors.models.sensor_model import StereoModel, TlsModel
+
+_WHERE = "series.conditions"
+_AXES = ("x", "y", "z")
+
+AxisCourses = Annotated[
+    Annotated[Course, Tag("all axes")] | Annotated[tuple[Course, Course, Course], Tag("per axis")],
+    Discriminator(lambda value: "per axis" if isinstance(value, list | tuple) else "all axes"),
+]
+"""One course for each of the three axes, or a list of three; random walks are drawn for each axis."""
+
+
+class PoseCourses(Config):
+    """How the sensor's real pose departs from the surveyed one."""
+
+    position_m: AxisCourses | None = Field(None, description="real minus surveyed position, world x, y, z [m]")
+    rotation_rad: AxisCourses | None = Field(
+        None, description="rotation of the real against the surveyed pose about world x, y, z; of cameras about their own [rad]"
+    )
+
+
+def _parameters(values: Any) -> Any:
+    """Check the names of effects and parameters; a course directly under an effect is that of its only main parameter."""
+    if not isinstance(values, dict):
+        return values
+    return {name: _of_effect(str(name), courses) for name, courses in values.items()}
+
+
+def _of_effect(name: str, courses: Any) -> Any:
+    """Return the courses of an effect by parameter."""
+    names = [effect.tag() for effect in EFFECTS]
+    if name.rpartition(".")[2] not in names:
+        raise ValueError(f"unknown effect '{name}'; {nearest(name, names) or 'see the effects of the reference'}")
+    kind = effect_of(name)
+    known = [key for key, info in kind.model_fields.items() if isinstance(info.json_schema_extra, dict)]
+    if isinstance(courses, dict) and courses and set(courses) <= set(Course.model_fields):
+        main = list(kind.nulls())
+        if len(main) != 1:
+            raise ValueError(f"'{name}' has several parameters, so name one: {', '.join(known)}")
+        return {main[0]: courses}
+    for key in courses if isinstance(courses, dict) else ():
+        if key not in known:
+            raise ValueError(f"'{name}' has no parameter '{key}'; {nearest(str(key), known) or 'allowed: ' + ', '.join(known)}")
+    return courses
+
+
+EffectCourses = Annotated[dict[str, dict[str, Course]], BeforeValidator(_parameters)]
+"""Courses by effect and parameter."""
+
+
+@dataclass(frozen=True)
+class PoseShift:
+    """Real against surveyed pose at one epoch. position_m, rotation_rad: (3,) along and about the world's axes."""
+
+    position_m: FloatArray
+    rotation_rad: FloatArray
+
+    @property
+    def is_null(self) -> bool:
+        """Whether both poses agree."""
+        return not (self.position_m.any() or self.rotation_rad.any())
+
+
+def pose_shifts(courses: PoseCourses | None, hours: FloatArray, random: KeyedRandom) -> list[PoseShift]:
+    """Return the pose's departure at each time (n,), h."""
+    found = np.zeros((2, len(hours), 3))
+    for row, name in enumerate(("position_m", "rotation_rad")):
+        given: AxisCourses | None = None if courses is None else getattr(courses, name)
+        if given is None:
+            continue
+        for axis, course in enumerate(given if isinstance(given, tuple) else (given,) * 3):
+            found[row, :, axis] = course.values(hours, random.child(name, _AXES[axis]))
+    return [PoseShift(found[0, number], found[1, number]) for number in range(len(hours))]
+
+
+def effect_values(courses: EffectCourses, hours: FloatArray, random: KeyedRandom) -> dict[str, dict[str, FloatArray]]:
+    """Return the departure (n,) of each parameter at each time (n,), h, by effect and parameter."""
+    return {
+        name: {key: course.values(hours, random.child(name, key)) for key, course in parameters.items()}
+        for name, parameters in courses.items()
+    }
+
+
+def with_effects(model: TlsModel, values: Mapping[str, Mapping[str, float]]) -> TlsModel:
+    """Return a scanner's model whose parameters are larger by `values`, by effect and parameter; other sensors' are ignored.
+
+    An effect that the model does not have begins at its null values. Raises InputError for a value out of its bounds.
+    """
+    return model.model_copy(update={"effects": _changed(model.effects, "tls", values)})
+
+
+def with_stereo_effects(model: StereoModel, values: Mapping[str, Mapping[str, float]], shift: PoseShift) -> StereoModel:
+    """Do the same for a stereo pair, and move both cameras by `shift`."""
+    effects = _changed(model.effects, "stereo", values)
+    if not shift.is_null:
+        moved = [{"name": "camera_shift", **dict(zip(("x_m", "y_m", "z_m"), shift.position_m.tolist(), strict=True))}]
+        turned = zip(("camera_omega", "camera_phi", "camera_kappa"), shift.rotation_rad.tolist(), strict=True)
+        moved += [{"name": name, "angle_rad": angle} for name, angle in turned]
+        effects += tuple(parse(effect_of(each["name"]), {**each, "camera": "both"}, f"{_WHERE}.pose") for each in moved)
+    return model.model_copy(update={"effects": effects})
+
+
+def _changed(effects: tuple[Any, ...], sensor: str, values: Mapping[str, Mapping[str, float]]) -> tuple[Effect, ...]:
+    """Return effects with changed parameters."""
+    found: list[Effect] = list(effects)
+    for name, parameters in values.items():
+        kind = effect_of(name)
+        if kind.sensor != sensor:
+            continue
+        if not any(each.name == kind.tag() for each in found):
+            found.append(kind.model_validate({"name": kind.tag()}))
+        for place, each in enumerate(found):
+            if each.name == kind.tag():
+                now = {key: getattr(each, key) + value for key, value in parameters.items()}
+                found[place] = parse(kind, {**each.model_dump(), **now}, f"{_WHERE}.effects.{name}")
+    return tuple(found)
