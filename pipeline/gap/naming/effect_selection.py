@@ -240,7 +240,7 @@ def _detectable_sizes(
 
     left: (n,) residuals after the systematic effects.
     """
-    members = [each.candidate for each in found.beside]
+    members = [each.candidate for each in found.further]
     systematic = found.search.detectable_sizes(members, found.tried, random.child("power"))
     noise = detectable_noise(found.residuals, found.search.design.cells, left, noise_terms, random)
     return (*systematic, *noise)
