@@ -184,7 +184,8 @@ class Run:
     def _repr_html_(self) -> str:
         rows: dict[str, Any] = {"sensor": self.sensor, "seed": self.record.get("seed"), "epochs": len(self.epochs)}
         rows |= {f"epoch {each.number}": each.summary() for each in self.epochs[:5]}
-        picture = self.plot() if len(self) > 1 else None
+        pictured = [each for each in self.epochs if each.pictured]
+        picture = pictured[0].plot() if pictured else None
         return html_table(f"Run {self.folder}", {**rows, "report": self.report}, picture)
 
 
@@ -220,6 +221,11 @@ class Epoch:
                 remedy="choose one of these products, or simulate with it (`products` in the config)",
             )
         return path
+
+    @property
+    def pictured(self) -> bool:
+        """Whether it has figures: of a series, only the epochs have in which rocks fell."""
+        return (self.run.folder / f"difference_{self.number:03d}.png").is_file()
 
     @property
     def record(self) -> dict[str, Any]:
@@ -301,7 +307,7 @@ class Epoch:
     def _repr_html_(self) -> str:
         title = f"Epoch {self.number} of {self.run.folder}"
         rows = {"points": f"{self.record.get('points', 0):,}"} | ({"": self.summary()} if self.number else {})
-        return html_table(title, rows, self.plot())
+        return html_table(title, rows, self.plot() if self.number == 0 or self.pictured else None)
 
 
 def _blocks(epochs: list[Epoch]) -> geopandas.GeoDataFrame:

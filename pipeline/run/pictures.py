@@ -29,6 +29,8 @@ def write_reference_pictures(out: Path, reference: ReferenceEpoch) -> None:
 def write_epoch_pictures(out: Path, epoch: LaterEpoch, grid: Grid, sigma: float) -> None:
     """Write the style of an epoch's difference map, and its pictures, into the run's folder.
 
+    In a series, only the epochs in which rocks fell since the epoch before have pictures.
+
     Parameters
     ----------
     out : Folder of the run.
@@ -38,6 +40,8 @@ def write_epoch_pictures(out: Path, epoch: LaterEpoch, grid: Grid, sigma: float)
     """
     number = f"{epoch.number:03d}"
     difference_style(out / f"difference_{number}.tif", SCALE_SIGMAS * sigma)
+    if not _is_pictured(epoch):
+        return
     masks = epoch.raster.block != WALL
     write_bytes(out / f"difference_{number}.png", difference_figure(epoch.difference, grid, epoch.raster.block, sigma))
     largest = sorted(epoch.blocks, key=lambda record: -record["volume_m3"])
@@ -49,6 +53,14 @@ def write_epoch_pictures(out: Path, epoch: LaterEpoch, grid: Grid, sigma: float)
     write_bytes(out / f"histogram_{number}.png", histogram_figure(epoch.difference[~masks], epoch.difference[masks]))
     if epoch.registration is not None:
         write_bytes(out / f"icp_{number}.png", convergence_figure(epoch.registration.history))
+
+
+def _is_pictured(epoch: LaterEpoch) -> bool:
+    """Return whether an epoch has pictures."""
+    if epoch.since_last is None or not epoch.rockfalls:
+        return True
+    new = epoch.since_last.block
+    return bool(((new > WALL) & (new <= epoch.rockfalls)).any())
 
 
 def write_m3c2_pictures(out: Path, number: int, found: M3c2Map, sigma: float) -> None:
