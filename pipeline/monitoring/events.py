@@ -25,8 +25,8 @@ _BEGINS = 7.0
 """Standard deviations by which the mean over a square must differ from zero for a region to begin."""
 _GROWS = 0.5
 """Share of the level of detection that pixels at a region's rim exceed."""
-_LEAST_PIXELS = 16
-_SIGNIFICANT = 7.0
+LEAST_PIXELS = 16
+SIGNIFICANT = 7.0
 """Standard deviations by which the mean over a whole region must differ from zero."""
 _STEEP = 4.0
 """Tangent of the angle to the wall's plane beyond which heights are those of an edge (76 degrees)."""
@@ -162,7 +162,7 @@ def region_of_mask(mask: NDArray[np.bool_], row: int, column: int, score: float,
         return None
     kind: Kind = "missing" if window[known].mean() >= 0 else "added"
     region = replace(_measured(known, row, column, kind, change), score=score)
-    return region if region.significance >= _SIGNIFICANT else replace(region, marks=(*region.marks, "insignificant"))
+    return region if region.significance >= SIGNIFICANT else replace(region, marks=(*region.marks, "insignificant"))
 
 
 def _begins(standard: NDArray[np.floating], significance: Significance) -> NDArray[np.bool_]:
@@ -179,10 +179,10 @@ def _begins(standard: NDArray[np.floating], significance: Significance) -> NDArr
 
 def _kept(mask: NDArray[np.bool_], row: int, column: int, kind: str, change: Change) -> Iterator[ChangedRegion]:
     """The region of a mask, where it is large and significant enough."""
-    if int(mask.sum()) < _LEAST_PIXELS:
+    if int(mask.sum()) < LEAST_PIXELS:
         return
     region = _measured(mask, row, column, "missing" if kind == "missing" else "added", change)
-    if region.significance >= _SIGNIFICANT:
+    if region.significance >= SIGNIFICANT:
         yield region
 
 

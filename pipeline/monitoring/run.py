@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-import multiprocessing
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
+from pipeline.dataset.cluster import map_on_workers
 from pipeline.formats.files.atomic import empty_folder
 from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.monitoring.comparison import EpochChange, compare_epoch
@@ -88,8 +87,8 @@ def monitor(
     further = list(enumerate(sources[1:], start=1))
     progress.plan({f"epoch {number}": 1.0 for number, _ in further} | {"report": 0.3})
     records = {number: kept(out, number, source.checksums(), fingerprint) for number, source in further} if resume else {}
-    if workers > 1:
-        left = [(number, source) for number, source in further if records.get(number) is None]
+    left = [(number, source) for number, source in further if records.get(number) is None]
+    if workers > 1 and len(left) > 1:
         records |= _compared_in_processes(left, site, out, options, fingerprint, workers, progress)
     followed = []
     catalogue = Catalogue()
@@ -126,13 +125,11 @@ def _compared_in_processes(
     workers: int,
     progress: Progress,
 ) -> dict[int, EpochRecord | None]:
-    """The records of epochs, compared in processes of their own, by number."""
-    context = multiprocessing.get_context("spawn")
+    """The records of epochs, compared on local workers of Dask, by number."""
     found: dict[int, EpochRecord | None] = {}
-    with progress.stage("comparisons"), ProcessPoolExecutor(min(workers, len(left) or 1), mp_context=context) as pool:
-        waiting = [pool.submit(_in_worker, number, source, site.source, out, options, fingerprint) for number, source in left]
-        for done in as_completed(waiting):
-            record = done.result()
+    tasks = [(number, source, site.source, out, options, fingerprint) for number, source in left]
+    with progress.stage("comparisons"):
+        for record in map_on_workers(_in_worker, tasks, workers):
             found[record.number] = record
             progress.advance(len(found) / len(left))
     return found

@@ -16,8 +16,9 @@ from pipeline.registration.rigid import RigidTransform
 from scene.geometry.mesh import FloatArray
 
 MOST_VIEWS = 6
-_PATCHES, _NEIGHBOURS = 20_000, 16
-"""Patches whose normals are taken, and neighbouring ones through which a patch's plane is fitted."""
+_PATCHES, _NEIGHBOURS = 3_000, 16
+"""Patches whose normals are taken, and neighbouring ones through which a patch's plane is fitted: these are 0.5 % of the wall, so
+that relief does not count."""
 _STEEP_DEG, _MUCH = 65.0, 0.1
 """Angle of a patch to the direction of a single view, and share of the patches beyond it from which there are several views."""
 _SEEN_WELL_DEG, _LEFT = 55.0, 0.05
