@@ -148,8 +148,8 @@ def lattice(step_a: FloatArray, step_b: FloatArray, normals: FloatArray, sights:
 def detection_probability(sampling: Sampling, side_m: FloatArray | float, config: PlanningConfig) -> FloatArray:
     """Return the probability that the fall of a cube is detected: the change of the niche's floor exceeds the level of detection.
 
-    Change and level of detection are those of M3C2. The probability is the mean over the places of the sampling lattice relative to
-    the niche.
+    Change and level of detection are those of M3C2. The probability is the mean over the places of the sampling lattice relative
+    to the niche.
 
     Parameters
     ----------
