@@ -24,7 +24,7 @@ from tiny_dataset import tiny_set
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "benchmarks"
-LIBRARIES = {"measure", "documents", "matcher_cases", "varied", "workshop"}
+LIBRARIES = {"measure", "documents", "coverage_contexts", "matcher_cases", "varied", "workshop"}
 """Modules that benchmarks import; they run with them."""
 ELSEWHERE = {
     "fuzz": "tests/test_fuzz.py, test_fuzz_commands.py and test_fuzz_records.py run what it runs",
@@ -34,6 +34,8 @@ ELSEWHERE = {
     "gap_injections/run": "tests/test_gap_injections.py",
     "gap_second_generator/run": "tests/test_gap_second_generator.py",
     "gap_thresholds": "tests/test_varied.py",
+    "mutation": "tests/test_mutation.py",
+    "performance": "tests/test_performance.py",
     "readers/draw": "tests/test_generated_pages.py",
     "field_reports/run": "tests/test_field_reports.py",
     **dict.fromkeys(
@@ -117,6 +119,7 @@ SCRIPTS: dict[str, Tiny] = {
     "niche_texture": Tiny(("--set", "tiny")),
     "noise_table": Tiny(("--maps", "2", "--levels", "high", "--out", "noise"), overrides=SMALL_SITE),
     "reconstruction": Tiny(keys=COARSE_WALL | {"RigConfig": {"width": 1472, "height": 984, "distance_m": 25.0}}),
+    "scale": Tiny(("--only", "surface:points"), values={"POINTS": 5000}),
     "sgbm": Tiny(keys=COARSE_WALL | SMALL_FRAME),
     "soak": Tiny(arguments=("tls", 3), overrides=SMALL_SITE),
     "startup": Tiny(values={"_REPEATS": 1}),
@@ -124,6 +127,7 @@ SCRIPTS: dict[str, Tiny] = {
     "tls": Tiny(values={"PULSES": 2000}, keys=COARSE_WALL),
     "tls_beam": Tiny(values={"PULSES": 500}, keys=COARSE_WALL),
     "tls_process": Tiny(values={"PULSES": 2000, "SUB_RAYS": {"one ray": 1}}),
+    "tls_steps": Tiny(values={"PULSES": 2000, "ROUNDS": 1}),
     "upper_bound": Tiny(("--width", "6", "--height", "4"), values={"WAYS": (("vertices", "low", "relief"),)}),
 }
 

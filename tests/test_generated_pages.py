@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import importlib
+import json
 import re
 from collections import Counter
+from pathlib import Path
+
+import pytest
 
 from benchmarks.readers.draw import COUNTS, PAGE, definitions, drawn, messages, page
+
+ROOT = Path(__file__).parents[1]
 
 
 def test_a_draw_has_its_numbers_and_can_be_repeated() -> None:
@@ -42,3 +49,11 @@ def test_the_page_of_long_tests_is_that_of_their_list() -> None:
     from make_tests_page import page as page_of_tests
 
     assert OF_TESTS.read_text(encoding="utf-8") == page_of_tests()
+
+
+def test_the_pages_of_scripts_run_by_hand_are_those_of_their_records(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    for name in ("try_install",):
+        script = importlib.import_module(name)
+        record = json.loads(script.RECORD.read_text(encoding="utf-8"))
+        assert script.PAGE.read_text(encoding="utf-8") == script.page(record), name

@@ -161,7 +161,7 @@ def test_where_much_of_the_wall_moved_nothing_is_said_of_the_sensor(tmp_path: Pa
     assert found.verdict == "insufficient_data"
     assert found.evidence.moved_share > 0.3
     assert found.effects == ()
-    assert found.remaining["note"].index("name stable_areas") < 400
+    assert found.remaining["note"].index("add stable_areas") < 400
     assert "stable_areas in measurement.yaml" in summarise(found)
 
 

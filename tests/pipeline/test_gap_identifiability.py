@@ -121,4 +121,4 @@ def test_a_measurement_gives_its_own_geometry_and_refuses_overrides(tmp_path: Pa
     assert main(["gap", "--identifiability", str(tmp_path), "--out", str(tmp_path / "out")]) == 0
     assert json.loads((tmp_path / "out/identifiability.json").read_text())["surveys"][0]["points"] > 10_000
     assert main(["gap", "--identifiability", str(tmp_path), "--set", "seed=2"]) == 2
-    assert "--set and another --sensor need a config" in capsys.readouterr().err
+    assert "a measurement takes neither --set nor another --sensor" in capsys.readouterr().err

@@ -238,3 +238,12 @@ def test_mistakes_are_named(wall: TriangleMesh, values: dict[str, Any], message:
     with pytest.raises(InputError, match=message) as caught:
         place_blocks(config(**values), wall, RANDOM)
     assert "\n" not in str(caught.value)
+
+
+def test_one_of_several_blocks_keeps_what_is_known_of_it(wall: TriangleMesh) -> None:
+    blocks = place_blocks(config(count=4), wall, RANDOM)
+    alone = blocks.only(2)
+    assert len(alone) == 1
+    np.testing.assert_array_equal(alone.mesh(0).vertices, blocks.mesh(2).vertices)
+    for name in ("shape", "size_m", "position_m"):
+        np.testing.assert_array_equal(getattr(alone, name), getattr(blocks, name)[2:3])
