@@ -350,8 +350,9 @@ def verdicts() -> dict[str, Verdict]:
             "that remains has a p-value above 0.01. A corrected registration and regions where rock moved (`scene_changes` in "
             "gap.json) are reported, but do not count as a gap. If the model predicts more noise than there is, the report "
             "states the noise that would fit (`lower_noise` under `remaining` in gap.json).",
-            "You need not add anything to the model. `scarpsim gap MEASUREMENT --identifiability` tells how large an effect "
-            "could remain unseen.",
+            "You need not add anything to the model. Smaller effects may be hidden: `detectable` in gap.json and the report list "
+            "the size from which each would have shown with a probability of 95 %. If the reference is better than its error was "
+            "estimated (`reference_error_m`), say so with `--reference-error`, and smaller effects show.",
             "A scan has noise, a slightly wrong pose, a reference with errors of fractions of a millimetre, and lost returns. "
             "The model allows for all of them.",
             _case(seed=1),

@@ -57,8 +57,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--reference-error",
         type=between(0.0, 100.0),
         metavar="M",
-        help="with --identifiability: standard error of the reference surface, m, correlated over 3 m (default: 0.001 tls, 0.005 "
-        "stereo)",
+        help="standard error of the reference surface, m, correlated over metres: largest one that the diagnosis may assume "
+        "(default: estimated), or with --identifiability the one to expect (default: 0.001 tls, 0.005 stereo)",
     )
     add_output_options(parser)
 
@@ -81,8 +81,8 @@ def _measurement_folder(arguments: argparse.Namespace, out: Path) -> Path:
         raise InputError(
             "is a raw file, and no reference is given to compare it with",
             where=str(given[0]),
-            remedy="add --reference (a mesh, a cloud, or half) and --scanner, or --photographs for a cloud from photographs "
-            "without cameras; or give the folder of a measurement",
+            remedy="add --reference (a mesh, a cloud or the word half) and --scanner, or --photographs for a cloud from "
+            "photographs without cameras; or give the folder of a measurement",
         )
     return build_measurement_folder(arguments, given, out / "measurement").folder
 
@@ -95,7 +95,8 @@ def _diagnosis(arguments: argparse.Namespace, out: Path) -> CommandOutput:
     from pipeline.gap.thresholds import read_thresholds
     from pipeline.report.progress import shown_progress
 
-    thresholds = read_thresholds(arguments.overrides)
+    known = arguments.reference_error
+    thresholds = read_thresholds([*arguments.overrides, *([f"mean.most_reference_error={known}"] if known else [])])
     weights = {**STEPS, "report": 2.0}
     steps = iter(weights)
     with shown_progress(quiet=arguments.quiet) as progress, ExitStack() as stage:

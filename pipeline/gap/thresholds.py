@@ -181,6 +181,12 @@ class MeanThresholds(ThresholdGroup):
     prior_size: PositiveFloat = threshold_field(
         20.0, "typical sizes of the effect", "Standard deviation of the Gaussian prior of an effect's size.", JUDGEMENT
     )
+    most_reference_error: PositiveFloat = threshold_field(
+        1.0,
+        "m",
+        "Largest standard deviation that the reference's correlated error may have; `--reference-error` sets it.",
+        "no limit, unless the user knows the reference",
+    )
     largest_size: PositiveFloat = threshold_field(
         100.0,
         "typical sizes of the effect",

@@ -124,7 +124,7 @@ def test_too_few_points_are_no_data(tmp_path: Path) -> None:
     assert found_in(tmp_path, 1, step_rad=0.05).verdict == "insufficient_data"
 
 
-def test_the_corrected_model_leaves_no_gap_and_files_are_as_promised(tmp_path: Path) -> None:
+def test_the_corrected_model_leaves_no_gap_and_files_are_as_promised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     case, out = tmp_path / "case", tmp_path / "out"
     case.mkdir()
     write_scan(case, 8, ranges=lambda scan: scan.R + 0.004 * (1 / scan.cos_i - 1), intensity=False, step_rad=0.008)
@@ -133,6 +133,12 @@ def test_the_corrected_model_leaves_no_gap_and_files_are_as_promised(tmp_path: P
     assert result["verdict"] == "named"
     assert result["effects"][0]["name"] == "tls.range_incidence_bias"
     assert "intensity" in result["remaining"]["note"]
+    hidden = {each["name"]: each for each in result["detectable"]}
+    assert "tls.range_incidence_bias" not in hidden
+    assert 1e-4 < hidden["tls.range_offset"]["size"] < 0.02
+    assert hidden["tls.range_intensity_bias"]["size"] is None
+    assert "not recorded" in hidden["tls.range_intensity_bias"]["note"]
+    assert "would have shown" in capsys.readouterr().out
     assert {path.name for path in out.iterdir()} >= {"gap.json", "model_after.yaml", "before.laz", "after.laz", "report.html"}
     (case / "model.yaml").write_text((out / "model_after.yaml").read_text())
     assert yaml.safe_load((case / "model.yaml").read_text())["effects"][0]["name"] == "range_incidence_bias"

@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from pipeline.gap.mean.candidates import nonparametric_terms
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.noise_and_edges.grid_noise import _variogram
-from pipeline.gap.noise_and_edges.variance_model import null_p_value
+from pipeline.gap.noise_and_edges.sign_flips import null_p_value
 from pipeline.gap.residuals import wall_blocks
 from pipeline.gap.residuals.correlated_noise import GridCorrelatedNoise
 from pipeline.gap.residuals.nominal_pair import PixelGeometry

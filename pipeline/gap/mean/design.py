@@ -18,6 +18,7 @@ from pipeline.gap.mean.mean_model import CellCovariance, MeanFit, MeanModel, Pro
 from pipeline.gap.mean.normal_equations import NoiseDraws, NormalEquations, SineProducts, assemble, extend, sine_products
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.wall_blocks import WallCells
+from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
@@ -140,7 +141,8 @@ class Design:
         place = _number_columns(chosen.plain, count)
         fixed = model.project(_columns(model, pose, chosen.plain, place))
         value = model.project(residuals.value[rows, None] * root)
-        model, covariances, bases = model.restrict([fixed.select(list(range(count))), fixed], value)
+        most_sigma = thresholds().mean.most_reference_error / float(np.median(residuals.unit_m))
+        model, covariances, bases = model.restrict([fixed.select(list(range(count))), fixed], value, most_sigma)
         fixed, value = fixed.in_bases(bases), value.in_bases(bases)
         noise = NoiseDraws.of(model, NULL_DRAWS, _NULL_ROWS, random.child("within"))
         grids = [grid.part(rows) for grid in chosen.grids]

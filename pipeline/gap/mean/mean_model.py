@@ -143,6 +143,7 @@ class MeanModel:
             return np.maximum(values, 0.0), vectors
 
         self._bases: list[tuple[FloatArray, FloatArray]] = map_in_threads(basis, _CORRELATIONS)
+        self._ratios = [0.0, *map(float, _RATIOS)]
         self._white = CellCovariance(0, 0.0, np.ones(len(self._total)))
 
     def __len__(self) -> int:
@@ -158,7 +159,7 @@ class MeanModel:
         return CellCovariance(length, ratio, 1 / (1 + ratio * self._bases[length][0])) if ratio else self._white
 
     def restrict(
-        self, designs: list[ProjectedColumns], value: ProjectedColumns
+        self, designs: list[ProjectedColumns], value: ProjectedColumns, most_sigma: float = np.inf
     ) -> tuple[MeanModel, list[CellCovariance], list[int]]:
         """Drop trial covariances of the reference error under which the residuals are unlikely, to save time later.
 
@@ -168,13 +169,14 @@ class MeanModel:
         ----------
         designs : Sets of columns to fit: the smallest and the largest one.
         value : The residuals, as one column.
+        most_sigma : Largest standard deviation of the reference's error, in the unit of the observable.
 
         Returns
         -------
         The model with the remaining correlation functions, the remaining covariances, and the indices of the remaining
         correlation functions (for `ProjectedColumns.in_bases`).
         """
-        ratios = [0.0, *map(float, _RATIOS)]
+        ratios = [ratio for ratio in self._ratios if ratio <= (most_sigma / self.typical_sigma) ** 2]
         normals = [_NormalEquations.of(design, value) for design in designs]
 
         def highest(which: tuple[_NormalEquations, int]) -> tuple[int, float]:
@@ -186,7 +188,7 @@ class MeanModel:
         tops, heights = (np.reshape(part, shape) for part in zip(*found, strict=True))
         kept = [int(basis) for basis in np.flatnonzero((heights > heights.max(axis=1, keepdims=True) - _WORSE).any(axis=0))]
         narrower = copy(self)
-        narrower._bases = [self._bases[basis] for basis in kept]
+        narrower._bases, narrower._ratios = [self._bases[basis] for basis in kept], ratios
         chosen: list[CellCovariance] = []
         for number, basis in enumerate(kept):
             low, high = max(tops[:, basis].min() - 1, 0), min(tops[:, basis].max() + 1, len(ratios) - 1)
@@ -197,7 +199,7 @@ class MeanModel:
     @property
     def covariances(self) -> list[CellCovariance]:
         """Every combination of a remaining correlation function of the reference error and a trial amplitude."""
-        return [self._covariance(basis, float(ratio)) for basis in range(len(self._bases)) for ratio in (0.0, *_RATIOS)]
+        return [self._covariance(basis, float(ratio)) for basis in range(len(self._bases)) for ratio in self._ratios]
 
     def _orthonormal_planes(self, offsets: list[FloatArray]) -> sparse.csr_array:
         """(3 m, n) orthonormal rows of a plane in each cell: means, and slopes along each of the offsets (n,)."""
@@ -336,9 +338,11 @@ _CORRELATIONS: list[Callable[[FloatArray], FloatArray]] = [
 
 @dataclass(frozen=True)
 class ProjectedColumns:
-    """k design columns (or residuals), divided into their parts within and between the m cells of the wall.
+    """k design columns (or residuals) at n points, divided into their parts within and between the m cells of the wall.
 
-    The reference's error varies little within a cell, so only the part between cells depends on its covariance.
+    The wall is divided into at most about 800 square cells (`WallCells`), each with several points. The part between cells is
+    the mean of a column in each cell, the part within cells the deviation from it. The reference's error varies little within a
+    cell, so only the part between cells depends on its covariance.
 
     Attributes
     ----------
@@ -354,7 +358,7 @@ class ProjectedColumns:
 
     @classmethod
     def concatenate(cls, parts: Sequence[ProjectedColumns]) -> ProjectedColumns:
-        """Join the columns of several sets of the same points, in their order."""
+        """Join the design columns of several sets of effects for the same n points, in the order of the sets."""
         if len(parts) == 1:
             return parts[0]
         within = np.concatenate([each.within for each in parts], axis=1)
@@ -370,11 +374,11 @@ class ProjectedColumns:
         return ProjectedColumns(within, weighed, [part[:, columns] for part in self.between])
 
     def in_bases(self, bases: list[int]) -> ProjectedColumns:
-        """Keep the cell means for only some of the trial correlation functions of the reference error, given by their indices."""
+        """Return the same columns, with `between` only for the trial correlation functions that have these indices."""
         return ProjectedColumns(self.within, self.within_weighted, [self.between[basis] for basis in bases])
 
     def append(self, other: ProjectedColumns) -> ProjectedColumns:
-        """Return these columns followed by the columns of another set of the same points."""
+        """Return these design columns followed by those of another set of effects for the same n points."""
         return ProjectedColumns.concatenate([self, other])
 
 

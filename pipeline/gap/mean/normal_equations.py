@@ -278,10 +278,10 @@ class NormalEquations:
         (C, v) log-likelihoods under each of C covariances, for each of v columns of residuals.
         """
         right = self.right[:, base]
-        return np.asarray(self.constant + 0.5 * np.einsum("ckv,ckv->cv", right, self._solved(base, right)))
+        return np.asarray(self.constant + 0.5 * np.einsum("ckv,ckv->cv", right, self.solved(base, right)))
 
-    def _solved(self, base: list[int], right: FloatArray) -> FloatArray:
-        """Coefficients of the columns `base` for some right sides."""
+    def solved(self, base: list[int], right: FloatArray) -> FloatArray:
+        """Return the (C, b, a) coefficients of the b fixed columns `base` for right sides (C, b, a)."""
         matrix = self.fixed[:, base][:, :, base]
         scale = 1 / np.sqrt(np.maximum(np.einsum("ckk->ck", matrix), 1e-300))
         regular = matrix * scale[:, :, None] * scale[:, None, :] + _RIDGE * np.eye(len(base))
@@ -309,7 +309,7 @@ class NormalEquations:
         count, whole = self.right.shape[2], self.fixed.shape[2]
         waves = self.wave_fixed[:, :, [self.held_columns.index(column) for column in base]]
         beside = self.fixed[:, base]
-        solved = self._solved(base, np.concatenate([self.right[:, base], beside, waves.transpose(0, 2, 1)], axis=2))
+        solved = self.solved(base, np.concatenate([self.right[:, base], beside, waves.transpose(0, 2, 1)], axis=2))
         value, others, sines = np.split(solved, [count, count + whole], axis=2)
         plain = self.constant + 0.5 * np.einsum("ckv,ckv->cv", self.right[:, base], value)
         left = self.right - beside.transpose(0, 2, 1) @ value

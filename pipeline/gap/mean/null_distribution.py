@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +31,7 @@ class NullDistribution:
     log_likelihood_ratios: Mapping[str, FloatArray]
 
     @classmethod
-    def of(cls, design: Design, random: KeyedRandom) -> NullDistribution:
+    def of(cls, design: Design, random: KeyedRandom, ranked: Sequence[int] | None = None) -> NullDistribution:
         """Simulate the null distribution of a search.
 
         Simulations are drawn under the most likely covariance and fitted under the eight most likely ones. Each family is
@@ -41,9 +41,11 @@ class NullDistribution:
         ----------
         design : The regression problem of the search.
         random : Source of the random numbers.
+        ranked : Numbers of the covariances, the most likely first; by default those of the measured residuals.
         """
-        near = design.equations.at_covariances(design.ranked_covariances[:_NEAR_NULL])
-        draws = design.model.null_draws(design.null_covariance, NULL_DRAWS, random.child("between"))
+        likely = (design.ranked_covariances if ranked is None else list(ranked))[:_NEAR_NULL]
+        near = design.equations.at_covariances(likely)
+        draws = design.model.null_draws(near.covariances[0], NULL_DRAWS, random.child("between"))
 
         def values(at: CellCovariance) -> tuple[FloatArray, FloatArray, FloatArray]:
             weighted = draws[at.basis] * at.weight[:, None]
@@ -81,6 +83,15 @@ class NullDistribution:
         larger : Families over which the maximum is taken, each with a factor that multiplies its simulated ratios; None: all
             families, with factor 1.
         """
+        return float((1 + np.sum(self._largest_scores(larger) >= score)) / (1 + NULL_DRAWS))
+
+    def critical_score(self, significance: float, larger: Mapping[str, float] | None = None) -> float:
+        """Return the score that must be exceeded for a p-value of at most `significance`; `larger` is that of `p_value`."""
+        allowed = max(int(significance * (1 + NULL_DRAWS) + 1e-9) - 1, 0)
+        return float(np.sort(self._largest_scores(larger))[-1 - allowed])
+
+    def _largest_scores(self, larger: Mapping[str, float] | None) -> FloatArray:
+        """(NULL_DRAWS,) largest score over the families in each simulation."""
         times = dict.fromkeys(self.log_likelihood_ratios, 1.0) if larger is None else larger
         scores = np.stack([each * self.log_likelihood_ratios[name] - self.penalty(name) for name, each in times.items()])
-        return float((1 + np.sum(scores.max(axis=0) >= score)) / (1 + NULL_DRAWS))
+        return np.asarray(scores.max(axis=0))

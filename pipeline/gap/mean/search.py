@@ -18,6 +18,7 @@ from pipeline.gap.mean.candidates import (
     harmonics,
 )
 from pipeline.gap.mean.design import Design
+from pipeline.gap.mean.detection_power import DetectableSize, detectable_sizes
 from pipeline.gap.mean.mean_model import MeanFit
 from pipeline.gap.mean.null_distribution import NullDistribution
 from pipeline.gap.mean.selection import EffectSet, FamilyScore, ForwardSelection, SelectedEffect
@@ -147,16 +148,41 @@ class MeanSearch:
         The p-value; None if no candidate remains to be tested.
         """
         scores = [item.score for item in family_scores if not item.name.startswith(SPATIAL_NULL)]
-        if not scores:
-            return None
+        return self._null.p_value(max(scores), self._discounts(family_scores)) if scores else None
+
+    def _discounts(self, family_scores: Sequence[FamilyScore]) -> dict[str, float]:
+        """Factors by which the null ratios of all families but the spatial null candidates count; above 1 for sines."""
         oblique_waves = [item for item in family_scores if item.name.startswith(SPATIAL_NULL) and item.candidate.wave is not None]
         expected = sum(float(self._null.log_likelihood_ratios[item.candidate.family].mean()) for item in oblique_waves)
         inflation = max(sum(item.log_likelihood_ratio for item in oblique_waves) / expected, 1.0) if expected else 1.0
         members = self.design.families.by_name
-        allowed = {
-            name: inflation if members[name][1] else 1.0 for name in members if not name.startswith(f"free {SPATIAL_NULL}")
-        }
-        return self._null.p_value(max(scores), allowed)
+        return {name: inflation if members[name][1] else 1.0 for name in members if not name.startswith(f"free {SPATIAL_NULL}")}
+
+    def detectable_sizes(
+        self, members: Sequence[Candidate], family_scores: tuple[FamilyScore, ...], random: KeyedRandom
+    ) -> list[DetectableSize]:
+        """Compute the detectable sizes of the effects that were not found, and of smooth errors outside the catalogue.
+
+        An effect shows if the model is rejected. The null distribution is that of the covariance that would be estimated with it
+        in the residuals.
+
+        Parameters
+        ----------
+        members : Effects that were found in this search.
+        family_scores : Scores of all families beside them.
+        random : Source of the random numbers.
+        """
+        discounts = self._discounts(family_scores)
+        nulls: dict[int, NullDistribution] = {}
+
+        def needed(candidate: Candidate, ranked: Sequence[int]) -> float:
+            if ranked[0] not in nulls:
+                nulls[ranked[0]] = NullDistribution.of(self.design, random.child("null"), ranked)
+            null = nulls[ranked[0]]
+            critical = null.critical_score(thresholds().verdict.rejection_p, discounts)
+            return critical + null.penalty(candidate.family)
+
+        return detectable_sizes(self._conditioned_on(tuple(members)), members, needed, random)
 
     def spatial_null_p_value(self, family_scores: Sequence[FamilyScore]) -> float | None:
         """Return the p-value of the best score among the spatial null candidates, which only the reference's error can explain.

@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement
 from pipeline.gap.mean.candidates import LINE_PATTERN, SPATIAL_NULL
+from pipeline.gap.mean.detection_power import DetectableSize
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
 from pipeline.gap.naming.candidate_families import candidate_families, model_has
@@ -31,10 +32,10 @@ from pipeline.gap.naming.nonlinear_refit import (
     SearchInput,
     SearchOutcome,
     select_and_refit,
-    with_added_variance,
-    with_fitted_variance,
 )
+from pipeline.gap.naming.search_residuals import with_added_variance, with_fitted_variance
 from pipeline.gap.noise_and_edges.grid_noise import find_grid_noise, separate_white_and_grid_noise
+from pipeline.gap.noise_and_edges.noise_power import detectable_noise
 from pipeline.gap.noise_and_edges.pixel_locking import NoiseBounds, find_locking
 from pipeline.gap.noise_and_edges.rounded_ranges import find_range_step
 from pipeline.gap.noise_and_edges.variance_model import NoiseRatio, VarianceScore, VarianceTerm, fit_variance_model
@@ -73,6 +74,7 @@ class SelectionResult:
         leaves.
     reference_sigma : standard deviation of the reference error, in the observable's unit.
     noise_ratio : observed over predicted standard deviation of the residuals after the systematic effects.
+    detectable : sizes that the effects that were not found would need to show.
     """
 
     tried: tuple[FamilyScore, ...]
@@ -85,6 +87,7 @@ class SelectionResult:
     identifiability: dict[str, Any]
     reference_sigma: float
     noise_ratio: float
+    detectable: tuple[DetectableSize, ...]
 
     def p_value_given(self, named: Sequence[NamedEffect]) -> float | None:
         """Return the p-value of the misfit that remains if only some of the selected effects are kept in the model.
@@ -222,11 +225,25 @@ def select_effects(
         table,
         sigma,
         noise_ratio_left,
+        _detectable_sizes(found, [each.effect for each in noise_terms], left, random),
     )
     angles = [each for each in systematic if each.effect is AngleEmpirical]
     if angles and not model_has(measurement, AngleEmpirical.tag()):
         return _select_beside_angle_terms(measurement, all_residuals, angles, result, random, excluded)
     return named, result
+
+
+def _detectable_sizes(
+    found: SearchOutcome, noise_terms: Sequence[str], left: FloatArray, random: KeyedRandom
+) -> tuple[DetectableSize, ...]:
+    """Sizes from which the effects that were not found would have shown beside those that were.
+
+    left: (n,) residuals after the systematic effects.
+    """
+    members = [each.candidate for each in found.further]
+    systematic = found.search.detectable_sizes(members, found.tried, random.child("power"))
+    noise = detectable_noise(found.residuals, found.search.design.cells, left, noise_terms, random)
+    return (*systematic, *noise)
 
 
 def _explains_everything(found: SearchOutcome) -> bool:

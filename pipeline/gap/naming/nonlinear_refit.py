@@ -21,14 +21,13 @@ from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import FamilyScore, SelectedEffect, equivalence_margin
 from pipeline.gap.naming.candidate_families import PERIODIC, candidate_families, catalogue_families
 from pipeline.gap.naming.named_effects import Estimate, aligned_with, effect_from_estimate, out_of_bounds
+from pipeline.gap.naming.search_residuals import with_added_variance, with_fitted_variance
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
 from pipeline.gap.residuals.alignment import AlignedMeasurement, at_points_of, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.thresholds import thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
-from sensors.effects import effect_of
-from sensors.effects.matching_noise import MatchingNoise
 
 _MOST_CONVERGED, _MOST_ROUNDS, _CONVERGED_GAIN = 3, 8, 1.0
 """Effects that are refitted to convergence, and most iterations of each."""
@@ -93,12 +92,15 @@ class SearchOutcome:
 class _SingleFit:
     """One effect alone in the model, without linearising.
 
-    estimate: the effect; residuals, measurement: with it in the model, at the estimated pose; log_likelihood: of all points.
+    estimate: the effect; residuals, measurement: with it in the model, at the estimated pose; value: (n,) registered residuals of
+    all points, 0 where a point is not used; used: (n,) points that are used; log_likelihood: of these points.
     """
 
     estimate: Estimate
     residuals: Residuals
     measurement: Measurement
+    value: FloatArray
+    used: BoolArray
     log_likelihood: float
 
     @property
@@ -124,7 +126,9 @@ class _SingleFit:
         if kept.mean() < thresholds().points.least_share_on_reference:
             return None
         value[kept] = np.where(found.usable, np.clip(registered_residuals, -largest, largest), 0.0)
-        return cls(estimate, at_points_of(found, given.part), measurement, first.design.log_likelihood(value, estimate.candidate))
+        kept[kept] = found.usable
+        log_likelihood = first.design.log_likelihood(value, estimate.candidate)
+        return cls(estimate, at_points_of(found, given.part), measurement, value, kept, log_likelihood)
 
     def improved(self, given: SearchInput, first: MeanSearch) -> _SingleFit | None:
         """Return the fit after one Gauss-Newton step from the present values."""
@@ -132,6 +136,27 @@ class _SingleFit:
         width = candidate.columns.shape[1]
         step = _gauss_newton_step(self.residuals, candidate.columns, prior_precision(candidate, width), np.zeros(width))
         return _SingleFit.of(given, first, replace(self.estimate, values=self.estimate.values + step))
+
+
+def _on_common_points(fits: list[_SingleFit], first: MeanSearch) -> list[_SingleFit]:
+    """The fits with likelihoods of the points that all of them use; a point that one leaves out would favour it."""
+    common, design = np.all([each.used for each in fits], axis=0), first.design
+    values = (np.where(common, each.value, 0.0) for each in fits)
+    return [
+        replace(each, log_likelihood=design.log_likelihood(value, each.estimate.candidate))
+        for each, value in zip(fits, values, strict=True)
+    ]
+
+
+def _ranked_on_common_points(fits: list[_SingleFit], first: MeanSearch) -> list[_SingleFit]:
+    """The same, best first."""
+    return sorted(_on_common_points(fits, first), key=lambda each: -each.score)
+
+
+def _gain_over(later: _SingleFit, earlier: _SingleFit, first: MeanSearch) -> float:
+    """Log-likelihood ratio of two fits."""
+    after, before = _on_common_points([later, earlier], first)
+    return after.log_likelihood - before.log_likelihood
 
 
 def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
@@ -277,7 +302,7 @@ def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list
         alone = _single_fit(given, first, candidate)
         if alone is None:
             continue
-        linearised = first.design.log_likelihood(given.part.value, candidate)
+        linearised = first.design.log_likelihood(np.where(alone.used, given.part.value, 0.0), candidate)
         if not found and abs(alone.log_likelihood - linearised) < tolerance:
             return []
         found.append(alone)
@@ -300,7 +325,7 @@ def _with_alternatives(given: SearchInput, first: MeanSearch, alone: list[_Singl
     more = [each for each in (_single_fit(given, first, variant) for variant in variants) if each is not None]
     if not more:
         return alone
-    ranked = sorted([*alone, *_best_variants(given, first, more)], key=lambda each: -each.score)
+    ranked = _ranked_on_common_points([*alone, *_best_variants(given, first, more)], first)
     return _with_alternatives(given, first, ranked, set(ranked[0].estimate.chosen.indistinguishable))
 
 
@@ -318,10 +343,10 @@ def _best_variants(given: SearchInput, first: MeanSearch, found: list[_SingleFit
     ranked = sorted(found, key=lambda each: -each.log_likelihood)
     variants = {each.name: each for each in reversed(ranked)}
     likely = sorted(variants.values(), key=lambda each: -each.log_likelihood)[:_MOST_CONVERGED]
-    best, *rest = sorted((_converged(given, first, each) for each in likely), key=lambda each: -each.score)
+    best, *rest = _ranked_on_common_points([_converged(given, first, each) for each in likely], first)
     others = [each for each in ranked if each.name == best.name and each is not variants[best.name]][: _MOST_CONVERGED - 1]
-    best = max([best, *(_converged(given, first, each) for each in others)], key=lambda each: each.score)
-    return [best, *rest]
+    same = _ranked_on_common_points([best, *(_converged(given, first, each) for each in others)], first)
+    return _ranked_on_common_points([same[0], *rest], first)
 
 
 def _search_beside_best(given: SearchInput, plain: SearchOutcome, alone: list[_SingleFit]) -> SearchOutcome | None:
@@ -346,7 +371,7 @@ def _converged(given: SearchInput, first: MeanSearch, alone: _SingleFit) -> _Sin
     """Gauss-Newton steps until the log-likelihood rises by less than 1."""
     for _ in range(_MOST_ROUNDS):
         improved = alone.improved(given, first)
-        if improved is None or improved.log_likelihood < alone.log_likelihood + _CONVERGED_GAIN:
+        if improved is None or _gain_over(improved, alone, first) < _CONVERGED_GAIN:
             break
         alone = improved
     return alone
@@ -362,31 +387,6 @@ def _search_beside(given: SearchInput, chosen: SearchOutcome) -> SearchOutcome |
         return None
     search, at, estimates, further, tried = again
     return replace(chosen, estimates=estimates, search=search, residuals=at, further=further, tried=tried)
-
-
-def with_added_variance(part: Residuals, variance: float) -> Residuals:
-    """Return residuals whose predicted variance is increased by `variance`, in squared units of the observable."""
-    return replace(part, sigma=np.sqrt(part.sigma**2 + variance)) if variance else part
-
-
-def with_fitted_variance(part: Residuals, noise_terms: list[VarianceTerm], noise_ratio: float) -> Residuals:
-    """Return residuals with fitted noise instead of the predicted one, for weights in a search.
-
-    The standard deviations are those that count for means over many neighbours.
-
-    Parameters
-    ----------
-    part : residuals.
-    noise_terms : fitted noise terms; without any, the predicted standard deviations are multiplied by `noise_ratio`.
-    noise_ratio : observed over predicted standard deviation.
-    """
-    part = part.with_sigma_of_means
-    if not noise_terms:
-        return replace(part, sigma=part.sigma * noise_ratio)
-    made = (effect_of(each.effect)(**each.parameters) for each in noise_terms if each.parameters)
-    shared = [effect for effect in made if isinstance(effect, MatchingNoise)]
-    sigma = np.sqrt(part.sigma**2 + sum(each.variance for each in noise_terms))
-    return replace(part, sigma=sigma, correlated_noise=part.correlated_noise.with_effects(shared))
 
 
 def _estimates_of(search: MeanSearch, chosen: list[SelectedEffect]) -> list[Estimate]:

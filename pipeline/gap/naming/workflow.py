@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from pipeline.formats.measurements.checks import check_noise
 from pipeline.formats.measurements.measurement import FILE, Measurement, StereoMeasurement, TlsMeasurement
+from pipeline.gap.mean.detection_power import DetectableSize
 from pipeline.gap.mean.selection import FamilyScore
 from pipeline.gap.naming.candidate_families import model_has
 from pipeline.gap.naming.effect_selection import NONPARAMETRIC_TERMS, SelectionResult
@@ -27,6 +28,7 @@ from pipeline.gap.naming.named_effects import (
 )
 from pipeline.gap.naming.selection_passes import PassInput, PassInputs, best_pass, subsample, subsample_rows
 from pipeline.gap.naming.separating_measurements import with_separating_measurements
+from pipeline.gap.naming.unseen_effects import unseen_effects
 from pipeline.gap.naming.validation import Validation, ValidationResult
 from pipeline.gap.naming.validation_scores import ValidatedEffects, describe_weakness, validate_effects
 from pipeline.gap.naming.verdict import (
@@ -86,6 +88,8 @@ class GapDiagnosis:
     remaining : entry `remaining` of gap.json.
     identifiability : names of the effects, cosines between their signatures, and the share of each that the pose fit leaves.
     seconds, timings : duration of the whole diagnosis and of each step, s.
+    unseen : effects that were not named, each with the size that would have shown with a probability of 95 %.
+    reference_sigma : estimated standard deviation of the reference's correlated error, in the observable's unit.
     thresholds : thresholds that were used.
     """
 
@@ -105,6 +109,8 @@ class GapDiagnosis:
     identifiability: dict[str, Any]
     seconds: float
     timings: dict[str, float]
+    unseen: tuple[DetectableSize, ...] = ()
+    reference_sigma: float = 0.0
     thresholds: Thresholds = _DEFAULTS
 
     @property
@@ -218,6 +224,8 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
         identifiability=selection.identifiability,
         seconds=clock.total,
         timings=clock.laps,
+        unseen=unseen_effects(plain, selection.detectable, [item.name.partition(".")[2] for item in result.named]),
+        reference_sigma=selection.reference_sigma,
         thresholds=thresholds(),
     )
 
@@ -408,7 +416,7 @@ def _insufficient_data(measurement: Measurement, residuals: Residuals, clock: _C
     return GapDiagnosis(
         "insufficient_data", (), (), residuals, empty > 1, residuals.value, residuals.value, pose, measurement.model,
         None, (), (), _remaining_entry(Evidence(None, None), [note], {}), {"names": [], "cosines": [], "survival": []},
-        clock.total, clock.laps, thresholds(),
+        clock.total, clock.laps, thresholds=thresholds(),
     )  # fmt: skip
 
 

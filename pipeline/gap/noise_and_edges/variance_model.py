@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pipeline.change.robust import nmad
+from pipeline.gap.noise_and_edges.sign_flips import null_p_value
 from pipeline.gap.residuals.residuals import BoolArray, Geometry, Residuals
 from pipeline.gap.residuals.wall_blocks import WallCells, wall_block_numbers
 from pipeline.gap.thresholds import thresholds
@@ -21,8 +22,6 @@ from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, ShowsIn
 
-DRAWS = 1999
-"""Number of sign flips of the null distribution."""
 _LEAST_REMAINING_VARIANCE = 0.3
 """Least share of a point's variance that the plane of its cell must leave."""
 _LEAST_WHITE_SHARE, _EXPECTATION_DRAWS = 0.02, 10
@@ -37,7 +36,7 @@ _FISHER_ROUNDS = 25
 
 @dataclass(frozen=True)
 class VarianceCandidate:
-    """A noise term to try: a variance at each of n points that k factors theta can scale.
+    """A noise effect to try: the variance that it adds at each of n points, with k fitted factors theta (one for each parameter).
 
     Attributes
     ----------
@@ -57,7 +56,7 @@ class VarianceCandidate:
     fixed: Mapping[str, float] = field(default_factory=dict)
 
     def parameters(self, theta: FloatArray) -> dict[str, float]:
-        """Return the effect's parameters by name, given the (k,) factors theta of its variances."""
+        """Return the effect's parameters by name. theta: (k,) fitted factors; 1 is the variance at a parameter's typical size."""
         return dict(zip(self.names, map(float, np.sqrt(theta) * np.array(self.scale)), strict=True)) | dict(self.fixed)
 
     def standard_deviations(self, theta: FloatArray, error: FloatArray) -> dict[str, float]:
@@ -65,7 +64,7 @@ class VarianceCandidate:
 
         Parameters
         ----------
-        theta : (k,) factors of the variances.
+        theta : (k,) fitted factors; 1 stands for the variance at a parameter's typical size.
         error : (k,) standard deviations of theta.
         """
         root = np.sqrt(theta)
@@ -443,31 +442,6 @@ def _gain_over(squares: FloatArray, first: FloatArray, second: FloatArray, block
 def _log_likelihood_gain(squares: FloatArray, added: FloatArray) -> float:
     """Log-likelihood ratio of an added variance (n,)."""
     return float(0.5 * np.sum(squares * added / (1 + added) - np.log1p(added)))
-
-
-def null_p_value(squares: FloatArray, shapes: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
-    """Test whether any candidate variance explains the squared deviations.
-
-    The test statistic is the largest standardised score over the candidates, which corrects for their number. Its null
-    distribution comes from N random sign flips of the scores of whole wall blocks.
-
-    Parameters
-    ----------
-    squares : (n,) squared deviations over the predicted variance.
-    shapes : for each candidate the (n,) variance that it adds over the predicted one.
-    block : (n,) number of each point's wall block.
-    random : source of random numbers.
-
-    Returns
-    -------
-    float : the p-value (1 + b) / (1 + N), if b of the N flips reach the observed statistic.
-    """
-    _, number = np.unique(block, return_inverse=True)
-    scores = np.stack([np.bincount(number, (squares - 1) * shape) for shape in shapes])
-    size = np.sqrt(np.sum(scores**2, axis=1))
-    signs = random.child("spread").generator().choice([-1.0, 1.0], size=(scores.shape[1], DRAWS))
-    largest = np.max(scores @ signs / size[:, None], axis=0)
-    return float((1 + np.sum(largest >= np.max(scores.sum(axis=1) / size))) / (1 + DRAWS))
 
 
 def _best_binned_variance(squares: FloatArray, covariates: Mapping[str, FloatArray]) -> tuple[str, float, FloatArray]:

@@ -19,6 +19,7 @@ from pipeline.gap.report.contributions import contributions
 from pipeline.gap.report.covariate_ranking import inliers, rank_disagreements
 from pipeline.gap.report.datum_scale import estimate_scale
 from pipeline.gap.report.figures import gap_figure, maps_figure, matrix_figure, profiles_figure
+from pipeline.gap.report.unseen import reference_line, unseen_entry, unseen_line, unseen_rows
 from pipeline.gap.report.wording import (
     answer,
     covariate_with_unit,
@@ -63,6 +64,8 @@ def _to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
         "identifiability": found.identifiability,
         "gap": found.gap.to_dict() if found.gap else None,
         "remaining": found.remaining,
+        "detectable": unseen_entry(found),
+        "reference_error_m": found.reference_sigma * float(np.median(found.residuals.unit_m)) if len(found.residuals) else None,
         "decisions": found.thresholds.model_dump(),
         "seconds": round(found.seconds, 2),
     }
@@ -138,6 +141,8 @@ def _summary(found: GapDiagnosis) -> str:
         factor, unit = found.gap.display_unit
         scores = ", ".join(f"{factor * value:.3f} {unit} {name}" for name, value in found.gap.scores.items())
         lines.append(f"  gap {scores}: {describe_closing(found.gap, found.model_changed)}")
+    lines += [f"  {line}"] if (line := unseen_line(found)) else []
+    lines += [f"  {line}"] if (line := reference_line(found)) else []
     if found.verdict == "no_gap" and found.remaining.get("note"):
         lines.append(f"  note: {found.remaining['note']}")
     return "\n".join(lines)
@@ -187,6 +192,8 @@ def _render_page(found: GapDiagnosis, pictures: dict[str, bytes]) -> str:
         where=rows,
         tried=[(item, best - item.score, outcome(found, tried, item)) for item in tried[:_MOST_TRIED]],
         more=max(len(tried) - _MOST_TRIED, 0),
+        unseen=unseen_rows(found),
+        reference_words=reference_line(found),
         variance_tried=[(item, variance_outcome(found, item)) for item in found.variance_tried],
         added=_yaml({"effects": [round_entry(effect.entry) for effect in found.effects]}),
         model=_yaml(after),

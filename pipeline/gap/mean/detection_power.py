@@ -1,0 +1,301 @@
+"""Compute the detectable size of each systematic effect: the size that would have shown with a probability of 95 %.
+
+A signature S e with size t is added to the simulations of the null distribution: pose, correlated error of the reference and
+noise. Under each covariance of the cells' means, with nuisance columns J and the projection P beside them, the log-likelihoods
+without and with the candidate are
+
+    L0(t) = L0(0) - t e'U - t² e'H e / 2        U = S'P y,  H = S'P S
+    L1(t) = L0(t) + R'(H + K)^-1 R / 2          R = U + t H e,  K: prior precision of the sizes
+
+Both are maximised over the covariances, because an effect that is left out makes the estimated error of the reference larger.
+Twice their difference is noncentral chi-square with the noncentrality t² e'H e if the covariance is known; this gives the first
+value of the search for t.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import ncx2
+
+from pipeline.gap.mean.candidates import Candidate, robust_extent
+from pipeline.gap.mean.design import NULL_DRAWS, Design
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+
+POWER = 0.95
+"""Probability with which an effect of its detectable size would have been found."""
+_SIZES = np.geomspace(0.7, 40.0, 48)
+"""Sizes that are tried, relative to the one that the noncentral chi-square distribution gives."""
+_ROUNDS = 2
+"""Number of times that a size is computed, with the covariance that would be estimated beside an effect of that size."""
+_NOTHING = 1e-9
+"""Share of a signature's sum of squares below which nothing of it is left beside the nuisance parameters."""
+_PHASE, _BOTH = "phase_rad", "both"
+
+
+@dataclass(frozen=True)
+class DetectableSize:
+    """The size of an effect that a measurement would have shown with a probability of 95 %.
+
+    Attributes
+    ----------
+    name : Name of the effect, or what an error outside the catalogue depends on.
+    parameter : Name of the parameter that holds the size; "" for the unit of the observable.
+    size : Value of that parameter; infinite if no size shows, NaN if it was not computed.
+    at : Values of the variant for which it holds, such as a period or a camera.
+    note : Condition or reason, in words.
+    """
+
+    name: str
+    parameter: str
+    size: float
+    at: Mapping[str, float | str] = field(default_factory=dict)
+    note: str = ""
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the entry of gap.json."""
+        size = self.size if np.isfinite(self.size) else None
+        return {"name": self.name, "parameter": self.parameter, "size": size, "at": dict(self.at), "note": self.note}
+
+
+@dataclass(frozen=True, eq=False)
+class Signature:
+    """One direction in the columns of a candidate.
+
+    Attributes
+    ----------
+    candidate : The candidate.
+    parameter : Name of the parameter that holds the size.
+    columns : Numbers of its columns among all columns that are examined.
+    sine : Whether the candidate has a phase; the phase that is hardest to detect is then taken.
+    needed : Function from the numbers of the covariances, the most likely first, to the log-likelihood ratio from which it shows.
+    """
+
+    candidate: Candidate
+    parameter: str
+    columns: list[int]
+    sine: bool
+    needed: Callable[[Sequence[int]], float]
+
+    def direction(self, information: FloatArray) -> FloatArray:
+        """Return the (k,) direction of coefficients: one parameter alone, or the phase with the least information (k, k)."""
+        if self.sine:
+            return np.asarray(np.linalg.eigh(information)[1][:, 0])
+        return np.eye(len(information))[self.candidate.names.index(self.parameter)]
+
+    @property
+    def at(self) -> dict[str, float | str]:
+        """Values of the variant."""
+        return dict(self.candidate.fixed)
+
+
+def noncentrality(needed: float, columns: int, power: float = POWER) -> float:
+    """Return the noncentrality with which a log-likelihood ratio reaches a value with a given probability.
+
+    Parameters
+    ----------
+    needed : Value that the log-likelihood ratio has to reach.
+    columns : Number of columns, the degrees of freedom.
+    power : The probability.
+    """
+    at, rare = 2 * needed, 1e-9
+    return float(brentq(lambda x: ncx2.sf(at, columns, x) - power, rare, 4 * (at + 10 * columns + 10)))
+
+
+@dataclass(frozen=True, eq=False)
+class DetectionPower:
+    """Products of the examined columns with the simulations, under each of C covariances.
+
+    Attributes
+    ----------
+    likely : Number of the most likely covariance, under which the simulations were drawn.
+    plain : (C, d) log-likelihood of the nuisance columns alone.
+    right : (C, k, d) products of the columns with the simulations, beside the nuisance columns.
+    matrix : (C, k, k) products of the columns with each other, beside the nuisance columns.
+    whole : (C, k) squares of the columns before.
+    """
+
+    likely: int
+    plain: FloatArray
+    right: FloatArray
+    matrix: FloatArray
+    whole: FloatArray
+
+    @classmethod
+    def of(
+        cls, design: Design, members: Sequence[Candidate], plain: list[int], sines: list[int], random: KeyedRandom
+    ) -> DetectionPower:
+        """Simulate measurements without further effects.
+
+        Parameters
+        ----------
+        design : Design that is conditioned on the members.
+        members : Effects that are fitted beside each candidate. Sines among them only count for the covariance.
+        plain, sines : Numbers of the fixed columns and of the sines to examine; the latter follow the former.
+        random : Source of the random numbers.
+        """
+        equations, known = design.equations, design.columns(members)
+        likely = int(np.argmax(equations.log_likelihood(known)[:, 0]))
+        draws = design.model.null_draws(equations.covariances[likely], NULL_DRAWS, random)
+        base = [column for column in known if column < len(design.noise_products)]
+        held = [equations.held_columns.index(column) for column in base]
+        pairs = [2 * number + part for number in sines for part in (0, 1)]
+        wanted, count = [*base, *plain], len(base)
+        noise = np.concatenate([design.noise_products[wanted], design.sine_products.noise[pairs]])
+        right, constant = [], []
+        for each in equations.covariances:
+            weighted = draws[each.basis] * each.weight[:, None]
+            columns = np.concatenate(
+                [design.fixed.between[each.basis][:, wanted], design.sine_products.between[each.basis][:, pairs]], axis=1
+            )
+            right.append(noise + columns.T @ weighted)
+            constant.append(0.5 * (np.log(each.weight).sum() - np.sum(draws[each.basis] * weighted, axis=0)))
+        drawn = np.stack(right)
+        own = _block_diagonal(equations.fixed[:, plain][:, :, plain], equations.wave_own[:, sines])
+        cross = np.concatenate([equations.fixed[:, plain][:, :, base], equations.wave_fixed[:, pairs][:, :, held]], axis=1)
+        solved = equations.solved(base, np.concatenate([drawn[:, :count], cross.transpose(0, 2, 1)], axis=2))
+        fitted, beside = np.split(solved, [NULL_DRAWS], axis=2)
+        alone = np.stack(constant) + 0.5 * np.einsum("cbd,cbd->cd", drawn[:, :count], fitted)
+        return cls(likely, alone, drawn[:, count:] - cross @ fitted, own - cross @ beside, np.einsum("ckk->ck", own))
+
+    def size(self, signature: Signature) -> float:
+        """Return the detectable size of a signature; infinite if no size shows.
+
+        An effect of that size makes the estimated error of the reference larger, and thereby the log-likelihood ratio that it
+        needs. The size is therefore computed twice.
+        """
+        rows = signature.columns
+        precision = signature.candidate.prior_precision
+        matrix, right = self.matrix[:, rows][:, :, rows], self.right[:, rows]
+        known = np.zeros(len(rows)) if precision is None else precision
+        information = matrix - np.diag(known)  # the normal equations contain the prior
+        along = signature.direction(information[self.likely])
+        gained = information @ along
+        squares = gained @ along
+        if squares[self.likely] <= _NOTHING * float(along**2 @ self.whole[self.likely, rows]):
+            return np.inf
+        inverse = np.linalg.inv(matrix)
+        slope = np.einsum("k,ckd->cd", along, right)
+
+        def without(size: float) -> FloatArray:
+            return self.plain - size * slope - 0.5 * size**2 * squares[:, None]
+
+        def reached(size: float) -> float:
+            left, moved = without(size), right + size * gained[:, :, None]
+            explained = left + 0.5 * np.einsum("ckd,ckl,cld->cd", moved, inverse, moved)
+            return float(np.quantile(explained.max(axis=0) - left.max(axis=0), 1 - POWER))
+
+        size = 0.0
+        for _ in range(_ROUNDS):
+            needed = signature.needed(np.argsort(-without(size).mean(axis=1), kind="stable").tolist())
+            start = np.sqrt(noncentrality(needed, len(rows)) / squares[self.likely])
+            size = _first_reaching(start * _SIZES, reached, needed)
+            if not np.isfinite(size):
+                break
+        return size
+
+
+def _first_reaching(sizes: FloatArray, reached: Callable[[float], float], needed: float) -> float:
+    """The smallest size at which a rising function reaches a value, interpolated; infinite if none does."""
+    before = 0.0, 0.0
+    for size in map(float, sizes):
+        value = reached(size)
+        if value >= needed:
+            share = (needed - before[1]) / max(value - before[1], 1e-300) if before[0] else 1.0
+            return before[0] + share * (size - before[0])
+        before = size, value
+    return float("inf")
+
+
+def _block_diagonal(plain: FloatArray, sines: FloatArray) -> FloatArray:
+    """(C, k, k) products of plain columns (C, p, p), then of pairs of columns of sines (C, w, 2, 2); those of two sines are 0."""
+    count, start = plain.shape[1] + 2 * sines.shape[1], plain.shape[1]
+    found = np.zeros((len(plain), count, count))
+    found[:, :start, :start] = plain
+    for number in range(sines.shape[1]):
+        rows = slice(start + 2 * number, start + 2 * number + 2)
+        found[:, rows, rows] = sines[:, number]
+    return found
+
+
+def detectable_sizes(
+    design: Design,
+    members: Sequence[Candidate],
+    needed: Callable[[Candidate, Sequence[int]], float],
+    random: KeyedRandom,
+) -> list[DetectableSize]:
+    """Compute the detectable size of every systematic effect of the catalogue, and of smooth errors outside it.
+
+    The smooth errors are waves with one cycle over the field of view. Of an effect with a camera the camera in which it is harder
+    to see counts, and of a searched period the one in the middle of the grid.
+
+    Parameters
+    ----------
+    design : Design that is conditioned on the members.
+    members : Effects that were found; they are fitted beside each candidate and not listed.
+    needed : Function from a candidate, and the numbers of the covariances with the most likely first, to the log-likelihood ratio
+        from which it shows.
+    random : Source of the random numbers.
+    """
+    names = {each.name for each in members if not each.empirical}
+    plain = [each for each in design.families.plain if not each.empirical and each.name not in names and not _both(each)]
+    numbers = [number for number in _examined_sines(design) if design.families.sine(number).name not in names]
+    columns = [column for each in plain for column in design.column_numbers[each]]
+    place = {column: row for row, column in enumerate(columns)}
+    power = DetectionPower.of(design, members, columns, numbers, random)
+    found: dict[tuple[str, str], list[DetectableSize]] = {}
+    for each in plain:
+        rows = [place[column] for column in design.column_numbers[each]]
+        sine = _PHASE in each.names
+        for parameter in each.names[:1] if sine else each.names:
+            size = power.size(Signature(each, parameter, rows, sine, partial(needed, each)))
+            found.setdefault((each.name, parameter), []).append(DetectableSize(each.name, parameter, size, dict(each.fixed)))
+    for row, number in enumerate(numbers):
+        each = design.families.sine(number)
+        rows = [len(columns) + 2 * row, len(columns) + 2 * row + 1]
+        size = power.size(Signature(each, each.names[0], rows, True, partial(needed, each)))
+        name = f"smooth error along {each.name}" if each.empirical else each.name
+        at = {} if each.empirical else dict(each.fixed)
+        parameter = "" if each.empirical else each.names[0]
+        found.setdefault((name, parameter), []).append(DetectableSize(name, parameter, size, at))
+    return [_of_variants(variants) for variants in found.values()]
+
+
+def _both(candidate: Candidate) -> bool:
+    """Whether a candidate changes both cameras alike, which a pair hardly sees."""
+    return candidate.fixed.get("camera") == _BOTH
+
+
+def _of_variants(variants: list[DetectableSize]) -> DetectableSize:
+    """Of each camera the set of parameters that shows the smallest size; of the cameras the one with the largest."""
+    cameras: dict[object, DetectableSize] = {}
+    for each in variants:
+        side = each.at.get("camera")
+        if side not in cameras or each.size < cameras[side].size:
+            cameras[side] = each
+    return max(cameras.values(), key=lambda each: each.size)
+
+
+def _examined_sines(design: Design) -> list[int]:
+    """Numbers of the sines to examine: the middle period of each effect, and one cycle along each covariate of the position."""
+    found: list[int] = []
+    start, seen = 0, set()
+    for grid in design.families.grids:
+        count = len(grid.frequencies)
+        if not grid.empirical:
+            key = grid.name, grid.fixed.get("camera")
+            if key not in seen:
+                found.append(start + count // 2)
+            seen.add(key)
+        elif grid.name in design.residuals.position_covariates and not grid.angle:
+            once = 1 / robust_extent(grid.wave.x)
+            if (grid.name, "") not in seen:
+                found.append(start + int(np.argmin(np.abs(grid.frequencies - once))))
+            seen.add((grid.name, ""))
+        start += count
+    return found

@@ -1,0 +1,90 @@
+"""Compute the detectable size of each noise term: the variance model would have found it with a probability of 95 %."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.change.robust import nmad
+from pipeline.gap.mean.detection_power import DetectableSize
+from pipeline.gap.noise_and_edges.sign_flips import null_critical_score
+from pipeline.gap.noise_and_edges.variance_model import VarianceCandidate, standardised_deviations, variance_candidates
+from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.residuals.wall_blocks import WallCells, wall_block_numbers
+from pipeline.gap.thresholds import thresholds
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+
+_ONE_SIDED = 1.645
+"""Standard deviations that a normal variable exceeds with a probability of 5 %."""
+_SIZES = np.geomspace(1e-4, 1e4, 321)
+"""Variances that are tried, relative to the variance at the effect's typical sizes."""
+
+
+def detectable_noise(
+    residuals: Residuals, cells: WallCells, value: FloatArray, named: Sequence[str], random: KeyedRandom
+) -> list[DetectableSize]:
+    """Compute the detectable size of every noise term that neighbouring points do not share.
+
+    Parameters
+    ----------
+    residuals : Residuals with their predicted standard deviations.
+    cells : Cells of the wall.
+    value : (n,) residuals after the systematic effects.
+    named : Effects that were found, which are not listed.
+    random : Source of random numbers of the null distribution.
+    """
+    candidates = variance_candidates(residuals)
+    if not candidates:
+        return []
+    z = standardised_deviations(residuals, cells, value)
+    used = np.isfinite(z) & (np.abs(z) < thresholds().variance.clip_sigmas * max(1.0, nmad(z, 0.0)))
+    squares = z[used] ** 2 / float(np.mean(z[used] ** 2))
+    block = np.unique(wall_block_numbers(residuals.wall_xy[used], cells.side_m), return_inverse=True)[1]
+    shapes = [(each.variance[used] / residuals.sigma[used, None] ** 2).sum(axis=1) for each in candidates]
+    critical = null_critical_score(squares, shapes, block, random)
+    missing = 1 - min(float(np.mean(z[used] ** 2)), 1.0)
+    found: dict[str, DetectableSize] = {}
+    for candidate, shape in zip(candidates, shapes, strict=True):
+        if candidate.name in named:
+            continue
+        item = _detectable(candidate, _least_variance(squares, shape, block, critical, missing))
+        if candidate.name not in found or item.size < found[candidate.name].size:
+            found[candidate.name] = item
+    return list(found.values())
+
+
+def _detectable(candidate: VarianceCandidate, theta: float) -> DetectableSize:
+    """The detectable size of a noise term from its detectable variance, in units of that at its typical sizes."""
+    value = candidate.parameters(np.full(len(candidate.names), theta))[candidate.names[0]] if np.isfinite(theta) else np.inf
+    return DetectableSize(candidate.name, candidate.names[0], value, dict(candidate.fixed))
+
+
+def _least_variance(squares: FloatArray, shape: FloatArray, block: NDArray[np.int64], critical: float, missing: float) -> float:
+    """Return the smallest variance that passes all tests of the variance model with a probability of 95 %.
+
+    Parameters
+    ----------
+    squares : (n,) squared deviations, with mean 1.
+    shape : (n,) the term's variance over the predicted one.
+    block : (n,) wall block of each point.
+    critical : Standardised score that must be exceeded.
+    missing : Share by which the observed variance is below the predicted one; the term must make up for it first.
+    """
+    by = thresholds().variance
+    of_null, of_term = np.bincount(block, (squares - 1) * shape), np.bincount(block, shape**2)
+    mean_error = float(np.linalg.norm(np.bincount(block, squares - 1))) / len(squares)
+    for theta in _SIZES:
+        added = theta * shape
+        score = float(theta * of_term.sum() / np.sqrt(np.sum(of_null**2 + (theta * of_term) ** 2)))
+        gain = 0.5 * float(np.sum(added - np.log1p(added)))
+        excess = float(np.mean(added)) - missing
+        if (
+            score - _ONE_SIDED > critical
+            and gain - _ONE_SIDED * np.sqrt(2 * gain) > by.least_gain
+            and excess - _ONE_SIDED * mean_error > by.least_excess
+        ):
+            return float(theta)
+    return np.inf

@@ -1,0 +1,51 @@
+"""Test noise terms against a null distribution in which the signs of the wall blocks' scores are flipped."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.gap.thresholds import thresholds
+from scene.common.keyed_random import KeyedRandom
+from scene.geometry.mesh import FloatArray
+
+DRAWS = 1999
+"""Number of sign flips of the null distribution."""
+
+
+def null_p_value(squares: FloatArray, shapes: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
+    """Test whether any candidate variance explains the squared deviations.
+
+    The test statistic is the largest standardised score over the candidates, which corrects for their number. Its null
+    distribution comes from N random sign flips of the scores of whole wall blocks.
+
+    Parameters
+    ----------
+    squares : (n,) squared deviations over the predicted variance.
+    shapes : for each candidate the (n,) variance that it adds over the predicted one.
+    block : (n,) number of each point's wall block.
+    random : source of random numbers.
+
+    Returns
+    -------
+    float : the p-value (1 + b) / (1 + N), if b of the N flips reach the observed statistic.
+    """
+    observed, largest = _scores_with_flipped_signs(squares, shapes, block, random)
+    return float((1 + np.sum(largest >= observed)) / (1 + DRAWS))
+
+
+def null_critical_score(squares: FloatArray, shapes: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
+    """Return the standardised score that is significant; the parameters are those of `null_p_value`."""
+    _, largest = _scores_with_flipped_signs(squares, shapes, block, random)
+    return float(np.quantile(largest, 1 - thresholds().variance.significance))
+
+
+def _scores_with_flipped_signs(
+    squares: FloatArray, shapes: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom
+) -> tuple[float, FloatArray]:
+    """The largest standardised score over the candidates, observed and (DRAWS,) with the signs flipped by wall block."""
+    _, number = np.unique(block, return_inverse=True)
+    scores = np.stack([np.bincount(number, (squares - 1) * shape) for shape in shapes])
+    size = np.sqrt(np.sum(scores**2, axis=1))
+    signs = random.child("spread").generator().choice([-1.0, 1.0], size=(scores.shape[1], DRAWS))
+    return float(np.max(scores.sum(axis=1) / size)), np.max(scores @ signs / size[:, None], axis=0)

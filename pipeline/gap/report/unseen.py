@@ -1,0 +1,86 @@
+"""Say what a diagnosis could not have seen: the detectable size of each effect that was not named."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipeline.gap.mean.detection_power import POWER, DetectableSize
+from pipeline.gap.naming.workflow import GapDiagnosis
+from pipeline.gap.report.quantities import format_with_std
+from pipeline.gap.survey.identifiability import REFERENCE_ERRORS_M
+from sensors.effects import EFFECTS
+
+_MOST_NAMED = 4
+"""Effects that the line in the terminal lists."""
+_UNUSUAL = 3.0
+"""An error of the reference is unusual if it is more than this many times the usual one."""
+_OBSERVABLE = {"tls": "smooth_m", "stereo": "smooth_px"}
+"""A key with the unit of each sensor's observable."""
+
+
+def unseen_entry(found: GapDiagnosis) -> list[dict[str, Any]]:
+    """Return the entry `detectable` of gap.json."""
+    return [{**each.to_dict(), "name": _full_name(each, found.residuals.sensor)} for each in found.unseen]
+
+
+def unseen_rows(found: GapDiagnosis) -> list[dict[str, str]]:
+    """Return the rows of the report's table: name, size, and the variant or the reason for no size."""
+    return [
+        {
+            "name": _full_name(each, found.residuals.sensor),
+            "size": f"{each.parameter} {_format(each, found.residuals.sensor)}".strip(),
+            "note": each.note or ", ".join(f"{key} {_short(value)}" for key, value in each.at.items()),
+        }
+        for each in found.unseen
+    ]
+
+
+def unseen_line(found: GapDiagnosis) -> str:
+    """Return the effects that could be largest without having shown, as one line; "" where none was computed."""
+    sensor = found.residuals.sensor
+    known = [each for each in found.unseen if np.isfinite(each.size) and each.parameter]
+    largest = sorted(known, key=lambda each: -each.size / _typical(each))[:_MOST_NAMED]
+    if not largest:
+        return ""
+    named = ", ".join(f"{each.name} {_format(each, sensor)}" for each in largest)
+    more = f"; {len(known) - len(largest)} more in report.html" if len(known) > len(largest) else ""
+    return f"smaller effects than these may be hidden ({100 * POWER:.0f} % would have shown): {named}{more}"
+
+
+def reference_line(found: GapDiagnosis) -> str:
+    """Return a sentence on a reference whose estimated error is larger than is usual; else ""."""
+    if not len(found.residuals) or not found.reference_sigma:
+        return ""
+    error_m = found.reference_sigma * float(np.median(found.residuals.unit_m))
+    usual_m = REFERENCE_ERRORS_M[found.residuals.sensor]
+    if error_m <= _UNUSUAL * usual_m:
+        return ""
+    return (
+        f"the reference seems to err by {1e3 * error_m:.2g} mm (standard deviation, correlated over metres), more than the usual "
+        f"{1e3 * usual_m:.2g} mm, and what looks like that is hidden. If the reference is better, give its error with "
+        "--reference-error; if not, use a better one"
+    )
+
+
+def _full_name(item: DetectableSize, sensor: str) -> str:
+    """The name with the sensor as prefix; that of an error outside the catalogue as it is."""
+    return f"{sensor}.{item.name}" if any(effect.tag() == item.name for effect in EFFECTS) else item.name
+
+
+def _typical(item: DetectableSize) -> float:
+    """Typical size of the effect's parameter."""
+    return next(effect.typical_sizes().get(item.parameter, 1.0) for effect in EFFECTS if effect.tag() == item.name)
+
+
+def _format(item: DetectableSize, sensor: str) -> str:
+    """The size with its unit, to two digits; a dash where there is none."""
+    if not np.isfinite(item.size):
+        return "\N{EN DASH}"
+    return format_with_std(item.parameter or _OBSERVABLE[sensor], float(f"{item.size:.2g}"))
+
+
+def _short(value: float | str) -> str:
+    """A value of the variant."""
+    return value if isinstance(value, str) else f"{value:.3g}"
