@@ -12,7 +12,7 @@ help:
 	@echo 'make validate    long statistical tests and trainings, as before a release (see docs/validation/tests.md)'
 	@echo 'make docs        the documentation site, in site/index.html'
 	@echo 'make format      put the code into the project'"'"'s format'
-	@echo 'make benchmarks  every benchmark that makes its own data, each with its ratio to the limit measured in the same run'
+	@echo 'make benchmarks  speed and memory with an empty and a filled kernel cache, into docs/validation/performance.md (an hour)'
 	@echo 'make nightly     robustness at length: 500 drawn inputs a command, the list of bad inputs, the soak (hours)'
 
 setup:
@@ -45,9 +45,8 @@ format: setup-all
 	$(BIN)/ruff check --fix-only -q .
 	$(BIN)/ruff format .
 
-# A script with an argument that is required needs a data set of the user's own.
 benchmarks: setup-all
-	@for file in $$(grep -L 'required=True' benchmarks/*.py); do echo "== $$file"; $(BIN)/python $$file || exit 1; done
+	$(BIN)/python benchmarks/performance.py
 
 nightly: setup-all
 	$(BIN)/python benchmarks/fuzz.py 500

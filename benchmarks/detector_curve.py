@@ -25,7 +25,7 @@ def tested(folder: Path, model: str, windows: str) -> Tested:
     """A set and what a detector finds in it."""
     truth = json.loads((folder / "test" / "annotations.json").read_text(encoding="utf-8"))
     out = folder.with_name(f"{folder.name}_found_{windows}")
-    return Tested(placement_of(folder), truth, detections(model, folder / "test", out, unmirrored=True), [])
+    return Tested(placement_of(folder), truth, detections(model, folder / "test", out), [])
 
 
 def f1(test: Tested, bar: Bar, size: str) -> float:

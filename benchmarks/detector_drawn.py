@@ -1,6 +1,6 @@
 """Measure how well a detector draws the blocks that it finds, and what limits it: boxes, outlines, the mask's grid, or noise.
 
-    python benchmarks/detector_drawn.py --set sets/mixed [--split val] [--model default] [--unmirrored] [--write]
+    python benchmarks/detector_drawn.py --set sets/mixed [--split val] [--model default] [--mirrored] [--write]
 
 Of the detected blocks (masks overlap by 0.25, score 0.95), it gives the share whose mask overlaps by 0.75: with masks as they
 are, drawn in other boxes, with another margin or probability threshold, and with the true masks cut or sampled like the predicted
@@ -212,10 +212,10 @@ def main() -> None:
     parser.add_argument("--set", type=Path, required=True, dest="folder", help="a data set")
     parser.add_argument("--split", default="val", help="its folder with the tiles")
     parser.add_argument("--model", default="default", help="default, or a trained detector's folder")
-    parser.add_argument("--unmirrored", action="store_true", help="look at maps as they are, not at their mirror images too")
+    parser.add_argument("--mirrored", action="store_true", help="also look at the mirror images of the maps")
     parser.add_argument("--write", action="store_true", help="put the table into docs/validation/detector.md")
     arguments = parser.parse_args()
-    model = weights.load(detector_folder(arguments.model), unmirrored=arguments.unmirrored)
+    model = weights.load(detector_folder(arguments.model), mirrored=arguments.mirrored)
     text = "\n".join(rows(list(blocks(model, CocoFolder(arguments.folder / arguments.split)))))
     print(text)
     if arguments.write:

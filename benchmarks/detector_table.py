@@ -73,7 +73,8 @@ class Tested:
     def of(cls, folder: Path, model: str, out: Path) -> Tested:
         """Read the set in `folder`; detections are kept in `out` and made only once."""
         truth = json.loads((folder / "test" / "annotations.json").read_text(encoding="utf-8"))
-        return cls(placement_of(folder), truth, *(detections(each, folder / "test", out) for each in (model, BASELINE)))
+        network = detections(model, folder / "test", out, mirrored=model != BASELINE)
+        return cls(placement_of(folder), truth, network, detections(BASELINE, folder / "test", out))
 
     def on(self, *sensors: str) -> Cells:
         """Return the cells of these sensors, taken together."""
@@ -91,11 +92,11 @@ def placement_of(folder: Path) -> str:
     return " and ".join(sorted(found))
 
 
-def detections(model: str, folder: Path, out: Path, *, unmirrored: bool = False) -> list[dict[str, Any]]:
-    """Return what a detector finds in a set's tests, made once. unmirrored: without mirrored views."""
+def detections(model: str, folder: Path, out: Path, *, mirrored: bool = False) -> list[dict[str, Any]]:
+    """Return what a detector finds in a set's tests, made once. mirrored: with mirrored views."""
     path = out / (BASELINE if model == BASELINE else "network") / "detections.json"
     if not path.exists():
-        detect(model, [folder], path.parent, confidences=(LOWEST_SCORE,), pictures=False, unmirrored=unmirrored)
+        detect(model, [folder], path.parent, confidences=(LOWEST_SCORE,), pictures=False, mirrored=mirrored)
     return list(json.loads(path.read_text(encoding="utf-8"))["annotations"])
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -22,6 +23,8 @@ from pathlib import Path
 
 import numpy as np
 from documents import printed, write_between
+from numpy.typing import NDArray
+from scipy import ndimage
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -29,22 +32,28 @@ sys.path.insert(0, str(ROOT))
 from pipeline.api.building import observe, open_wall, stage  # noqa: E402
 from pipeline.api.runs import simulate  # noqa: E402
 from pipeline.change.difference import SurfaceRaster  # noqa: E402
-from pipeline.change.m3c2 import M3c2Config, m3c2  # noqa: E402
+from pipeline.change.m3c2 import M3c2Config, M3c2Map, m3c2  # noqa: E402
 from pipeline.formats.point_cloud import PointCloud  # noqa: E402
 from pipeline.formats.points.laz import read_laz, write_laz  # noqa: E402
-from pipeline.formats.rasters.geotiff import read_geotiff  # noqa: E402
+from pipeline.monitoring.comparison import EpochChange, compare_epoch  # noqa: E402
+from pipeline.monitoring.events import LEAST_PIXELS, SIGNIFICANT, Change, ChangedRegion, region_of_mask  # noqa: E402
 from pipeline.monitoring.options import MonitorOptions  # noqa: E402
 from pipeline.monitoring.products import Result  # noqa: E402
-from pipeline.monitoring.reading import read_epoch  # noqa: E402
+from pipeline.monitoring.reading import find_epochs, read_epoch  # noqa: E402
 from pipeline.monitoring.run import monitor_paths  # noqa: E402
+from pipeline.monitoring.site import prepared  # noqa: E402
 from pipeline.registration.rigid import RigidTransform  # noqa: E402
 from scene.geometry.frame import WallFrame  # noqa: E402
 from scene.geometry.mesh import FloatArray  # noqa: E402
 
 DOCUMENT = ROOT / "docs" / "validation" / "monitor.md"
-MARKS = {name: (f"<!-- {name} -->", f"<!-- end of {name} -->") for name in ("simulated", "cliff", "m3c2", "speed")}
+MARKS = {
+    name: (f"<!-- {name} -->", f"<!-- end of {name} -->")
+    for name in ("simulated", "nothing", "cliff", "m3c2", "regions", "speed")
+}
 CLIFF = ROOT.parent / "shared" / "data" / "trier_cliff"
 PAIR, PAIR_FROM = CLIFF.parent / "tls_rock_blocks_pair", np.array([547_466.3, 149_575.8, 706.1])
+PAIR_FILES = (PAIR / "before.txt", PAIR / "after.txt")
 UTM = np.array([345_200.0, 5_389_450.0, 120.0])
 CLASSES_L = ((0.3, 1.0), (1.0, 3.0), (3.0, 10.0), (10.0, np.inf))
 SITES = {
@@ -92,7 +101,7 @@ def compared(run: Path, result: Result) -> tuple[list[Found], list[bool], float]
         corners = [np.array(block["bbox_m"]).reshape(2, 3)[:, :2] for block in blocks]
         measured: dict[int, tuple[float, float]] = {}
         for region in epoch.regions:
-            centre = result.site.frame.to_world(np.array([region.x_m, region.y_m, region.z_m])) - UTM
+            centre = result.site.views[region.view - 1].frame.to_world(np.array([region.x_m, region.y_m, region.z_m])) - UTM
             at = frame.to_wall(centre)[:2]
             half = np.array([region.width_m, region.height_m]) / 2
             shared = [_overlap(at - half, at + half, *each) for each in corners]
@@ -108,6 +117,23 @@ def compared(run: Path, result: Result) -> tuple[list[Found], list[bool], float]
             found.append(Found(block["volume_m3"], seen, volume, float(np.sqrt(variance))))
         area += epoch.record.area_m2
     return found, false, area
+
+
+def nothing(count: int) -> Iterator[str]:
+    """Rows of the table of epochs in which nothing fell."""
+    yield "| site | compared, m² | events: all, unmarked | in 1,000 m²: all, unmarked |"
+    yield "|---|---|---|---|"
+    for name, (sensor, config, keys) in SITES.items():
+        with tempfile.TemporaryDirectory() as folder:
+            run, scans = Path(folder) / "run", Path(folder) / "scans"
+            simulate(config, sensor, out=run, seed=78, epochs=count, progress=False, **keys, rockfall__count=0)
+            scans.mkdir()
+            files = epochs_of(run, scans, 6)
+            position = np.array([12.0, -50.0, 5.0]) + UTM
+            result = monitor_paths(files, Path(folder) / "out", MonitorOptions(position=position))
+        marked = [bool(region.marks) for epoch in result.epochs for region in epoch.regions]
+        area = sum(epoch.record.area_m2 for epoch in result.epochs)
+        yield f"| {name} | {area:,.0f} | {len(marked)}, {len(marked) - sum(marked)} | {_rates(marked, area)} |"
 
 
 def _overlap(low: FloatArray, high: FloatArray, other_low: FloatArray, other_high: FloatArray) -> float:
@@ -190,6 +216,83 @@ def cliff() -> Iterator[str]:
             yield f"| {state} | {len(large)} | {volumes[0]:.1f} | {volumes[1]:.1f} |"
 
 
+@dataclass(frozen=True)
+class BothWays:
+    """One pair of epochs compared by monitor and by M3C2 with the same registration."""
+
+    change: EpochChange
+    other: M3c2Map
+
+    @classmethod
+    def of(cls, files: Sequence[Path], position: FloatArray) -> BothWays:
+        """Compare two files with one view."""
+        options = MonitorOptions(position=position, views=1)
+        reference, epoch = find_epochs(files)
+        site = prepared(reference, options)
+        grid, raster = site.grid, site.views[0].raster
+        points = [read_epoch(source, options).wall_points(site.frame, grid.gsd) for source in (reference, epoch)]
+        change = compare_epoch(site.reference, points[1], (), options.seed)
+        surface = SurfaceRaster(grid, raster.height, np.zeros(grid.shape, dtype=np.int32))
+        config = M3c2Config(core_step_px=1, cylinder_radius_m=3 * grid.gsd, normal_radius_m=6 * grid.gsd, direction="wall")
+        other = m3c2(points[0].sample, change.transform.apply(points[1].sample), surface, surface.block, config)
+        return cls(change, other)
+
+    def areas(self, name: str) -> str:
+        """Row of the table of areas."""
+        change, gsd = self.change.changes[0], self.change.changes[0].grid.gsd
+        level = change.significance.level
+        known = np.isfinite(change.difference) & np.isfinite(self.other.level)
+        ours, theirs = (np.abs(change.difference) > level) & known, self.other.significant & known
+        areas = [gsd**2 * int(each.sum()) for each in (ours & theirs, ours & ~theirs, theirs & ~ours)]
+        levels = [1e3 * float(np.nanmedian(each)) for each in (level, self.other.level)]
+        return f"| {name} | {levels[0]:.1f}, {levels[1]:.1f} mm | {areas[0]:.1f}, {areas[1]:.1f}, {areas[2]:.1f} |"
+
+    def regions(self) -> Iterator[str]:
+        """Rows of the table of regions, from the largest on."""
+        change, grid = self.change.changes[0], self.change.changes[0].grid
+        rows, matched = [], set[int]()
+        for sign in (1, -1):
+            significant = self.other.significant & (sign * self.other.distance > 0)
+            labels, count = ndimage.label(significant, np.ones((3, 3)))
+            for number in range(1, count + 1):
+                mask = labels == number
+                if mask.sum() < LEAST_PIXELS:
+                    continue
+                volume = sign * float(np.nansum(self.other.distance[mask])) * grid.gsd**2
+                ours = [each for each in self.change.regions if mask[each.window][each.mask].any()]
+                matched |= {id(each) for each in ours}
+                found = sum(each.volume_m3 for each in ours)
+                reason = _reason(mask, ours, change, self.other)
+                row, column = np.argwhere(mask).mean(axis=0)
+                at = f"{grid.x_min + column * grid.gsd:.1f}, {grid.y_max - row * grid.gsd:.1f}"
+                rows.append((volume, f"| {at} | {volume:.3f} | {f'{found:.3f}' if ours else '-'} | {reason} |"))
+        for each in self.change.regions:
+            if id(each) not in matched:
+                at = f"{each.x_m:.1f}, {each.y_m:.1f}"
+                reason = f"M3C2 has no level there or a higher one; marked {' '.join(each.marks) or 'with nothing'}"
+                rows.append((each.volume_m3, f"| {at} | - | {each.volume_m3:.3f} | {reason} |"))
+        yield from (text for _, text in sorted(rows, reverse=True))
+
+
+def _reason(mask: NDArray[np.bool_], ours: Sequence[ChangedRegion], change: Change, other: M3c2Map) -> str:
+    """Why monitor and M3C2 differ on a region that M3C2 has."""
+    if ours:
+        parts = "" if len(ours) == 1 else f"; {len(ours)} events, as the change between them is below half of the level"
+        return f"both{parts}"
+    known = mask & np.isfinite(change.difference)
+    if not known.any():
+        return "too few points for a plane through 3 x 3 pixels, which M3C2's larger cylinder has"
+    levels = [1e3 * float(np.nanmedian(each[known])) for each in (change.significance.level, other.level)]
+    measured = region_of_mask(known, 0, 0, 1.0, change)
+    significance = 0.0 if measured is None else measured.significance
+    if significance >= SIGNIFICANT:
+        return "no square of 3, 5 or 9 pixels in it is significant by itself"
+    return (
+        f"mean change {significance:.1f} standard deviations, events need {SIGNIFICANT:.0f}; "
+        f"level {levels[0]:.0f} mm, M3C2's {levels[1]:.0f} mm"
+    )
+
+
 def against_m3c2() -> Iterator[str]:
     """Rows of the table of significant pixels by both methods, of a simulated epoch and of the real pair of shared/data."""
     yield "| data | level of detection, median: monitor, M3C2 | area significant by both, by monitor alone, by M3C2 alone, m² |"
@@ -198,35 +301,24 @@ def against_m3c2() -> Iterator[str]:
         run, scans = Path(folder) / "run", Path(folder) / "scans"
         simulate(None, "tls", out=run, seed=77, epochs=1, progress=False)
         scans.mkdir()
-        yield _m3c2_row(
-            "simulated rockfalls, 50 m", epochs_of(run, scans, 5), np.array([12.0, -50.0, 5.0]) + UTM, Path(folder) / "out"
-        )
-        if PAIR.is_dir():
-            files = [PAIR / "before.txt", PAIR / "after.txt"]
-            yield _m3c2_row("real pair, coordinates rounded to 6 cm", files, PAIR_FROM, Path(folder) / "pair")
+        position = np.array([12.0, -50.0, 5.0]) + UTM
+        yield BothWays.of(epochs_of(run, scans, 5), position).areas("simulated rockfalls, 50 m")
+    if PAIR.is_dir():
+        yield BothWays.of(PAIR_FILES, PAIR_FROM).areas("real pair, coordinates rounded to 6 cm")
 
 
-def _m3c2_row(name: str, files: Sequence[Path], position: FloatArray, out: Path) -> str:
-    options = MonitorOptions(position=position)
-    result = monitor_paths(files, out, options)
-    site, record = result.site, result.epochs[0].record
-    grid, heights = site.grid, site.reference.raster.height
-    points = [site.frame.to_wall(read_epoch(source, options).points) for source in result.sources]
-    raster = SurfaceRaster(grid, heights, np.zeros(grid.shape, dtype=np.int32))
-    config = M3c2Config(core_step_px=1, cylinder_radius_m=3 * grid.gsd, normal_radius_m=6 * grid.gsd, direction="wall")
-    other = m3c2(points[0], record.transform.apply(points[1]), raster, raster.block, config)
-    difference, level = (read_geotiff(out / f"{kind}_001.tif")[0] for kind in ("difference", "lod"))
-    known = np.isfinite(difference) & np.isfinite(other.level)
-    ours, theirs = (np.abs(difference) > level) & known, other.significant & known
-    areas = [grid.gsd**2 * int(each.sum()) for each in (ours & theirs, ours & ~theirs, theirs & ~ours)]
-    levels = [1e3 * float(np.nanmedian(each)) for each in (level, other.level)]
-    return f"| {name} | {levels[0]:.1f}, {levels[1]:.1f} mm | {areas[0]:.1f}, {areas[1]:.1f}, {areas[2]:.1f} |"
+def regions() -> Iterator[str]:
+    """Rows of the table of regions of the real pair, as both methods have them."""
+    yield "| place on the wall, m | M3C2, m³ | monitor, m³ | found by, and why |"
+    yield "|---|---|---|---|"
+    if PAIR.is_dir():
+        yield from BothWays.of(PAIR_FILES, PAIR_FROM).regions()
 
 
 def speed() -> Iterator[str]:
     """Rows of the table of times, with a process of its own for its memory."""
-    yield "| points in each of two epochs | time | largest memory |"
-    yield "|---|---|---|"
+    yield "| points in each of two epochs | time | processor time | largest memory | others' load on the two cores |"
+    yield "|---|---|---|---|---|"
     with tempfile.TemporaryDirectory() as folder:
         for number in (1, 2):
             write_laz(
@@ -238,8 +330,10 @@ def speed() -> Iterator[str]:
         began = time.monotonic()
         subprocess.run(command, check=True, cwd=ROOT, capture_output=True)
         took = time.monotonic() - began
-        peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6
-        yield f"| {POINTS:,} | {took:.0f} s | {peak:.1f} GB |"
+        used = resource.getrusage(resource.RUSAGE_CHILDREN)
+        processor = used.ru_utime + used.ru_stime
+        others = max(os.getloadavg()[0] - processor / took, 0.0)
+        yield f"| {POINTS:,} | {took:.0f} s | {processor:.0f} s | {used.ru_maxrss / 1e6:.1f} GB | {others:.1f} |"
 
 
 def _large_wall(seed: int) -> FloatArray:
@@ -256,7 +350,14 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", default=list(MARKS), choices=list(MARKS))
     parser.add_argument("--write", action="store_true", help="put the tables into docs/validation/monitor.md")
     arguments = parser.parse_args()
-    rows = {"simulated": lambda: simulated(arguments.epochs), "cliff": cliff, "m3c2": against_m3c2, "speed": speed}
+    rows = {
+        "simulated": lambda: simulated(arguments.epochs),
+        "nothing": lambda: nothing(arguments.epochs),
+        "cliff": cliff,
+        "m3c2": against_m3c2,
+        "regions": regions,
+        "speed": speed,
+    }
     for part in arguments.parts:
         table = printed(rows[part]())
         if arguments.write:

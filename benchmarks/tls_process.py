@@ -83,7 +83,6 @@ def scan(wall: Path, sub_rays: int, rate_only: bool) -> None:
     from scene.common.backend import dr
     from scene.common.config import parse
     from scene.common.keyed_random import KeyedRandom
-    from scene.ray_casting.raycast import RayCaster
 
     marks[1] = "import", time.time()
     beam = {"name": "beam_divergence", "divergence_rad": 3e-4, "sub_rays": sub_rays}
@@ -97,7 +96,7 @@ def scan(wall: Path, sub_rays: int, rate_only: bool) -> None:
     sensor = {"sensor": "tls", "effects": [beam] if sub_rays > 1 else []}
     site = prepare_site(parse(SimulationConfig, {**values, "sensor": sensor}, "benchmark"), "tls", random)
     marks.append(("load", time.time()))
-    caster = RayCaster(site.mesh)
+    caster = site.caster_of(site.mesh)
     marks.append(("build", time.time()))
     seen = site.sensor.observe(caster, random)
     if rate_only:

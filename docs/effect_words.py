@@ -53,3 +53,35 @@ def symbols(effect: type[Effect]) -> str:
     text = inspect.cleandoc(effect.__doc__ or "")
     used = [meaning for pattern, meaning in _SYMBOLS[effect.sensor] if re.search(pattern, text)]
     return "\n".join(["Symbols:", "", *(f"- {meaning}" for meaning in used)]) if used else ""
+
+
+_REFERENCES = {
+    "Lichti 2007": "Lichti (2007), Error modelling, calibration and analysis of an AM-CW terrestrial laser scanner system, ISPRS"
+    " Journal of Photogrammetry and Remote Sensing 61(5); A0, B2 and so on are the names of its parameters",
+    "NIST x": "NIST: Muralikrishnan et al. (2015), Volumetric performance evaluation of a laser scanner based on geometric error"
+    " model, Precision Engineering 40; x4 and so on are the names of its parameters",
+    "Soudarissanane et al. 2011": "Soudarissanane et al. (2011), Scanning geometry: influencing factor on the quality of"
+    " terrestrial laser scanning points, ISPRS Journal of Photogrammetry and Remote Sensing 66(4)",
+    "Wujanz et al. 2017": "Wujanz et al. (2017), An intensity-based stochastic model for terrestrial laser scanners, ISPRS"
+    " Journal of Photogrammetry and Remote Sensing 125",
+    "Schmitz et al. 2019": "Schmitz et al. (2019), How to efficiently determine the range precision of 3D terrestrial laser"
+    " scanners, Sensors 19(6)",
+    "Hirschmueller 2008": "Hirschmueller (2008), Stereo processing by semiglobal matching and mutual information, IEEE"
+    " Transactions on Pattern Analysis and Machine Intelligence 30(2)",
+    "Shimizu & Okutomi 2005": "Shimizu and Okutomi (2005), Sub-pixel estimation error cancellation on area-based matching,"
+    " International Journal of Computer Vision 63(3)",
+    "Knutsson & Westin 1993": "Knutsson and Westin (1993), Normalized and differential convolution, CVPR 1993",
+    "James & Robson 2014": "James and Robson (2014), Mitigating systematic error in topographic models derived from UAV and"
+    " ground-based image networks, Earth Surface Processes and Landforms 39(10)",
+    "Metashape user manual": "Agisoft Metashape user manual, appendix D, Camera models",
+}
+
+
+def references(effect: type[Effect]) -> str:
+    """Return the publications that the equation and the parameters of an effect name, in Markdown; empty if there are none."""
+    extras = [info.json_schema_extra for info in effect.model_fields.values()]
+    text = inspect.cleandoc(effect.__doc__ or "") + " ".join(
+        str(extra.get("source", "")) for extra in extras if isinstance(extra, dict)
+    )
+    named = [title for key, title in _REFERENCES.items() if key in text]
+    return "\n".join(["## References", "", *(f"- {title}" for title in named)]) if named else ""

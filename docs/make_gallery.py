@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from effect_words import STAGES, symbols
+from effect_words import STAGES, references, symbols
 from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -148,18 +148,21 @@ def page(effect: type[Effect], comparison: Comparison) -> str:
     parts = [
         f"# {name}",
         inspect.cleandoc(sys.modules[effect.__module__].__doc__ or ""),
-        f"This page defines an error of a {SENSORS[effect.sensor]}. It is for users who simulate it{found}.",
+        f"This page defines one way in which a real {SENSORS[effect.sensor]} departs from an ideal one. It is for users who"
+        f" simulate it{found}.",
         f"**What it means:** {effect.means}\n\n**What to do:** {effect.act}",
         f"## Equation\n\n```text\n{inspect.cleandoc(effect.__doc__ or '')}\n```",
         symbols(effect),
         f"When the program simulates a measurement, {STAGES[effect.stage]} (stage [`{stage}`](README.md#when-an-effect-acts)).",
         f"## Parameters\n\n{_parameters(effect)}",
-        "With the default values the effect is off. The source `empirical` means that no publication gives the value.",
+        "With the default values the effect is off. A unit of `[1]` marks a pure number, and the source"
+        " `empirical` a value that no publication gives.",
         f"## In a config\n\n```yaml\n{yaml(shown)}\n```",
         f"## Its difference map\n\n![{name}]({name}.png)",
         f"The map shows the recorded {_quantity(effect)} with the effect of the example minus that without it. Red is farther"
         f" away, as missing rock would be. {SCENES[effect.sensor]} There is no other noise.",
         _figures(comparison),
+        references(effect),
         "[From symptom to cause](../gap/symptoms.md) compares the maps of all effects. The [glossary](../glossary.md) explains"
         " the words. `docs/make_gallery.py` writes this page from the code; do not edit it.",
     ]

@@ -184,7 +184,7 @@ def _class(effect: NamedEffect) -> str:
     """Words for what an effect cannot be told from, or for one that describes and does not explain."""
     if effect.kind == "empirical":
         return ", as a description"
-    names = ", ".join(f"`{name.partition('.')[2]}`" for name in effect.alike)
+    names = ", ".join(f"`{name.partition('.')[2]}`" for name in effect.indistinguishable)
     return f", cannot be told from {names}" if names else ""
 
 

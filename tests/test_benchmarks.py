@@ -24,7 +24,7 @@ from tiny_dataset import tiny_set
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "benchmarks"
-LIBRARIES = {"measure", "documents", "matcher_cases", "varied", "workshop"}
+LIBRARIES = {"measure", "documents", "coverage_contexts", "matcher_cases", "varied", "workshop"}
 """Modules that benchmarks import; they run with them."""
 ELSEWHERE = {
     "fuzz": "tests/test_fuzz.py, test_fuzz_commands.py and test_fuzz_records.py run what it runs",
@@ -34,6 +34,8 @@ ELSEWHERE = {
     "gap_injections/run": "tests/test_gap_injections.py",
     "gap_second_generator/run": "tests/test_gap_second_generator.py",
     "gap_thresholds": "tests/test_varied.py",
+    "mutation": "tests/test_mutation.py",
+    "performance": "tests/test_performance.py",
     "readers/draw": "tests/test_generated_pages.py",
     "field_reports/run": "tests/test_field_reports.py",
     **dict.fromkeys(

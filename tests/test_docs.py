@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +15,7 @@ import numpy as np
 import pytest
 import yaml
 from nbclient import NotebookClient
+from shared_outputs import build_site, made_once
 
 from pipeline.formats.points.laz import read_laz
 from scene.common.config import load_yaml, parse
@@ -70,20 +68,15 @@ FURTHER = {
         "scarpsim dataset": ["--set", "parts.0.train=1", "--set", "parts.0.val=1", "--set", "tiles.size_px=192"],
         "scarpsim train": ["--set", "training.epochs=1"],
         "scarpsim detect": ["--no-pictures"],
-        "scarpsim detect default": ["--unmirrored"],
         "simulate": [*SMALL_WALL, *FEW_POINTS, *FEW_BLOCKS],
     },
 }
 """What is added to the pages' commands, so that they are done in seconds."""
 
 
-def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+def test_the_site_builds_without_a_warning(tmp_path_factory: pytest.TempPathFactory) -> None:
     """In `strict` mode a bad link, anchor or a page missing from the navigation is an error. Nothing is fetched."""
-    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1", "SIGNATURE_WIDTH": "100000"}  # no formatter for each signature
-    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--site-dir", str(tmp_path / "site")]
-    built = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert built.returncode == 0, built.stderr
-    pages = list((tmp_path / "site").rglob("*.html"))
+    pages = list(made_once(tmp_path_factory, "site", build_site).rglob("*.html"))
     assert len(pages) > 80
     fetched = re.compile(r'<(?:script|img|iframe)[^>]* src="(?:https?:)?//|<link[^>]* rel="stylesheet"[^>]* href="(?:https?:)?//')
     without_words = re.compile(r'<img(?![^>]* alt="[^"]+)[^>]*>')

@@ -84,6 +84,8 @@ RESOLVED = (
     "scarpsim dataset configs/datasets/detector_test.yaml --out sets/detector_test",
     'scarpsim dataset configs/datasets/detector_test.yaml --set "sensors=[tls]" --set "parts.0.sizes=[large]" '
     "--set tiles.size_px=1560 --set tiles.minimum_valid_share=0.05 --set name=whole --out sets/whole",
+    "scarpsim dataset configs/datasets/detector_test.yaml --set tiles.size_px=1560 --set tiles.minimum_valid_share=0.05 "
+    '--set name=whole --set "parts.0.walls=[glendale-b,bismantova]" --set parts.0.test=1 --out sets/whole_two',
     'scarpsim dataset configs/datasets/detector_test.yaml --set "sensors=[tls]" --set "parts.0.sizes=[large]" '
     "--set tiles.size_px=1560 --set tiles.minimum_valid_share=0.05 --set name=whole-mean --set parts.0.test=1 "
     "--set sizes.large.rockfall.placement=mean_surface --out sets/whole_mean",
@@ -212,8 +214,8 @@ PARSED = (
     "scarpsim dataset split sets/thirteen --by sensor --out sets/thirteen_by",
     "scarpsim detect detector/best runs/bulga --out found",
     "scarpsim detect default runs/bulga --out found",
-    "scarpsim detect default runs/bulga --unmirrored",
-    "scarpsim detect default sets/direct/test --out found",
+    "scarpsim detect default runs/bulga --mirrored",
+    "scarpsim detect default sets/direct/test --mirrored --out found",
     "scarpsim evaluate sets/direct/test found/detections.json --by size_class --confidence 0.95",
     "scarpsim detect baseline runs/bulga --out found_by_threshold",
     "scarpsim evaluate sets/small/test found/detections.json --by noise --confidence 0.5 --confidence 0.95",
@@ -251,6 +253,7 @@ NAMED = (
     "scarpsim compare CONFIG [CONFIG ...] [--measured FOLDER ...] [--epochs N] [--sizes-m FIRST LAST | --blocks config] "
     "[--own-step]",
     "scarpsim detect",
+    "scarpsim evaluate",
     "scarpsim export",
     "scarpsim gap",
     "scarpsim gap --identifiability",

@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import importlib
+import json
+import re
 from collections import Counter
+from pathlib import Path
 
-from benchmarks.readers.draw import COUNTS, PAGE, definitions, drawn, page
+import pytest
+
+from benchmarks.readers.draw import COUNTS, PAGE, definitions, drawn, messages, page
+
+ROOT = Path(__file__).parents[1]
 
 
 def test_a_draw_has_its_numbers_and_can_be_repeated() -> None:
@@ -20,6 +28,18 @@ def test_every_public_definition_has_a_docstring() -> None:
     assert len(without) < 50, without
 
 
+def test_readers_see_the_words_of_messages_instead_of_the_names_of_variables() -> None:
+    texts = [each["text"] for each in messages()]
+    bare = [text for text in texts if re.match(r"\w+(;|$)", text)]
+    assert len(texts) > 500
+    assert len(bare) < 0.02 * len(texts), bare
+
+
+def test_nearly_every_message_says_what_to_do() -> None:
+    without = [f"{each['where']} {each['text']}" for each in messages() if "remedy: " not in each["text"]]
+    assert len(without) < 0.05 * len(list(messages())), without
+
+
 def test_the_page_is_that_of_the_grades() -> None:
     assert not PAGE.is_file() or PAGE.read_text(encoding="utf-8") == page()
 
@@ -29,3 +49,11 @@ def test_the_page_of_long_tests_is_that_of_their_list() -> None:
     from make_tests_page import page as page_of_tests
 
     assert OF_TESTS.read_text(encoding="utf-8") == page_of_tests()
+
+
+def test_the_pages_of_scripts_run_by_hand_are_those_of_their_records(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    for name in ("try_install",):
+        script = importlib.import_module(name)
+        record = json.loads(script.RECORD.read_text(encoding="utf-8"))
+        assert script.PAGE.read_text(encoding="utf-8") == script.page(record), name

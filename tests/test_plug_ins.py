@@ -109,7 +109,7 @@ def test_a_run_takes_a_scanner_and_a_style_of_another_package(package: dict[str,
 @pytest.mark.parametrize(
     ("entry", "problem"),
     [
-        ("known = os:sep", "there is a 'known' already; choose another name"),
+        ("known = os:sep", "the name 'known' is already in use; choose another name"),
         ("other = os:nonesuch", r"does not load \(AttributeError"),
         ("other = os:sep", "is a str; allowed: a number"),
     ],

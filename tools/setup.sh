@@ -97,3 +97,9 @@ if [ -n "$missing" ]; then
     missing=$(missing_packages)
     [ -z "$missing" ] || fail "still missing after the installation: $missing"
 fi
+
+# The tests look at reports, viewer and documentation in Chromium, and are skipped where there is none.
+if [ "$extras" = poisson ] && [ -z "$groups" ] && ! command -v chromium >/dev/null 2>&1; then
+    apt_update
+    (apt_install chromium) || say "without Chromium the tests of what a browser shows are skipped"
+fi

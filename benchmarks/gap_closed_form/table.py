@@ -89,10 +89,11 @@ def _introduction(found: Json) -> str:
 
     return f"""This page shows how often `scarpsim gap` names the right effect in {_cases(found)} simulated measurements whose
 truth it cannot see. It is for users who want to know how far to trust an answer. The generator (`benchmarks/gap_closed_form`)
-works in closed form and shares no code with the sensors or the diagnosis.
+works in closed form: surfaces and sensors are formulas, without meshes or ray casting. It shares no code with the sensors or
+the diagnosis.
 
 - {counted("right class")} clear effects are in the right class.
-- {counted("wrong names among committed answers")} answers that name an effect hold a wrong name.
+- {counted("wrong names among committed answers")} answers that name an effect contain a wrong name.
 - {counted("false alarms on no-effect cases")} measurements without an effect raise a false alarm.
 
 ## Words

@@ -201,6 +201,13 @@ def _surface(true: Array, row_px: int) -> TriangleMesh:
 
 
 _GROUND = "ground of the forest (RIEGL VZ-400i), 40 degrees of azimuth, 2 to 5 m away, one half against the other"
+_TREES = "trunks, twigs and ground of the same forest, all zenith angles"
+_ROCKS = "34 patches of a scanned rock face, coordinates rounded to 6 cm, one half of the points against the other"
+_LIGHT = (
+    "photographs of the scene Motorcycle (Middlebury 2014): disparities measured with structured "
+    "light, odd rows against even ones"
+)
+_MATCHER = "the same scene: disparities of OpenCV's refined matcher against those of structured light"
 BASES = {
     base.name: base
     for base in (
@@ -208,9 +215,9 @@ BASES = {
         Base("ground_2", _GROUND, forest((-80, -40), (104, 131)), put_scanned),
         Base("ground_3", _GROUND, forest((100, 140), (104, 131)), put_scanned),
         Base("ground_4", _GROUND, forest((-30, 10), (104, 131)), put_scanned),
-        Base("trees", "trunks, twigs and ground of the forest, all zenith angles", forest((140, 170), (40, 131)), put_scanned),
-        Base("rocks", "34 patches of a rock face, coordinates rounded to 6 cm, one half against the other", rocks, put_scanned),
-        Base("light", "motorcycle: disparities by structured light, odd rows against even ones", structured_light, put_matched),
-        Base("matcher", "motorcycle: disparities of the refined matcher against structured light", refined, put_matched),
+        Base("trees", _TREES, forest((140, 170), (40, 131)), put_scanned),
+        Base("rocks", _ROCKS, rocks, put_scanned),
+        Base("light", _LIGHT, structured_light, put_matched),
+        Base("matcher", _MATCHER, refined, put_matched),
     )
 }

@@ -44,6 +44,8 @@ def definitions() -> Iterator[dict[str, str]]:
 def _public(node: ast.stmt, place: str) -> Iterator[dict[str, str]]:
     if not isinstance(node, ast.FunctionDef | ast.ClassDef) or node.name.startswith("_"):
         return
+    if any(ast.unparse(each) == "overload" for each in node.decorator_list):
+        return  # the function below the overloads has the docstring
     yield {"where": f"{place}: {node.name}", "text": f"{_signature(node)}\n{ast.get_docstring(node) or '(no docstring)'}"}
     for inner in node.body if isinstance(node, ast.ClassDef) else ():
         if isinstance(inner, ast.FunctionDef) and not inner.name.startswith("_") and ast.get_docstring(inner):
@@ -71,11 +73,54 @@ def messages() -> Iterator[dict[str, str]]:
         for path in sorted((ROOT / package).rglob("*.py")):
             tree = ast.parse(path.read_text(encoding="utf-8"))
             texts = _constants(tree)
-            for node in ast.walk(tree):
-                if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "InputError" and node.args:
-                    filled = _WithTexts(texts).visit(node)
-                    parts = [ast.unparse(filled.args[0]), *(f"{key.arg}: {ast.unparse(key.value)}" for key in filled.keywords)]
-                    yield {"where": f"{path.relative_to(ROOT)}:{node.lineno}", "text": "; ".join(parts)}
+            for node, function in _errors(tree):
+                given = texts | _given_texts(tree, function) | _local_texts(function, node.lineno)
+                filled = _WithTexts(given).visit(node)
+                parts = [ast.unparse(filled.args[0]), *(f"{key.arg}: {ast.unparse(key.value)}" for key in filled.keywords)]
+                yield {"where": f"{path.relative_to(ROOT)}:{node.lineno}", "text": "; ".join(parts)}
+
+
+def _errors(tree: ast.Module) -> Iterator[tuple[ast.Call, ast.AST]]:
+    """Calls of InputError, each with the innermost function in which it stands."""
+
+    def within(node: ast.AST, function: ast.AST) -> Iterator[tuple[ast.Call, ast.AST]]:
+        for child in ast.iter_child_nodes(node):
+            yield from within(child, child if isinstance(child, ast.FunctionDef) else function)
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "InputError" and node.args:
+            yield node, function
+
+    yield from within(tree, tree)
+
+
+def _local_texts(function: ast.AST, line: int) -> dict[str, ast.expr]:
+    """Return the texts that a function last assigns to names before a line, as users see them in place of the names."""
+    found: dict[str, ast.expr] = {}
+    assigned = [node for node in ast.walk(function) if isinstance(node, ast.Assign) and node.lineno < line]
+    for node in sorted(assigned, key=lambda node: node.lineno) if isinstance(function, ast.FunctionDef) else ():
+        if len(node.targets) == 1 and isinstance(node.targets[0], ast.Name):
+            found[node.targets[0].id] = node.value
+    texts = ast.Constant | ast.JoinedStr | ast.IfExp | ast.BoolOp
+    return {name: value for name, value in found.items() if isinstance(value, texts)}
+
+
+def _given_texts(tree: ast.Module, function: ast.AST) -> dict[str, ast.expr]:
+    """Return the texts that a function gets as arguments: those of its first call in the module, or its defaults."""
+    if not isinstance(function, ast.FunctionDef):
+        return {}
+    every = function.args
+    names = [each.arg for each in every.args]
+    found: dict[str, ast.expr] = dict(zip(names[len(names) - len(every.defaults) :], every.defaults, strict=True))
+    found |= {each.arg: value for each, value in zip(every.kwonlyargs, every.kw_defaults, strict=True) if value is not None}
+    calls = (node for node in ast.walk(tree) if isinstance(node, ast.Call) and _called(node) == function.name)
+    for call in list(calls)[:1]:
+        found |= dict(zip([name for name in names if name not in ("self", "cls")], call.args, strict=False))
+        found |= {key.arg: key.value for key in call.keywords if key.arg}
+    return {name: value for name, value in found.items() if isinstance(value, ast.Constant | ast.JoinedStr)}
+
+
+def _called(call: ast.Call) -> str:
+    """Return the name of the function or method that a call calls."""
+    return str(getattr(call.func, "id", getattr(call.func, "attr", "")))
 
 
 def _constants(tree: ast.Module) -> dict[str, ast.expr]:
@@ -94,6 +139,18 @@ class _WithTexts(ast.NodeTransformer):
 
     def __init__(self, texts: dict[str, ast.expr]) -> None:
         self._texts = texts
+
+    def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.expr:
+        """Join texts that an f-string contains to it; leave its other parts as they are."""
+        values: list[ast.expr] = []
+        for value in node.values:
+            name = value.value if isinstance(value, ast.FormattedValue) else None
+            text = self._texts.get(name.id) if isinstance(name, ast.Name) else None
+            if isinstance(text, ast.JoinedStr):
+                values += text.values
+            else:
+                values.append(ast.Constant(str(text.value)) if isinstance(text, ast.Constant) else value)
+        return ast.JoinedStr(values)
 
     def visit_Name(self, node: ast.Name) -> ast.expr:
         """Replace a name of a constant."""

@@ -149,7 +149,7 @@ def make_blocks(
     size = _table(np.repeat(size[:, None], 3, axis=1) if size.ndim == 1 else size, "sizes", len(place))
     turn = np.zeros_like(place) if rotations_rad is None else _table(rotations_rad, "rotations_rad", len(place))
     if not (size > 0).all():
-        raise InputError(f"got {size.min():g} m", where="sizes", allowed="above 0")
+        raise InputError(f"got {size.min():g} m", where="sizes", allowed="above 0", remedy="give sizes in metres, above 0")
     return solids.make_regular_blocks(place, size, turn, shape, subdivisions)
 
 
@@ -319,7 +319,12 @@ def _table(values: ArrayLike, name: str, rows: int | None = None) -> Any:
     """Return the values as a finite (n, 3) float64 array; raise InputError for other shapes."""
     array = np.asarray(values, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3 or not len(array) or (rows is not None and len(array) != rows):
-        raise InputError(f"have the shape {array.shape}", where=name, allowed=f"({'n' if rows is None else rows}, 3)")
+        raise InputError(
+            f"have the shape {array.shape}",
+            where=name,
+            allowed=f"({'n' if rows is None else rows}, 3)",
+            remedy="give an array of rows x, y, z",
+        )
     if not np.isfinite(array).all():
-        raise InputError("are not all finite", where=name)
+        raise InputError("contains values that are NaN or infinite", where=name, remedy="remove these rows")
     return array

@@ -69,7 +69,7 @@ def configure(
 def check_sensor(sensor: str | None) -> None:
     """Raise InputError if `sensor` is neither None nor the name of a kind of sensor."""
     if sensor not in (None, "stereo", "tls"):
-        raise InputError(f"got {sensor!r:.80}", where="sensor", allowed="'stereo', 'tls'")
+        raise InputError(f"got {sensor!r:.80}", where="sensor", allowed="'stereo', 'tls'", remedy="give one of them")
 
 
 def one_sensor(config: SimulationConfig, sensor: SensorName | None) -> SensorName:
@@ -78,7 +78,9 @@ def one_sensor(config: SimulationConfig, sensor: SensorName | None) -> SensorNam
         return sensor
     names = config.sensor_names()
     if len(names) > 1:
-        raise InputError("the config has both", where="sensor", remedy="give sensor='tls' or sensor='stereo'")
+        raise InputError(
+            "the config contains both sensors, and none was chosen", where="sensor", remedy="give sensor='tls' or sensor='stereo'"
+        )
     return names[0]
 
 

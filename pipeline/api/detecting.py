@@ -38,7 +38,7 @@ def detect(
     *,
     confidence: float | Sequence[float] = run.CONFIDENCES,
     out: Path | str | None = None,
-    unmirrored: bool = False,
+    mirrored: bool = False,
     progress: Show = "auto",
 ) -> Detections:
     """Find fallen blocks in difference maps, as `scarpsim detect` does.
@@ -57,8 +57,8 @@ def detect(
     out : path, optional
         Folder for COCO files, tables, masks and overlays. Default: a temporary folder, which is deleted together with the
         result.
-    unmirrored : bool
-        Show the network only the maps and not their mirror images. This is faster and finds less.
+    mirrored : bool
+        Also show the network the mirror images of the maps. This takes three to four times as long and draws blocks better.
     progress : "auto" or bool
         Whether progress is shown; "auto": in notebooks and on terminals.
 
@@ -74,10 +74,10 @@ def detect(
         places = [_place(each, Path(written), number) for number, each in enumerate(_several(maps), start=1)]
         if model == run.BASELINE:
             with python_progress(progress) as shown:
-                found = run.detect(str(model), places, folder, confidences, True, shown, unmirrored=unmirrored)
+                found = run.detect(str(model), places, folder, confidences, True, shown, mirrored=mirrored)
         else:
             with python_progress(progress) as shown, shown.stage(_WAITING):
-                _in_another_process(str(model), places, folder, confidences, unmirrored=unmirrored)
+                _in_another_process(str(model), places, folder, confidences, mirrored=mirrored)
             found = read_events(folder / f"events_{min(confidences):g}.csv")
     return Detections(folder, tuple(found), min(confidences), kept)
 
@@ -166,10 +166,10 @@ def _place(given: Any, folder: Path, number: int) -> Path:
     return path
 
 
-def _in_another_process(model: str, places: Sequence[Path], out: Path, confidences: Sequence[float], *, unmirrored: bool) -> None:
+def _in_another_process(model: str, places: Sequence[Path], out: Path, confidences: Sequence[float], *, mirrored: bool) -> None:
     """Run `scarpsim detect` as a command, because TensorFlow and the ray tracer's compiler cannot share a process."""
     words = [model, *map(str, places), "--out", str(out), *(f"--confidence={value:g}" for value in confidences), "--quiet"]
-    command = [sys.executable, "-c", _COMMAND, "detect", *words, *["--unmirrored"] * unmirrored]
+    command = [sys.executable, "-c", _COMMAND, "detect", *words, *["--mirrored"] * mirrored]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         message = (

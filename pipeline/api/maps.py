@@ -76,11 +76,16 @@ def raster_of(array: Any, where: str) -> tuple[NDArray[np.float32], Grid]:
     Raises InputError if it has other dimensions than y and x, or pixels that are not square.
     """
     if set(array.dims) != {"y", "x"}:
-        raise InputError(f"has the dimensions {', '.join(map(str, array.dims))}", where=where, allowed="y, x")
+        raise InputError(
+            f"has the dimensions {', '.join(map(str, array.dims))}",
+            where=where,
+            allowed="y, x",
+            remedy="give a two-dimensional map with the dimensions y and x",
+        )
     array = array.sortby("y", ascending=False).sortby("x").transpose("y", "x")
     x, y = (np.asarray(array[name], dtype=np.float64) for name in ("x", "y"))
     if min(len(x), len(y)) < 2:
-        raise InputError(f"has {len(y)} x {len(x)} pixels", where=where, allowed="at least 2 x 2")
+        raise InputError(f"has {len(y)} x {len(x)} pixels", where=where, allowed="at least 2 x 2", remedy="give a larger map")
     steps = np.concatenate([np.diff(x), -np.diff(y)])
     gsd = float(np.median(steps))
     if not (gsd > 0 and np.ptp(steps) <= _SPREAD * gsd):

@@ -24,10 +24,9 @@ from pipeline.formats.measurements.measurement import (
     assembled,
     nominal_pair,
     read_measurement,
-    read_model,
-    sensor_model,
 )
 from pipeline.formats.measurements.measurement import Measurement as Measured
+from pipeline.formats.measurements.model_file import read_model, sensor_model
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points.points import read_points
 from pipeline.gap.naming import workflow
@@ -99,12 +98,21 @@ def measure(
     if given is not None:
         return Measurement(read_measurement(Path(given)))
     if reference is None or points is None:
-        raise InputError("got neither a folder nor both reference and points", where="measure", remedy="give one of the two")
+        raise InputError(
+            "got neither a folder nor both reference and points",
+            where="measure",
+            remedy="give the folder of a measurement, or both reference= and points=",
+        )
     values = {"sensor": sensor, "reference": "reference", "points": "points", "model": "model", **plain(keys)}
     config = parse(MeasurementConfig, values, "measure")
     pair = nominal_pair(Path(cameras)) if isinstance(cameras, str | os.PathLike) else cameras
     if sensor == "stereo" and not isinstance(pair, CameraPair | None):
-        raise InputError(f"got {type(pair).__name__}", where="cameras", allowed="a CameraPair, a file, or None if unknown")
+        raise InputError(
+            f"got {type(pair).__name__}",
+            where="cameras",
+            allowed="a CameraPair, a file, or None if unknown",
+            remedy="give one of them as cameras=",
+        )
     mesh, notes = (reference, ()) if isinstance(reference, TriangleMesh) else read_reference(Path(reference))
     material = Material(mesh, _clouds(points), _model(model, sensor), pair if sensor == "stereo" else None, notes)
     return Measurement(assembled(config, material, "reference", "measure"))
@@ -341,7 +349,9 @@ def _clouds(points: Any) -> dict[str, PointCloud]:
             continue
         array = np.asarray(each, dtype=np.float64)
         if array.ndim != 2 or array.shape[1] != 3 or not len(array):
-            raise InputError(f"have the shape {array.shape}", where=name, allowed="(n, 3)")
+            raise InputError(
+                f"have the shape {array.shape}", where=name, allowed="(n, 3)", remedy="give an array of rows x, y, z"
+            )
         found[name] = PointCloud(array)
     return found
 

@@ -44,11 +44,22 @@ class Mesh(TriangleMesh):
         corners, triangles = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
         for name, array in (("vertices", corners), ("faces", triangles)):
             if array.ndim != 2 or array.shape[1] != 3 or not len(array):
-                raise InputError(f"have the shape {array.shape}", where=name, allowed="(n, 3)")
+                raise InputError(
+                    f"have the shape {array.shape}", where=name, allowed="(n, 3)", remedy="give an array with three columns"
+                )
         if triangles.dtype.kind not in "iu" or triangles.min() < 0 or triangles.max() >= len(corners):
-            raise InputError("are not all vertex indices", where="faces", allowed=f"whole numbers from 0 to {len(corners) - 1}")
+            raise InputError(
+                "are not all vertex indices",
+                where="faces",
+                allowed=f"whole numbers from 0 to {len(corners) - 1}",
+                remedy="correct the faces; vertices are counted from 0",
+            )
         if not np.isfinite(corners).all():
-            raise InputError("are not all finite", where="vertices")
+            raise InputError(
+                "contain values that are NaN or infinite",
+                where="vertices",
+                remedy="remove these vertices and the faces that use them",
+            )
         return cls(corners, triangles.astype(np.int32))
 
     @classmethod

@@ -16,7 +16,6 @@ from pipeline.api.pictures import Picture, html_table
 from pipeline.api.tables import frame
 from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.monitoring.options import MonitorOptions
-from pipeline.monitoring.outlines import in_survey
 from pipeline.monitoring.products import COLUMNS, Result
 from pipeline.monitoring.report import headline
 from pipeline.monitoring.run import monitor_paths
@@ -58,8 +57,8 @@ def monitor(
     progress : "auto" or bool
         Whether progress is shown; "auto": in notebooks and on terminals.
     **options
-        Fields of `MonitorOptions`: position, direction, gsd_m, stable, unit, columns, scanner, model, photographs, detector,
-        seed.
+        Fields of `MonitorOptions`: position, direction, views, gsd_m, stable, unit, columns, scanner, model, photographs,
+        detector, seed.
 
     Returns
     -------
@@ -74,7 +73,9 @@ def monitor(
     unknown = sorted(set(options) - set(MonitorOptions.__dataclass_fields__))
     if unknown:
         allowed = ", ".join(MonitorOptions.__dataclass_fields__)
-        raise InputError(f"unknown option '{unknown[0]}'", where="monitor", allowed=allowed)
+        raise InputError(
+            f"unknown option '{unknown[0]}'", where="monitor", allowed=allowed, remedy="correct the name, or leave it out"
+        )
     values: dict[str, Any] = dict(options)
     for name in _VECTORS:
         if values.get(name) is not None:
@@ -113,7 +114,7 @@ class Monitoring:
     def differences(self) -> xarray.DataArray:
         """Difference maps, (epoch, y, x), m: reference minus epoch along the wall's normal.
 
-        Missing rock is positive; pixels without data are NaN.
+        Missing rock is positive; pixels without data are NaN. Of several views these are the maps of the first.
         """
         xarray = library("xarray")
         maps = [self._map("difference", epoch.number) for epoch in self.result.epochs]
@@ -123,12 +124,9 @@ class Monitoring:
     def events(self) -> geopandas.GeoDataFrame:
         """One row per event and epoch, with the columns of events.csv. The geometry is the outline in survey coordinates."""
         geopandas, shapely = library("geopandas"), library("shapely")
-        site = self.result.site
-        heights = site.reference.raster.height
-        regions = [region for epoch in self.result.epochs for region in epoch.regions]
-        rings = [in_survey(region, site.grid, heights, site.frame) for region in regions]
-        outlines = [shapely.MultiPolygon([shapely.Polygon(ring) for ring in each]) for each in rings]
-        return geopandas.GeoDataFrame(frame(self.result.rows(), list(COLUMNS)), geometry=outlines, crs=site.crs or None)
+        outlines = [shapely.MultiPolygon([shapely.Polygon(ring) for ring in each]) for each in self.result.outlines()]
+        crs = self.result.site.crs or None
+        return geopandas.GeoDataFrame(frame(self.result.rows(), list(COLUMNS)), geometry=outlines, crs=crs)
 
     @property
     def registration(self) -> dict[int, dict[str, Any]]:
@@ -140,7 +138,12 @@ class Monitoring:
         number = self.result.epochs[-1].number if epoch is None else epoch
         path = self.folder / f"map_{number:03d}.png"
         if not path.is_file():
-            raise InputError(f"there is no epoch {number}", where="plot", allowed=f"1 to {len(self.result.epochs)}")
+            raise InputError(
+                f"there is no epoch {number}",
+                where="plot",
+                allowed=f"1 to {len(self.result.epochs)}",
+                remedy="choose one of these epochs",
+            )
         return Picture(path.read_bytes())
 
     def summary(self) -> str:

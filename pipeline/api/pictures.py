@@ -53,7 +53,9 @@ class Picture:
 def pick(pictures: Mapping[str, Any], kind: str | None, where: str) -> Any:
     """Return the picture called `kind`, or the first if `kind` is None; raise InputError with the available names otherwise."""
     if not pictures:
-        raise InputError("the result has no pictures to plot", where=where)
+        raise InputError(
+            "the result has no pictures to plot", where=where, remedy="make the result again; its report needs pictures too"
+        )
     if kind is None:
         return next(iter(pictures.values()))
     if kind not in pictures:

@@ -15,7 +15,7 @@ from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points.laz import EXACT_INTENSITY
 from pipeline.formats.points.pcd import write_pcd
 from pipeline.formats.points.xyz import write_xyz
-from pipeline.run.products import write_cloud
+from pipeline.run.clouds import write_cloud
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 
@@ -67,7 +67,12 @@ class Points(np.ndarray[Any, Any]):
         elif path.suffix in (".xyz", ".txt"):
             write_xyz(path, cloud)
         else:
-            raise InputError(f"unknown format '{path.suffix}'", where=str(path), allowed=".laz .copc.laz .las .ply .pcd .xyz")
+            raise InputError(
+                f"unknown format '{path.suffix}'",
+                where=str(path),
+                allowed=".laz .copc.laz .las .ply .pcd .xyz",
+                remedy="choose a file name with one of these endings",
+            )
         return path
 
     def to_open3d(self) -> Any:
@@ -90,7 +95,12 @@ class Points(np.ndarray[Any, Any]):
     def plot(self, channel: str = "z") -> Picture:
         """Return a plot of the points over x and y, coloured by a channel. At most 100,000 points are drawn."""
         if channel not in (self.dtype.names or ()):
-            raise InputError(f"there is no channel '{channel}'", where="points", allowed=", ".join(self.dtype.names or ()))
+            raise InputError(
+                f"there is no channel '{channel}'",
+                where="points",
+                allowed=", ".join(self.dtype.names or ()),
+                remedy="choose one of these channels",
+            )
         return scatter(self.xyz[:, :2], np.asarray(self[channel], dtype=np.float64), channel)
 
     def _repr_html_(self) -> str:

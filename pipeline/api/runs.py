@@ -184,7 +184,8 @@ class Run:
     def _repr_html_(self) -> str:
         rows: dict[str, Any] = {"sensor": self.sensor, "seed": self.record.get("seed"), "epochs": len(self.epochs)}
         rows |= {f"epoch {each.number}": each.summary() for each in self.epochs[:5]}
-        picture = self.plot() if len(self) > 1 else None
+        pictured = [each for each in self.epochs if each.pictured]
+        picture = pictured[0].plot() if pictured else None
         return html_table(f"Run {self.folder}", {**rows, "report": self.report}, picture)
 
 
@@ -214,9 +215,17 @@ class Epoch:
         if not path.is_file():
             kinds = [name for name in PICTURES if (self.run.folder / f"{name}_{self.number:03d}{suffix}").is_file()]
             raise InputError(
-                f"epoch {self.number} has no '{kind}'", where=str(self.run.folder), allowed=", ".join(kinds) or "none"
+                f"epoch {self.number} has no '{kind}'",
+                where=str(self.run.folder),
+                allowed=", ".join(kinds) or "none",
+                remedy="choose one of these products, or simulate with it (`products` in the config)",
             )
         return path
+
+    @property
+    def pictured(self) -> bool:
+        """Whether it has figures: of a series, only the epochs have in which rocks fell."""
+        return (self.run.folder / f"difference_{self.number:03d}.png").is_file()
 
     @property
     def record(self) -> dict[str, Any]:
@@ -260,7 +269,11 @@ class Epoch:
         """Statistics of the differences outside the blocks, SI units, and the RMS of the registration."""
         outside = self.record.get("statistics", {}).get("outside_blocks")
         if outside is None:
-            raise InputError(f"epoch {self.number} has no statistics", where=str(self.run.folder / RUN_FILE))
+            raise InputError(
+                f"epoch {self.number} has no statistics",
+                where=str(self.run.folder / RUN_FILE),
+                remedy="continue the run with simulate(..., resume=True)",
+            )
         registration = self.record.get("registration")
         return {"epoch": self.number, **outside, "registration_rms_m": registration and registration.get("rms_m")}
 
@@ -294,7 +307,7 @@ class Epoch:
     def _repr_html_(self) -> str:
         title = f"Epoch {self.number} of {self.run.folder}"
         rows = {"points": f"{self.record.get('points', 0):,}"} | ({"": self.summary()} if self.number else {})
-        return html_table(title, rows, self.plot())
+        return html_table(title, rows, self.plot() if self.number == 0 or self.pictured else None)
 
 
 def _blocks(epochs: list[Epoch]) -> geopandas.GeoDataFrame:

@@ -35,7 +35,14 @@ from sensors.stereo.stereo_pair import StereoPair
 
 _ALIKE = 0.9
 """Absolute correlation above which two parameters count as inseparable."""
-STAGES = {"read": 1.0, "statistics": 1.0, "prepare": 2.0, "round 1": 20.0, "last round": 100.0, "compare": 2.0}
+STAGES = {
+    "read maps": 1.0,
+    "describe noise": 1.0,
+    "prepare simulation": 2.0,
+    "search, round 1": 20.0,
+    "search, last round": 100.0,
+    "compare searches": 2.0,
+}
 """Expected duration of each stage, s, for the progress display; the search corrects them when it knows how many maps it needs."""
 _GREEDY_OBSERVATIONS = 300
 """Observations that the greedy search is expected to simulate, for the progress display."""
@@ -60,7 +67,7 @@ class OrientationPatterns:
     cosines: FloatArray
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content as `calibration.json` holds it."""
+        """Return the fields as a dictionary, as `calibration.json` holds them."""
         return {"names": self.names, "rms_m": self.size_m, "cosines": self.cosines}
 
 
@@ -177,8 +184,8 @@ def calibrate(
         If the maps or the config cannot be used.
     """
     began, random = time.perf_counter(), KeyedRandom(config.seed)
-    progress.plan(STAGES | ({"compare": OBSERVATION_S * _GREEDY_OBSERVATIONS} if with_greedy else {}))
-    with progress.stage("read"):
+    progress.plan(STAGES | ({"compare searches": OBSERVATION_S * _GREEDY_OBSERVATIONS} if with_greedy else {}))
+    with progress.stage("read maps"):
         inputs = read_inputs(paths, config, sensor, random)
     return calibrate_inputs(config, sensor, inputs, progress, with_greedy=with_greedy, began=began)
 
@@ -212,12 +219,12 @@ def calibrate_inputs(
     random, settings = KeyedRandom(config.seed).child("calibrate"), config.calibration
     windows = inputs.windows(config)
     measured = np.stack([windows.cut(values) for values in inputs.maps]).astype(np.float64)
-    with progress.stage("statistics"):
+    with progress.stage("describe noise"):
         epochs = tuple(
             epoch_noise(name, inputs.on_stable(number), measured[number], inputs.grid.gsd, random.child("normality", number))
             for number, name in enumerate(inputs.names)
         )
-    with progress.stage("prepare"):
+    with progress.stage("prepare simulation"):
         error = inputs.reference_error
         simulator = WindowSimulator(config, inputs.site, windows, of_points=inputs.of_points, reference_error=error)
         summary = SummaryStatistics(windows, simulator.noiseless_heights, _direction_to_sensor(inputs.site.sensor, windows))
@@ -231,7 +238,7 @@ def calibrate_inputs(
     started, before = time.perf_counter(), simulator.observations
     found = search.run(observed, settings.simulations, settings.confidence)
     rate = (simulator.observations - before) / (time.perf_counter() - started)
-    with progress.stage("compare"):
+    with progress.stage("compare searches"):
         baseline = _baseline(search, found, summary, observed, random) if with_greedy else None
         patterns = _patterns(simulator, inputs.site.sensor) if isinstance(inputs.site.sensor, StereoPair) else None
         predicted = simulator.maps(fitted.model(np.exp(found.x)), 1, random.child("predicted"))[0]

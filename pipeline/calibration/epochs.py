@@ -43,7 +43,7 @@ class EpochNoise:
     independent: float
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content as `calibration.json` holds it."""
+        """Return the fields as a dictionary, as `calibration.json` holds them."""
         return {
             "name": self.name,
             **self.size.to_dict(),
@@ -68,7 +68,7 @@ class Trend:
     p_value: float | None
 
     def to_dict(self) -> dict[str, float | None]:
-        """Return the content as `calibration.json` holds it."""
+        """Return the fields as a dictionary, as `calibration.json` holds them."""
         return {"per_epoch_m": self.per_epoch_m, "p_value": self.p_value}
 
 

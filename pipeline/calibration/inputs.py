@@ -65,7 +65,7 @@ class CalibrationInputs:
     reference_error: ReferenceError | None = None
 
     def windows(self, config: SimulationConfig) -> Windows:
-        """Choose the windows in which measured and simulated maps are compared."""
+        """Choose the windows of the wall in which measured and simulated maps are compared, by the config's number and size."""
         return choose_windows(self.stable, self.grid, config.calibration)
 
     def on_stable(self, number: int) -> NDArray[np.floating]:
@@ -110,7 +110,9 @@ def sensor_of(paths: Sequence[Path], config: SimulationConfig, wanted: SensorNam
 def _matching_sensor(found: SensorName, wanted: SensorName | None, path: Path) -> SensorName:
     """Return the sensor found in the input, or raise InputError if the user named the other one."""
     if wanted not in (None, found):
-        raise InputError(f"measured by {found}, but --sensor is {wanted}", where=str(path), remedy="leave --sensor out")
+        raise InputError(
+            f"the maps were measured by {found}, but --sensor is {wanted}", where=str(path), remedy="leave --sensor out"
+        )
     return found
 
 

@@ -89,7 +89,7 @@ class Simulations:
         return Simulations(np.concatenate([self.x, other.x]), np.concatenate([self.s, other.s]))
 
     def at(self, rows: NDArray[Any]) -> Simulations:
-        """Return the simulations of some rows, given as indices or a mask."""
+        """Return a subset of the simulations, given as indices or a mask."""
         return Simulations(self.x[rows], self.s[rows])
 
 
@@ -132,7 +132,7 @@ class ResponseSurface:
         return cls(centre, scale, coefficients, covariance, linalg.solve_triangular(factor, np.eye(len(factor)), lower=True))
 
     def mean(self, x: FloatArray) -> FloatArray:
-        """Return the (m,) expected statistics at logarithmic parameters (k,)."""
+        """Return the (m,) summary statistics that are expected for logarithmic noise parameters (k,)."""
         return _design(((x - self.centre) / self.scale)[None])[0] @ self.coefficients
 
     def misfit(self, x: FloatArray, observed: FloatArray) -> FloatArray:
@@ -150,7 +150,7 @@ class ResponseSurface:
         return self.whitening @ (observed - self.mean(x))
 
     def jacobian(self, x: FloatArray) -> FloatArray:
-        """Return the (m, k) derivatives of `misfit` at logarithmic parameters (k,)."""
+        """Return the (m, k) derivatives of `misfit` by the logarithmic noise parameters, at (k,) values of these."""
         return -self.whitening @ (_gradient((x - self.centre) / self.scale) @ self.coefficients).T / self.scale
 
     def minimum(self, observed: FloatArray, start: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
@@ -266,11 +266,13 @@ class NoiseSearch:
     def _run_once(self, observed: FloatArray, simulations: int, confidence: float, density: int) -> SearchResult:
         """Approach the minimum, simulate the last round around it, and repeat that round while the minimum lies outside of it."""
         last = OBSERVATION_S * (self.epochs + 1) * simulations
-        self.progress.plan({f"round {number}": 2 * OBSERVATION_S * self._round_size for number in range(2, _APPROACHES + 1)})
-        self.progress.plan({"round 1": 2 * OBSERVATION_S * self._first_size(density), "last round": last})
+        self.progress.plan(
+            {f"search, round {number}": 2 * OBSERVATION_S * self._round_size for number in range(2, _APPROACHES + 1)}
+        )
+        self.progress.plan({"search, round 1": 2 * OBSERVATION_S * self._first_size(density), "search, last round": last})
         x, covariance, history = self._approach(observed, density)
         for attempt in range(1 + _MORE_ROUNDS):
-            stage = f"last round{' again' * attempt}"
+            stage = f"search, last round{' again' * attempt}"
             self.progress.plan({stage: last})
             with self.progress.stage(stage):
                 sample = self._sample(self._around(x, covariance, simulations), self.epochs)
@@ -304,7 +306,7 @@ class NoiseSearch:
         sample = Simulations(np.empty((0, len(self.low))), np.empty((0, len(observed))))
         points, history = self.low + sobol * (self.high - self.low), []
         for number in range(_APPROACHES):
-            with self.progress.stage(f"round {number + 1}"):
+            with self.progress.stage(f"search, round {number + 1}"):
                 sample = sample.with_more(self._sample(points, 1))
             near = sample.at(np.argsort(_distance(sample.s, observed))[:size])
             surface = ResponseSurface.fit(near)

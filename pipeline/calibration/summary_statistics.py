@@ -63,7 +63,7 @@ class SummaryStatistics:
         )  # fmt: skip
 
     def compute(self, maps: FloatArray) -> FloatArray:
-        """Compute the statistics of e difference maps together.
+        """Compute the statistics of e difference maps together: size, variogram and spatial pattern of the noise.
 
         Parameters
         ----------
@@ -71,7 +71,7 @@ class SummaryStatistics:
 
         Returns
         -------
-        (m,) logarithms of lengths in m.
+        (m,) logarithms of lengths in m, in the order of `names`.
         """
         middle = np.nanmedian(maps, axis=(2, 3))
         rest = maps - middle[..., None, None]

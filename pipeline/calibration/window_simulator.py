@@ -93,7 +93,7 @@ class WindowSimulator:
         self.sensor = _supported_sensor(config, site)
         self.config, self.site, self.windows, self.of_points = config, site, windows, of_points
         self.reference_error = reference_error
-        self.caster = RayCaster(site.mesh)
+        self.caster = site.caster_of(site.mesh)
         self.noiseless_model = _without_noise(self.sensor.model)
         self.observations = 0
         whole = _sensor_for_cells(self.sensor, self.noiseless_model).observe(self.caster, KeyedRandom(0))

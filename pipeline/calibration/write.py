@@ -20,7 +20,6 @@ from pipeline.report.provenance import versions
 from scene.common.keyed_random import KeyedRandom
 from scene.common.yaml_text import yaml_line
 from scene.geometry.mesh import FloatArray
-from scene.ray_casting.raycast import RayCaster
 
 MODEL_FILE, RECORD_FILE, REPORT_FILE = "calibrated.yaml", "calibration.json", "report.html"
 
@@ -71,7 +70,7 @@ def _whole_map(config: SimulationConfig, result: CalibrationResult) -> FloatArra
     """Simulate one map of the whole wall on the measured maps' grid, m; NaN where those have no data."""
     site = result.simulated_site()
     random = KeyedRandom(config.seed).child("calibrate", "whole")
-    values = noise_map(config, site, site, RayCaster(site.mesh), random, result.inputs.grid)
+    values = noise_map(config, site, site, site.caster_of(site.mesh), random, result.inputs.grid)
     return np.where(np.isnan(result.inputs.maps[-1]), np.float32(np.nan), values)
 
 

@@ -62,7 +62,12 @@ def raster_grid(bounds: FloatArray, config: DifferenceConfig) -> Grid:
     finest, coarsest = np.sqrt(width * height / most), min(width, height)
     allowed = f"{_rounded_up(finest):g} to {coarsest:.3g} m for a surface of {width:.1f} x {height:.1f} m"
     if config.gsd_m > coarsest:
-        raise InputError(f"a pixel of {config.gsd_m:g} m is larger than the surface", where="difference.gsd_m", allowed=allowed)
+        raise InputError(
+            f"a pixel of {config.gsd_m:g} m is larger than the surface",
+            where="difference.gsd_m",
+            allowed=allowed,
+            remedy="choose a smaller gsd_m",
+        )
     pixels = width * height / config.gsd_m**2
     if pixels > most:
         raise InputError(
@@ -70,6 +75,7 @@ def raster_grid(bounds: FloatArray, config: DifferenceConfig) -> Grid:
             f"{available / 1e9:.1f} GB are free",
             where="difference.gsd_m",
             allowed=allowed,
+            remedy="choose a larger gsd_m",
         )
     return Grid.over(bounds, config.gsd_m)
 
@@ -84,7 +90,7 @@ def surface_raster(mesh: TriangleMesh, grid: Grid) -> SurfaceRaster:
 
 
 def cast_raster(caster: RayCaster, grid: Grid) -> SurfaceRaster:
-    """Do the same as `surface_raster` for a mesh that is already prepared for ray casting."""
+    """Rasterise a mesh (wall frame) that is already prepared for ray casting, as `surface_raster` does."""
     hits, point = caster.look_down(grid)
     z = mi.Float32(dr.select(hits.valid, point.z, np.nan))
     if caster.mesh.face_block is not None:
@@ -103,7 +109,11 @@ def difference(reference: SurfaceRaster, epoch: SurfaceRaster) -> NDArray[np.flo
     It is positive where rock is missing, negative where it was added, and NaN without data.
     """
     if reference.grid != epoch.grid:
-        raise InputError(f"{epoch.grid} is not the reference's {reference.grid}", where="difference")
+        raise InputError(
+            f"{epoch.grid} is not the reference's {reference.grid}",
+            where="difference",
+            remedy="make both rasters on the same grid",
+        )
     return reference.heights - epoch.heights
 
 

@@ -116,7 +116,11 @@ def m3c2(reference: FloatArray, epoch: FloatArray, raster: SurfaceRaster, block:
     grid, every = core_grid(raster.grid, config.core_step_px)
     heights, labels = (full[every, every][: grid.height, : grid.width] for full in (raster.heights, block))
     if heights.shape != grid.shape:
-        raise InputError("leaves no core point in the difference map", where="m3c2.core_step_px", remedy="lower it")
+        raise InputError(
+            "is so large that no core point (place where M3C2 is computed) lies in the difference map",
+            where="m3c2.core_step_px",
+            remedy="lower it",
+        )
     place = np.flatnonzero(np.isfinite(heights))
     row, column = np.divmod(place, grid.width)
     offset = (config.core_step_px // 2 + 0.5) * raster.grid.gsd  # of the selected pixel's centre from its cell's corner

@@ -84,12 +84,16 @@ def tiles(values: NDArray[np.float32], block: IntArray, grid: Grid, config: Tile
         If the shapes differ, or for more than MOST_TILES.
     """
     if not values.shape == block.shape == grid.shape:
-        raise InputError(f"raster {values.shape}, labels {block.shape} and grid {grid.shape} differ in shape", where="tiles")
+        raise InputError(
+            f"raster {values.shape}, labels {block.shape} and grid {grid.shape} differ in shape",
+            where="tiles",
+            remedy="give arrays of the shape of the grid",
+        )
     size = config.size_px
     count = len(tile_starts(grid.height, config)) * len(tile_starts(grid.width, config))
     if count > MOST_TILES:
         raise InputError(
-            f"{count:,} tiles of a map of {grid.width} x {grid.height} px",
+            f"the config cuts a map of {grid.width} x {grid.height} px into {count:,} tiles",
             where="tiles",
             allowed=f"up to {MOST_TILES:,}",
             remedy="raise size_px or lower overlap_px",

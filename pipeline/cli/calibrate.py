@@ -15,7 +15,7 @@ EXAMPLE = """  scarpsim calibrate my_measurement --out calibration
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim calibrate` on its parser."""
     parser.add_argument(
         "measured",
         type=Path,
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Fit the noise and write the report."""
+    """Fit the noise of a sensor model to measured epochs and write the report."""
     from pipeline.calibration.calibrate import calibrate
     from pipeline.calibration.inputs import config_of, sensor_of
     from pipeline.calibration.report import summary

@@ -17,7 +17,7 @@ MOST_EPOCHS = 999
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim compare` on its parser."""
     parser.add_argument(
         "configs",
         nargs="+",
@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Simulate and compare the sensors and write the report."""
+    """Simulate and compare several sensors on the same wall and write the report."""
     from pipeline.comparison.comparison import compare_sensors
     from pipeline.comparison.report import COMPARISON_FILE, summary, write_comparison
     from pipeline.comparison.sensor_setups import sensor_setups

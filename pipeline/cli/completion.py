@@ -17,7 +17,7 @@ _SHELLS, _SCRIPTS = ("bash", "zsh", "fish"), ("scarpsim", "simulate")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim completion` on its parser."""
     parser.add_argument("shell", type=one_of(*_SHELLS), metavar="|".join(_SHELLS), help="your shell")
     parser.add_argument(
         "--script",
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Return the completion script."""
+    """Return the script that completes commands in a shell."""
     import shtab
 
     from pipeline.cli.main import COMMANDS, command_parser

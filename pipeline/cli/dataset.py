@@ -26,7 +26,7 @@ _DEFAULT_SPLIT_KEYS = "sensor,noise,size"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim dataset` on its parser."""
     parser.add_argument(
         "words",
         nargs="+",
@@ -135,7 +135,11 @@ def _document(summary: DatasetSummary) -> dict[str, Any]:
 def _single_folder(folders: list[str], action: str) -> Path:
     """Return the only folder in a list; raise InputError if there are none or several."""
     if len(folders) != 1:
-        raise InputError(f"takes one folder, got {len(folders)}", where=f"scarpsim dataset {action}")
+        raise InputError(
+            f"takes one folder, got {len(folders)}",
+            where=f"scarpsim dataset {action}",
+            remedy="give one folder, and run the command once for each",
+        )
     return Path(folders[0])
 
 

@@ -17,7 +17,7 @@ EXAMPLE = """  scarpsim detect default runs/my_run --out found
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim detect` on its parser."""
     parser.add_argument(
         "model",
         metavar="MODEL",
@@ -39,16 +39,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="smallest score to accept; may be given several times (default: 0.9 0.95 0.99)",
     )
     parser.add_argument(
-        "--unmirrored",
+        "--mirrored",
         action="store_true",
-        help="do not also search mirror images of the maps; with 'default' three to four times as fast, but finds less",
+        help="also search mirror images of the maps: takes three to four times as long and draws blocks better",
     )
     parser.add_argument("--no-pictures", action="store_true", help="write neither overlays nor mask rasters")
     add_output_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Find the blocks and write masks, tables and pictures."""
+    """Find fallen blocks in difference maps and write masks, tables and pictures."""
     from pipeline.cli.train import load_keras
     from pipeline.detection.products.run import BASELINE, CONFIDENCES, detect, sorted_confidences
     from pipeline.formats.files.atomic import check_place, new_folder
@@ -61,7 +61,9 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
         from pipeline.detection.inference.weights import check_detector
         from pipeline.detection.products.run import detector_folder, find_inputs
 
-        check_detector(detector_folder(arguments.model))  # report mistakes before TensorFlow takes its time to load
+        check_detector(
+            detector_folder(arguments.model), mirrored=arguments.mirrored
+        )  # report mistakes before TensorFlow takes its time to load
         find_inputs(arguments.inputs)
         load_keras(quiet=arguments.quiet)
     with shown_progress(quiet=arguments.quiet) as progress:
@@ -72,7 +74,7 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
             confidences,
             not arguments.no_pictures,
             progress,
-            unmirrored=arguments.unmirrored,
+            mirrored=arguments.mirrored,
         )
     volume = sum(item.volume_m3 for item in found)
     told = f"{counted(len(found), 'block')} with a score of {min(confidences):g} or more, {volume:.3g} m³"

@@ -79,7 +79,7 @@ class Finding:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim doctor` on its parser."""
     add_output_options(parser)
 
 

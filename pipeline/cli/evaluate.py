@@ -18,7 +18,7 @@ EXAMPLE = """  scarpsim evaluate my_dataset/test/annotations.json found/detectio
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim evaluate` on its parser."""
     parser.add_argument("truth", type=Path, metavar="TRUTH", help="COCO annotations, or a folder with annotations.json")
     parser.add_argument("predictions", type=Path, metavar="PREDICTIONS", help="COCO detections with scores")
     parser.add_argument(
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Score the detections and print the tables."""
+    """Score detections against annotations and print the tables."""
     from pipeline.detection.products.run import CONFIDENCES, sorted_confidences
     from pipeline.detection.products.score_files import as_text, assess, write
     from pipeline.formats.files.atomic import check_place

@@ -25,7 +25,7 @@ FORMS = (*_SUFFIXES, *_SETS, "package")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim export` on its parser."""
     sets = " and ".join(_SETS)
     parser.add_argument("folder", type=Path, metavar="FOLDER", help=f"a run; for {sets} a data set; for package any result")
     parser.add_argument(
@@ -77,7 +77,9 @@ def _check_options(arguments: argparse.Namespace) -> None:
             raise InputError(f"works only with {', '.join(forms)}", where=f"--{option.replace('_', '-')}", remedy="leave it out")
     suffix = _SUFFIXES.get(arguments.form)
     if suffix and arguments.out is not None and not arguments.out.name.lower().endswith(suffix):
-        raise InputError(f"got '{arguments.out.name}'", where="--out", allowed=suffix)
+        raise InputError(
+            f"got '{arguments.out.name}'", where="--out", allowed=suffix, remedy="choose a file name with this ending"
+        )
 
 
 def _export_data_set(arguments: argparse.Namespace) -> CommandOutput:
@@ -106,7 +108,12 @@ def _export_run(arguments: argparse.Namespace) -> CommandOutput:
 
     run, form, number = ExportedRun(arguments.folder), arguments.form, 1 if arguments.epoch is None else arguments.epoch
     if number > run.last or (number == 0 and form == "gltf"):
-        raise InputError(f"there is no epoch {number}", where="--epoch", allowed=f"{int(form == 'gltf')} to {run.last}")
+        raise InputError(
+            f"there is no epoch {number}",
+            where="--epoch",
+            allowed=f"{int(form == 'gltf')} to {run.last}",
+            remedy="choose one of these epochs",
+        )
     path = arguments.out or arguments.folder / f"{form}{'' if form == 'epochs' else f'_{number:03d}'}{_SUFFIXES[form]}"
     with shown_progress(quiet=arguments.quiet) as progress:
         _save(form, run, number, path, arguments.width or 1280, progress)
@@ -123,7 +130,7 @@ def _save(form: str, run: Any, number: int, path: Path, width: int, progress: An
         return
     if form == "copc":
         from pipeline.formats.points.laz import LazHeader
-        from pipeline.run.products import write_cloud
+        from pipeline.run.clouds import write_cloud
 
         with progress.stage("points"):
             cloud, wkt = run.survey_points(number)

@@ -22,7 +22,7 @@ EXAMPLE = """  scarpsim gap my_measurement --out diagnosis
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim gap` on its parser."""
     parser.add_argument(
         "measurement",
         nargs="+",
@@ -120,7 +120,12 @@ def _identifiability(arguments: argparse.Namespace, out: Path) -> CommandOutput:
     from pipeline.gap.survey.load_surveys import load_surveys
 
     if len(arguments.measurement) > 1:
-        raise InputError(f"got {len(arguments.measurement)} inputs", where="--identifiability", allowed="one")
+        raise InputError(
+            f"got {len(arguments.measurement)} inputs",
+            where="--identifiability",
+            allowed="one",
+            remedy="give one measurement or config",
+        )
     wanted = load_surveys(arguments.measurement[0], arguments.overrides, arguments.sensor)
     found = [identifiability(survey, arguments.reference_error) for survey in wanted]
     report = write_identifiability(out, found)

@@ -20,7 +20,7 @@ MOST_OFFSET_M = 100.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim icp-study` on its parser."""
     parser.add_argument(
         "source",
         type=Path,
@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Run the study and write the report."""
+    """Study the settings of the registration and write the report."""
     from pipeline.config.bundled import config_path
     from pipeline.config.simulation import load_config
     from pipeline.formats.files.atomic import empty_folder, new_folder
@@ -71,7 +71,12 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
     from scene.common.keyed_random import KeyedRandom
 
     if not 0 <= arguments.offset_m <= MOST_OFFSET_M:
-        raise InputError(f"got {arguments.offset_m:g}", where="--offset-m", allowed=f"0 to {MOST_OFFSET_M:g} m")
+        raise InputError(
+            f"got {arguments.offset_m:g}",
+            where="--offset-m",
+            allowed=f"0 to {MOST_OFFSET_M:g} m",
+            remedy="give a length in metres",
+        )
     out = empty_folder(arguments.out or new_folder(Path("runs"), "icp_study"))
     with shown_progress(quiet=arguments.quiet) as progress:
         if arguments.source.is_dir():

@@ -19,7 +19,7 @@ EXAMPLE = """  scarpsim init --site glendale --scanner riegl_vz400i --out my_sit
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim init` on its parser."""
     parser.add_argument("--site", metavar="NAME", help="start from a bundled site, such as glendale (default: the demo)")
     words = "take the wall from this mesh file, or from the several that make up the scene, in survey coordinates"
     parser.add_argument("--mesh", type=Path, metavar="FILE", nargs="+", help=words)
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Write the config and its JSON schema."""
+    """Write a config to start from and its JSON schema."""
     out = arguments.out
     if arguments.dataset and (arguments.site or arguments.scanner or arguments.mesh or arguments.cameras):
         raise InputError(

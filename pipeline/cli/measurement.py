@@ -26,7 +26,7 @@ EXAMPLE = """  scarpsim measurement scan.e57 --reference wall.ply --scanner rieg
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim measurement` on its parser."""
     parser.add_argument(
         "scans",
         nargs="+",

@@ -22,7 +22,7 @@ EXAMPLE = """  scarpsim monitor march.laz april.laz --out april
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim monitor` on its parser."""
     parser.add_argument(
         "epochs",
         nargs="+",
@@ -43,6 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=comma_separated_numbers(3),
         metavar="X,Y,Z",
         help="measure change along it, towards the sensor (default: mean plane)",
+    )
+    parser.add_argument(
+        "--views",
+        type=one_of(*map(str, range(1, 7))),
+        metavar="N",
+        help="number of parts of the wall with maps of their own (default: as its corners and overhangs need)",
     )
     parser.add_argument("--scanner", metavar="PRESET", help="also predict the level of detection of this scanner")
     parser.add_argument("--model", type=Path, metavar="FILE", help="sensor model (model.yaml) instead of --scanner")
@@ -81,7 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Compare the epochs and write maps, events and report."""
+    """Compare real epochs with the first one and write maps, events and report."""
     from pipeline.monitoring.follow import follow
     from pipeline.monitoring.report import headline
     from pipeline.monitoring.run import monitor_paths
@@ -115,6 +121,7 @@ def _options(arguments: argparse.Namespace) -> MonitorOptions:
     return MonitorOptions(
         position=None if arguments.position is None else np.array(arguments.position),
         direction=None if arguments.direction is None else np.array(arguments.direction),
+        views=None if arguments.views is None else int(arguments.views),
         gsd_m=arguments.gsd,
         stable=() if arguments.stable is None else read_areas(arguments.stable),
         unit=arguments.unit,

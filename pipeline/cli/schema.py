@@ -14,7 +14,7 @@ _KINDS = ("simulation", "dataset", "detector", "scanner", "model", "measurement"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim schema` on its parser."""
     parser.add_argument(
         "kind",
         type=one_of(*_KINDS),
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Return the JSON schema."""
+    """Return the JSON schema of one kind of config."""
     from pipeline.cli.json_schema import schema_text
 
     return CommandOutput(schema_text(arguments.kind).rstrip("\n"))

@@ -18,7 +18,7 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `simulate` on its parser."""
     parser.add_argument(
         "--sensor", required=True, type=one_of("stereo", "tls"), metavar="stereo|tls", help="sensor that observes the wall"
     )

@@ -16,7 +16,7 @@ EXAMPLE = """  scarpsim surface scan.laz --seen-from 345180.0 6389420.0 121.6 --
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim surface` on its parser."""
     parser.add_argument("cloud", type=Path, metavar="CLOUD", help="points (.laz .las .ply .e57 .xyz)")
     parser.add_argument(
         "--out", type=Path, required=True, metavar="FILE", help="mesh to write (.ply), in the points' coordinates, m"
@@ -59,10 +59,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Mesh the point cloud and write the PLY file."""
+    """Make a surface of a point cloud and write it as PLY."""
     out = arguments.out
     if out.suffix.lower() != ".ply":
-        raise InputError(f"got '{out.suffix}'", where="--out", allowed=".ply")
+        raise InputError(f"got '{out.suffix}'", where="--out", allowed=".ply", remedy="choose a file name that ends in .ply")
     if out.exists():
         raise InputError("exists already", where=str(out), remedy="choose another name with --out")
     import numpy as np

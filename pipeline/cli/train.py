@@ -16,7 +16,7 @@ EXAMPLE = """  scarpsim train my_dataset --out my_detector
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim train` on its parser."""
     parser.add_argument(
         "data_set", type=Path, metavar="DATASET", help="folder with train/ and val/, as scarpsim dataset makes them"
     )

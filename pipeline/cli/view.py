@@ -17,7 +17,7 @@ _PORT = 8050
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the arguments of `scarpsim view` on its parser."""
     parser.add_argument(
         "folder", type=Path, metavar="FOLDER", help="a run, a result of scarpsim gap or monitor, or a split of a data set"
     )
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Serve the page until it is closed."""
+    """Serve the page that shows results in a browser until it is interrupted."""
     from pipeline.view.server import serve
 
     serve(arguments.folder, arguments.second, arguments.detections, arguments.port, open_browser=not arguments.no_browser)

@@ -89,7 +89,7 @@ class MapNoise:
         return float(np.median(known)) if known.size else None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content as `comparison.json` holds it."""
+        """Return the fields as a dictionary, as `comparison.json` holds them."""
         return {
             "stable": self.stable.to_dict(),
             "per_epoch": [each.to_dict() for each in self.per_epoch],
@@ -124,7 +124,7 @@ class DetectionClass:
     volume_spread: float | None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content as JSON and CSV hold it."""
+        """Return the fields as a dictionary for JSON and CSV."""
         return {
             "low_m": self.low_m,
             "high_m": self.high_m,
@@ -160,7 +160,7 @@ class DetectionSummary:
     trials: int
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content as `comparison.json` holds it; the blocks themselves are in blocks.csv."""
+        """Return the fields as a dictionary, as `comparison.json` holds them; the blocks themselves are in blocks.csv."""
         return {
             "blocks": len(self.blocks),
             "in_view": sum(block.in_view for block in self.blocks),
@@ -210,7 +210,7 @@ class SensorAssessment:
     registration_rms_m: float | None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content as `comparison.json` holds it."""
+        """Return the fields as a dictionary, as `comparison.json` holds them."""
         return {
             "name": self.name,
             "sensor": self.sensor,
@@ -419,5 +419,5 @@ def shared_scale_m(noises: list[MapNoise]) -> float:
 
 
 def grid_record(grid: Grid) -> dict[str, float]:
-    """Return the raster that all maps share as `comparison.json` holds it."""
+    """Return the origin, pixel size and shape of the raster that all maps share, for `comparison.json`."""
     return {"x_min_m": grid.x_min, "y_max_m": grid.y_max, "gsd_m": grid.gsd, "width_px": grid.width, "height_px": grid.height}

@@ -105,7 +105,7 @@ class BlockDetection:
     seen: bool
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content as JSON and CSV hold it."""
+        """Return the fields as a dictionary for JSON and CSV."""
         return dataclasses.asdict(self)
 
 

@@ -87,7 +87,7 @@ class DetectionCurve:
         return (1 - self.lapse) * special.ndtr((np.log(size_m) - np.log(self.middle_m)) / self.width)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content as JSON holds it."""
+        """Return the fields as a dictionary for JSON."""
         return dataclasses.asdict(self)
 
 

@@ -31,7 +31,7 @@ from pipeline.report.map_styles import difference_style, quantity_style
 from pipeline.report.page import millimetres, p_value_in_words, percent, template
 from pipeline.report.progress import duration
 from pipeline.report.provenance import versions
-from pipeline.run.products import write_cloud
+from pipeline.run.clouds import write_cloud
 from pipeline.run.recorded_points import recorded_points
 
 COMPARISON_FILE = "comparison.json"

@@ -73,8 +73,17 @@ def _place(container: Any, part: str, name: str, where: str) -> str | int:
     if isinstance(container, dict):
         return part
     if not isinstance(container, list):
-        raise InputError(f"'{name}' is {container!r} and has no '{part}' in it", where=where)
+        raise InputError(
+            f"'{name}' is {container!r} and has no '{part}' in it",
+            where=where,
+            remedy="remove the part after it, or set the whole key",
+        )
     if not (part.isdecimal() and int(part) < len(container)):
         allowed = f"0 to {len(container) - 1}" if container else f"none, the list is empty; set it as a whole: {name}=[...]"
-        raise InputError(f"'{part}' is not an index of the list '{name}'", where=where, allowed=allowed)
+        raise InputError(
+            f"'{part}' is not an index of the list '{name}'",
+            where=where,
+            allowed=allowed,
+            remedy="write the number of an entry, from 0",
+        )
     return int(part)

@@ -85,7 +85,10 @@ def with_preset(values: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(own, dict) or "preset" not in own:
         return values
     if not isinstance(own["preset"], str):
-        raise InputError(f"'scanner.preset': expected a name or a file, got {own['preset']!r:.80}")
+        raise InputError(
+            f"'scanner.preset': expected a name or a file, got {own['preset']!r:.80}",
+            remedy="write for example preset: riegl_vz400i",
+        )
     preset = read_preset(own["preset"])
     section = preset.scanner_values() | {key: value for key, value in own.items() if key != "preset"}
     return {**values, "scanner": section, "sensor": _with_model(values.get("sensor"), preset)}

@@ -303,7 +303,7 @@ def load_config(path: Path, overrides: Sequence[str | Override], sensor: SensorN
 def resolved(
     values: Any, overrides: Sequence[str | Override], sensor: SensorName | None, seed: int | None, path: Path
 ) -> SimulationConfig:
-    """Do the same as `load_config` for values that have already been read; `path` is their file, or names them."""
+    """Make a config of values that have already been read, with overrides and the seed; `path` is their file, or names them."""
     own: dict[str, Any] = {}
     values = {} if values is None else values
     if not isinstance(values, dict):

@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
@@ -49,7 +49,7 @@ _RUNS_EACH = 2
 
 
 def runs(orders: Sequence[EpochOrder], workers: int) -> list[Run]:
-    """Divide orders into runs of equal length that share a stage, so that a worker sets up the stage once."""
+    """Divide epochs into groups of equal length that share wall, sensor and reference, so that a worker sets these up once."""
     longest = min(max(len(orders) // (_RUNS_EACH * workers), 1), _LONGEST_RUN)
     found = []
     for _, same in groupby(orders, key=lambda order: (order.source, order.stage)):
@@ -57,6 +57,43 @@ def runs(orders: Sequence[EpochOrder], workers: int) -> list[Run]:
         length = -(-len(shared) // -(-len(shared) // longest))
         found += [shared[start : start + length] for start in range(0, len(shared), length)]
     return found
+
+
+def map_on_workers(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], count: int) -> Iterator[Any]:
+    """Call a function with each task's arguments on local worker processes, and yield the results as they finish.
+
+    Parameters
+    ----------
+    function : Function of a module, which workers import; what it raises is raised here.
+    tasks : Arguments of each call.
+    count : Number of workers.
+
+    Raises
+    ------
+    InputError
+        If Dask is not installed.
+    OutsideError
+        If workers die repeatedly at one task, or none is left.
+    """
+    _require_distributed("--workers")
+    left = {f"task-{number:06d}": task for number, task in enumerate(tasks)}
+    for start in range(1, _STARTS + 1):
+        try:
+            with ExitStack() as stack:
+                cluster = _local(stack, min(count, len(left)))
+                client = _client(stack, cluster)
+                futures = client.map(_called, [function] * len(left), list(left.values()), key=list(left))
+                for future, result in _results(client, futures, cluster):
+                    del left[future.key]
+                    yield result
+            return
+        except _LostError as lost:
+            if start == _STARTS:
+                raise OutsideError(f"{lost}; finished work is kept, run the same command with --resume to continue") from None
+
+
+def _called(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+    return function(*arguments)
 
 
 class _LostError(Exception):
@@ -126,9 +163,7 @@ def _make(orders: list[EpochOrder], count: int, scheduler: str) -> Iterator[tupl
                 yield index[order.source, order.index], each
 
 
-def _results(
-    client: Client, futures: list[Future], cluster: LocalCluster | None
-) -> Iterator[tuple[Future, list[dict[str, Any]]]]:
+def _results(client: Client, futures: list[Future], cluster: LocalCluster | None) -> Iterator[tuple[Future, Any]]:
     """Yield each future with its result as it finishes, and release it.
 
     Dask would otherwise repeat the epochs of dead workers.

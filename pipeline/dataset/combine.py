@@ -39,7 +39,11 @@ def merge_datasets(folders: Sequence[Path], out: Path) -> DatasetSummary:
         If a set is unfinished, two sets hold the same epochs, or the folder is in use.
     """
     if len(folders) < 2:
-        raise InputError(f"two or more folders are needed, got {len(folders)}", where="scarpsim dataset merge")
+        raise InputError(
+            f"two or more folders are needed, got {len(folders)}",
+            where="scarpsim dataset merge",
+            remedy="name the folders of the sets to merge",
+        )
     sets = [(folder, _finished(folder)) for folder in folders]
     sources: dict[str, Any] = {}
     epochs: dict[str, list[int]] = defaultdict(list)

@@ -43,7 +43,7 @@ class ScaledModel(Config):
         return self
 
     def on(self, wall: str) -> StereoModel | TlsModel:
-        """Return the model with its noise scaled for a wall."""
+        """Return the sensor model for maps of the given wall: its noise times the factor of that wall."""
         factor = self.scale[wall] if isinstance(self.scale, dict) else self.scale
         sigmas = {key: value for key, value in self.model.noise.model_dump().items() if key not in _NO_SIGMA}
         values = {key: _scaled(value, factor) for key, value in sigmas.items() if self.scaled in ("all", key)}
@@ -236,10 +236,14 @@ def _wall(values: Any, where: str, folder: Path) -> Any:
         return values
     wrong = sorted(set(values) - {"site", "set"})
     if wrong:
-        raise InputError(f"unknown key '{wrong[0]}'", where=where, allowed="site, set")
+        raise InputError(f"unknown key '{wrong[0]}'", where=where, allowed="site, set", remedy="put simulation keys under `set`")
     site, overrides = values["site"], values.get("set", [])
     if not isinstance(site, str) or not isinstance(overrides, list):
-        raise InputError("expected `site: name` and `set: [key=value, ...]`", where=where)
+        raise InputError(
+            "expected `site: name` and `set: [key=value, ...]`",
+            where=where,
+            remedy="see configs/datasets/small.yaml for an example",
+        )
     path = folder / site if is_path(site) else bundled_config("sites", site)
     return load_config(path, [str(item) for item in overrides], None, None).model_dump(mode="json")
 

@@ -75,7 +75,12 @@ class Tiles(Sequence[Sample]):
         self.records = [image for image in content.images if all(image.get(key) == value for key, value in filters.items())]
         if not self.records:
             present = {key: sorted({str(image[key]) for image in content.images if key in image}) for key in filters}
-            raise InputError(f"no tile has {filters}", where=str(self.folder), allowed=str(present))
+            raise InputError(
+                f"no tile has the properties {filters}",
+                where=str(self.folder),
+                allowed=str(present),
+                remedy="choose among the properties that the set has",
+            )
         self._annotations: dict[int, list[dict[str, Any]]] = {image["id"]: [] for image in self.records}
         for annotation in content.annotations:
             if annotation["image_id"] in self._annotations:

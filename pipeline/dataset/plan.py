@@ -75,7 +75,11 @@ def simulation_of(config: DatasetConfig, epoch: PlannedEpoch) -> SimulationConfi
     """Return the config that simulates an epoch; the number of its blocks is set later, when the wall's area is known."""
     level = config.noise[epoch.noise].of(epoch.sensor)
     if level is None:  # the config's validation excludes this
-        raise InputError(f"there is no model of the {epoch.sensor} sensor", where=f"noise.{epoch.noise}")
+        raise InputError(
+            f"has no model for the {epoch.sensor} sensor",
+            where=f"noise.{epoch.noise}",
+            remedy=f"add `{epoch.sensor}: {{model: ...}}`, or leave the sensor out of `sensors`",
+        )
     wall = config.walls[epoch.wall]
     if epoch.sensor == "tls" and wall.reconstruction == "vertices":  # stereo only
         wall = wall.model_copy(update={"reconstruction": "direct"})
@@ -104,6 +108,7 @@ def block_count(config: DatasetConfig, size: str, grid: Grid) -> int:
             f"this gives {count:,.3g} blocks on {area:,.0f} m2",
             where=f"sizes.{size}.blocks_per_m2",
             allowed=f"up to {MOST_BLOCKS / area:.3g}, {MOST_BLOCKS:,} blocks",
+            remedy="lower blocks_per_m2",
         )
     return max(1, round(count))
 

@@ -51,6 +51,7 @@ class Workers:
                 f"got {self.count:,} workers",
                 where="--workers",
                 allowed=f"1 to {_MOST_WORKERS * cores} here, {_MOST_WORKERS} for each of {cores} cores",
+                remedy="choose a number in this range",
             )
 
 
@@ -190,7 +191,11 @@ def _completed(folder: Path, workers: Workers, progress: Progress) -> DatasetSum
     stages = {source: _stages(known, source, folder) for source in {source for source, _ in found}}
     unplanned = [index for source, index in found if index >= len(stages[source])]
     if unplanned:
-        raise InputError(f"epoch {unplanned[0]} is not in the plan of its config", where=str(folder / DATASET_FILE))
+        raise InputError(
+            f"epoch {unplanned[0]} is not in the plan of its config",
+            where=str(folder / DATASET_FILE),
+            remedy="restore dataset.json from a copy, or make the set again in another folder",
+        )
     write_dataset_file(folder, known["name"], known["sources"], known["epochs"])
     job = uuid.uuid4().hex
     orders = [EpochOrder(str(folder.absolute()), job, source, index, stages[source][index]) for source, index in found]

@@ -33,7 +33,7 @@ _one_at_a_time = threading.Lock()
 
 @dataclass(frozen=True)
 class EpochOrder:
-    """An epoch to make.
+    """The instruction to a worker to make one epoch of a data set.
 
     Attributes
     ----------

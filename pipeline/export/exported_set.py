@@ -13,5 +13,10 @@ def splits_of(folder: Path) -> dict[str, Tiles]:
     """Return the tiles of each split in a data set's folder. Raises InputError if there is none."""
     splits = [split for split in SPLITS if (folder / split / "annotations.json").is_file()]
     if not splits:
-        raise InputError("contains no split of a data set", where=str(folder), allowed=f"a folder with {', '.join(SPLITS)}")
+        raise InputError(
+            "contains no split of a data set",
+            where=str(folder),
+            allowed=f"a folder with {', '.join(SPLITS)}",
+            remedy="give the folder that scarpsim dataset made",
+        )
     return {split: Tiles(folder / split) for split in splits}

@@ -55,7 +55,7 @@ Simulated difference maps of rock walls with annotated rockfalls, made by scarps
 
 @dataclass(frozen=True)
 class HuggingFaceSet:
-    """What was written: the folder, and the number of images and of blocks by split, with the Hub's names."""
+    """Result of an export for Hugging Face: the folder, and the number of images and of blocks by split, with the Hub's names."""
 
     folder: Path
     images: dict[str, int]
@@ -154,11 +154,11 @@ def _row(tiles: Tiles, sample: Sample) -> dict[str, Any]:
 
 
 def summary(made: HuggingFaceSet) -> str:
-    """Describe what was written, in lines."""
+    """Describe the exported set as lines of text."""
     lines = [f"{split}: {images:,} images, {made.blocks[split]:,} blocks" for split, images in made.images.items()]
     return "\n".join([*lines, f"load it with datasets.load_dataset({str(made.folder)!r})"])
 
 
 def to_dict(made: HuggingFaceSet) -> dict[str, Any]:
-    """Return what was written, for --json."""
+    """Return folder and numbers of images and blocks as JSON types, for the option --json."""
     return {"folder": str(made.folder), "images": made.images, "blocks": made.blocks}

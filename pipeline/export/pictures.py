@@ -67,9 +67,10 @@ def save_scan(run: ExportedRun, number: int, path: Path) -> None:
     """
     if run.record["sensor"] != "tls":
         raise InputError(
-            "is a run of a stereo pair, which records all points at once",
+            "is a run of a stereo pair, whose points are all recorded at once, so there is no scan to animate",
             where=str(run.folder),
             allowed="a run of a laser scanner",
+            remedy="export `epochs` or `picture` instead",
         )
     cloud = run.points(number)
     count, clock = len(cloud.points), np.zeros(len(cloud.points)) if cloud.gps_time is None else cloud.gps_time
@@ -78,6 +79,7 @@ def save_scan(run: ExportedRun, number: int, path: Path) -> None:
             f"the points of epoch {number} have no valid times",
             where=str(run.folder),
             allowed=f"numbers of seconds over at most {_LONGEST_SCAN_S:g} s",
+            remedy="make the run again",
         )
     order = np.argsort(clock, kind="stable")[:: max(1, count // _SCAN_POINTS)]
     places, time = cloud.points[order], clock[order]

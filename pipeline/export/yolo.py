@@ -29,7 +29,7 @@ _SIGMAS = 6.0
 
 @dataclass(frozen=True)
 class YoloSet:
-    """What was written.
+    """Result of an export for YOLO.
 
     Attributes
     ----------
@@ -140,7 +140,7 @@ def _line(points: NDArray[np.float64], shape: tuple[int, ...]) -> str:
 
 
 def summary(made: YoloSet) -> str:
-    """Describe what was written, in lines."""
+    """Describe the exported set as lines of text."""
     return "\n".join(_sentences(made))
 
 
@@ -152,5 +152,5 @@ def _sentences(made: YoloSet) -> Iterator[str]:
 
 
 def to_dict(made: YoloSet) -> dict[str, Any]:
-    """Return what was written, for --json."""
+    """Return folder, limit and numbers of images and blocks as JSON types, for the option --json."""
     return {"folder": str(made.folder), "limit_m": made.limit_m, "images": made.images, "blocks": made.blocks}

@@ -27,7 +27,10 @@ _LEAST_KEPT = 5e-4
 
 
 def write_icp_study(out: Path, study: IcpStudy) -> Path:
-    """Write everything; return the report's path. The folder appears when everything has been written."""
+    """Write report, tables and pictures of the study; return the path of the report.
+
+    The folder appears when everything has been written.
+    """
     with filling(out) as folder:
         _write(folder, study)
     return out / "report.html"

@@ -53,7 +53,7 @@ _TO_TRUTH = IcpConfig(outlier_distance_threshold=0.2, threshold=0.0, delta_thres
 
 @dataclass(frozen=True)
 class StudyEpoch:
-    """An epoch to be registered.
+    """An epoch of the study, displaced by a known motion, that is to be registered.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class PoseError:
 
 @dataclass(frozen=True)
 class StudyRow:
-    """One registration.
+    """Result of one registration with one setting.
 
     Attributes
     ----------
@@ -217,7 +217,12 @@ def surfaces_of_run(folder: Path, epochs: int) -> tuple[SimulationConfig, str, l
     if len(records) < 2:
         raise InputError("has no epoch after the reference", where=str(folder), remedy="finish it with simulate --resume")
     if epochs >= len(records):
-        raise InputError(f"got {epochs}", where="--epochs", allowed=f"1 to {len(records) - 1}, as many epochs as {folder} has")
+        raise InputError(
+            f"got {epochs}",
+            where="--epochs",
+            allowed=f"1 to {len(records) - 1}, as many epochs as {folder} has",
+            remedy="choose a number in this range",
+        )
     config = load_config(path, [], None, None)
     found = []
     for number, applied in records[: epochs + 1]:

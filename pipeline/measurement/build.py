@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.config.presets import read_preset
-from pipeline.formats.measurements.measurement import read_model
+from pipeline.formats.measurements.model_file import read_model
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.measurement.folder import Interpretation, MeasurementContent, write
 from pipeline.measurement.photogrammetry import describe_view, read_pair, viewing_rotation
@@ -114,7 +114,12 @@ def build_stereo(request: Request, cameras: Path, labels: tuple[str, str] | None
     pair = read_pair(cameras, labels)
     model = StereoModel() if request.model is None else read_model(request.model)
     if not isinstance(model, StereoModel):
-        raise InputError("the model is of a laser scanner", where=str(request.model), allowed="sensor: stereo")
+        raise InputError(
+            "the model is of a laser scanner",
+            where=str(request.model),
+            allowed="sensor: stereo",
+            remedy="name a model of a stereo pair with --model",
+        )
     scans = _scans(request)
     eye = pair.left.position, viewing_rotation(pair.left)
     words = describe_view(pair, scans[0].cloud.points, scans[0].name)
@@ -155,7 +160,12 @@ def _scans(request: Request) -> list[RawScan]:
         each = read_scans(path, request.unit, request.columns)
         if request.number is not None:
             if request.number > len(each):
-                raise InputError(f"got {request.number}", where="--scan", allowed=f"1 to {len(each)} in {path.name}")
+                raise InputError(
+                    f"got {request.number}",
+                    where="--scan",
+                    allowed=f"1 to {len(each)} in {path.name}",
+                    remedy="choose a scan of the file",
+                )
             each = [each[request.number - 1]]
         for scan in each:
             check_extent(scan.cloud.points, str(path), request.unit)
@@ -213,7 +223,12 @@ def _model(request: Request) -> tuple[TlsModel, tuple[str, ...]]:
     if request.model is not None:
         model = read_model(request.model)
         if not isinstance(model, TlsModel):
-            raise InputError("the model is of a stereo pair", where=str(request.model), allowed="sensor: tls")
+            raise InputError(
+                "the model is of a stereo pair",
+                where=str(request.model),
+                allowed="sensor: tls",
+                remedy="name a model of a laser scanner with --model, or a preset with --scanner",
+            )
         return model, (f"as in {request.model}",)
     if request.scanner is None:
         raise InputError("the scanner is unknown", where="--scanner", remedy=_NAME_SCANNER)

@@ -75,7 +75,7 @@ class MeasurementContent:
 
 
 def write(out: Path, content: MeasurementContent, found: Interpretation) -> None:
-    """Write the folder and check that it can be used.
+    """Write the folder of a measurement and check that `gap` can read it.
 
     Parameters
     ----------

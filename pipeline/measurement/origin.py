@@ -41,7 +41,7 @@ _GROUPS = 24
 
 @dataclass(frozen=True)
 class Origin:
-    """Origin of a scan.
+    """Where the scanner stood, found from the pattern of its points.
 
     Attributes
     ----------

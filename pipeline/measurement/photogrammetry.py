@@ -20,7 +20,12 @@ def read_pair(path: Path, labels: tuple[str, str] | None) -> CameraPair:
     labels names the left and right camera of a project. Raises InputError if the file does not determine a pair.
     """
     if not path.exists():
-        raise InputError("there is no such file", where=str(path), allowed="cameras.yaml, Metashape XML or .psx, a COLMAP folder")
+        raise InputError(
+            "there is no such file",
+            where=str(path),
+            allowed="cameras.yaml, Metashape XML or .psx, a COLMAP folder",
+            remedy="check the path",
+        )
     found = read_oriented(path)
     if found is None:
         return read_cameras_yaml(path)

@@ -83,7 +83,12 @@ def reference_from_file(
         If the file cannot be used.
     """
     if not path.is_file():
-        raise InputError("there is no such file", where=str(path), allowed=f"a mesh, a cloud, a DEM, or the word {HALF}")
+        raise InputError(
+            "there is no such file",
+            where=str(path),
+            allowed=f"a mesh, a cloud, a DEM, or the word {HALF}",
+            remedy="check the path",
+        )
     if path.suffix.lower() in DEMS:
         return reference_from_dem(path, unit, "--reference-unit")
     if not is_cloud(path):

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.formats.measurements.config import MeasurementConfig
-from pipeline.formats.measurements.measurement import Material, SurfaceMeasurement, assembled, read_model
+from pipeline.formats.measurements.measurement import Material, SurfaceMeasurement, assembled
+from pipeline.formats.measurements.model_file import read_model
 from pipeline.formats.measurements.surface_fit import air_side, check_in_metres
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.gap.residuals.surface_noise import estimate_surface_noise
@@ -80,7 +81,7 @@ def _check(request: Request) -> None:
 def _read(path: Path, request: Request) -> RawScan:
     """Read the points of a cloud, the vertices of a mesh, or the pixels of an elevation model."""
     if not path.is_file():
-        raise InputError("there is no such file", where=str(path), allowed="a cloud, a mesh, a DEM")
+        raise InputError("there is no such file", where=str(path), allowed="a cloud, a mesh, a DEM", remedy="check the path")
     if path.suffix.lower() in DEMS:
         dem = reference_from_dem(path, request.unit)
         words = ("the heights of an elevation model", *dem.words[1:])
@@ -145,7 +146,12 @@ def _model(request: Request, cloud: RawScan, reference: Reference) -> tuple[Ster
     if request.model is not None:
         model = read_model(request.model)
         if not isinstance(model, StereoModel):
-            raise InputError("the model is of a laser scanner", where=str(request.model), allowed="sensor: stereo")
+            raise InputError(
+                "the model is of a laser scanner",
+                where=str(request.model),
+                allowed="sensor: stereo",
+                remedy="name a model of a stereo pair with --model",
+            )
         check_in_metres(model, str(request.model))
         return model, (f"as in {request.model}",)
     guess = StereoModel(

@@ -31,6 +31,8 @@ from scene.common.keyed_random import KeyedRandom
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray
 
+SAME = RigidTransform(np.eye(3), np.zeros(3))
+"""No motion."""
 _MOST_REFERENCE, _MOST_MOVING = 400_000, 200_000
 """Points that ICP works with."""
 _TUKEY = 4.685
@@ -44,6 +46,8 @@ _MOST_FITTED = 150_000
 """Pixels that the fit takes."""
 _BLOCKS = 6
 """Blocks along the longer side of the wall, of which one at a time is left out."""
+_MOST_BLOCKS = 10_000
+"""Numbers of blocks of one view begin so far from those of the one before."""
 _LEAST_PIXELS = 300
 """Stable pixels without which no fit is made."""
 _FEWEST_BLOCKS = 5
@@ -58,6 +62,37 @@ _UNDETERMINED = 1e-7
 
 
 @dataclass(frozen=True)
+class RasterPair:
+    """Heights of the reference and of an epoch on one grid, those of one view of the wall.
+
+    from_wall: from the wall frame, in which the epoch moves, to the frame of the grid; both are the same where there is one view.
+    """
+
+    reference: HeightRaster
+    epoch: HeightRaster
+    from_wall: RigidTransform = SAME
+
+    @property
+    def difference(self) -> NDArray[np.float32]:
+        """(h, w) reference minus epoch as it lies, m."""
+        return self.reference.height - self.epoch.height
+
+    def design(self, centre: FloatArray) -> NDArray[np.float32]:
+        """(6, h, w) change of the epoch's heights with its shift and rotation about `centre`, wall frame; NaN without data."""
+        found = _design(self.epoch, self.from_wall.apply(centre))
+        if self.from_wall is SAME:
+            return found
+        turned = self.from_wall.rotation.T.astype(np.float32)
+        return np.concatenate([np.tensordot(turned, part, 1) for part in (found[:3], found[3:])])
+
+    def points(self, where: NDArray[np.bool_]) -> FloatArray:
+        """(n, 3) pixels of the epoch, wall frame, m."""
+        x, y = _places(self.epoch.grid)
+        found = np.stack([x[where], y[where], self.epoch.height[where].astype(np.float64)], axis=1)
+        return self.from_wall.inverse().apply(found)
+
+
+@dataclass(frozen=True)
 class Alignment:
     """How an epoch was brought to the reference.
 
@@ -69,8 +104,8 @@ class Alignment:
         Of shift (m) and rotation (rad) about `centre`, wall frame.
     centre : (3,) array
         Centre of the rotation, wall frame, m.
-    stable : (h, w) bool array
-        Pixels that did not change, on which the registration rests and noise is measured.
+    stable : tuple of (h, w) bool arrays
+        Pixels of each view that did not change, on which the registration rests and noise is measured.
     rms_m : float
         Root mean square of the differences on these pixels.
     notes : tuple of str
@@ -80,13 +115,13 @@ class Alignment:
     transform: RigidTransform
     covariance: FloatArray
     centre: FloatArray
-    stable: NDArray[np.bool_]
+    stable: tuple[NDArray[np.bool_], ...]
     rms_m: float
     notes: tuple[str, ...] = ()
 
-    def sigma(self, raster: HeightRaster) -> NDArray[np.float32]:
+    def sigma(self, pair: RasterPair) -> NDArray[np.float32]:
         """Standard deviation of the registration's effect on each pixel's height, (h, w), m; NaN without data."""
-        design = _design(raster, self.centre)
+        design = pair.design(self.centre)
         variance = (design * np.tensordot(self.covariance.astype(np.float32), design, 1)).sum(axis=0)
         return np.sqrt(np.maximum(variance, 0.0)).astype(np.float32)
 
@@ -95,7 +130,7 @@ class Alignment:
         sigma = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         return {
             **self.transform.to_dict(),
-            "stable_pixels": int(self.stable.sum()),
+            "stable_pixels": sum(int(each.sum()) for each in self.stable),
             "rms_m": self.rms_m,
             "sigma_translation_m": sigma[:3].tolist(),
             "sigma_rotation_rad": sigma[3:].tolist(),
@@ -103,16 +138,18 @@ class Alignment:
         }
 
 
-def reference_surface(raster: HeightRaster) -> ReferenceSurface:
-    """Index the pixels of the reference with their normals for ICP."""
-    rows, columns = np.nonzero(raster.known)
-    few = slice(None, None, max(len(rows) // _MOST_REFERENCE, 1))
-    rows, columns = rows[few], columns[few]
-    x, y = _places(raster.grid)
-    points = np.stack([x[rows, columns], y[rows, columns], raster.height[rows, columns]], axis=1).astype(np.float64)
-    slopes = raster.slope_x[rows, columns], raster.slope_y[rows, columns]
-    normals = np.stack([-slopes[0], -slopes[1], np.ones(len(rows))], axis=1)
-    return ReferenceSurface.build(points, normals)
+def reference_surface(rasters: Sequence[HeightRaster], from_wall: Sequence[RigidTransform] = (SAME,)) -> ReferenceSurface:
+    """Index the pixels of the reference's views with their normals, in the wall frame, for ICP."""
+    points, normals = [], []
+    step = max(sum(int(raster.known.sum()) for raster in rasters) // _MOST_REFERENCE, 1)
+    for raster, transform in zip(rasters, from_wall, strict=True):
+        rows, columns = (each[::step] for each in np.nonzero(raster.known))
+        x, y = _places(raster.grid)
+        at = np.stack([x[rows, columns], y[rows, columns], raster.height[rows, columns]], axis=1).astype(np.float64)
+        slopes = raster.slope_x[rows, columns], raster.slope_y[rows, columns]
+        points.append(transform.inverse().apply(at))
+        normals.append(np.stack([-slopes[0], -slopes[1], np.ones(len(rows))], axis=1) @ transform.rotation)
+    return ReferenceSurface.build(np.concatenate(points), np.concatenate(normals))
 
 
 def coarse(surface: ReferenceSurface, points: FloatArray, gsd_m: float, seed: int) -> RigidTransform:
@@ -122,13 +159,13 @@ def coarse(surface: ReferenceSurface, points: FloatArray, gsd_m: float, seed: in
     return register_to(surface, moving, config, KeyedRandom(seed)).transform
 
 
-def refine(reference: HeightRaster, epoch: HeightRaster, areas: Sequence[Area]) -> Alignment:
-    """Fit what ICP left, by the pixels that are stable; `transform` is from the gridded points to the reference.
+def refine(pairs: Sequence[RasterPair], areas: Sequence[Area]) -> Alignment:
+    """Fit what ICP left, by the pixels that are stable; `transform` is from the gridded points to the reference, wall frame.
 
     Parameters
     ----------
-    reference, epoch : HeightRaster
-        On one grid.
+    pairs : sequence of RasterPair
+        One for each view of the wall.
     areas : sequence of Area
         Where the wall is stable, as the user says, wall frame; empty: found here.
 
@@ -137,67 +174,75 @@ def refine(reference: HeightRaster, epoch: HeightRaster, areas: Sequence[Area]) 
     InputError
         Where too few pixels are stable.
     """
-    difference = reference.height - epoch.height
-    compared = np.isfinite(difference)
-    if areas:
-        compared &= in_areas(areas, *_places(reference.grid))
-    if int(compared.sum()) < _LEAST_PIXELS:
-        place = "in the stable areas" if areas else "of the epoch on the reference"
-        remedy = "give larger stable areas" if areas else "check that both epochs show the same wall, or give a larger --gsd"
-        raise InputError(
-            f"only {int(compared.sum()):,} pixels {place} have data in both epochs",
-            where="registration",
-            allowed=f"at least {_LEAST_PIXELS}",
-            remedy=remedy,
-        )
-    x, y = _places(reference.grid)
-    centre = np.array([x[compared].mean(), y[compared].mean(), float(epoch.height[compared].mean())])
-    fitted = _thinned(compared)
-    design = _design(epoch, centre)[:, fitted]
-    target, weight = difference[fitted].astype(np.float64), _weights_by_sigma(reference, epoch, fitted)
-    expected = float(np.median(np.sqrt(weight) * np.hypot(reference.sigma[fitted], epoch.sigma[fitted])))
-    fit = _robust_fit(design, target, weight, expected)
-    whole = _design(epoch, centre)
+    compared = [_compared(pair, areas) for pair in pairs]
+    count = sum(int(each.sum()) for each in compared)
+    _check_enough(count, bool(areas))
+    centre = np.concatenate([pair.points(each) for pair, each in zip(pairs, compared, strict=True)]).mean(axis=0)
+    designs = [pair.design(centre) for pair in pairs]
+    columns = _Columns.of(pairs, designs, compared)
+    expected = columns.expected
+    fit = _robust_fit(columns, expected)
+    stable = compared
     for _ in range(_REFITS):
-        rest = np.where(compared, difference - np.tensordot(fit.parameters.astype(np.float32), whole, 1), np.nan)
-        stable = _stable(rest, reference, epoch, fit.limit, compared, bool(areas))
-        fitted = _thinned(stable)
-        design, target, weight = (
-            whole[:, fitted],
-            difference[fitted].astype(np.float64),
-            _weights_by_sigma(reference, epoch, fitted),
-        )
-        fit = _robust_fit(design, target, weight, expected)
-    covariance, groups = _jackknife(design, target, weight * fit.robust, _block_numbers(fitted))
-    rest = difference[fitted] - fit.parameters @ design
-    notes = _notes(float(stable.sum() / compared.sum()), groups, bool(areas))
+        stable = [_stable(*each, fit, bool(areas)) for each in zip(pairs, designs, compared, strict=True)]
+        if sum(int(each.sum()) for each in stable) < _LEAST_PIXELS:
+            stable = [_near(*each, fit) for each in zip(pairs, designs, compared, strict=True)]
+        columns = _Columns.of(pairs, designs, stable)
+        fit = _robust_fit(columns, expected)
+    covariance, groups = _jackknife(columns, fit.robust)
+    rest = columns.target - fit.parameters @ columns.design
+    notes = _notes(sum(int(each.sum()) for each in stable) / count, groups, bool(areas))
     transform = RigidTransform.about(centre, fit.parameters[3:], fit.parameters[:3])
-    return Alignment(transform, covariance, centre, stable, float(np.sqrt(np.mean(rest[fit.robust > 0] ** 2))), notes)
+    rms = float(np.sqrt(np.mean(rest[fit.robust > 0] ** 2)))
+    return Alignment(transform, covariance, centre, tuple(stable), rms, notes)
 
 
-def _stable(
-    rest: FloatArray,
-    reference: HeightRaster,
-    epoch: HeightRaster,
-    limit: float,
-    compared: NDArray[np.bool_],
-    given: bool,
-) -> NDArray[np.bool_]:
-    """(h, w) pixels that did not change: in areas that the user gave, all but the farthest ones; else those found here."""
-    if not given:
-        found = unchanged_pixels(rest / np.hypot(reference.sigma, epoch.sigma), compared)
-        return found if found.sum() >= _LEAST_PIXELS else compared & (np.abs(rest) < limit)
-    stable = compared.copy()
-    stable[compared] = np.abs(rest[compared]) * np.sqrt(_weights_by_sigma(reference, epoch, compared)) < _FARTHEST_NOISE * limit
-    return stable
-
-
-def applied(alignment: Alignment, epoch: HeightRaster) -> NDArray[np.float32]:
+def applied(alignment: Alignment, pair: RasterPair) -> NDArray[np.float32]:
     """Return the epoch's heights, (h, w), m, once the fit of `refine` is applied, to first order in its small motion."""
     shift = alignment.transform.apply(alignment.centre) - alignment.centre
     parameters = np.concatenate([shift, alignment.transform.rotation_vector])
-    change = np.tensordot(parameters.astype(np.float32), _design(epoch, alignment.centre), 1)
-    return np.asarray(epoch.height + change.astype(np.float32))
+    return np.asarray(pair.epoch.height + np.tensordot(parameters.astype(np.float32), pair.design(alignment.centre), 1))
+
+
+def _compared(pair: RasterPair, areas: Sequence[Area]) -> NDArray[np.bool_]:
+    """(h, w) pixels with data in both epochs, in the user's stable areas where there are any."""
+    found = np.isfinite(pair.difference)
+    if areas:
+        places = pair.points(found)
+        found[found] = in_areas(areas, places[:, 0], places[:, 1])
+    return found
+
+
+def _check_enough(count: int, given: bool) -> None:
+    if count >= _LEAST_PIXELS:
+        return
+    place = "in the stable areas" if given else "of the epoch on the reference"
+    remedy = "give larger stable areas" if given else "check that both epochs show the same wall, or give a larger --gsd"
+    raise InputError(
+        f"only {count:,} pixels {place} have data in both epochs",
+        where="registration",
+        allowed=f"at least {_LEAST_PIXELS}",
+        remedy=remedy,
+    )
+
+
+def _stable(
+    pair: RasterPair, design: NDArray[np.float32], compared: NDArray[np.bool_], fit: _RobustFit, given: bool
+) -> NDArray[np.bool_]:
+    """(h, w) pixels that did not change: in areas that the user gave, all but the farthest ones; else those found here."""
+    if not compared.any():
+        return compared
+    rest = np.where(compared, fit.residuals(pair, design), np.nan)
+    if not given:
+        return unchanged_pixels(rest / np.hypot(pair.reference.sigma, pair.epoch.sigma), compared)
+    stable = compared.copy()
+    stable[compared] = np.abs(rest[compared]) * np.sqrt(_weights_by_sigma(pair, compared)) < _FARTHEST_NOISE * fit.limit
+    return stable
+
+
+def _near(pair: RasterPair, design: NDArray[np.float32], compared: NDArray[np.bool_], fit: _RobustFit) -> NDArray[np.bool_]:
+    """(h, w) pixels on which the robust fit rests."""
+    return compared & (np.abs(fit.residuals(pair, design)) < fit.limit)
 
 
 def _places(grid: Grid) -> tuple[FloatArray, FloatArray]:
@@ -207,8 +252,8 @@ def _places(grid: Grid) -> tuple[FloatArray, FloatArray]:
     return np.broadcast_to(x, grid.shape), np.broadcast_to(y[:, None], grid.shape)
 
 
-def _design(raster: HeightRaster, centre: FloatArray) -> FloatArray:
-    """(6, h, w) change of height with shift and rotation about `centre`; NaN without data."""
+def _design(raster: HeightRaster, centre: FloatArray) -> NDArray[np.float32]:
+    """(6, h, w) change of height with shift and rotation about `centre`, frame of the grid; NaN without data."""
     x, y = _places(raster.grid)
     x, y, z = x - centre[0], y - centre[1], raster.height.astype(np.float64) - centre[2]
     a, b = raster.slope_x.astype(np.float64), raster.slope_y.astype(np.float64)
@@ -216,20 +261,50 @@ def _design(raster: HeightRaster, centre: FloatArray) -> FloatArray:
     return np.asarray(found)
 
 
-def _weights_by_sigma(reference: HeightRaster, epoch: HeightRaster, where: NDArray[np.bool_]) -> FloatArray:
+def _weights_by_sigma(pair: RasterPair, where: NDArray[np.bool_]) -> FloatArray:
     """Weights of pixels by the variance of their difference, at most those of the best tenth: no pixel rules alone."""
-    variance = reference.sigma[where].astype(np.float64) ** 2 + epoch.sigma[where].astype(np.float64) ** 2
+    variance = pair.reference.sigma[where].astype(np.float64) ** 2 + pair.epoch.sigma[where].astype(np.float64) ** 2
     floor = max(float(np.quantile(variance, 0.1)), 1e-12)
     return np.asarray(floor / np.maximum(variance, floor))
 
 
-def _thinned(compared: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return every so many pixels of those that are compared: heights of 3 x 3 pixels share their points anyway."""
-    step = int(np.ceil(np.sqrt(compared.sum() / _MOST_FITTED)))
-    if step <= 1:
-        return compared
-    few = np.zeros_like(compared)
-    few[::step, ::step] = compared[::step, ::step]
+@dataclass(frozen=True)
+class _Columns:
+    """Pixels of all views that a fit takes.
+
+    design (6, n), target (n,) m, weight (n,), block (n,): number of the block of the wall; expected: standard deviation of a
+    weighted residual by the heights' own errors, m.
+    """
+
+    design: FloatArray
+    target: FloatArray
+    weight: FloatArray
+    block: NDArray[np.int64]
+    expected: float
+
+    @classmethod
+    def of(
+        cls, pairs: Sequence[RasterPair], designs: Sequence[NDArray[np.float32]], where: Sequence[NDArray[np.bool_]]
+    ) -> _Columns:
+        """Take every so many pixels: heights of 3 x 3 pixels share their points anyway."""
+        step = int(np.ceil(np.sqrt(sum(int(each.sum()) for each in where) / _MOST_FITTED)))
+        few = [_every(each, max(step, 1)) for each in where]
+        shown = [view for view, each in enumerate(few) if each.any()]
+        weight = [_weights_by_sigma(pairs[view], few[view]) for view in shown]
+        sigma = [np.hypot(pairs[view].reference.sigma[few[view]], pairs[view].epoch.sigma[few[view]]) for view in shown]
+        side = max(max(max(each.shape) for each in where) // _BLOCKS, 1)
+        block = [_block_numbers(few[view], side) + view * _MOST_BLOCKS for view in shown]
+        target = [pairs[view].difference[few[view]].astype(np.float64) for view in shown]
+        weights = np.concatenate(weight)
+        expected = float(np.median(np.sqrt(weights) * np.concatenate(sigma)))
+        design = np.concatenate([designs[view][:, few[view]] for view in shown], axis=1).astype(np.float64)
+        return cls(design, np.concatenate(target), weights, np.concatenate(block), expected)
+
+
+def _every(where: NDArray[np.bool_], step: int) -> NDArray[np.bool_]:
+    """(h, w) every so many rows and columns of a mask."""
+    few = np.zeros_like(where)
+    few[::step, ::step] = where[::step, ::step]
     return few
 
 
@@ -241,19 +316,20 @@ class _RobustFit:
     robust: FloatArray
     limit: float
 
+    def residuals(self, pair: RasterPair, design: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(h, w) what the fit leaves of the differences, m."""
+        return np.asarray(pair.difference - np.tensordot(self.parameters.astype(np.float32), design, 1))
 
-def _robust_fit(design: FloatArray, target: FloatArray, weight: FloatArray, expected: float) -> _RobustFit:
+
+def _robust_fit(columns: _Columns, expected: float) -> _RobustFit:
     """Iteratively reweighted least squares with Tukey's weights, from the median on.
 
     The scale begins at the spread of the residuals. Where much of the wall moved, that is far more than noise: it is lowered step
     by step towards what noise explains, as long as enough pixels agree, so that the fit settles on what did not move.
 
-    Parameters
-    ----------
-    design, target, weight : (6, n), (n,), (n,) arrays
-    expected : float
-        Standard deviation of a weighted residual by the heights' own errors, m.
+    expected: standard deviation of a weighted residual by the heights' own errors, m.
     """
+    design, target, weight = columns.design, columns.target, columns.weight
     parameters = np.zeros(6)
     parameters[2] = np.median(target)
     standard = np.sqrt(weight) * (target - parameters @ design)
@@ -285,15 +361,15 @@ def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray(vectors[:, kept] @ ((vectors[:, kept].T @ (right / scale)) / values[kept]) / scale)
 
 
-def _block_numbers(where: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Number of the block of the wall of each pixel in `where`."""
-    side = max(max(where.shape) // _BLOCKS, 1)
+def _block_numbers(where: NDArray[np.bool_], side: int) -> NDArray[np.int64]:
+    """Number of the block of the wall, of so many pixels a side, of each pixel in `where`."""
     row, column = np.nonzero(where)
     return np.asarray((row // side) * (where.shape[1] // side + 1) + column // side)
 
 
-def _jackknife(design: FloatArray, target: FloatArray, weight: FloatArray, block: NDArray[np.int64]) -> tuple[FloatArray, int]:
+def _jackknife(columns: _Columns, robust: FloatArray) -> tuple[FloatArray, int]:
     """Covariance (6, 6) of the parameters by leaving out one block at a time, and the number of blocks."""
+    design, target, weight, block = columns.design, columns.target, columns.weight * robust, columns.block
     numbers = [number for number in np.unique(block) if weight[block == number].any()]
     if len(numbers) < 2:
         return np.diag(np.full(6, np.inf)), len(numbers)

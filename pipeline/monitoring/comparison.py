@@ -2,33 +2,59 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline.change.areas import Area
-from pipeline.monitoring.alignment import Alignment, applied, coarse, reference_surface, refine
+from pipeline.monitoring.alignment import SAME, Alignment, RasterPair, applied, coarse, reference_surface, refine
 from pipeline.monitoring.events import Change, ChangedRegion, find_regions
-from pipeline.monitoring.gridding import HeightRaster, WallPoints, gridded
+from pipeline.monitoring.gridding import HeightRaster, PointSums, WallPoints
 from pipeline.monitoring.significance import significance
+from pipeline.monitoring.views import Partition
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.rigid import RigidTransform
 from scene.geometry.grid import Grid
+from scene.geometry.mesh import FloatArray
 
 
 @dataclass(frozen=True)
 class ReferenceHeights:
-    """The reference epoch: its heights, and its pixels as a surface that ICP pairs points with."""
+    """The reference epoch: the heights of each view of the wall, and their pixels as a surface that ICP pairs points with.
 
-    raster: HeightRaster
+    Attributes
+    ----------
+    rasters : tuple of HeightRaster
+        One for each view.
+    from_wall : tuple of RigidTransform
+        From the wall frame to that of each view.
+    partition : Partition or None
+        Which points belong to which view, wall frame; None for a single view.
+    surface : ReferenceSurface
+        Wall frame.
+    """
+
+    rasters: tuple[HeightRaster, ...]
+    from_wall: tuple[RigidTransform, ...]
+    partition: Partition | None
     surface: ReferenceSurface
 
     @classmethod
-    def of(cls, points: WallPoints, grid: Grid) -> ReferenceHeights:
-        """Prepare the reference from its points."""
-        raster = gridded(points.chunks(), grid)
-        return cls(raster, reference_surface(raster))
+    def of(
+        cls,
+        points: WallPoints,
+        grids: Sequence[Grid],
+        from_wall: Sequence[RigidTransform] = (SAME,),
+        partition: Partition | None = None,
+    ) -> ReferenceHeights:
+        """Prepare the reference from its points, wall frame; one grid and transform for each view."""
+        rasters = _gridded(points.chunks(), grids, from_wall, partition)
+        return cls(tuple(rasters), tuple(from_wall), partition, reference_surface(rasters, from_wall))
+
+    def gridded(self, chunks: Iterable[FloatArray]) -> list[HeightRaster]:
+        """Heights of another epoch from chunks of its points, wall frame, m, on the grids of the reference."""
+        return _gridded(chunks, [raster.grid for raster in self.rasters], self.from_wall, self.partition)
 
 
 @dataclass(frozen=True)
@@ -41,19 +67,21 @@ class EpochChange:
         From the epoch's points as they were read to the reference, wall frame.
     alignment : Alignment
         The last fit, with its uncertainty.
-    change : Change
-        Difference map and level of detection.
+    changes : list of Change
+        Difference map and level of detection of each view.
     regions : list of ChangedRegion
         What changed, the largest volume first.
     """
 
     transform: RigidTransform
     alignment: Alignment
-    change: Change
+    changes: list[Change]
     regions: list[ChangedRegion]
 
 
-def compare_epoch(reference: ReferenceHeights, points: WallPoints, stable: Sequence[Area], seed: int) -> EpochChange:
+def compare_epoch(
+    reference: ReferenceHeights, points: WallPoints, stable: Sequence[Area], seed: int, start: RigidTransform | None = None
+) -> EpochChange:
     """Compare an epoch's points with the reference.
 
     Parameters
@@ -64,19 +92,44 @@ def compare_epoch(reference: ReferenceHeights, points: WallPoints, stable: Seque
         Stable rock as the user says, wall frame; empty: found here.
     seed : int
         Of the subsets that ICP begins with.
+    start : RigidTransform, optional
+        Brings the points near the reference, wall frame, instead of ICP.
 
     Raises
     ------
     InputError
         Where the two do not meet, or too little is stable.
     """
-    grid = reference.raster.grid
-    first = coarse(reference.surface, points.sample, grid.gsd, seed)
-    epoch = gridded(map(first.apply, points.chunks()), grid)
-    alignment = refine(reference.raster, epoch, stable)
-    difference = reference.raster.height - applied(alignment, epoch)
-    registration = alignment.sigma(epoch)
-    predicted = np.sqrt(reference.raster.sigma**2 + epoch.sigma**2 + registration**2).astype(np.float32)
-    noise = significance(difference, predicted, alignment.stable)
-    change = Change(difference, noise, registration, reference.raster, epoch)
-    return EpochChange(alignment.transform.after(first), alignment, change, find_regions(change))
+    gsd = reference.rasters[0].grid.gsd
+    first = coarse(reference.surface, points.sample, gsd, seed) if start is None else start
+    epochs = reference.gridded(map(first.apply, points.chunks()))
+    pairs = [RasterPair(*each) for each in zip(reference.rasters, epochs, reference.from_wall, strict=True)]
+    alignment = refine(pairs, stable)
+    changes = [_change(pair, alignment, view) for view, pair in enumerate(pairs)]
+    regions = [replace(region, view=view) for view, change in enumerate(changes, start=1) for region in find_regions(change)]
+    return EpochChange(
+        alignment.transform.after(first), alignment, changes, sorted(regions, key=lambda region: -region.volume_m3)
+    )
+
+
+def _change(pair: RasterPair, alignment: Alignment, view: int) -> Change:
+    difference = pair.reference.height - applied(alignment, pair)
+    registration = alignment.sigma(pair)
+    predicted = np.sqrt(pair.reference.sigma**2 + pair.epoch.sigma**2 + registration**2).astype(np.float32)
+    noise = significance(difference, predicted, alignment.stable[view])
+    return Change(difference, noise, registration, pair.reference, pair.epoch)
+
+
+def _gridded(
+    chunks: Iterable[FloatArray], grids: Sequence[Grid], from_wall: Sequence[RigidTransform], partition: Partition | None
+) -> list[HeightRaster]:
+    """Heights of each view from chunks of points (n, 3), wall frame, m."""
+    sums = [PointSums.over(grid) for grid in grids]
+    for chunk in chunks:
+        if partition is None:
+            sums[0].add(chunk)
+            continue
+        view = partition.of(chunk)
+        for number, (each, transform) in enumerate(zip(sums, from_wall, strict=True)):
+            each.add(transform.apply(chunk[view == number]))
+    return [each.heights() for each in sums]

@@ -25,8 +25,8 @@ _BEGINS = 7.0
 """Standard deviations by which the mean over a square must differ from zero for a region to begin."""
 _GROWS = 0.5
 """Share of the level of detection that pixels at a region's rim exceed."""
-_LEAST_PIXELS = 16
-_SIGNIFICANT = 7.0
+LEAST_PIXELS = 16
+SIGNIFICANT = 7.0
 """Standard deviations by which the mean over a whole region must differ from zero."""
 _STEEP = 4.0
 """Tangent of the angle to the wall's plane beyond which heights are those of an edge (76 degrees)."""
@@ -77,6 +77,8 @@ class ChangedRegion:
         "edge", "vegetation", "thin": what else may explain the change; "insignificant": a detector's that noise may explain.
     identity : int
         Number of the event; 0 as yet unknown.
+    view : int
+        Number of the view of the wall in whose map it lies, from 1 on.
     """
 
     kind: Kind
@@ -97,6 +99,7 @@ class ChangedRegion:
     score: float = float("nan")
     marks: tuple[str, ...] = ()
     identity: int = 0
+    view: int = 1
 
     @property
     def window(self) -> tuple[slice, slice]:
@@ -110,7 +113,11 @@ class ChangedRegion:
             "kind", "row", "column", "x_m", "y_m", "z_m", "width_m", "height_m", "area_m2", "depth_median_m", "depth_largest_m",
             "volume_m3", "volume_std_m3", "significance", "score",
         )  # fmt: skip
-        return {name: getattr(self, name) for name in names} | {"marks": list(self.marks), "id": self.identity}
+        return {name: getattr(self, name) for name in names} | {
+            "marks": list(self.marks),
+            "id": self.identity,
+            "view": self.view,
+        }
 
 
 @dataclass(frozen=True)
@@ -155,7 +162,7 @@ def region_of_mask(mask: NDArray[np.bool_], row: int, column: int, score: float,
         return None
     kind: Kind = "missing" if window[known].mean() >= 0 else "added"
     region = replace(_measured(known, row, column, kind, change), score=score)
-    return region if region.significance >= _SIGNIFICANT else replace(region, marks=(*region.marks, "insignificant"))
+    return region if region.significance >= SIGNIFICANT else replace(region, marks=(*region.marks, "insignificant"))
 
 
 def _begins(standard: NDArray[np.floating], significance: Significance) -> NDArray[np.bool_]:
@@ -172,10 +179,10 @@ def _begins(standard: NDArray[np.floating], significance: Significance) -> NDArr
 
 def _kept(mask: NDArray[np.bool_], row: int, column: int, kind: str, change: Change) -> Iterator[ChangedRegion]:
     """The region of a mask, where it is large and significant enough."""
-    if int(mask.sum()) < _LEAST_PIXELS:
+    if int(mask.sum()) < LEAST_PIXELS:
         return
     region = _measured(mask, row, column, "missing" if kind == "missing" else "added", change)
-    if region.significance >= _SIGNIFICANT:
+    if region.significance >= SIGNIFICANT:
         yield region
 
 
@@ -299,6 +306,8 @@ class Catalogue:
 
 def _shared_share(one: ChangedRegion, other: ChangedRegion) -> float:
     """Pixels that two regions share, over those of the smaller one."""
+    if one.view != other.view:
+        return 0.0
     top, left = max(one.row, other.row), max(one.column, other.column)
     bottom = min(one.row + one.mask.shape[0], other.row + other.mask.shape[0])
     right = min(one.column + one.mask.shape[1], other.column + other.mask.shape[1])

@@ -94,12 +94,32 @@ def gridded(points: FloatArray | Iterable[FloatArray], grid: Grid) -> HeightRast
 
     Points outside the grid are left out.
     """
-    chunks = [points] if isinstance(points, np.ndarray) else points
-    sums = np.zeros((10, grid.height * grid.width))
-    for chunk in chunks:
-        for start in range(0, len(chunk), _CHUNK):
-            _add_moments(sums, chunk[start : start + _CHUNK], grid)
-    return _fitted(sums.reshape(10, grid.height, grid.width), grid)
+    sums = PointSums.over(grid)
+    for chunk in [points] if isinstance(points, np.ndarray) else points:
+        sums.add(chunk)
+    return sums.heights()
+
+
+@dataclass(frozen=True)
+class PointSums:
+    """Sums over the points of each pixel, (10, h w), to which points are added; they are all that planes need."""
+
+    grid: Grid
+    sums: FloatArray
+
+    @classmethod
+    def over(cls, grid: Grid) -> PointSums:
+        """Sums without a point."""
+        return cls(grid, np.zeros((10, grid.height * grid.width)))
+
+    def add(self, points: FloatArray) -> None:
+        """Add points (n, 3), m; those outside the grid are left out."""
+        for start in range(0, len(points), _CHUNK):
+            _add_moments(self.sums, points[start : start + _CHUNK], self.grid)
+
+    def heights(self) -> HeightRaster:
+        """Planes through all that was added."""
+        return _fitted(self.sums.reshape(10, self.grid.height, self.grid.width), self.grid)
 
 
 def _add_moments(sums: FloatArray, points: FloatArray, grid: Grid) -> None:

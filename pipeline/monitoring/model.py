@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.config.presets import read_preset
-from pipeline.formats.measurements.measurement import read_model
+from pipeline.formats.measurements.model_file import read_model
 from pipeline.monitoring.gridding import HeightRaster
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.significance import NORMAL_95

@@ -28,6 +28,8 @@ class MonitorOptions:
         Where the sensor stood, or any place before the wall, survey coordinates, m.
     direction : (3,) array or None
         Direction along which change is measured, towards the sensor; None: the normal of the mean plane.
+    views : int or None
+        Number of views of the wall, each along a direction of its own; None: as many as its shape needs.
     gsd_m : float or None
         Side of a pixel of the maps; None: by the density of the reference.
     stable : tuple of Area
@@ -49,6 +51,7 @@ class MonitorOptions:
     reference: Path | None = None
     position: FloatArray | None = None
     direction: FloatArray | None = None
+    views: int | None = None
     gsd_m: float | None = None
     stable: tuple[Area, ...] = ()
     unit: str | None = None

@@ -24,8 +24,9 @@ from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.outlines import in_survey
 from pipeline.monitoring.reading import EpochData, EpochSource
 from pipeline.monitoring.records import EpochRecord
-from pipeline.monitoring.site import ReferenceSite
+from pipeline.monitoring.site import ReferenceSite, WallView
 from pipeline.report.provenance import versions
+from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray
 
 SCHEMA = 1
@@ -33,7 +34,7 @@ COLUMNS: dict[str, type] = {
     "id": int, "epoch": int, "time": str, "first_seen_after": str, "first_seen_by": str, "kind": str,
     "x_m": float, "y_m": float, "world_x_m": float, "world_y_m": float, "world_z_m": float,
     "width_m": float, "height_m": float, "area_m2": float, "depth_median_m": float, "depth_largest_m": float,
-    "volume_m3": float, "volume_std_m3": float, "significance": float, "score": float, "marks": str,
+    "volume_m3": float, "volume_std_m3": float, "significance": float, "score": float, "marks": str, "view": int,
 }  # fmt: skip
 """Of events.csv and events.gpkg."""
 _SCALE_M = 1e-4
@@ -70,13 +71,23 @@ class Result:
         rows = []
         for epoch in self.epochs:
             for region in epoch.regions:
-                world = self.site.frame.to_world(np.array([region.x_m, region.y_m, region.z_m])).tolist()
+                frame = self.site.views[region.view - 1].frame
+                world = frame.to_world(np.array([region.x_m, region.y_m, region.z_m])).tolist()
                 after, by = first[region.identity]
                 known = region.numbers() | dict(zip(("world_x_m", "world_y_m", "world_z_m"), world, strict=True))
                 known |= {"epoch": epoch.number, "time": epoch.source.time.text, "first_seen_after": after, "first_seen_by": by}
                 known["marks"] = " ".join(region.marks)
                 rows.append({name: None if _is_nan(known[name]) else known[name] for name in COLUMNS})
         return rows
+
+    def outlines(self) -> list[list[FloatArray]]:
+        """The rings of each row's event, survey coordinates, m."""
+        found = []
+        for epoch in self.epochs:
+            for region in epoch.regions:
+                view = self.site.views[region.view - 1]
+                found.append(in_survey(region, view.grid, view.raster.height, view.frame))
+        return found
 
     def _first_seen(self) -> dict[int, tuple[str, str]]:
         """Between which two epochs, by time or by name, each event began."""
@@ -90,17 +101,28 @@ class Result:
 
 def write_points(epoch: Followed, data: EpochData, site: ReferenceSite, out: Path) -> None:
     """Write an epoch's points, registered, in survey coordinates, with what the maps say at each."""
-    maps = [read_geotiff(out / f"{kind}_{epoch.number:03d}.tif")[0] for kind in ("difference", "lod")]
-    maps.append(event_raster(epoch.regions, site.grid.shape).astype(np.float32))
+    maps = [_maps_of(epoch, view, out) for view in site.views]
+    partition = site.reference.partition
 
     def registered(points: FloatArray) -> tuple[FloatArray, dict[str, NDArray[Any]]]:
         wall = epoch.record.transform.apply(site.frame.to_wall(points))
-        distance, level, event = _at(maps, wall, site)
-        extra = {"distance_m": distance, "lod_m": level, "event": np.nan_to_num(event).astype(np.uint32)}
-        return site.frame.to_world(wall), extra
+        world = site.frame.to_world(wall)
+        values = np.full((3, len(points)), np.nan, dtype=np.float32)
+        belongs = np.zeros(len(points), dtype=np.int8) if partition is None else partition.of(wall)
+        for view, rasters in zip(site.views, maps, strict=True):
+            inside = belongs == view.number - 1
+            local = wall if view.number == 1 else view.frame.to_wall(world)
+            values[:, inside] = _at(rasters, local[inside], view.grid)
+        return world, {"distance_m": values[0], "lod_m": values[1], "event": np.nan_to_num(values[2]).astype(np.uint32)}
 
     header = LazHeader(scale_m=_SCALE_M, wkt=data.crs)
     write_chunks(out / f"epoch_{epoch.number:03d}.laz", data.bounds, map(registered, data.chunks()), header)
+
+
+def _maps_of(epoch: Followed, view: WallView, out: Path) -> list[NDArray[np.float32]]:
+    """Difference, level of detection and numbers of the events of a view."""
+    names = [out / f"{kind}_{epoch.number:03d}{view.suffix}.tif" for kind in ("difference", "lod")]
+    return [*(read_geotiff(name)[0] for name in names), event_raster(epoch.regions, view).astype(np.float32)]
 
 
 def write_results(result: Result) -> None:
@@ -108,35 +130,34 @@ def write_results(result: Result) -> None:
     from pipeline.monitoring.report import write_report
 
     rows = result.rows()
-    write_geotiff(result.folder / "reference.tif", result.site.reference.raster.height, result.site.grid)
+    for view in result.site.views:
+        write_geotiff(result.folder / f"reference{view.suffix}.tif", view.raster.height, view.grid)
     _write_table(result.folder / "events.csv", rows)
-    grid, heights = result.site.grid, result.site.reference.raster.height
-    outlines = [in_survey(region, grid, heights, result.site.frame) for epoch in result.epochs for region in epoch.regions]
-    write_geopackage(result.folder / "events.gpkg", "events", COLUMNS, rows, outlines, result.site.crs)
-    write_json(result.folder / "annotations.json", _coco(result.epochs, grid.shape))
+    write_geopackage(result.folder / "events.gpkg", "events", COLUMNS, rows, result.outlines(), result.site.crs)
+    write_json(result.folder / "annotations.json", _coco(result.epochs, result.site.views))
     write_report(result)
     write_json(result.folder / "monitor.json", without_nan(_document(result, rows)))
 
 
-def event_raster(regions: Sequence[ChangedRegion], shape: tuple[int, ...]) -> NDArray[np.int32]:
-    """(h, w) the number of the event at each pixel, 0 where there is none; smaller events lie over larger ones."""
-    raster = np.zeros(shape, dtype=np.int32)
-    for region in sorted(regions, key=lambda each: -each.area_m2):
+def event_raster(regions: Sequence[ChangedRegion], view: WallView) -> NDArray[np.int32]:
+    """(h, w) the number of the event at each pixel of a view, 0 where there is none; smaller events lie over larger ones."""
+    raster = np.zeros(view.grid.shape, dtype=np.int32)
+    inside = (region for region in regions if region.view == view.number)
+    for region in sorted(inside, key=lambda each: -each.area_m2):
         raster[region.window][region.mask] = region.identity
     return raster
 
 
-def _at(rasters: Sequence[NDArray[np.float32]], wall: FloatArray, site: ReferenceSite) -> list[NDArray[np.float32]]:
-    """(n,) each raster's values at points (n, 3) of the wall frame, NaN beside the map."""
-    grid = site.grid
-    column = np.floor((wall[:, 0] - grid.x_min) / grid.gsd)
-    row = np.floor((grid.y_max - wall[:, 1]) / grid.gsd)
+def _at(rasters: Sequence[NDArray[np.float32]], at: FloatArray, grid: Grid) -> NDArray[np.float32]:
+    """(k, n) each raster's values at points (n, 3) in the frame of their grid, NaN beside the map."""
+    column = np.floor((at[:, 0] - grid.x_min) / grid.gsd)
+    row = np.floor((grid.y_max - at[:, 1]) / grid.gsd)
     inside = (column >= 0) & (column < grid.width) & (row >= 0) & (row < grid.height)
     pixel = (row[inside] * grid.width + column[inside]).astype(np.int64)
-    found = np.full((len(rasters), len(wall)), np.nan, dtype=np.float32)
+    found = np.full((len(rasters), len(at)), np.nan, dtype=np.float32)
     for values, raster in zip(found, rasters, strict=True):
         values[inside] = raster.ravel()[pixel]
-    return list(found)
+    return found
 
 
 def _write_table(path: Path, rows: Sequence[dict[str, Any]]) -> None:
@@ -153,34 +174,41 @@ def _wide(row: dict[str, Any]) -> list[Any]:
     return [f"{value:.3f}" if name.startswith("world_") and value is not None else value for name, value in row.items()]
 
 
-def _coco(epochs: Sequence[Followed], shape: tuple[int, ...]) -> dict[str, Any]:
+def _coco(epochs: Sequence[Followed], views: Sequence[WallView]) -> dict[str, Any]:
     """The events as COCO annotations of the difference maps; `event` is the event's number."""
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
-    for epoch in epochs:
-        name = f"difference_{epoch.number:03d}.tif"
-        images.append({"id": epoch.number, "file_name": name, "height": shape[0], "width": shape[1], "epoch": epoch.number})
-        for region in epoch.regions:
-            height, width = region.mask.shape
-            annotations.append(
-                {
-                    "id": len(annotations) + 1,
-                    "image_id": epoch.number,
-                    "category_id": BLOCK_CATEGORY["id"],
-                    "bbox": [region.column, region.row, width, height],
-                    "area": int(region.mask.sum()),
-                    "iscrowd": 0,
-                    "segmentation": run_length_encoding(region.mask, region.row, region.column, shape),
-                    "event": region.identity,
-                    "kind": region.kind,
-                }
-            )
+    last = max((epoch.number for epoch in epochs), default=0)
+    for view in views:
+        height, width = view.grid.shape
+        for epoch in epochs:
+            image = epoch.number + (view.number - 1) * last
+            name = f"difference_{epoch.number:03d}{view.suffix}.tif"
+            images.append({"id": image, "file_name": name, "height": height, "width": width, "epoch": epoch.number})
+            inside = [region for region in epoch.regions if region.view == view.number]
+            annotations += [_annotation(region, image, view, len(annotations) + 1 + place) for place, region in enumerate(inside)]
     return {"images": images, "annotations": annotations, "categories": [BLOCK_CATEGORY]}
+
+
+def _annotation(region: ChangedRegion, image: int, view: WallView, number: int) -> dict[str, Any]:
+    """A region as COCO holds it."""
+    height, width = region.mask.shape
+    return {
+        "id": number,
+        "image_id": image,
+        "category_id": BLOCK_CATEGORY["id"],
+        "bbox": [region.column, region.row, width, height],
+        "area": int(region.mask.sum()),
+        "iscrowd": 0,
+        "segmentation": run_length_encoding(region.mask, region.row, region.column, view.grid.shape),
+        "event": region.identity,
+        "kind": region.kind,
+    }
 
 
 def _document(result: Result, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """monitor.json."""
-    site, frame = result.site, result.site.frame
+    site = result.site
     inputs = []
     by_number = {epoch.number: epoch.record for epoch in result.epochs}
     for number, source in enumerate(result.sources):
@@ -203,18 +231,8 @@ def _document(result: Result, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "complete": True,
         "inputs": inputs,
         "options": result.options.to_dict(),
-        "wall_frame": {
-            "matrix_world_to_wall": frame.matrix.tolist(),
-            "rotation": frame.rotation.tolist(),
-            "origin_m": frame.origin.tolist(),
-        },
-        "grid": {
-            "x_min_m": site.grid.x_min,
-            "y_max_m": site.grid.y_max,
-            "gsd_m": site.grid.gsd,
-            "width": site.grid.width,
-            "height": site.grid.height,
-        },
+        **_place_of(site.views[0]),
+        "views": [{"view": view.number, "suffix": view.suffix, **_place_of(view)} for view in site.views],
         "epochs": [
             {
                 "epoch": epoch.number,
@@ -230,6 +248,25 @@ def _document(result: Result, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         ],
         "events": list(rows),
         "versions": versions(),
+    }
+
+
+def _place_of(view: WallView) -> dict[str, Any]:
+    """Frame and grid of a view's maps."""
+    frame, grid = view.frame, view.grid
+    return {
+        "wall_frame": {
+            "matrix_world_to_wall": frame.matrix.tolist(),
+            "rotation": frame.rotation.tolist(),
+            "origin_m": frame.origin.tolist(),
+        },
+        "grid": {
+            "x_min_m": grid.x_min,
+            "y_max_m": grid.y_max,
+            "gsd_m": grid.gsd,
+            "width": grid.width,
+            "height": grid.height,
+        },
     }
 
 

@@ -21,6 +21,7 @@ from pipeline.monitoring.gridding import WallPoints
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.times import EpochTime, check_order, time_of
 from scene.common.errors import InputError
+from scene.common.keyed_random import KeyedRandom
 from scene.geometry.frame import WallFrame
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray, TriangleMesh
@@ -146,10 +147,12 @@ class EpochData:
         """All points (n, 3), survey coordinates, m, chunk by chunk."""
         return iter(np.array_split(self.points, -(-len(self.points) // CHUNK))) if self.large is None else self.large.chunks()
 
-    def wall_points(self, frame: WallFrame, gsd_m: float) -> WallPoints:
-        """Points in the wall frame, m; those of a mesh lie on it, four to a pixel."""
+    def wall_points(self, frame: WallFrame, gsd_m: float, *, several: bool = False) -> WallPoints:
+        """Points in the wall frame, m; those of a mesh lie on it, four to a pixel, on all sides of it for `several` views."""
         if self.mesh is None:
             return WallPoints(frame.to_wall(self.points), lambda: map(frame.to_wall, self.chunks()))
+        if several:
+            return WallPoints.of(frame.to_wall(_spread_over(self.mesh, gsd_m / 2)))
         from pipeline.change.difference import surface_raster
 
         mesh = self.mesh.with_vertices(frame.to_wall(self.mesh.vertices))
@@ -158,6 +161,18 @@ class EpochData:
         row, column = np.nonzero(np.isfinite(heights))
         x, y = grid.x_min + (column + 0.5) * grid.gsd, grid.y_max - (row + 0.5) * grid.gsd
         return WallPoints.of(np.stack([x, y, heights[row, column]], axis=1).astype(np.float64))
+
+
+def _spread_over(mesh: TriangleMesh, apart_m: float) -> FloatArray:
+    """(n, 3) points at random on a mesh, as many as squares of that side have room on it, m."""
+    corners = mesh.vertices[mesh.faces]
+    sides = corners[:, 1:] - corners[:, :1]
+    ends = np.cumsum(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2)
+    random = KeyedRandom(0).child("monitor", "mesh").generator()
+    face = np.searchsorted(ends, random.uniform(0, ends[-1], int(ends[-1] / apart_m**2)))
+    share = random.uniform(size=(len(face), 2))
+    share = np.where(share.sum(axis=1, keepdims=True) > 1, 1 - share, share)
+    return np.asarray(corners[face, 0] + np.einsum("nk,nki->ni", share, sides[face]))
 
 
 def find_epochs(paths: Sequence[Path], times: Sequence[str] = ()) -> list[EpochSource]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -55,14 +55,14 @@ class EpochRecord:
     area_m2: float
     regions: tuple[ChangedRegion, ...]
 
-    def write(self, folder: Path, fingerprint: str, shape: tuple[int, ...]) -> None:
-        """Keep the record; fingerprint: of the reference and the options; shape: of the map."""
+    def write(self, folder: Path, fingerprint: str, shapes: Sequence[tuple[int, ...]]) -> None:
+        """Keep the record; fingerprint: of the reference and the options; shapes: of the maps of all views."""
         values = {name: getattr(self, name) for name in ("number", "inputs", "points", "notes", "registration", "area_m2")}
         levels = {
             "level_m": self.level_m,
             "predicted_level_m": None if np.isnan(self.predicted_level_m) else self.predicted_level_m,
         }
-        regions = [_plain(region, shape) for region in self.regions]
+        regions = [_plain(region, shapes[region.view - 1]) for region in self.regions]
         write_json(
             _file(folder, self.number),
             {"fingerprint": fingerprint, **values, **levels, "transform": self.transform.to_dict(), "regions": regions},

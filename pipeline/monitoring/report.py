@@ -13,6 +13,7 @@ from pipeline.monitoring.magnitude import PowerLaw, fit_power_law
 from pipeline.monitoring.model import compared_in_words
 from pipeline.monitoring.products import Followed, Result, event_raster
 from pipeline.monitoring.significance import NORMAL_95
+from pipeline.monitoring.site import WallView
 from pipeline.report.figures import blocks_figure, difference_figure, hillshade_figure, label_axes, png_bytes
 from pipeline.report.map_styles import difference_style, quantity_style
 from pipeline.report.page import template
@@ -27,9 +28,11 @@ _EPOCHS_FOR_LAW = 3
 
 def write_report(result: Result) -> None:
     """Write report.html, its pictures as files of their own, and styles of the maps for GIS programs."""
-    pictures = {"reference.png": hillshade_figure(result.site.reference.raster.height, result.site.grid)}
-    for epoch in result.epochs:
-        pictures |= _pictures_of(epoch, result)
+    pictures: dict[str, bytes] = {}
+    for view in result.site.views:
+        pictures[f"reference{view.suffix}.png"] = hillshade_figure(view.raster.height, view.grid)
+        for epoch in result.epochs:
+            pictures |= _pictures_of(epoch, view, result)
     law = None
     if len(result.sources) >= _EPOCHS_FOR_LAW:
         pictures["volumes.png"] = _volumes_figure(result)
@@ -100,21 +103,22 @@ def _about(epoch: Followed, result: Result) -> dict[str, Any]:
     return {"number": epoch.number, "registered": registered, "predicted": predicted, "notes": record.notes}
 
 
-def _pictures_of(epoch: Followed, result: Result) -> dict[str, bytes]:
-    grid, number = result.site.grid, epoch.number
-    difference, _ = read_geotiff(result.folder / f"difference_{number:03d}.tif")
-    level, _ = read_geotiff(result.folder / f"lod_{number:03d}.tif")
+def _pictures_of(epoch: Followed, view: WallView, result: Result) -> dict[str, bytes]:
+    """Map and gallery of an epoch in one view, and styles of its maps."""
+    grid, place = view.grid, f"{epoch.number:03d}{view.suffix}"
+    difference, _ = read_geotiff(result.folder / f"difference_{place}.tif")
+    level, _ = read_geotiff(result.folder / f"lod_{place}.tif")
     sigma = max(epoch.record.level_m / NORMAL_95, 1e-6)
-    difference_style(result.folder / f"difference_{number:03d}.tif", _SIGMAS_SHOWN * sigma)
-    quantity_style(result.folder / f"lod_{number:03d}.tif", level, "mm", 1e3)
-    labels = event_raster(epoch.regions, grid.shape)
+    difference_style(result.folder / f"difference_{place}.tif", _SIGMAS_SHOWN * sigma)
+    quantity_style(result.folder / f"lod_{place}.tif", level, "mm", 1e3)
+    labels = event_raster(epoch.regions, view)
     captions = {
         region.identity: f"{region.volume_m3:.3g} m³" if region.volume_m3 >= 0.1 else f"{1e3 * region.volume_m3:.3g} l"
-        for region in epoch.regions[:_LARGEST_SHOWN]
+        for region in [each for each in epoch.regions if each.view == view.number][:_LARGEST_SHOWN]
     }
-    found = {f"map_{number:03d}.png": difference_figure(difference, grid, labels, sigma)}
+    found = {f"map_{place}.png": difference_figure(difference, grid, labels, sigma)}
     gallery = blocks_figure(difference, grid, labels, sigma, captions)
-    return found if gallery is None else found | {f"events_{number:03d}.png": gallery}
+    return found if gallery is None else found | {f"events_{place}.png": gallery}
 
 
 def _missing_volumes(result: Result) -> dict[int, float]:

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-import multiprocessing
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
+from pipeline.dataset.cluster import map_on_workers
 from pipeline.formats.files.atomic import empty_folder
 from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.monitoring.comparison import EpochChange, compare_epoch
@@ -87,8 +87,8 @@ def monitor(
     further = list(enumerate(sources[1:], start=1))
     progress.plan({f"epoch {number}": 1.0 for number, _ in further} | {"report": 0.3})
     records = {number: kept(out, number, source.checksums(), fingerprint) for number, source in further} if resume else {}
-    if workers > 1:
-        left = [(number, source) for number, source in further if records.get(number) is None]
+    left = [(number, source) for number, source in further if records.get(number) is None]
+    if workers > 1 and len(left) > 1:
         records |= _compared_in_processes(left, site, out, options, fingerprint, workers, progress)
     followed = []
     catalogue = Catalogue()
@@ -108,7 +108,11 @@ def monitor(
 
 def _fingerprint(site: ReferenceSite, options: MonitorOptions) -> str:
     """Of all that a record depends on beside its epoch."""
-    told = {"reference": site.source.checksums(), "options": options.to_dict(), "grid": site.grid.__dict__}
+    told = {
+        "reference": site.source.checksums(),
+        "options": options.to_dict(),
+        "grids": [view.grid.__dict__ for view in site.views],
+    }
     return hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()
 
 
@@ -121,13 +125,11 @@ def _compared_in_processes(
     workers: int,
     progress: Progress,
 ) -> dict[int, EpochRecord | None]:
-    """The records of epochs, compared in processes of their own, by number."""
-    context = multiprocessing.get_context("spawn")
+    """The records of epochs, compared on local workers of Dask, by number."""
     found: dict[int, EpochRecord | None] = {}
-    with progress.stage("comparisons"), ProcessPoolExecutor(min(workers, len(left) or 1), mp_context=context) as pool:
-        waiting = [pool.submit(_in_worker, number, source, site.source, out, options, fingerprint) for number, source in left]
-        for done in as_completed(waiting):
-            record = done.result()
+    tasks = [(number, source, site.source, out, options, fingerprint) for number, source in left]
+    with progress.stage("comparisons"):
+        for record in map_on_workers(_in_worker, tasks, workers):
             found[record.number] = record
             progress.advance(len(found) / len(left))
     return found
@@ -165,14 +167,18 @@ def processed(
     """Compare one epoch, write its maps and its record; returns the record and what was read."""
     data = read_epoch(source, options)
     notes = [*data.notes, *_check_same_site(data, site, source)]
-    points = data.wall_points(site.frame, site.grid.gsd)
+    points = data.wall_points(site.frame, site.grid.gsd, several=len(site.views) > 1)
     found = compare_epoch(site.reference, points, options.stable, options.seed)
-    write_geotiff(out / f"difference_{number:03d}.tif", found.change.difference, site.grid)
-    write_geotiff(out / f"lod_{number:03d}.tif", found.change.significance.level, site.grid)
-    regions = found.regions
-    if options.detector != NO_DETECTOR:
-        regions = regions_of_detector(options.detector, out / f"difference_{number:03d}.tif", found.change)
-    compared = np.isfinite(found.change.difference)
+    regions = found.regions if options.detector == NO_DETECTOR else []
+    for view, change in zip(site.views, found.changes, strict=True):
+        difference = out / f"difference_{number:03d}{view.suffix}.tif"
+        write_geotiff(difference, change.difference, view.grid)
+        write_geotiff(out / f"lod_{number:03d}{view.suffix}.tif", change.significance.level, view.grid)
+        if options.detector != NO_DETECTOR:
+            detected = regions_of_detector(options.detector, difference, change)
+            regions += [replace(region, view=view.number) for region in detected]
+    levels = np.concatenate([change.significance.level[np.isfinite(change.significance.level)] for change in found.changes])
+    compared = sum(int(np.isfinite(change.difference).sum()) for change in found.changes)
     record = EpochRecord(
         number=number,
         inputs=source.checksums(),
@@ -180,12 +186,12 @@ def processed(
         notes=(*notes, *found.alignment.notes),
         transform=found.transform,
         registration={**found.alignment.to_dict(), **found.transform.to_dict()},
-        level_m=float(np.nanmedian(found.change.significance.level)),
+        level_m=float(np.median(levels)),
         predicted_level_m=_predicted(options, site, found),
-        area_m2=float(compared.sum()) * site.grid.gsd**2,
+        area_m2=float(compared) * site.grid.gsd**2,
         regions=tuple(regions),
     )
-    record.write(out, fingerprint, site.grid.shape)
+    record.write(out, fingerprint, [view.grid.shape for view in site.views])
     return record, data
 
 
@@ -193,12 +199,14 @@ def _predicted(options: MonitorOptions, site: ReferenceSite, found: EpochChange)
     model = None if options.photographs else scanner_model(options)
     if model is None:
         return float("nan")
-    return predicted_level(model, site.reference.raster, found.change.epoch, site.station)
+    return predicted_level(model, site.views[0].raster, found.changes[0].epoch, site.station)
 
 
 def _check_same_site(data: EpochData, site: ReferenceSite, source: EpochSource) -> list[str]:
     """Notes on an epoch's coordinates and density. Raises InputError where it lies elsewhere, or is in another unit."""
     wall = site.frame.to_wall(data.points[:: max(len(data.points) // 100_000, 1)])
+    if site.reference.partition is not None:
+        wall = wall[site.reference.partition.of(wall) == 0]
     grid = site.grid
     extent = np.ptp(np.quantile(wall[:, :2], [0.02, 0.98], axis=0), axis=0)
     ratio = float(np.min(extent / np.array([grid.width * grid.gsd, grid.height * grid.gsd])))

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.monitoring.alignment import SAME
 from pipeline.monitoring.comparison import ReferenceHeights
 from pipeline.monitoring.frame import raster_of, towards_sensor, wall_frame
+from pipeline.monitoring.gridding import HeightRaster
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.reading import EpochData, EpochSource, read_epoch
+from pipeline.monitoring.views import MOST_VIEWS, Partition, divided
+from pipeline.registration.rigid import RigidTransform
+from scene.common.errors import InputError
 from scene.geometry.frame import WallFrame
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray
@@ -19,14 +25,43 @@ _STEEP = float(np.tan(np.radians(65.0)))
 
 
 @dataclass(frozen=True)
+class WallView:
+    """A part of the wall with maps of its own.
+
+    Attributes
+    ----------
+    number : int
+        From 1 on; the first is the largest, and its frame is the wall frame.
+    frame : WallFrame
+        z along the direction of change, towards the sensor.
+    raster : HeightRaster
+        Heights of the reference.
+    """
+
+    number: int
+    frame: WallFrame
+    raster: HeightRaster
+
+    @property
+    def grid(self) -> Grid:
+        """Of its maps."""
+        return self.raster.grid
+
+    @property
+    def suffix(self) -> str:
+        """What the names of its files end in."""
+        return "" if self.number == 1 else f"_view{self.number}"
+
+
+@dataclass(frozen=True)
 class ReferenceSite:
     """The reference, prepared for comparisons.
 
     Attributes
     ----------
     source : EpochSource
-    frame : WallFrame
-        z along the direction of change, towards the sensor.
+    views : tuple of WallView
+        One, or several where the wall turns a corner or overhangs.
     station : (3,) array
         Where the sensor stood, or a place before the wall, wall frame, m.
     reference : ReferenceHeights
@@ -37,7 +72,7 @@ class ReferenceSite:
     """
 
     source: EpochSource
-    frame: WallFrame
+    views: tuple[WallView, ...]
     station: FloatArray
     reference: ReferenceHeights
     points: int
@@ -45,30 +80,85 @@ class ReferenceSite:
     notes: tuple[str, ...]
 
     @property
+    def frame(self) -> WallFrame:
+        """The wall frame: that of the first view."""
+        return self.views[0].frame
+
+    @property
     def grid(self) -> Grid:
-        """Of all maps."""
-        return self.reference.raster.grid
+        """Of the maps of the first view."""
+        return self.views[0].grid
 
 
 def prepared(source: EpochSource, options: MonitorOptions) -> ReferenceSite:
-    """Read the reference and choose frame and raster."""
+    """Read the reference and choose views, frames and rasters."""
     data = read_epoch(source, options)
     towards, how = towards_sensor(data, options, source.name)
-    frame = wall_frame(data.points, towards, options.direction)
-    grid = raster_of(frame.to_wall(data.points), options.gsd_m or _gsd_of_mesh(data), data.count)
-    points = data.wall_points(frame, grid.gsd)
-    reference = ReferenceHeights.of(points, grid)
-    seen = float(reference.raster.known.mean())
+    frames, partition = _frames(data, towards, options)
+    wall = frames[0]
+    grids = _grids(data, frames, partition, options)
+    points = data.wall_points(wall, grids[0].gsd, several=partition is not None)
+    reference = ReferenceHeights.of(points, grids, [_between(wall, frame) for frame in frames], partition)
+    parts = zip(frames, reference.rasters, strict=True)
+    views = tuple(WallView(number, *each) for number, each in enumerate(parts, start=1))
     notes = [*data.notes, f"the wall was seen from its side of ({', '.join(f'{value:.2f}' for value in towards)}), {how}"]
-    steep = reference.raster.steepness[reference.raster.known]
-    if (share := float((steep > _STEEP).mean())) > _TENTH:
+    notes += _notes(views)
+    return ReferenceSite(source, views, wall.to_wall(towards), reference, data.count, data.crs, tuple(notes))
+
+
+def _frames(data: EpochData, towards: FloatArray, options: MonitorOptions) -> tuple[list[WallFrame], Partition | None]:
+    """Frame of each view, the largest first, and which point belongs to which, in the first frame."""
+    single = wall_frame(data.points, towards, options.direction)
+    count = options.views or (None if options.direction is None else 1)
+    if count is not None and not 1 <= count <= MOST_VIEWS:
+        raise InputError(f"got {count}", where="--views", allowed=f"1 to {MOST_VIEWS}")
+    found = divided(data.points - single.origin, towards - single.origin, single.rotation[2], count)
+    if found is None:
+        return [single], None
+    view = found.of(data.points - single.origin)
+    frames = [WallFrame.along(direction, data.points[view == number]) for number, direction in enumerate(found.directions)]
+    wall = frames[0]
+    return frames, found.for_points(RigidTransform(wall.rotation.T, wall.origin - single.origin))
+
+
+def _grids(data: EpochData, frames: Sequence[WallFrame], partition: Partition | None, options: MonitorOptions) -> list[Grid]:
+    """Raster of each view; all have the pixel of the first."""
+    gsd = options.gsd_m or _gsd_of_mesh(data)
+    if partition is None:
+        return [raster_of(frames[0].to_wall(data.points), gsd, data.count)]
+    view, grids = partition.of(frames[0].to_wall(data.points)), list[Grid]()
+    for number, frame in enumerate(frames):
+        part = frame.to_wall(data.points[view == number])
+        grids.append(raster_of(part, gsd, round(data.count * len(part) / len(data.points))))
+        gsd = grids[0].gsd
+    return grids
+
+
+def _between(wall: WallFrame, view: WallFrame) -> RigidTransform:
+    """From the wall frame to that of a view."""
+    if view is wall:
+        return SAME
+    return RigidTransform(view.rotation @ wall.rotation.T, view.rotation @ (wall.origin - view.origin))
+
+
+def _notes(views: Sequence[WallView]) -> list[str]:
+    notes = []
+    if len(views) > 1:
+        notes.append(
+            f"the wall turns or overhangs: it has {len(views)} views with maps of their own (difference_001.tif, "
+            "difference_001_view2.tif, ...), registered together"
+        )
+    known = sum(int(view.raster.known.sum()) for view in views)
+    steep = sum(int((view.raster.steepness[view.raster.known] > _STEEP).sum()) for view in views)
+    if (share := steep / max(known, 1)) > _TENTH:
         notes.append(
             f"{100 * share:.0f} % of the surface stands at more than 65 degrees to the maps' plane, where changes show badly: "
-            "give another --direction, or monitor the sides of a corner by themselves"
+            "give another --direction, or a number of --views"
         )
-    if seen < _TENTH:
+    seen = known / sum(view.raster.known.size for view in views)
+    if len(views) == 1 and seen < _TENTH:
         notes.append(f"only {100 * seen:.0f} % of the map has data: a larger --gsd has fewer gaps")
-    return ReferenceSite(source, frame, frame.to_wall(towards), reference, data.count, data.crs, tuple(notes))
+    return notes
 
 
 def _gsd_of_mesh(data: EpochData) -> float | None:

@@ -11,8 +11,10 @@ from pipeline.formats.files.atomic import write_text
 from pipeline.formats.meshes.ply import write_ply
 from pipeline.monitoring.products import Result
 from pipeline.monitoring.significance import NORMAL_95
+from pipeline.monitoring.site import ReferenceSite
 from pipeline.surface.raster_mesh import mesh_of_raster
 from scene.common.errors import InputError
+from scene.geometry.mesh import TriangleMesh
 
 _HEAD = """# The site of {name}, as `scarpsim monitor` saw it: simulate it with
 #   simulate --sensor tls --config {file}
@@ -30,14 +32,14 @@ def write_site(result: Result, path: Path) -> None:
     for file in (path, wall):
         if file.exists():
             raise InputError("exists already", where=str(file), remedy="choose another name with --write-site")
-    mesh = mesh_of_raster(site.reference.raster.height, site.grid).submesh()
+    mesh = _mesh(site)
     if not len(mesh.faces):
         raise InputError(
             "the epoch gives no surface: no pixels with data lie side by side",
             where=site.source.name,
             remedy="give a larger --gsd",
         )
-    write_ply(wall, mesh.with_vertices(site.frame.to_world(mesh.vertices)))
+    write_ply(wall, mesh)
     middle = np.array(
         [site.grid.x_min + site.grid.width * site.grid.gsd / 2, site.grid.y_max - site.grid.height * site.grid.gsd / 2, 0]
     )
@@ -57,9 +59,18 @@ def write_site(result: Result, path: Path) -> None:
     write_text(path, _HEAD.format(name=site.source.name, file=path.name) + text)
 
 
+def _mesh(site: ReferenceSite) -> TriangleMesh:
+    """The reference's surface, that of all views, survey coordinates, m."""
+    parts = [(view, mesh_of_raster(view.raster.height, view.grid).submesh()) for view in site.views]
+    first = np.cumsum([0, *(len(mesh.vertices) for _, mesh in parts)])
+    vertices = np.concatenate([view.frame.to_world(mesh.vertices) for view, mesh in parts])
+    faces = [mesh.faces + start for (_, mesh), start in zip(parts, first[:-1], strict=True)]
+    return TriangleMesh(vertices, np.concatenate(faces).astype(np.int32))
+
+
 def _range_sigma(result: Result) -> float:
     """White noise of a point along the wall's normal, m, that explains the median level of detection."""
-    raster = result.site.reference.raster
+    raster = result.site.views[0].raster
     share = float(np.nanmedian(raster.sigma / raster.scatter))
     level = float(np.median([epoch.record.level_m for epoch in result.epochs]))
     return level / NORMAL_95 / np.sqrt(2.0) / max(share, 1e-6)

@@ -96,7 +96,7 @@ def read_measured(folder: Path, config: DifferenceConfig, icp: IcpConfig | None,
             raise InputError(
                 f"the map's grid {grid} differs from {grids[0]} of {files[0].name}",
                 where=str(file),
-                remedy="bring the maps to one grid",
+                remedy="resample the maps to one grid",
             )
     return MeasuredMaps(folder.name, grids[0], np.stack(maps), None)
 

@@ -53,7 +53,7 @@ class TailFigures:
     largest_m: float
 
     def to_dict(self) -> dict[str, float | None]:
-        """Return the values for JSON; NaN becomes null."""
+        """Return the fields as a dictionary for JSON; NaN becomes null."""
         return {name: None if np.isnan(value) else value for name, value in dataclasses.asdict(self).items()}
 
 
@@ -90,7 +90,7 @@ class Normality:
     sample: int
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the values for JSON."""
+        """Return the fields as a dictionary for JSON."""
         return dataclasses.asdict(self)
 
 
@@ -133,7 +133,7 @@ class BinStatistics:
     statistics: DifferenceStatistics
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the values for JSON; an infinite end becomes null."""
+        """Return the fields as a dictionary for JSON; an infinite end becomes null."""
         low, high = (end if np.isfinite(end) else None for end in (self.low, self.high))
         return {"low": low, "high": high, **self.statistics.to_dict()}
 

@@ -67,7 +67,7 @@ class Variogram:
     pairs: FloatArray
 
     def to_dict(self) -> dict[str, list[float]]:
-        """Return the values for JSON."""
+        """Return the fields as a dictionary for JSON."""
         return {field.name: getattr(self, field.name).tolist() for field in dataclasses.fields(self)}
 
 
@@ -211,7 +211,7 @@ class VariogramModel:
         return self.sill_m2 - self.semivariance(distance)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the values for JSON."""
+        """Return the fields as a dictionary for JSON."""
         return {**dataclasses.asdict(self), "sill_m2": self.sill_m2}
 
     def summary(self) -> str:

@@ -11,6 +11,8 @@ from pipeline.formats.files.atomic import filling, write_json
 from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.planning.maps import Plan, plans
 from pipeline.planning.report import write_plan_report
+from pipeline.planning.series import SeriesPlan
+from pipeline.planning.series_report import series_parts
 from pipeline.report.map_styles import quantity_style
 from pipeline.report.progress import Progress
 from pipeline.report.provenance import versions
@@ -52,7 +54,7 @@ def inspect(config: SimulationConfig, sensors: Sequence[SensorName], progress: P
     return found
 
 
-def write_plans(out: Path, config: SimulationConfig, found: Sequence[Plan]) -> Path:
+def write_plans(out: Path, config: SimulationConfig, found: Sequence[Plan], series: Sequence[SeriesPlan] = ()) -> Path:
     """Write the maps, plan.json and report.html of plans into a folder, which appears when everything has been written.
 
     Maps are named <sensor>_<map>.tif, or <sensor>_station_<n>_<map>.tif for one of several stations; values are SI, in the wall
@@ -66,6 +68,8 @@ def write_plans(out: Path, config: SimulationConfig, found: Sequence[Plan]) -> P
         The config of the plans.
     found : sequence of Plan
         The plans.
+    series : sequence of SeriesPlan
+        Promises of series, for plan.json and the report.
 
     Returns
     -------
@@ -78,11 +82,11 @@ def write_plans(out: Path, config: SimulationConfig, found: Sequence[Plan]) -> P
         If the folder is in use.
     """
     with filling(out) as folder:
-        _write(folder, config, found)
+        _write(folder, config, found, series)
     return out / REPORT_FILE
 
 
-def _write(out: Path, config: SimulationConfig, found: Sequence[Plan]) -> None:
+def _write(out: Path, config: SimulationConfig, found: Sequence[Plan], series: Sequence[SeriesPlan]) -> None:
     """Write everything into the folder."""
     for each in found:
         for plotted in each.maps:
@@ -94,8 +98,9 @@ def _write(out: Path, config: SimulationConfig, found: Sequence[Plan]) -> None:
         "schema": 1,
         "seed": config.seed,
         "plans": [each.to_dict() for each in found],
+        **({"series": [each.to_dict() for each in series]} if series else {}),
         "config": config.model_dump(mode="json"),
         "versions": versions(),
     }
     write_json(out / PLAN_FILE, record)
-    write_plan_report(out / REPORT_FILE, found, config.model_dump(mode="json"))
+    write_plan_report(out / REPORT_FILE, found, config.model_dump(mode="json"), series_parts(series))

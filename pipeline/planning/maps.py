@@ -169,7 +169,7 @@ def plans(config: SimulationConfig, site: SensorSite) -> list[Plan]:
     InputError
         If the sensor, or one of its stations, sees nothing of the wall.
     """
-    caster = RayCaster(site.mesh if config.wetness is None else config.wetness.with_wet_patches(site.mesh))
+    caster = site.caster_of(site.mesh if config.wetness is None else config.wetness.with_wet_patches(site.mesh))
     raster = wall_raster(caster, config.planning.gsd_m)
     if isinstance(site.sensor, StereoPair):
         return [_stereo_plan(site.name, site.sensor, caster, raster, config.planning)]

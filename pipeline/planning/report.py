@@ -67,7 +67,7 @@ class _Part:
 
 
 def summary(plan: Plan) -> str:
-    """Describe a plan as aligned lines of text for the terminal."""
+    """Describe a plan as lines of text for the terminal: its single figures and the summaries of its maps."""
     lines = [f"{plan.instrument}, wall {plan.wall}", f"  {answer(plan)}"]
     lines += [f"  {title:<52}{value:>12}" for title, value in _figures(plan)]
     lines.append(f"  {'map':<52}{'middle':>12}{'median':>10}{'5 %':>10}{'95 %':>10}")
@@ -96,7 +96,7 @@ def _in_the_middle(plan: Plan, name: str) -> float | None:
     return next(found for found in plan.maps if found.name == name).summary(plan.in_middle)["middle"]
 
 
-def write_plan_report(path: Path, plans: Sequence[Plan], config: Mapping[str, Any]) -> None:
+def write_plan_report(path: Path, plans: Sequence[Plan], config: Mapping[str, Any], series: Sequence[Any] = ()) -> None:
     """Write report.html of some plans, completely or not at all. Equal arguments give equal bytes.
 
     Parameters
@@ -107,10 +107,13 @@ def write_plan_report(path: Path, plans: Sequence[Plan], config: Mapping[str, An
         The plans.
     config : mapping
         The resolved config, which the page lists.
+    series : sequence of SeriesPart
+        Promises of series.
     """
     page = template("planning/report.html.jinja").render(
         title=f"{plans[0].wall.replace('_', ' ').capitalize()}: a plan",
         parts=[_part(plan) for plan in plans],
+        series=series,
         depth_ratio=plans[0].config.depth_ratio,
         config=yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True),
     )

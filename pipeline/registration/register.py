@@ -135,7 +135,7 @@ class IcpIteration:
     undetermined: int
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the values for JSON; an infinite outlier threshold becomes null."""
+        """Return the fields as a dictionary for JSON; an infinite outlier threshold becomes null."""
         values = dataclasses.asdict(self)
         return values | {"outlier_threshold_m": _finite(self.outlier_threshold_m)}
 

@@ -69,7 +69,7 @@ class RigidTransform:
         return sine * (angle / norm) if norm > 0 else sine
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the values for JSON: rotation, translation_m and, for readers, rotation_vector_rad."""
+        """Return the fields as a dictionary for JSON: rotation, translation_m and, for readers, rotation_vector_rad."""
         return {
             "rotation": self.rotation.tolist(),
             "translation_m": self.translation.tolist(),

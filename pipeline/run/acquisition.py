@@ -80,14 +80,20 @@ def acquire(config: SimulationConfig, site: SensorSite, scene: RayCaster, random
         if not isinstance(sensor, StereoPair):
             allowed = "direct, for the tls sensor" if isinstance(sensor, LaserScanner) else "direct, colmap, for matcher: sgbm"
             raise InputError(
-                "only a stereo pair with simulated matching can measure vertices", where="reconstruction", allowed=allowed
+                "`vertices` needs a stereo pair with simulated matching",
+                where="reconstruction",
+                allowed=allowed,
+                remedy="choose one of these reconstructions",
             )
         vertices = observe_vertices(sensor, scene, random)
     seen = sensor.observe(scene, random)
     if not isinstance(sensor, StereoPair | MatchedStereoPair):
         if colmap:
             raise InputError(
-                "colmap needs the depth maps of a stereo pair", where="reconstruction", allowed="direct, for the tls sensor"
+                "colmap needs the depth maps of a stereo pair",
+                where="reconstruction",
+                allowed="direct, for the tls sensor",
+                remedy="set reconstruction to direct, or simulate a stereo pair",
             )
         return Acquisition(seen, None, _join_stations(config, site, scene, seen, random))
     if not (colmap or config.products.metashape):

@@ -103,7 +103,7 @@ class LaterEpoch:
 
 @dataclass(frozen=True)
 class SinceLast:
-    """Change since the epoch before, (h, w): the one before minus this one, m, and the labels of what is new."""
+    """Change since the epoch before. difference: (h, w) that epoch minus this one, m; block: (h, w) labels of what is new."""
 
     difference: NDArray[np.float32]
     block: IntArray
@@ -138,7 +138,7 @@ STAGES = {"carve": 4.0, "observe": 3.0, "mesh": 1.0, "register": 4.0, "differenc
 def observe_reference(config: SimulationConfig, site: SensorSite, random: KeyedRandom, progress: Progress) -> ReferenceEpoch:
     """Observe the untouched wall, reconstruct it and rasterise it. `random` is the run's source."""
     with progress.stage("epoch 0: observe"):
-        caster = RayCaster(with_wetness(config, site.mesh))
+        caster = site.caster_of(with_wetness(config, site.mesh))
         for where, viewpoint in site.viewpoints.items():
             check_in_front(caster, viewpoint, where)
         seen = acquire(config, reference_sensor(config, site), caster, random.child("epoch", 0, "observe"))

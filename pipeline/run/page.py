@@ -145,6 +145,8 @@ class RunReport:
         Further rows of the table at the top: name to value with its unit.
     complete : bool
         False if the run was interrupted.
+    total : int, optional
+        Number of later epochs, with those of a series that the page leaves out; None: all are shown.
     """
 
     title: str
@@ -155,12 +157,15 @@ class RunReport:
     config: Mapping[str, Any]
     key_figures: Mapping[str, str] = field(default_factory=dict)
     complete: bool = True
+    total: int | None = None
 
     def summary(self) -> str:
         """Describe in words what was done."""
         sensor = _SENSORS.get(self.sensor, self.sensor)
         end = "" if self.complete else " The run was interrupted: later epochs are missing."
-        return f"A {sensor} observed a rock wall before and after rocks fell, in {_count(len(self.epochs), 'epoch')}.{end}"
+        total = len(self.epochs) if self.total is None else self.total
+        shown = "" if total == len(self.epochs) else f" The page shows the {len(self.epochs)} in which rocks fell."
+        return f"A {sensor} observed a rock wall before and after rocks fell, in {_count(total, 'epoch')}.{shown}{end}"
 
 
 def write_report(path: Path, report: RunReport) -> None:

@@ -6,7 +6,7 @@ The checksums of everything written are recorded, so that a later call can tell 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from functools import partial
@@ -22,29 +22,13 @@ from pipeline.change.m3c2 import M3c2Map
 from pipeline.change.tiles import tiles
 from pipeline.config.simulation import SimulationConfig
 from pipeline.formats.cameras.crs import wkt_of
-from pipeline.formats.files.atomic import explained, give_name, note, noting, to_disk, write_bytes, write_json
+from pipeline.formats.files.atomic import explained, give_name, note, noting, to_disk, write_json
 from pipeline.formats.files.checksum import sha256
 from pipeline.formats.files.inside import inside
-from pipeline.formats.meshes.ply import write_ply, write_ply_points
+from pipeline.formats.meshes.ply import write_ply
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.copc import SUFFIX as COPC
-from pipeline.formats.points.copc import write_copc
-from pipeline.formats.points.e57 import E57Scan, write_e57
-from pipeline.formats.points.laz import LazHeader, PulseChannels, gps_seconds, write_laz
-from pipeline.formats.points.pcd import write_pcd
-from pipeline.formats.points.xyz import write_xyz
 from pipeline.formats.rasters.geotiff import write_geotiff, write_tiff
 from pipeline.formats.records.run_files import epoch_folder
-from pipeline.report.figures import (
-    SCALE_SIGMAS,
-    blocks_figure,
-    convergence_figure,
-    difference_figure,
-    hillshade_figure,
-    histogram_figure,
-)
-from pipeline.report.map_styles import difference_style, quantity_style
-from pipeline.report.page import litres
 from pipeline.run.acquisition import Acquisition
 from pipeline.run.epoch import LaterEpoch, ReferenceEpoch
 from pipeline.run.recorded_points import at_time, recorded_points, scans_of
@@ -57,7 +41,6 @@ from scene.walls.imported import ImportedWall
 
 EPOCH_RECORD = "epoch.json"
 """File in an epoch's folder that holds its record."""
-_HEADER = LazHeader()
 Checksums = dict[str, str]
 """SHA-256 of files by their names relative to the run's folder."""
 M3C2_ANNOTATIONS = "annotations_m3c2"
@@ -79,9 +62,11 @@ def write_reference(
     out: Path, config: SimulationConfig, site: SensorSite, reference: ReferenceEpoch, seen: Acquisition
 ) -> Checksums:
     """Write epoch_000, with what the sensor recorded (`seen`), and the hillshade of the reference."""
+    from pipeline.run import pictures  # loads slowly, so not before it is needed
+
     with noting() as written, _folder(out, 0) as folder:
         _write_common(folder, config, site, 0, seen, reference.surface, reference.caster.mesh, [])
-        write_bytes(out / "reference.png", hillshade_figure(reference.raster.heights, reference.raster.grid, "Reference"))
+        pictures.write_reference_pictures(out, reference)
         record = {
             "epoch": 0,
             **_seen_record(seen),
@@ -95,6 +80,8 @@ def write_reference(
 
 def write_epoch(out: Path, config: SimulationConfig, site: SensorSite, reference: ReferenceEpoch, epoch: LaterEpoch) -> Checksums:
     """Write an epoch's folder, its difference map, tiles and pictures."""
+    from pipeline.run import pictures  # loads slowly, so not before it is needed
+
     name = f"difference_{epoch.number:03d}"
     grid = reference.raster.grid
     with noting() as written, _folder(out, epoch.number) as folder:
@@ -111,21 +98,7 @@ def write_epoch(out: Path, config: SimulationConfig, site: SensorSite, reference
             write_geotiff(path, epoch.since_last.difference, grid, description=words)
         images = list(_images(out, config, epoch, reference, name))
         sigma = max(epoch.statistics.outside.nmad, 1e-4) if epoch.statistics.outside.count else 1e-3
-        difference_style(out / f"{name}.tif", SCALE_SIGMAS * sigma)
-        masks = epoch.raster.block != WALL
-        write_bytes(out / f"{name}.png", difference_figure(epoch.difference, grid, epoch.raster.block, sigma))
-        largest = sorted(epoch.blocks, key=lambda record: -record["volume_m3"])
-        captions = {record["label"]: f"{litres(record['volume_m3'])} l" for record in largest}
-        zooms = blocks_figure(epoch.difference, grid, epoch.raster.block, sigma, captions)
-        if zooms is not None:
-            write_bytes(out / f"blocks_{epoch.number:03d}.png", zooms)
-        write_bytes(
-            out / f"hillshade_{epoch.number:03d}.png", hillshade_figure(epoch.raster.heights, grid, f"Epoch {epoch.number}")
-        )
-        histogram = histogram_figure(epoch.difference[~masks], epoch.difference[masks])
-        write_bytes(out / f"histogram_{epoch.number:03d}.png", histogram)
-        if epoch.registration is not None:
-            write_bytes(out / f"icp_{epoch.number:03d}.png", convergence_figure(epoch.registration.history))
+        pictures.write_epoch_pictures(out, epoch, grid, sigma)
         write_json(folder / EPOCH_RECORD, _record(config, epoch, images, sigma))
     return _checksums(out, written)
 
@@ -186,17 +159,17 @@ def _m3c2_record(config: SimulationConfig, number: int, found: M3c2Map) -> dict[
 
 def _write_m3c2(out: Path, number: int, found: M3c2Map) -> None:
     """Write the distances and their levels of detection as maps, the distances as a picture, and everything as points."""
+    from pipeline.run import clouds, pictures  # loads slowly, so not before it is needed
+
     write_geotiff(out / f"m3c2_{number:03d}.tif", found.distance, found.grid, description="M3C2, m; missing rock is positive")
     write_geotiff(out / f"m3c2_lod_{number:03d}.tif", found.level, found.grid, description="M3C2 level of detection 95 %, m")
     calm = statistics(found.distance[found.block == WALL])
     sigma = max(calm.nmad, 1e-4) if calm.count else 1e-3
-    difference_style(out / f"m3c2_{number:03d}.tif", SCALE_SIGMAS * sigma)
-    quantity_style(out / f"m3c2_lod_{number:03d}.tif", found.level, "mm", 1e3)
-    write_bytes(out / f"m3c2_{number:03d}.png", difference_figure(found.distance, found.grid, found.block, sigma, "M3C2"))
+    pictures.write_m3c2_pictures(out, number, found, sigma)
     maps: dict[str, NDArray[Any]] = {"distance_m": found.distance, "lod_m": found.level, "block": found.block}
     maps["significant"] = found.significant.astype(np.uint8)
     extra = {name: values.ravel()[found.place] for name, values in maps.items()}
-    write_laz(out / f"m3c2_{number:03d}.laz", PointCloud(found.points, extra=extra))
+    clouds.write_cloud(out / f"m3c2_{number:03d}.laz", PointCloud(found.points, extra=extra))
 
 
 def _seen_record(seen: Acquisition) -> dict[str, Any]:
@@ -231,13 +204,16 @@ def _write_common(
     blocks: list[dict[str, Any]],
 ) -> None:
     """Write what every epoch has: points, depth map, surface, truth, blocks."""
+    from pipeline.formats.points.laz import LazHeader, gps_seconds
+    from pipeline.run import clouds  # these load slowly, so not before they are needed
+
     products = config.products
     cloud, header = recorded_points(seen.observations), LazHeader()
     if config.series is not None:
         cloud = at_time(cloud, gps_seconds(config.series.when(number)))
         header = LazHeader(date=config.series.when(number).date(), standard_time=True)
-    write_cloud(folder / "points.laz", cloud, header)
-    _write_formats(folder / "points", products.formats, cloud, partial(scans_of, seen.observations), header)
+    clouds.write_cloud(folder / "points.laz", cloud, header)
+    clouds.write_formats(folder / "points", products.formats, cloud, partial(scans_of, seen.observations), header)
     if seen.observation.sensor == "stereo":
         depth = seen.observation.depth.astype(np.float32)
         write_tiff(folder / "depth_left.tif", depth, description="depth along the left camera's axis, m")
@@ -249,41 +225,13 @@ def _write_common(
     if products.world or (products.world is None and isinstance(config.wall, ImportedWall)):
         cloud = replace(cloud, points=site.frame.to_world(cloud.points))
         header = replace(header, wkt=wkt_of(products.crs, "products.crs") if products.crs else "")
-        write_cloud(folder / "points_world.laz", cloud, header)
-        _write_formats(folder / "points_world", products.formats, cloud, partial(scans_of, seen.observations, site.frame), header)
+        scans = partial(scans_of, seen.observations, site.frame)
+        clouds.write_cloud(folder / "points_world.laz", cloud, header)
+        clouds.write_formats(folder / "points_world", products.formats, cloud, scans, header)
         if products.surface:
             write_ply(folder / "surface_world.ply", _in_world(surface, site))
     if products.metashape and seen.depth_maps is not None:
         write_metashape_export(folder / "metashape", *seen.depth_maps)
-
-
-def _write_formats(
-    stem: Path, formats: Sequence[str], cloud: PointCloud, scans: Callable[[], list[E57Scan]], header: LazHeader
-) -> None:
-    """Write points in the formats besides LAZ, all with the same stem."""
-    if "copc" in formats:
-        write_cloud(stem.with_suffix(COPC), cloud, header)
-    if "ply" in formats:
-        write_ply_points(stem.with_suffix(".ply"), cloud)
-    if "xyz" in formats:
-        write_xyz(stem.with_suffix(".xyz"), cloud)
-    if "pcd" in formats:
-        write_pcd(stem.with_suffix(".pcd"), cloud)
-    if "e57" in formats:
-        write_e57(stem.with_suffix(".e57"), scans())
-
-
-def write_cloud(path: Path, cloud: PointCloud, header: LazHeader = _HEADER) -> None:
-    """Write a point cloud as LAZ, or as COPC if `path` ends in .copc.laz.
-
-    Channels with a field of their own in the format go there.
-
-    header: coordinate system and time. Raises InputError as `write_laz` and `write_copc` do.
-    """
-    extra = dict(cloud.extra)
-    pulses = PulseChannels(*(extra.pop(name, None) for name in ("return_number", "number_of_returns", "scan_angle_rad")))
-    write = write_copc if path.name.lower().endswith(COPC) else write_laz
-    write(path, replace(cloud, extra=extra), pulses, header)
 
 
 def _write_block_meshes(folder: Path, wall: TriangleMesh, blocks: Blocks) -> None:

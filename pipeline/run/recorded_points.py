@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.e57 import E57Scan
 from scene.geometry.frame import WallFrame
 from sensors.signal_chain.observation import Observation
+
+if TYPE_CHECKING:
+    from pipeline.formats.points.e57 import E57Scan
 
 
 def recorded_points(observations: Sequence[Observation]) -> PointCloud:
@@ -48,6 +50,8 @@ def scans_of(observations: Sequence[Observation], frame: WallFrame | None = None
     The pose has the sensor's position and the wall frame's axes. frame: if given, the pose leads to the world instead of the wall
     frame.
     """
+    from pipeline.formats.points.e57 import E57Scan  # its library takes a tenth of a second to load
+
     frame = frame or WallFrame.identity()
     scans = []
     for number, seen in enumerate(observations, start=1):

@@ -39,7 +39,7 @@ SERIES_FILE = "series.json"
 
 @dataclass(frozen=True)
 class SeriesConditions:
-    """Conditions at each epoch.
+    """Conditions at each epoch of a time series.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class SeriesConditions:
 
     @classmethod
     def of(cls, series: SeriesConfig, random: KeyedRandom) -> SeriesConditions:
-        """Draw the conditions. `random` is the run's source."""
+        """Draw pose, sensor effects and cover of all epochs. `random` is the run's source of random numbers."""
         keyed, hours, given = random.child("series", "conditions"), series.hours, series.conditions
         snow, vegetation = (
             np.zeros(len(hours)) if course is None else course.values(hours, keyed.child(name))
@@ -81,7 +81,7 @@ class SeriesConditions:
 
 @dataclass(frozen=True)
 class Series:
-    """A series of a run.
+    """A time series of epochs, as the section `series` of a config describes it.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ class Series:
 
     @classmethod
     def of(cls, config: SimulationConfig, series: SeriesConfig, site: SensorSite, random: KeyedRandom) -> Series:
-        """Prepare a series."""
+        """Prepare the time series of a run: draw the conditions of all epochs."""
         return cls(config, series, site, random, SeriesConditions.of(series, random))
 
     @property
@@ -230,7 +230,7 @@ def observe_series_epoch(
     before: NDArray[np.float32] | None,
     progress: Progress,
 ) -> LaterEpoch:
-    """Observe one epoch of a series.
+    """Observe one epoch of a time series and compare it with the reference.
 
     Parameters
     ----------

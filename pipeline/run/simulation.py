@@ -37,7 +37,6 @@ from pipeline.run.products import (
     write_epoch,
     write_reference,
 )
-from pipeline.run.report import write_run_report
 from pipeline.run.series import SERIES_FILE, Series, SeriesScene, SeriesTruth, observe_series_epoch
 from pipeline.run.site import SensorSite, prepare_site
 from scene.common.backend import VARIANT
@@ -276,6 +275,8 @@ def _clean_up_after_error(run: _Run, resumed: bool, written: list[Path]) -> None
 
 def _finish(run: _Run, site: SensorSite, *, complete: bool) -> RunSummary:
     """Write what covers all epochs: annotations.json, report.html and run.json."""
+    from pipeline.run.report import write_run_report  # loads slowly, so not before it is needed
+
     out, identity = run.out, run.identity
     records = [json.loads((out / name / EPOCH_RECORD).read_text(encoding="utf-8")) for name in run.products]
     report = write_run_report(out, identity, site, records, complete=complete)

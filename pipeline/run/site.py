@@ -11,6 +11,7 @@ from scene.common.keyed_random import KeyedRandom
 from scene.geometry.frame import WallFrame
 from scene.geometry.mesh import FloatArray, TriangleMesh
 from scene.meshes.winding import check_distances, orient_to_sensors
+from scene.ray_casting.raycast import RayCaster
 from scene.walls.imported import ImportedWall
 from scene.walls.wall import Wall, build_wall
 from sensors.cameras.camera import CameraPair
@@ -44,6 +45,8 @@ class SensorSite:
         Positions of the sensor's viewpoints, by their place in the config, wall frame, m.
     further_stations : tuple of LaserScanner
         The stations after the first.
+    caster : RayCaster, optional
+        A ray caster of the wall, if one was needed to orient it.
     """
 
     name: str
@@ -53,6 +56,11 @@ class SensorSite:
     sensor: LaserScanner | StereoSensor
     viewpoints: dict[str, FloatArray]
     further_stations: tuple[LaserScanner, ...] = ()
+    caster: RayCaster | None = None
+
+    def caster_of(self, mesh: TriangleMesh) -> RayCaster:
+        """Return a ray caster of a mesh: the site's own, if the mesh is the wall as it is, else a new one."""
+        return self.caster if self.caster is not None and self.caster.mesh is mesh else RayCaster(mesh)
 
 
 def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRandom, given: Wall | None = None) -> SensorSite:
@@ -81,39 +89,40 @@ def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRand
         cameras = config.camera_pair(target)
         frame = config.frame.fit(wall.mesh.vertices, (cameras.left.position + cameras.right.position) / 2)
         positions = {f"cameras, {side}": getattr(cameras, side).position for side in ("left", "right")}
-        mesh, repairs = _orient_wall(wall, frame, positions, origin)
+        mesh, repairs, caster = _orient_wall(wall, frame, positions, origin)
         pair = _stereo(config, cameras, frame, random)
         eyes = {name: frame.to_wall(position) for name, position in positions.items()}
-        return SensorSite(wall.name, repairs, mesh, frame, pair, eyes)
+        return SensorSite(wall.name, repairs, mesh, frame, pair, eyes, caster=caster)
     stations = config.station_configs()
     poses = [station.place(target) for station in stations]
     frame = config.frame.fit(wall.mesh.vertices, poses[0][0])
     positions = {f"station, number {number}": position for number, (position, _) in enumerate(poses, start=1)}
     positions = positions if len(poses) > 1 else {"station": poses[0][0]}
-    mesh, repairs = _orient_wall(wall, frame, positions, origin)
+    mesh, repairs, caster = _orient_wall(wall, frame, positions, origin)
     instrument = config.scanner, config.tls_model(), config.products.truth_channels
     scanners = [
         LaserScanner.aimed(pose, frame, mesh.vertices, *instrument, station.pose_sigma)
         for pose, station in zip(poses, stations, strict=True)
     ]
     eyes = {name: scanner.position for name, scanner in zip(positions, scanners, strict=True)}
-    return SensorSite(wall.name, repairs, mesh, frame, scanners[0], eyes, tuple(scanners[1:]))
+    return SensorSite(wall.name, repairs, mesh, frame, scanners[0], eyes, tuple(scanners[1:]), caster)
 
 
 def _orient_wall(
     wall: Wall, frame: WallFrame, positions: Mapping[str, FloatArray], origin: Origin
-) -> tuple[TriangleMesh, tuple[str, ...]]:
+) -> tuple[TriangleMesh, tuple[str, ...], RayCaster | None]:
     """Return the wall in its frame, with the winding corrected for walls that were not generated here, and all repairs.
 
-    positions: of the sensors, world frame.
+    positions: of the sensors, world frame. The third value is a ray caster of the returned wall, if one was made.
     """
     check_distances(wall.mesh.vertices, positions, wall.name)
     mesh = wall.mesh.with_vertices(frame.to_wall(wall.mesh.vertices))
     if origin == "rule":
-        return mesh, wall.repairs
+        return mesh, wall.repairs, None
     eyes = [frame.to_wall(position) for position in positions.values()]
-    mesh, words = orient_to_sensors(mesh, eyes, wall.file or wall.name, cleaned=origin == "file")
-    return mesh, (*wall.repairs, *([words] if words else []))
+    caster = RayCaster(mesh)
+    oriented, words = orient_to_sensors(mesh, eyes, wall.file or wall.name, cleaned=origin == "file", scene=caster)
+    return oriented, (*wall.repairs, *([words] if words else [])), caster if oriented is mesh else None
 
 
 def _stereo(config: SimulationConfig, cameras: CameraPair, frame: WallFrame, random: KeyedRandom) -> StereoSensor:

@@ -101,7 +101,12 @@ def mesh_cloud(points: FloatArray, block: IntArray, viewpoint: FloatArray, confi
         Settings of the reconstruction.
     """
     if len(points) <= _NORMAL_NEIGHBOURS:
-        raise InputError(f"{len(points)} points are too few", where="Poisson surface", allowed="more than 16")
+        raise InputError(
+            f"{len(points)} points are too few",
+            where="Poisson surface",
+            allowed="more than 16",
+            remedy="give more points, or use the method that joins neighbours",
+        )
     usual = octree_depth(points)
     depth = config.poisson_depth or usual
     if depth > usual + _FINER:

@@ -94,7 +94,11 @@ def triangulate_seen_points(points: FloatArray, viewpoint: FloatArray, rotation:
     try:
         faces = Delaunay(plane).simplices.astype(np.int32)
     except (QhullError, ValueError):
-        raise InputError("all points lie on one line of sight, so they span no surface", where=where) from None
+        raise InputError(
+            "all points lie on one line of sight, so they span no surface",
+            where=where,
+            remedy="give the points of a surface, and the place from which they were seen",
+        ) from None
     faces = faces[_uncut(local, distance, plane, faces)]
     if not len(faces):
         raise InputError("no triangle is left between the points", where=where, remedy="give a denser cloud, or a mesh")

@@ -35,7 +35,9 @@ _QUANTILE = 0.98
 
 
 class GapResults:
-    """Residuals of a diagnosis: how much deeper the measured surface is than the predicted one; positive where rock is missing.
+    """Result of `scarpsim gap` for the page.
+
+    It shows the residuals: how much deeper the measured surface is than the predicted one; positive where rock is missing.
 
     The folder does not state the sensor's position, so the wall is shown from the side on which its normal points upwards.
     """
@@ -62,7 +64,7 @@ class GapResults:
         return [Layer("residual", "deeper than predicted (missing rock positive)", "mm", _MM, diverging=True, limit=self._limit)]
 
     def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
-        """Return mean residuals over cells."""
+        """Return the residuals in the window, averaged over cells, as height and colour."""
         return self._cells(step, window, budget)
 
     def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
@@ -77,7 +79,7 @@ class GapResults:
         )
 
     def items(self, step: str) -> list[Item]:
-        """Return the changes of the scene."""
+        """Return the regions where the scene itself changed."""
         return [self._change(number, each) for number, each in enumerate(self._record.get("scene_changes", []), start=1)]
 
     def _change(self, number: int, change: dict[str, Any]) -> Item:

@@ -25,7 +25,7 @@ _REMEDY = "run scarpsim monitor again"
 
 
 class MonitorResults:
-    """Epochs against the reference. Steps are the epochs, items the events."""
+    """Result of `scarpsim monitor` for the page: its steps are the epochs in each view of the wall, its items the events."""
 
     step_name = "epoch"
     surfaces = {"epoch": "as measured", "reference": "reference"}  # noqa: RUF012
@@ -37,14 +37,22 @@ class MonitorResults:
         try:
             epochs = self._record["epochs"]
             names = {str(each["epoch"]): each["time"] or Path(each["path"]).name for each in self._record["inputs"]}
-            frame = self._record["wall_frame"]
-            self._frame = WallFrame(np.array(frame["rotation"], dtype=float), np.array(frame["origin_m"], dtype=float))
-            self._levels = {str(each["epoch"]): float(each["level_of_detection_median_m"]) for each in epochs}
+            views = self._record.get("views") or [{"suffix": "", "view": 1, "wall_frame": self._record["wall_frame"]}]
+            self._views = {_key(each["epoch"], view["view"]): view for each in epochs for view in views}
+            self._frames = {key: _frame(view["wall_frame"]) for key, view in self._views.items()}
+            self._levels = {
+                _key(each["epoch"], view["view"]): float(each["level_of_detection_median_m"]) for each in epochs for view in views
+            }
             self._events = [dict(each) for each in self._record["events"]]
         except (KeyError, TypeError, ValueError):
             raise InputError("is not a record of scarpsim monitor", where=str(folder / MONITOR_FILE), remedy=_REMEDY) from None
-        self.title = f"{folder.name}: {len(epochs)} epochs against {names.get('0', 'the reference')}"
-        self.steps = {key: f"epoch {key}, {names.get(key, '')}" for key in self._levels}
+        self.title = (
+            f"{folder.name}: {len(epochs)} {'epoch' if len(epochs) == 1 else 'epochs'} against {names.get('0', 'the reference')}"
+        )
+        self.steps = {
+            key: f"epoch {key.split()[0]}, {names.get(key.split()[0], '')}" + (f", view {view['view']}" if len(views) > 1 else "")
+            for key, view in self._views.items()
+        }
         if not self.steps:
             raise InputError("contains no epoch", where=str(folder), remedy=_REMEDY)
         self._map = lru_cache(6)(read_geotiff)
@@ -52,7 +60,7 @@ class MonitorResults:
         self._numbers = lru_cache(2)(self._event_raster)
 
     def layers(self, step: str) -> list[Layer]:
-        """Change, level of detection, shaded rock and relief."""
+        """Return the quantities that can give the colours: change, level of detection, shaded rock and relief."""
         limit = SCALE_SIGMAS * self._levels[step] / _NORMAL_95 * _MM
         return [
             Layer("difference", "reference minus epoch (missing rock positive)", "mm", _MM, diverging=True, limit=limit),
@@ -62,8 +70,8 @@ class MonitorResults:
         ]
 
     def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
-        """The reference, or it minus the change, coloured by the layer."""
-        reference, grid = self._map(self.folder / REFERENCE_FILE)
+        """Return the surface in the window: the reference, or the epoch (reference minus change), coloured by the layer."""
+        reference, grid = self._map(self._reference(step))
         rows, columns, factor = cut(grid, window, budget)
         part = reference[rows, columns]
         if surface == "epoch":
@@ -78,33 +86,50 @@ class MonitorResults:
         return Patch(*centres(grid, rows, columns, factor), height, value, middle, factor)
 
     def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
-        """The registered points with their change and level of detection."""
-        path = self.folder / f"epoch_{int(step):03d}.laz"
+        """Return the registered points in the window, with their change and level of detection."""
+        path = self.folder / f"epoch_{_epoch(step):03d}.laz"
         if not path.is_file():
             return None
         cloud = self._cloud(path)
-        local = self._frame.to_wall(cloud.points)
+        local = self._frames[step].to_wall(cloud.points)
         shown = np.flatnonzero(inside(local, window))
         shown = shown[:: max(1, int(np.ceil(len(shown) / budget)))]
         facts = {name: channel[shown] for name, channel in cloud.extra.items()}
         return PointLayer(local[shown], None, facts, len(shown) / max(len(local), 1))
 
     def items(self, step: str) -> list[Item]:
-        """The events of the epoch."""
-        return [_item(each) for each in self._events if str(each["epoch"]) == step]
+        """Return the events of an epoch."""
+        return [_item(each) for each in self._events if _key(each["epoch"], each.get("view", 1)) == step]
 
     def _path(self, name: str, step: str) -> Path:
-        return self.folder / f"{name}_{int(step):03d}.tif"
+        return self.folder / f"{name}_{_epoch(step):03d}{self._views[step]['suffix']}.tif"
+
+    def _reference(self, step: str) -> Path:
+        return self.folder / f"reference{self._views[step]['suffix']}.tif"
 
     def _event_raster(self, step: str) -> NDArray[np.int32]:
         """(h, w) the number of the event at each pixel, 0 where there is none."""
-        shape = self._map(self.folder / REFERENCE_FILE)[0].shape
+        shape = self._map(self._reference(step))[0].shape
         raster = np.zeros(shape, dtype=np.int32)
         content = json.loads((self.folder / "annotations.json").read_text(encoding="utf-8"))
+        (image,) = (each["id"] for each in content["images"] if each["file_name"] == self._path("difference", step).name)
         for each in sorted(content["annotations"], key=lambda annotation: -annotation["area"]):
-            if str(each["image_id"]) == step:
+            if each["image_id"] == image:
                 raster[coco_mask.decode(each["segmentation"]) > 0] = each["event"]
         return raster
+
+
+def _key(epoch: int, view: int) -> str:
+    """Name of a step: the epoch, and the view from the second one on."""
+    return str(epoch) if view == 1 else f"{epoch} {view}"
+
+
+def _epoch(step: str) -> int:
+    return int(step.split()[0])
+
+
+def _frame(stated: dict[str, Any]) -> WallFrame:
+    return WallFrame(np.array(stated["rotation"], dtype=float), np.array(stated["origin_m"], dtype=float))
 
 
 def _item(event: dict[str, Any]) -> Item:

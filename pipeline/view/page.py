@@ -17,10 +17,15 @@ CELLS, POINTS = 60_000, 40_000
 _NOTHING = ""
 """The choice to show nothing beside."""
 _PLAY, _STOP, _EPOCH_MS = "play", "stop", 2500
-_GRAPH: Any = {"displaylogo": False, "scrollZoom": True, "modeBarButtonsToRemove": ["sendDataToCloud", "select2d", "lasso2d"]}
+_GRAPH: Any = {
+    "displaylogo": False,
+    "scrollZoom": True,
+    "showSendToCloud": False,
+    "modeBarButtonsToRemove": ["select2d", "lasso2d"],
+}
 
 
-def layout(results: Results, other: Results | None = None) -> html.Div:
+def layout(results: Results, other: Results | None = None) -> html.Main:
     """Make the page: controls on the left, the wall in 3D, the map, and a table for the item that is selected.
 
     other: a second run of the same wall, to be shown beside.
@@ -50,7 +55,7 @@ def layout(results: Results, other: Results | None = None) -> html.Div:
         html.Div(id="facts"),
         html.P(id="note", className="note"),
     ]
-    return html.Div(
+    return html.Main(
         [
             html.H1(results.title),
             html.Div(
@@ -72,7 +77,7 @@ def layout(results: Results, other: Results | None = None) -> html.Div:
 
 
 def register_callbacks(app: dash.Dash, results: Results, lock: Lock, other: Results | None = None) -> None:
-    """Connect the page's parts.
+    """Connect the parts of the page, so that a choice in one redraws the others.
 
     Parameters
     ----------

@@ -27,7 +27,7 @@ class ViewWindow(NamedTuple):
 
 @dataclass(frozen=True)
 class Layer:
-    """A quantity that gives the colours.
+    """A quantity that gives the colours of the picture.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ INSTRUMENTS = {"stereo": "stereo pair", "tls": "laser scanner"}
 
 @dataclass(frozen=True)
 class Patch:
-    """A raster over a window.
+    """Heights and colour values of the surface in a part of the wall.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class Patch:
 
 @dataclass(frozen=True)
 class PointLayer:
-    """Points in a window.
+    """Measured points in a part of the wall.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class PointLayer:
 
 @dataclass(frozen=True)
 class Item:
-    """Something that can be selected.
+    """Something on the wall that can be selected: a block, a detection, an event or a change.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class Item:
 
 
 class Results(Protocol):
-    """A folder that can be shown.
+    """Base class of the folders that the page can show.
 
     Attributes
     ----------

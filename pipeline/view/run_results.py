@@ -48,7 +48,12 @@ class RunResults:
         self._found = _detections(detections) if detections else {}
         if detections and not set(self._found) & set(self.steps):
             allowed = ", ".join(f"difference_{int(key):03d}.tif" for key in self.steps)
-            raise InputError("contains no detections of this run's maps", where=str(detections), allowed=allowed)
+            raise InputError(
+                "contains no detections of this run's maps",
+                where=str(detections),
+                allowed=allowed,
+                remedy="give the folder that scarpsim detect filled for this run",
+            )
         self._map = lru_cache(4)(read_geotiff)
         self._heights = lru_cache(3)(self._raster_of)
         self._cloud = lru_cache(1)(read_own_points)
@@ -161,7 +166,12 @@ def _confidence(path: Path) -> float:
     except ValueError:
         value = np.nan
     if not 0 <= value <= 1:
-        raise InputError("is not the name of a table of events", where=str(path), allowed="such as events_0.9.csv")
+        raise InputError(
+            "is not the name of a table of events",
+            where=str(path),
+            allowed="such as events_0.9.csv",
+            remedy="use the names that scarpsim detect gave",
+        )
     return value
 
 

@@ -66,6 +66,7 @@ def open_results(folder: Path, detections: Path | None = None) -> Results:
         where=str(folder),
         allowed="a run (run.json), a result of scarpsim gap (gap.json) or monitor (monitor.json), "
         "a split of a data set (annotations.json)",
+        remedy="give one of these folders",
     )
 
 
@@ -79,6 +80,7 @@ def make_app(results: Results, token: str, other: Results | None = None) -> dash
         assets_folder=str(Path(__file__).parent / "assets"),
         on_error=_tell,
     )
+    app.index_string = app.index_string.replace("<html>", '<html lang="en">')
     app.layout = layout(results, other)
     register_callbacks(app, results, threading.Lock(), other)
     app.server.before_request(_refuse_other_names)

@@ -19,7 +19,7 @@ _SIGMA_M = 0.01
 
 
 class TileResults:
-    """A folder with annotations.json and the difference maps that it names."""
+    """A split of a data set for the page: its steps are the tiles, and its items the annotated blocks."""
 
     step_name = "tile"
     surfaces = {"relief": "difference, as relief (rock that is missing lies deep)"}  # noqa: RUF012
@@ -47,7 +47,7 @@ class TileResults:
         ]
 
     def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
-        """Return a tile as relief."""
+        """Return the part of a tile in the window, with the difference as height and colour."""
         values, grid = self._map(self._coco.path(self._images[step]))
         rows, columns, factor = cut(grid, window, budget)
         shown = mean_pooled(values[rows, columns], factor)

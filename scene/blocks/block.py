@@ -294,7 +294,12 @@ def draw_shape(config: RockfallConfig, random: KeyedRandom) -> BlockShape:
     shape = ("cube", "sphere")[generator.integers(2)] if config.shape == "mixed" else config.shape
     size = _draw_per_axis(config.size_m, generator)
     if not size.min() > 0:
-        raise InputError(f"drew a length of {size.min():.3g} m", where="size_m", allowed="above 0", remedy="give it a minimum")
+        raise InputError(
+            f"a block with a length of {size.min():.3g} m was drawn",
+            where="size_m",
+            allowed="above 0",
+            remedy="give size_m a minimum above 0",
+        )
     unit, faces = _primitive(shape, config.subdivisions)
     vertices = Rotation.from_euler("xyz", _draw_per_axis(config.rotation_rad, generator)).apply(unit * size)
     factor = np.clip(1 + config.irregularity.sample(generator, len(vertices)), *_RADIAL_LIMITS)

@@ -169,8 +169,32 @@ def _part(whole: Piece, chosen: NDArray[np.bool_], label: int | IntArray) -> Tri
     return TriangleMesh(whole.vertices, whole.faces, face_block=labels).submesh(chosen)
 
 
-def _removed_volumes(removed: Piece, blocks: Blocks) -> FloatArray:
-    """Return the volume (k,) of the intersection with each block. Raises InputError for a block that removes nothing."""
+def removed_rocks(mesh: TriangleMesh, blocks: Blocks) -> TriangleMesh:
+    """Return the rocks that disjoint blocks cut out of a wall, each closed and in its place.
+
+    `face_block` and `vertex_block` are the label (1 to k) of the rock. Albedo is that of the nearest vertex of the wall on the
+    wall's surface and that of fresh rock elsewhere, if the wall has an albedo.
+    """
+    rows = faces_under_boxes(mesh, blocks.bbox, _HALO_M)
+    wall, _ = close_patch(mesh, rows, float(blocks.bbox[:, 0, 2].min()))
+    removed, _ = split_wall(wall, solid_of(blocks.vertices, blocks.faces, "blocks"))
+    label, component = _components(removed, blocks)
+    face_block = label[component].astype(np.int32)
+    vertex_block = np.full(len(removed.vertices), WALL, dtype=np.int32)
+    vertex_block[removed.faces] = face_block[:, None]
+    albedo = None
+    if mesh.vertex_albedo is not None:
+        from scipy.spatial import cKDTree
+
+        front = np.unique(removed.faces[removed.first])
+        near = np.unique(mesh.faces[rows])
+        albedo = np.full(len(removed.vertices), FRESH_ALBEDO, dtype=np.float32)
+        albedo[front] = mesh.vertex_albedo[near][cKDTree(mesh.vertices[near]).query(removed.vertices[front])[1]]
+    return TriangleMesh(removed.vertices, removed.faces, albedo, vertex_block, face_block).submesh()
+
+
+def _components(removed: Piece, blocks: Blocks) -> tuple[NDArray[np.int64], IntArray]:
+    """Return the block's label (c,) of each connected part of what was removed, and the part (m,) of each face."""
     from scipy import sparse
 
     links = removed.faces[:, [0, 1]].T, removed.faces[:, [1, 2]].T
@@ -182,6 +206,12 @@ def _removed_volumes(removed: Piece, blocks: Blocks) -> FloatArray:
     label[component[~removed.first]] = blocks.face_label[removed.source[~removed.first]]
     whole = np.flatnonzero(label == 0)  # pieces of wall entirely inside a block, which contain no face of it
     label[whole] = _containing(blocks, removed, component, whole)
+    return label, component
+
+
+def _removed_volumes(removed: Piece, blocks: Blocks) -> FloatArray:
+    """Return the volume (k,) of the intersection with each block. Raises InputError for a block that removes nothing."""
+    label, component = _components(removed, blocks)
     parts = prism_volumes(removed.vertices, removed.faces)
     volumes = np.bincount(label[component], parts, minlength=len(blocks) + 1)[1:].astype(np.float64)
     nothing = np.flatnonzero(volumes <= 0)

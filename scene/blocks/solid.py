@@ -35,7 +35,7 @@ class Solid:
 
 @dataclass(frozen=True)
 class Piece:
-    """Part of the result of a boolean.
+    """Triangles that result from a difference or intersection of two solids.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ def split_wall(wall: Solid, blocks: Solid) -> tuple[Piece, Piece]:
 
 
 def read_piece(result: Manifold, first: Solid) -> Piece:
-    """Read the result of a boolean of the solid `first` with another solid."""
+    """Read the triangles that result from a difference or intersection of the solid `first` with another solid."""
     mesh = result.to_mesh64()
     run_end = np.asarray(mesh.run_index).astype(np.int64) // 3
     runs = run_end[1:] - run_end[:-1]

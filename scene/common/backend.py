@@ -30,7 +30,12 @@ def _choose() -> str:
     wanted = os.environ.get(_VARIANT_VARIABLE)
     if wanted:
         if wanted not in (CUDA, LLVM):
-            raise InputError(f"got '{wanted}'", where=_VARIANT_VARIABLE, allowed=f"{CUDA}, {LLVM}")
+            raise InputError(
+                f"got '{wanted}'",
+                where=_VARIANT_VARIABLE,
+                allowed=f"{CUDA}, {LLVM}",
+                remedy="set the variable to one of them, or unset it",
+            )
         return wanted
     return CUDA if dr.has_backend(dr.JitBackend.CUDA) else LLVM
 

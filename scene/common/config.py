@@ -83,7 +83,11 @@ def load_yaml(path: Path) -> Any:
         return parse_yaml(read_text(path, most_bytes=_MOST_YAML_BYTES, remedy=remedy, smaller="give it as .json, which is fast"))
     except yaml.YAMLError as error:
         problem = " ".join(str(error).split())
-        raise InputError(f"is not valid YAML: {problem}", where=str(path)) from None
+        raise InputError(
+            f"is not valid YAML: {problem}",
+            where=str(path),
+            remedy="correct the line that is named",
+        ) from None
 
 
 _MOST_MISTAKES = 4

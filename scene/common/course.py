@@ -13,7 +13,7 @@ FloatArray = NDArray[np.float64]
 
 
 class Cycle(Config):
-    """A sine over time."""
+    """A periodic departure, such as a daily one: a sine over time."""
 
     amplitude: float = Field(description="half the difference of largest and smallest value, in the quantity's unit")
     period_h: float = Field(24.0, gt=0, description="period [h]")
@@ -36,7 +36,7 @@ class TimeTable(Config):
 
 
 class Course(Config):
-    """How a quantity departs over time from its value in the config: the sum of up to four terms."""
+    """How a quantity departs over time from its value in the config: the sum of a random walk, a drift, a cycle and a table."""
 
     random_walk: float = Field(0.0, ge=0, description="standard deviation of the change in one day; it grows as the root of time")
     drift: float = Field(0.0, description="change per day")

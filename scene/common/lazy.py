@@ -9,7 +9,10 @@ from typing import Any
 
 
 def lazy_attributes(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Make the `__getattr__` and `__dir__` of a package. homes: for each public name, the module that defines it."""
+    """Make the `__getattr__` and `__dir__` of a package, which import a module only when one of its names is first used.
+
+    homes: for each public name of the package, the module that defines it.
+    """
 
     def load(name: str) -> Any:
         if name not in homes:

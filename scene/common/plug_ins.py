@@ -37,14 +37,21 @@ def load_plug_ins(group: str, needs: str, is_one: Callable[[Any], bool], taken: 
     for entry in sorted(entry_points(group=group), key=lambda entry: entry.name):
         where = f"entry point '{entry.name} = {entry.value}' of {group}"
         if entry.name in taken or entry.name in found:
-            raise InputError(f"there is a '{entry.name}' already", where=where, remedy="choose another name for it")
+            raise InputError(
+                f"the name '{entry.name}' is already in use", where=where, remedy="choose another name in the entry point"
+            )
         try:
             value = entry.load()
         except Exception as error:  # the code of another package fails in any way
             raise InputError(
-                f"does not load ({type(error).__name__}: {error})", where=where, remedy="mend or uninstall that package"
+                f"does not load ({type(error).__name__}: {error})", where=where, remedy="repair or uninstall that package"
             ) from error
         if not is_one(value):
-            raise InputError(f"is a {type(value).__name__}", where=where, allowed=needs)
+            raise InputError(
+                f"is a {type(value).__name__}",
+                where=where,
+                allowed=needs,
+                remedy="change the entry point in the package that it comes from",
+            )
         found[entry.name] = value
     return found

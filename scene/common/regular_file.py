@@ -129,7 +129,9 @@ def read_limit_gb() -> float:
     except ValueError:
         most = math.nan
     if not most > 0:
-        raise InputError(f"got '{given}'", where=READ_LIMIT, allowed="gigabytes, above 0")
+        raise InputError(
+            f"got '{given}'", where=READ_LIMIT, allowed="gigabytes, above 0", remedy="set it to a number such as 8, or unset it"
+        )
     return most
 
 

@@ -51,7 +51,12 @@ class FrameConfig(Config):
         middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
         normal = towards - middle if self.normal == "sensor" else np.array(self.normal, dtype=np.float64)
         if not 0 < np.linalg.norm(normal) < np.inf:
-            raise InputError(f"got {self.normal}", where="frame.normal", allowed="a direction x, y, z that is not zero")
+            raise InputError(
+                f"got {self.normal}",
+                where="frame.normal",
+                allowed="a direction x, y, z that is not zero",
+                remedy="write for example [0, -1, 0], or leave it out",
+            )
         if np.dot(towards - middle, normal) < 0:
             raise InputError(
                 f"{self.normal} points away from the sensors",
@@ -102,7 +107,9 @@ class WallFrame:
         covariance = np.einsum("ni,nj->ij", local, local) / len(local)  # the SVD of 3 x 3: same axes, no (n, n) matrix
         axes, variances, _ = np.linalg.svd(covariance)
         if not variances[1] > 1e-12 * max(variances[0], 1e-300):
-            raise InputError("the vertices lie on one line, so there is no mean plane", where="wall mesh")
+            raise InputError(
+                "the vertices lie on one line, so there is no mean plane", where="wall mesh", remedy="use a mesh of a surface"
+            )
         normal = axes[:, 2]
         return cls.along(normal if np.dot(np.asarray(towards) - centre, normal) >= 0 else -normal, vertices)
 

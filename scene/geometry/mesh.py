@@ -100,6 +100,14 @@ class TriangleMesh:
         """(3 m,) indices that sort `edges`; equal ones keep their order."""
         return np.argsort(self.edges, kind="stable")
 
+    @cached_property
+    def shared_edges(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """The two positions (k,) in `edges` of each edge that exactly two triangles share."""
+        order, ordered = self.edge_order, self.edges[self.edge_order]
+        again = np.concatenate([[False], ordered[1:] == ordered[:-1], [False]])
+        twin = np.flatnonzero(again[1:-1] & ~again[:-2] & ~again[2:])
+        return order[twin], order[twin + 1]
+
     def with_vertices(self, vertices: FloatArray) -> TriangleMesh:
         """Return the same triangles with moved vertices."""
         return replace(self, vertices=vertices)

@@ -26,7 +26,7 @@ _HEAD_BYTES = 4096
 
 
 def has_plain_faces(text: bytes) -> bool:
-    """Return whether all faces are triangles with positive indices, which trimesh reads correctly."""
+    """Return whether all faces of an OBJ file are triangles with positive indices, which trimesh reads correctly."""
     return _OTHER_FACE.search(text) is None
 
 

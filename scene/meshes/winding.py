@@ -18,7 +18,9 @@ _GEOCENTRIC_M = 6.3e6, 6.5e6
 """Smallest and largest distance of sensors on the earth's surface from its centre."""
 
 
-def orient_to_sensors(mesh: TriangleMesh, viewpoints: list[FloatArray], where: str, *, cleaned: bool = False) -> Repaired:
+def orient_to_sensors(
+    mesh: TriangleMesh, viewpoints: list[FloatArray], where: str, *, cleaned: bool = False, scene: RayCaster | None = None
+) -> Repaired:
     """Wind each connected piece of a mesh consistently, and counter-clockwise as seen from the sensors.
 
     A piece that mostly shows its back is flipped. Vertices do not change.
@@ -33,6 +35,8 @@ def orient_to_sensors(mesh: TriangleMesh, viewpoints: list[FloatArray], where: s
         Name of the mesh in error messages.
     cleaned : bool
         Whether the mesh is already welded and consistently wound, as `clean` leaves it.
+    scene : RayCaster, optional
+        A ray caster of this mesh, if there is one.
 
     Returns
     -------
@@ -48,9 +52,11 @@ def orient_to_sensors(mesh: TriangleMesh, viewpoints: list[FloatArray], where: s
     if not cleaned:
         welded = weld(mesh)[0]
         odd = inconsistent_faces(welded, where)
-        mesh, welded = flip_faces(mesh, odd), flip_faces(welded, odd)
-        words = [f"{int(odd.sum())} triangles wound the other way round"] if odd.any() else []
-    backs = _pieces_seen_from_behind(mesh, welded, viewpoints, where)
+        if odd.any():
+            mesh, welded = flip_faces(mesh, odd), flip_faces(welded, odd)
+            words = [f"{int(odd.sum())} triangles wound the other way round"]
+    scene = scene if scene is not None and scene.mesh is mesh else RayCaster(mesh)
+    backs = _pieces_seen_from_behind(scene, welded, viewpoints, where)
     if backs.any():
         mesh = flip_faces(mesh, backs)
         part = "all" if backs.all() else "a piece of"
@@ -86,19 +92,18 @@ def check_distances(vertices: FloatArray, viewpoints: Mapping[str, FloatArray], 
 
 
 def _pieces_seen_from_behind(
-    mesh: TriangleMesh, welded: TriangleMesh, viewpoints: list[FloatArray], where: str
+    scene: RayCaster, welded: TriangleMesh, viewpoints: list[FloatArray], where: str
 ) -> NDArray[np.bool_]:
-    """Return the triangles (m,) of the pieces that have to be flipped."""
-    scene = RayCaster(mesh)
+    """Return the triangles (m,) of the scene's mesh that belong to pieces that have to be flipped."""
     seen = [scene.sides_seen(position) for position in viewpoints]
     face, behind = (np.concatenate(each) for each in zip(*seen, strict=True))
     if not behind.any():
-        return np.zeros(len(mesh.faces), bool)
+        return np.zeros(len(welded.faces), bool)
     piece = connected_groups(welded.faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(welded.vertices))[welded.faces[:, 0]]
     count = int(piece.max()) + 1
     backs = np.bincount(piece[face], np.where(behind, 1, -1), count) > 0
     if not backs.any():
-        return np.zeros(len(mesh.faces), bool)
+        return np.zeros(len(welded.faces), bool)
     if (backs & _is_outward_solid(welded, piece, count)).any():
         raise InputError(
             "the sensor stands inside a closed solid of the surface",

@@ -80,7 +80,7 @@ class RayCaster:
 
     def __init__(self, mesh: TriangleMesh) -> None:
         if len(mesh.faces) == 0:
-            raise InputError("the mesh has no triangles", where="ray casting")
+            raise InputError("the mesh has no triangles", where="ray casting", remedy="use a mesh with triangles")
         if not np.abs(mesh.bounds).max() < _LARGEST_COORDINATE:
             raise InputError(
                 f"coordinates reach {np.abs(mesh.bounds).max():.0f} m", where="ray casting", remedy="work in the wall frame"

@@ -85,6 +85,7 @@ def drawn_rockfalls(rate: RockfallRate, precursor: PrecursorConfig | None, end_h
             f"{rate.rate_per_day:g} rockfalls per day make {mean:,.0f} in this series",
             where="series.rockfall.rate_per_day",
             allowed=f"up to {MOST_EVENTS:,} rockfalls",
+            remedy="lower the rate, or shorten the series",
         )
     found = []
     for index in range(int(random.child("count").generator().poisson(mean))):

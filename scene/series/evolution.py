@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scene.blocks.block import Blocks, RockfallConfig
-from scene.blocks.carve import FRESH_ALBEDO, block_meshes, carve
+from scene.blocks.carve import carve, removed_rocks
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import DEFAULT_ALBEDO, WALL, TriangleMesh
 from scene.series.config import DepositsConfig
@@ -29,7 +29,7 @@ KINDS = ("missing", "moved", "deposit")
 
 @dataclass(frozen=True)
 class Rules:
-    """What does not change in a series.
+    """What stays the same in a time series of one wall: the rockfalls to come and how blocks are placed.
 
     Attributes
     ----------
@@ -55,11 +55,11 @@ class Rules:
     random: KeyedRandom
 
     def label(self, number: int, kind: str) -> int:
-        """Return the block label of a rockfall and a kind."""
+        """Return the label of what a rockfall leaves in a mesh. kind: "missing" (niche), "moved" (block) or "deposit"."""
         return KINDS.index(kind) * len(self.rockfalls) + number
 
     def rockfall_of(self, label: int) -> tuple[Rockfall, str]:
-        """Return the rockfall and the kind of a block label above 0."""
+        """Return the rockfall and the kind (see `label`) to which a label above 0 belongs."""
         kind, index = divmod(label - 1, len(self.rockfalls))
         return self.rockfalls[index], KINDS[kind]
 
@@ -226,7 +226,7 @@ def _carved(state: WallState, batch: Sequence[tuple[Rockfall, Blocks]]) -> WallS
             rockfall,
             block,
             float(volume),
-            _rock(state.base, block) if rockfall.motion is not None else None,
+            removed_rocks(state.base, block) if rockfall.motion is not None else None,
         )
         for (rockfall, block), volume in zip(batch, carved.removed_volume_m3, strict=True)
     ]
@@ -237,23 +237,6 @@ def _carved(state: WallState, batch: Sequence[tuple[Rockfall, Blocks]]) -> WallS
         balance_m3=state.balance_m3 + carved.balance_m3,
         wall_volume_m3=state.wall_volume_m3 or carved.wall_volume_m3,
     )
-
-
-def _rock(wall: TriangleMesh, block: Blocks) -> TriangleMesh:
-    """Return the rock that a block cuts out, closed, with the albedo of the wall in front and of fresh rock elsewhere."""
-    mesh = block_meshes(wall, block, 0).intersection
-    if wall.vertex_albedo is None or mesh.face_block is None:
-        return mesh
-    from scipy.spatial import cKDTree
-
-    front = np.zeros(len(mesh.vertices), dtype=bool)
-    front[mesh.faces[mesh.face_block == WALL].ravel()] = True
-    albedo = np.full(len(mesh.vertices), FRESH_ALBEDO, dtype=np.float32)
-    near = np.all(np.abs(wall.vertices - block.position_m[0]) < np.ptp(block.bbox[0], axis=0), axis=1)
-    if near.any():
-        _, nearest = cKDTree(wall.vertices[near]).query(mesh.vertices[front])
-        albedo[front] = wall.vertex_albedo[near][nearest]
-    return replace(mesh, vertex_albedo=albedo)
 
 
 def _labelled(mesh: TriangleMesh, label: int) -> TriangleMesh:

@@ -20,6 +20,7 @@ from scene.common.regular_file import check_file
 from scene.geometry.mesh import DEFAULT_ALBEDO, TriangleMesh
 from scene.meshes import obj
 from scene.meshes.cleaning import clean, drop_unused, flip_faces
+from scene.meshes.obj_triangles import read_triangles
 from scene.meshes.ply import read_elements
 from scene.meshes.polygons import triangulate_polygons
 from scene.meshes.rounding import check_rounding
@@ -172,12 +173,14 @@ def _read(path: Path, unit: str) -> TriangleMesh:
     if kind == "ply" and (plain := _plain_ply(path)) is not None:
         return plain
     check_file(path, most_bytes=_MOST_BYTES, smaller="export it as a binary PLY of triangles, which can have any size")
-    import trimesh
-
     options: dict[str, Any] = {"skip_materials": True} if kind == "obj" else {}
     try:
-        source = _obj_source(path, unit) if kind == "obj" else str(path)
-        loaded = trimesh.load(source, file_type=kind, process=False, resolver=_beside(path), **options)
+        source = _obj_text(path, unit) if kind == "obj" else b""
+        if source and (triangles := read_triangles(source)) is not None:
+            return triangles
+        import trimesh
+
+        loaded = trimesh.load(_for_trimesh(path, source), file_type=kind, process=False, resolver=_beside(path), **options)
         mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
     except InputError:
         raise
@@ -200,12 +203,16 @@ def _read(path: Path, unit: str) -> TriangleMesh:
         problem = f"has vertices of {vertices.shape[-1]} coordinates and faces of {faces.shape[-1]} corners"
         raise InputError(problem, where=where, allowed="3 and 3", remedy="export it anew, as triangles")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(f"a triangle names vertex {faces.max()} of {len(vertices)}", where=where, remedy="export it anew")
+        raise InputError(
+            f"a triangle refers to vertex {faces.max()}, but there are {len(vertices)} vertices, counted from 0",
+            where=where,
+            remedy="export it anew",
+        )
     return TriangleMesh(vertices, faces.astype(np.int32), _albedo(mesh))
 
 
-def _obj_source(path: Path, unit: str) -> str | io.BytesIO:
-    """Return what trimesh reads of an OBJ file: its path, or preprocessed text if trimesh would misread it.
+def _obj_text(path: Path, unit: str) -> bytes:
+    """Return the text of an OBJ file.
 
     Raises OSError if the file cannot be read, and InputError if a comment in it names another unit than `unit`.
     """
@@ -217,7 +224,12 @@ def _obj_source(path: Path, unit: str) -> str | io.BytesIO:
             where=str(path),
             remedy=f"set `unit` to {stated[0]}, or remove the comment if it is wrong",
         )
-    return str(path) if obj.has_plain_faces(text) else io.BytesIO(obj.with_plain_faces(text))
+    return text
+
+
+def _for_trimesh(path: Path, obj_text: bytes) -> str | io.BytesIO:
+    """Return what trimesh reads: the file's path, or preprocessed text of an OBJ file that trimesh would misread."""
+    return io.BytesIO(obj.with_plain_faces(obj_text)) if obj_text and not obj.has_plain_faces(obj_text) else str(path)
 
 
 def _beside(path: Path) -> Any:
@@ -260,7 +272,7 @@ def _plain_ply(path: Path) -> TriangleMesh | None:
 def _format(path: Path) -> str:
     """Return the file's format by its suffix. Raises InputError if trimesh has no mesh reader for it."""
     kind = path.suffix.lower().removeprefix(".")
-    if kind == "ply":
+    if kind in ("ply", "obj"):
         return kind
     import trimesh
 

@@ -58,14 +58,20 @@ def rectify(pair: CameraPair) -> Rectification:
     rotation = right.rotation.T @ left.rotation
     base = right.rotation.T @ (left.position - right.position)
     if pair.base_m < 1e-6:
-        raise InputError("both cameras stand at the same place", where="cameras", remedy="give them a base")
+        raise InputError(
+            "both cameras stand at the same place", where="cameras", remedy="give left and right different values of position_m"
+        )
     size = (left.width, left.height)
     rotations_and_projections = cv2.stereoRectify(
         _matrix(left), np.zeros(5), _matrix(right), np.zeros(5), size, rotation, base.reshape(3, 1), flags=0, alpha=-1
     )
     r_left, r_right, p_left, p_right = rotations_and_projections[:4]
     if abs(p_right[1, 3]) > abs(p_right[0, 3]):
-        raise InputError("the base runs along the images' columns", where="cameras", remedy="turn both cameras by 90 degrees")
+        raise InputError(
+            "the base, the line between the cameras, runs along the images' columns instead of their rows",
+            where="cameras",
+            remedy="turn both cameras by 90 degrees about their viewing axes",
+        )
     base_m = -p_right[0, 3] / p_left[0, 0]
     if base_m < 0:
         raise InputError("the left camera stands to the right of the right one", where="cameras", remedy="swap left and right")

@@ -25,5 +25,8 @@ class Collimation(AimEffect):
     )
 
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
-        """Return recorded minus true azimuth and zenith, rad: the collimation error over sin(zenith), and zero."""
+        """Return recorded minus true azimuth and zenith, rad: the collimation error over sin(zenith), and zero.
+
+        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        """
         return p.angle_rad / m.sin(at.zenith), 0.0

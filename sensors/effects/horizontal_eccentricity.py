@@ -27,5 +27,8 @@ class HorizontalEccentricity(AimEffect):
     )
 
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
-        """Return recorded minus true azimuth, a sine of the azimuth, and zenith, which is zero; rad."""
+        """Return recorded minus true azimuth, a sine of the azimuth, and zenith, which is zero; rad.
+
+        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        """
         return p.amplitude_rad * m.sin(at.azimuth + p.phase_rad), 0.0

@@ -32,7 +32,10 @@ class AimEffect(Effect):
 
     @abstractmethod
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
-        """Return recorded minus true azimuth and zenith, rad."""
+        """Return recorded minus true azimuth and zenith, rad.
+
+        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        """
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
         """Add the angle errors to the pulses: recorded minus true azimuth and zenith, rad."""
@@ -54,7 +57,10 @@ class RangeEffect(Effect):
 
     @abstractmethod
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
-        """Return recorded minus true range, m."""
+        """Return recorded minus true range, m.
+
+        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        """
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
         """Add the systematic error, m, to each recorded range."""
@@ -75,7 +81,10 @@ class RangeSpread(Effect):
 
     @abstractmethod
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
-        """Return the standard deviation of the range, m."""
+        """Return the standard deviation of the range, m.
+
+        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        """
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
         """Add normal noise, m, to each recorded range, independently for each pulse."""

@@ -36,7 +36,10 @@ class RangeCyclic(RangeEffect):
     phase_rad: float = parameter("phase at range 0", unit="rad", source="Lichti 2007", null=None, default=0.0, ge=-100, le=100)
 
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
-        """Return the range error (n,), m, a sine of the range."""
+        """Return the range error (n,), m, a sine of the range.
+
+        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        """
         return p.amplitude_m * m.sin(2 * math.pi * at.range_m / p.period_m + p.phase_rad)
 
     def argument(self, at: PulseGeometry) -> FloatArray:

@@ -40,7 +40,10 @@ class RangeIntensityBias(RangeEffect):
     )
 
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
-        """Return the range error (n,), m, in proportion to the logarithm of the received power over I_0."""
+        """Return the range error (n,), m, in proportion to the logarithm of the received power over I_0.
+
+        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        """
         return p.coefficient_m * m.log(at.power / p.reference_power)
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:

@@ -19,5 +19,8 @@ class RangeNoise(RangeSpread):
     sigma_m: float = parameter("standard deviation of the range", unit="m", source="datasheets", typical=0.003, ge=0, le=10)
 
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
-        """Return the standard deviation of the range, m, the same for all pulses."""
+        """Return the standard deviation of the range, m, the same for all pulses.
+
+        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        """
         return p.sigma_m

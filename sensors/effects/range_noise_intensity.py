@@ -39,5 +39,8 @@ class RangeNoiseIntensity(RangeSpread):
     )
 
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
-        """Return the standard deviation of the range (n,), m, a power of the received power."""
+        """Return the standard deviation of the range (n,), m, a power of the received power.
+
+        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        """
         return p.a_m * at.power**p.exponent

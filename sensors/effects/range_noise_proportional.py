@@ -23,5 +23,8 @@ class RangeNoiseProportional(RangeSpread):
     ppm: float = parameter("standard deviation per range", unit="ppm", source="datasheets", typical=20.0, ge=0, le=1e5)
 
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
-        """Return the standard deviation of the range (n,), m, in proportion to the range."""
+        """Return the standard deviation of the range (n,), m, in proportion to the range.
+
+        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        """
         return p.ppm * 1e-6 * at.range_m

@@ -24,5 +24,8 @@ class RangeOffset(RangeEffect):
     offset_m: float = parameter("recorded minus true range", unit="m", source="Lichti 2007, A0", typical=0.003, ge=-100, le=100)
 
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
-        """Return the range error, m, the same for all pulses."""
+        """Return the range error, m, the same for all pulses.
+
+        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        """
         return p.offset_m

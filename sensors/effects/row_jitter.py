@@ -38,7 +38,10 @@ class RowJitter(Effect):
     phase_rad: float = parameter("phase at the frame's top", unit="rad", source="empirical", null=None, default=0.0)
 
     def shift(self, row: Any, m: Functions, p: Any) -> Any:
-        """Return recorded minus ideal column (n,), px, of pixels at `row`, px."""
+        """Return recorded minus ideal column (n,), px, of pixels at `row`, px.
+
+        row: row of the pixels, px; m: functions for this kind of array; p: the effect's parameters.
+        """
         return p.amplitude_px * m.sin(2 * math.pi * row / p.rows_per_cycle + p.phase_rad)
 
     def evaluate(self, state: ImageRows, random: KeyedRandom) -> ImageRows:

@@ -21,5 +21,8 @@ class VerticalIndex(AimEffect):
     )
 
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
-        """Return recorded minus true azimuth, which is zero, and zenith, a constant; rad."""
+        """Return recorded minus true azimuth, which is zero, and zenith, a constant; rad.
+
+        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        """
         return 0.0, p.offset_rad

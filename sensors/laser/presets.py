@@ -25,14 +25,14 @@ _FULL_BEAM = {"1/e2": 1.0, "1/e": sqrt(2.0), "fwhm": sqrt(2.0 / log(2.0))}
 
 
 class Figure(Config):
-    """A property of the instrument other than an error."""
+    """A figure of a data sheet that is no error, such as the pulse rate, with its source."""
 
     value: float = Field(gt=0, description="value, in the unit that the key names")
     source: str = Field(min_length=1, description="where the figure is from")
 
 
 class Window(Config):
-    """A range of directions."""
+    """A range of directions that a scanner covers, with its source."""
 
     value: tuple[Annotated[float, Field(ge=0, le=180)], Annotated[float, Field(ge=0, le=180)]] = Field(
         description="smallest and largest direction, in the unit that the key names"

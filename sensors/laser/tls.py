@@ -231,6 +231,7 @@ class LaserScanner:
                 "two faces cannot be measured in the mode multiple, because faces are averaged pulse by pulse",
                 where="scanner.faces",
                 allowed="1",
+                remedy="set scanner.faces to 1, or choose another mode of beam_divergence",
             )
         echo = real.echo(scene, pulses, beam, beam.combine_echoes)
         seen = self._record(self.measured(pulses, echo, random), real)

@@ -108,7 +108,7 @@ def with_effects(model: TlsModel, values: Mapping[str, Mapping[str, float]]) -> 
 
 
 def with_stereo_effects(model: StereoModel, values: Mapping[str, Mapping[str, float]], shift: PoseShift) -> StereoModel:
-    """Do the same for a stereo pair, and move both cameras by `shift`."""
+    """Return a stereo pair's model whose parameters are larger by `values`, with both cameras moved by `shift`."""
     effects = _changed(model.effects, "stereo", values)
     if not shift.is_null:
         moved = [{"name": "camera_shift", **dict(zip(("x_m", "y_m", "z_m"), shift.position_m.tolist(), strict=True))}]

@@ -58,7 +58,7 @@ class Axis(Config):
         return index, place - mi.Float64(index)
 
     def place_on_host(self, x: FloatArray, count: int) -> tuple[Any, FloatArray]:
-        """Do the same as `place` for a NumPy array (n,)."""
+        """Locate the values of a NumPy array (n,) among `count` equally spaced ones, as `place` does on the device."""
         if count < 2:
             return np.zeros(len(x), dtype=np.int64), np.zeros(len(x))
         turned = np.mod(x, self.period) if self.period else x
@@ -95,7 +95,7 @@ def _between(table: mi.Float64, index: mi.UInt32, share: mi.Float64) -> mi.Float
 
 
 def interpolate_on_host(x: FloatArray, y: FloatArray, along: Axis, across: Axis, rows_of_values: Rows) -> FloatArray:
-    """Do the same as `interpolate` for NumPy arrays (n,); NaN where x or y is NaN."""
+    """Evaluate a table at NumPy arrays x, y (n,), as `interpolate` does on the device; NaN where x or y is NaN."""
     values = np.asarray(rows_of_values, dtype=np.float64)
     rows, columns = values.shape
     (i, a), (j, b) = across.place_on_host(y, rows), along.place_on_host(x, columns)

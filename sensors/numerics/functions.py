@@ -13,7 +13,10 @@ from scene.common.backend import dr, mi
 
 @dataclass(frozen=True)
 class Functions:
-    """Elementary functions for one kind of array. select(condition, a, b) is a where the condition holds, else b."""
+    """Elementary functions for one kind of array: those of the ray-tracing device or NumPy's.
+
+    select(condition, a, b) is a where the condition holds, else b.
+    """
 
     sin: Callable[[Any], Any]
     cos: Callable[[Any], Any]

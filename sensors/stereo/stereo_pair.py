@@ -127,7 +127,7 @@ class StereoPair:
         return (mi.Float64(column) + 0.5) * float(step), (mi.Float64(row) + 0.5) * float(step)
 
     def recorded(self, matches: Matches, camera_point: mi.Array3f64, left: Camera, true_point: mi.Array3f64) -> Observation:
-        """Make the observation.
+        """Make the observation that the pair records, with its points in the wall frame.
 
         Parameters
         ----------

@@ -121,7 +121,7 @@ def test_everything_with_a_picture_shows_it(run: Run, tmp_path: Path) -> None:
     for shown in (run, run[1], run[1].points, run[1].surface):
         assert "<table>" in shown._repr_html_()
         assert len(repr(shown)) < 2000
-    assert repr(run) == f"<Run {run.folder}: tls, 1 epochs>"
+    assert repr(run) == f"<Run {run.folder}: tls, 1 epoch>"
     assert len(repr(pictures[0])) < 60
     with pytest.raises(InputError, match="allowed: difference"):
         run.plot("diference")
@@ -249,7 +249,7 @@ def test_configs_by_object_mapping_file_and_keyword_are_one(run: Run, tmp_path: 
     [
         (lambda: configure(rockfall__cuont=5), "did you mean 'count'"),
         (lambda: configure("glendal"), "did you mean 'glendale'"),
-        (lambda: simulate(), "the config has both; give sensor='tls'"),
+        (lambda: simulate(), "and none was chosen; give sensor='tls'"),
         (lambda: simulate(sensor="radar"), "allowed: 'stereo', 'tls'"),
         (lambda: simulate(wall={"mesh": Path("nothing.ply")}, sensor="tls"), "nothing.ply"),
     ],

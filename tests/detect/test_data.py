@@ -112,9 +112,11 @@ def test_blocks_to_ignore_are_marked_as_such_for_the_loss(tmp_path):
 
 
 @pytest.mark.parametrize(("shape", "count"), [((512, 512), 1), ((300, 200), 1), ((513, 512), 2), ((1024, 700), 3 * 2)])
-def test_tiles_cover_the_map_with_half_their_side_shared(shape, count):
+def test_tiles_cover_the_map_and_share_a_quarter_of_their_side(shape, count):
     places = list(tile_places(shape, 512))
     assert len(places) == count
+    for starts in (np.unique([place[axis] for place in places]) for axis in (0, 1)):
+        assert (np.diff(starts) <= 384).all()
     seen = np.zeros(shape, bool)
     for row, column in places:
         seen[row : row + 512, column : column + 512] = True

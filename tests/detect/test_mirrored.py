@@ -83,10 +83,10 @@ def test_one_view_is_the_network_alone_bit_for_bit(model, images):
         assert_array_equal(one_view[name], values)
 
 
-def test_a_detector_looks_as_its_yaml_says_unless_it_is_asked_not_to(tmp_path):
+def test_mirrored_views_are_used_only_when_asked_for(tmp_path):
     head = {"score_shift": 1.0, "score_per_doubling": 0.25, "mirrored_score_shift": 2.0, "mirrored_score_per_doubling": -0.25}
     weights.save(build_network(weights.with_head(SMALL, mirrored="both", **head)), tmp_path)
-    looks, alone = weights.load(tmp_path), weights.load(tmp_path, unmirrored=True)
+    looks, alone = weights.load(tmp_path, mirrored=True), weights.load(tmp_path)
     assert isinstance(looks, MirroredMaskRCNN)
     assert looks.config.head.shifts == (2.0, -0.25)
     assert type(alone) is MaskRCNN
@@ -124,12 +124,20 @@ def test_a_way_of_looking_that_there_is_not_is_named(tmp_path):
         weights.load_config(tmp_path)
 
 
-def test_the_threshold_has_no_views_to_leave_out(tmp_path, capsys):
+def test_the_threshold_has_no_mirrored_views(tmp_path, capsys):
     (tmp_path / "map.tif").write_bytes(b"")
-    words = ["detect", "baseline", str(tmp_path / "map.tif"), "--out", str(tmp_path / "out"), "--unmirrored"]
+    words = ["detect", "baseline", str(tmp_path / "map.tif"), "--out", str(tmp_path / "out"), "--mirrored"]
     assert main(words) == 2
-    assert "--unmirrored: the option needs a network" in capsys.readouterr().err
+    assert "--mirrored: the option needs a network" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_asking_for_mirrored_views_that_the_detector_does_not_have_is_refused(tmp_path, capsys):
+    weights.save(build_network(SMALL), tmp_path / "detector")
+    (tmp_path / "map.tif").write_bytes(b"")
+    words = ["detect", str(tmp_path / "detector"), str(tmp_path / "map.tif"), "--out", str(tmp_path / "out"), "--mirrored"]
+    assert main(words) == 2
+    assert "has no mirrored views (`head.mirrored: none`)" in capsys.readouterr().err
 
 
 def test_the_detector_that_comes_along_looks_at_all_views():

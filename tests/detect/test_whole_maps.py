@@ -134,6 +134,18 @@ def test_margins_without_data_are_not_searched():
     assert inference.detect(framed, np.full(shape, np.nan, np.float32)) == []
 
 
+def test_tiles_without_data_are_not_searched():
+    """Data in two opposite corners: of 5 x 5 tiles only the two that see them are searched, one at a time."""
+    shape = (256, 256)
+    marks = [rectangle(shape, 10, 12, 9, 7), rectangle(shape, 240, 230, 9, 7)]
+    corners = rectangle(shape, 0, 0, 40, 40) | rectangle(shape, 216, 216, 40, 40)
+    assert len(list(tile_places(shape, TILE))) == 25
+    finder = MarkFinder()
+    found = inference.detect(finder, np.where(corners, map_of(shape, marks), np.nan).astype(np.float32))
+    assert as_set([whole(item, shape) for item in found]) == as_set(marks)
+    assert finder.calls == 2
+
+
 def _u_shape(shape: tuple[int, int]) -> np.ndarray:
     mask = rectangle(shape, 40, 30, 120, 110)
     mask[40:130, 50:120] = False

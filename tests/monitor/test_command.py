@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import laspy
@@ -127,6 +130,38 @@ def test_processes_and_resumption_give_the_same(result: Path, scans: Path, tmp_p
     assert cli.main([*words, "--resume"]) == 0
     assert (tmp_path / "out" / "events.csv").read_bytes() == (result / "events.csv").read_bytes()
     assert (tmp_path / "out" / "difference_001.tif").stat().st_mtime_ns == before
+
+
+def test_an_error_in_a_worker_is_one_line(scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, second, third = map(str, sorted(scans.glob("*.las")))
+    las(tmp_path / "site_2026-04-15.las", points(2000, 4) + np.array([5000.0, 0, 0]))
+    words = ["monitor", first, second, str(tmp_path / "site_2026-04-15.las"), third, "--position", ",".join(STATION.split())]
+    assert cli.main([*words, "--workers", "2", "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    told = capsys.readouterr().err
+    assert "lies elsewhere" in told
+    assert told.count("\n") == 1
+
+
+def test_a_killed_monitoring_goes_on(result: Path, scans: Path, tmp_path: Path) -> None:
+    """Killed (SIGKILL) once the first epoch is done: with --resume the same files come out, and the epoch is not made again."""
+    words = ["monitor", *map(str, sorted(scans.glob("*.las"))), "--position", ",".join(STATION.split())]
+    words += ["--out", str(tmp_path / "out"), "--quiet"]
+    command = "import sys; from pipeline.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    process = subprocess.Popen([sys.executable, "-c", command, *words])
+    first = tmp_path / "out" / ".monitor" / "epoch_001.json"
+    until = time.monotonic() + 120
+    while not first.is_file() and process.poll() is None and time.monotonic() < until:
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    assert first.is_file()
+    assert not (tmp_path / "out" / "monitor.json").exists()
+    before = first.stat().st_mtime_ns
+    assert cli.main([*words, "--resume"]) == 0
+    assert first.stat().st_mtime_ns == before
+    for name in ("events.csv", "difference_002.tif", "epoch_001.laz", "epoch_002.laz", "annotations.json"):
+        assert (tmp_path / "out" / name).read_bytes() == (result / name).read_bytes(), name
+    assert not list((tmp_path / "out").rglob(".*.part*"))
 
 
 def test_from_python(scans: Path, tmp_path: Path) -> None:

@@ -318,6 +318,15 @@ def test_help_imports_nothing_heavy() -> None:
     assert loaded & {"numpy", "pydantic", "yaml", "scipy", "matplotlib", "mitsuba", "shtab", "dash", "plotly", "rich"} == set()
 
 
+def test_a_simulation_starts_without_the_libraries_of_its_products() -> None:
+    """Pictures, reports and point files are written late, so their libraries are loaded late (see `benchmarks/startup.py`)."""
+    program = "import sys, pipeline.run.simulation; print(*sys.modules)"
+    shown = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    loaded = {name.partition(".")[0] for name in shown.stdout.split()}
+    assert "mitsuba" in loaded
+    assert loaded & {"matplotlib", "PIL", "laspy", "pyproj", "jinja2", "pye57", "scipy", "trimesh", "open3d"} == set()
+
+
 def test_the_page_of_the_command_line_says_what_there_is() -> None:
     page = (CONFIGS.parent / "docs/reference/command_line.md").read_text()
     for code in (cli.DONE, cli.FAILED, cli.WRONG_INPUT, cli.INTERRUPTED):

@@ -161,7 +161,7 @@ def test_where_much_of_the_wall_moved_nothing_is_said_of_the_sensor(tmp_path: Pa
     assert found.verdict == "insufficient_data"
     assert found.evidence.moved_share > 0.3
     assert found.effects == ()
-    assert found.remaining["note"].index("name stable_areas") < 400
+    assert found.remaining["note"].index("add stable_areas") < 400
     assert "stable_areas in measurement.yaml" in summarise(found)
 
 
@@ -191,5 +191,5 @@ def test_a_large_noise_is_no_wall_that_moved(tmp_path: Path) -> None:
     """
     write_scan(tmp_path, 9, ranges=lambda scan: scan.R + 0.08 * scan.rng.standard_normal(len(scan.R)), step_rad=0.009)
     found = diagnose(read_measurement(tmp_path))
-    assert "tls.range_noise" in {name for effect in found.effects for name in (effect.name, *effect.alike)}
+    assert "tls.range_noise" in {name for effect in found.effects for name in (effect.name, *effect.indistinguishable)}
     assert not found.evidence.much_moved

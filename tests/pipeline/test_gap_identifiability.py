@@ -59,7 +59,7 @@ def moved_by(azimuth: Array, zenith: Array, distance: Array, name: str) -> Array
 def test_the_table_writes_shares_with_a_space(found: Identifiability) -> None:
     head, *rows = format_table(found).splitlines()
     for row, share in zip(rows, found.survival, strict=True):
-        assert row[: head.index("seen from")].endswith(f" {100 * share:.1f} %  ")
+        assert row[: head.index("detectable from")].endswith(f" {100 * share:.1f} %  ")
 
 
 @pytest.mark.parametrize("name", ["range_offset", "vertical_index", "collimation", "trunnion_tilt"])
@@ -121,4 +121,4 @@ def test_a_measurement_gives_its_own_geometry_and_refuses_overrides(tmp_path: Pa
     assert main(["gap", "--identifiability", str(tmp_path), "--out", str(tmp_path / "out")]) == 0
     assert json.loads((tmp_path / "out/identifiability.json").read_text())["surveys"][0]["points"] > 10_000
     assert main(["gap", "--identifiability", str(tmp_path), "--set", "seed=2"]) == 2
-    assert "--set and another --sensor need a config" in capsys.readouterr().err
+    assert "a measurement takes neither --set nor another --sensor" in capsys.readouterr().err

@@ -61,7 +61,7 @@ def test_a_large_turn_of_a_camera_is_one_effect(tmp_path: Path, monkeypatch: pyt
     (truth,) = json.loads((tmp_path / "truth.json").read_text())["effects"]
     found = diagnose(read_measurement(tmp_path / "case"))
     (effect,) = found.effects
-    assert f"stereo.{kind}" in {effect.name, *effect.alike}
+    assert f"stereo.{kind}" in {effect.name, *effect.indistinguishable}
     if effect.name == f"stereo.{kind}" and effect.entry["camera"] == truth["parameters"]["camera"]:
         error = effect.entry["angle_rad"] - truth["parameters"]["angle_rad"]
         assert abs(error) < max(4 * effect.std["angle_rad"], 0.02 * abs(truth["parameters"]["angle_rad"]))
@@ -160,7 +160,7 @@ def test_the_class_of_an_effect_taken_exactly_is_by_exact_likelihoods(
     for margin in (0.0, 1e9):
         monkeypatch.setattr(nonlinear_refit, "equivalence_margin", lambda _, margin=margin: margin)
         one = _with_equivalence_class(_strongest_single_fits(points, first, first.select()[0]))
-        classes[margin] = set(effect_from_estimate(one.estimate, points.part).alike)
+        classes[margin] = set(effect_from_estimate(one.estimate, points.part).indistinguishable)
     exactly = classes[1e9] - classes[0.0]
     assert len(exactly) == 2
     assert f"stereo.{one.name}" not in classes[1e9]

@@ -37,7 +37,7 @@ GAP = Gap(before=0.004, after=0.0011, floor=0.001, error=0.0002, floor_error=0.0
 NAMED = NamedEffect(
     "tls.range_offset", "physical", {"name": "range_offset", "offset_m": 0.004}, {"offset_m": 3e-10}, (), 0.002, 80.0
 )
-ALIKE = replace(NAMED, alike=("tls.range_scale",), split_by="a second station at another range")
+ALIKE = replace(NAMED, indistinguishable=("tls.range_scale",), split_by="a second station at another range")
 EMPIRICAL = replace(NAMED, name="tls.range_empirical", kind="empirical", entry={"name": "range_empirical", "covariate": "zenith"})
 EFFECTS = {"named": (NAMED,), "several": (NAMED, NAMED), "ambiguous": (ALIKE,), "unknown": (EMPIRICAL,)}
 MATRIX = {"names": ["tls.range_offset", "tls.range_scale"], "cosines": [[1.0, 0.5], [0.5, 1.0]], "survival": [0.5, 0.2]}

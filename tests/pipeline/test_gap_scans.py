@@ -116,12 +116,12 @@ def test_an_ambiguous_effect_is_named_with_both_faces(tmp_path: Path) -> None:
     how = {"step_rad": 0.012, "angles": index(3e-4)}
     alone = diagnose(of(tmp_path / "one", (HERE, 1), **how))
     assert alone.verdict == "ambiguous"
-    assert {alone.effects[0].name, *alone.effects[0].alike} == {"tls.vertical_index", "tls.vertical_eccentricity"}
+    assert {alone.effects[0].name, *alone.effects[0].indistinguishable} == {"tls.vertical_index", "tls.vertical_eccentricity"}
     measurement = of(tmp_path / "faces", (HERE, 1), (HERE, 2), **how)
     found = diagnose(measurement)
     assert found.verdict == "named"
     assert found.effects[0].name == "tls.vertical_index"
-    assert found.effects[0].alike == ()
+    assert found.effects[0].indistinguishable == ()
     assert found.effects[0].entry["offset_rad"] == pytest.approx(3e-4, abs=3 * found.effects[0].std["offset_rad"])
     assert "further_registrations" not in to_dict(found, measurement)
 

@@ -169,7 +169,7 @@ def test_a_low_pass_that_others_feign_takes_no_outlines_along(monkeypatch: pytes
         )
 
     monkeypatch.setattr(SelectionPass, "of", classmethod(named))
-    starts: Any = SimpleNamespace(with_edge_effects=[], edge_effects_beside=lambda _: seen, with_these=lambda effects: effects)
+    starts: Any = SimpleNamespace(with_edge_effects=[], edge_effects_given=lambda _: seen, with_these=lambda effects: effects)
     assert best_pass(starts, KeyedRandom(1), frozenset()).edge_effect_names == {"edge_fattening"}
 
 
@@ -209,7 +209,7 @@ def test_a_low_pass_is_tried_where_the_sensor_stays_unless_one_effect_explains_a
 
     monkeypatch.setattr(SelectionPass, "of", classmethod(named))
     seen = [EdgeEffect(Smoothing(sigma_px=2.0), {}, 50.0, np.zeros(1, dtype=bool))]
-    starts: Any = SimpleNamespace(**{name: name for name in asked}, edge_effects_beside=lambda _: seen, with_these=lambda _: None)
+    starts: Any = SimpleNamespace(**{name: name for name in asked}, edge_effects_given=lambda _: seen, with_these=lambda _: None)
     found = best_pass(starts, KeyedRandom(1), frozenset())
     assert set(tried) == expected
     assert found.complexity == min(asked[name][0] for name in expected if asked[name][1] < 2)

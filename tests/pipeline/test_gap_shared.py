@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.formats.measurements.measurement import read_measurement, read_model
+from pipeline.formats.measurements.measurement import read_measurement
+from pipeline.formats.measurements.model_file import read_model
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.report.report import write_report
 

@@ -13,7 +13,8 @@ from scipy import stats
 from surface_cases import HEIGHT, SIGMA, WIDTH, Array, cloud, depth, normals, write_cloud, write_wall
 
 from pipeline.cli.main import main
-from pipeline.formats.measurements.measurement import SurfaceMeasurement, read_measurement, read_model
+from pipeline.formats.measurements.measurement import SurfaceMeasurement, read_measurement
+from pipeline.formats.measurements.model_file import read_model
 from pipeline.formats.meshes.ply import write_ply
 from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.gap.mean.signatures import systematic_families

@@ -99,8 +99,10 @@ def test_an_effect_that_is_not_believed_stays_in_the_class_of_what_looks_like_it
     ]
     left_out = frozenset({("camera_omega", False)})
     found = keep_implausible_in_class(named, [chosen], frozenset({"camera_omega"}), left_out)
-    assert [item.alike for item in found] == [(), ("stereo.camera_omega",)]
-    assert [item.alike for item in keep_implausible_in_class(named, [chosen], frozenset({"camera_omega"}), frozenset())] == [
+    assert [item.indistinguishable for item in found] == [(), ("stereo.camera_omega",)]
+    assert [
+        item.indistinguishable for item in keep_implausible_in_class(named, [chosen], frozenset({"camera_omega"}), frozenset())
+    ] == [
         (),
         (),
     ]
@@ -119,4 +121,4 @@ def test_what_is_named_in_the_place_of_an_effect_that_is_not_believed_shares_its
     found = keep_implausible_in_class(
         named, [chosen], frozenset({"vertical_index", "range_offset"}), frozenset({("vertical_index", False)})
     )
-    assert [item.alike for item in found] == [("tls.vertical_index",), ()]
+    assert [item.indistinguishable for item in found] == [("tls.vertical_index",), ()]

@@ -226,7 +226,7 @@ def test_a_coarse_wall_of_two_triangles() -> None:
         ({"count": 100, "maximum_attempts": 8}, "no room for a block of .* blocks are placed.*lower count"),
         ({"size_m": 30.0}, "40 of 40 blocks are larger than the wall.*allowed: below 11.9"),
         ({"safe_zone_offset_m": 5.0}, "leaves no room on a wall"),
-        ({"size_m": -0.1}, "drew a length of -0.1 m"),
+        ({"size_m": -0.1}, "a length of -0.1 m was drawn"),
         ({"count": 0}, "count"),
         ({"maximum_attempt": 3}, "did you mean 'maximum_attempts'"),
         ({"size_m": [0.1, 0.2]}, "size_m"),
@@ -238,3 +238,12 @@ def test_mistakes_are_named(wall: TriangleMesh, values: dict[str, Any], message:
     with pytest.raises(InputError, match=message) as caught:
         place_blocks(config(**values), wall, RANDOM)
     assert "\n" not in str(caught.value)
+
+
+def test_one_of_several_blocks_keeps_what_is_known_of_it(wall: TriangleMesh) -> None:
+    blocks = place_blocks(config(count=4), wall, RANDOM)
+    alone = blocks.only(2)
+    assert len(alone) == 1
+    np.testing.assert_array_equal(alone.mesh(0).vertices, blocks.mesh(2).vertices)
+    for name in ("shape", "size_m", "position_m"):
+        np.testing.assert_array_equal(getattr(alone, name), getattr(blocks, name)[2:3])

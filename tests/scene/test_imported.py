@@ -294,7 +294,7 @@ def test_each_wrong_mesh_is_answered_in_one_line(tmp_path, name):
         ("wall.ply", b"this is no mesh", "is not a valid ply file"),
         ("empty.ply", b"", "is not a valid ply file"),
         ("cut.off", b"OFF\n3 1 0\n0 0 0\n", "is not a valid off file"),
-        ("wild.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "names vertex 7 of 3|is not a valid off file"),
+        ("wild.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "refers to vertex 7|is not a valid off file"),
         ("points.xyz", b"0 0 0\n1 0 0\n0 1 0\n", "contains no triangles"),
     ],
 )

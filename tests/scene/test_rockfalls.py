@@ -144,3 +144,14 @@ def test_what_has_no_room_is_said() -> None:
         advanced(WallState(0.0, wall), 2.0, rules(wall, [{"after_h": 1.0, "volume_m3": 500.0}]))
     with pytest.raises(InputError, match="needs either `time` or `after_h`"):
         parse(EventConfig, {"volume_m3": 0.1}, "test")
+
+
+@pytest.mark.parametrize("up", [(0.0, 1.0, 0.0), (0.0, 0.8, 0.6), (0.48, 0.6, 0.64), (0.0, 0.0, 1.0)])
+def test_the_ground_is_level_and_leads_away_from_the_wall(up: tuple[float, float, float]) -> None:
+    wall = rough_wall(6.0, 4.0, 0.2)
+    ground = Ground.below(wall, np.array(up))
+    axes = np.stack([ground.up, ground.outward, ground.aside])
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert ground.outward[2] > 0 or up[2] == 1.0
+    heights = wall.vertices @ np.array(up)
+    assert ground.level_m == heights.min()

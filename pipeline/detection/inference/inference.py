@@ -10,18 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.detection.evaluation.detections import Detection, detection_from_mask
-from pipeline.detection.inference.seams import BlockPart, MapTile, block_part, merge_tile_parts
+from pipeline.detection.inference.seams import BlockPart, MapTile, block_part, merge_tile_parts, shared_px
 from pipeline.detection.network.normalisation import nmad, normalised
-
-_BATCH = 4
-"""Tiles in a batch."""
 
 
 def detect(model: Any, difference: NDArray[np.float32], minimum_score: float = 0.5) -> list[Detection]:
     """Detect blocks in a difference map with the network.
 
-    Tiles overlap by half of their side, so that every block up to that size is complete in one of them; `seams` merges blocks
-    that tiles cut. In maps larger than a tile, margins without data are skipped.
+    Tiles overlap as `seams.shared_px` says, so that every block up to that size is complete in one of them; `seams` merges
+    blocks that tiles cut. In maps larger than a tile, margins and tiles without data are skipped.
 
     Parameters
     ----------
@@ -57,24 +54,19 @@ def _detect_in_tiles(model: Any, difference: NDArray[np.float32], minimum_score:
     noise = nmad(difference)
     parts: list[BlockPart] = []
     tiles = [MapTile(row, column, size, difference.shape) for row, column in tile_places(difference.shape, size)]
-    for group in _batches(tiles):
-        images = [normalised(_pixels(difference, tile), model.config.normalisation, noise) for tile in group]
-        answers = model.predict_on_batch({"image": np.stack(images)})
-        for number, tile in enumerate(group):
-            answer = {name: values[number] for name, values in answers.items()}
-            parts += [block_part(item, tile) for item in _in_tile(answer, minimum_score, tile)]
+    for tile in tiles:
+        pixels = _pixels(difference, tile)
+        if not np.isfinite(pixels).any():
+            continue
+        image = normalised(pixels, model.config.normalisation, noise)
+        # One tile at a time: a batch is not faster on processors, and each further shape of the input is compiled anew.
+        answer = {name: values[0] for name, values in model.predict_on_batch({"image": image[None]}).items()}
+        parts += [block_part(item, tile) for item in _in_tile(answer, minimum_score, tile)]
     return merge_tile_parts(parts)
 
 
-def _batches(tiles: list[MapTile]) -> Iterator[list[MapTile]]:
-    """Yield full batches, then the remaining tiles one by one, so that only two shapes are compiled."""
-    whole = len(tiles) // _BATCH * _BATCH
-    yield from (tiles[first : first + _BATCH] for first in range(0, whole, _BATCH))
-    yield from ([tile] for tile in tiles[whole:])
-
-
 def tile_places(shape: tuple[int, ...], size: int) -> Iterator[tuple[int, int]]:
-    """Yield (row, column) of tiles of side `size` that overlap by at least half and end flush with the map's edge."""
+    """Yield (row, column) of tiles of side `size` that overlap by `shared_px` or more and end flush with the map's edge."""
     rows, columns = (_starts(length, size) for length in shape)
     return ((row, column) for row in rows for column in columns)
 
@@ -111,7 +103,7 @@ def _starts(length: int, size: int) -> list[int]:
     """Return the starts of overlapping tiles along one axis."""
     if length <= size:
         return [0]
-    count = -(-(length - size) // (size // 2)) + 1
+    count = -(-(length - size) // (size - shared_px(size))) + 1
     return [round(number * (length - size) / (count - 1)) for number in range(count)]
 
 

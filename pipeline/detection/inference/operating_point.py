@@ -33,7 +33,7 @@ _TRIED = tuple(float(score) for score in 1 / (1 + np.exp(-np.linspace(-3, 5, 33)
 def set_operating_point(folder: Path, validation: CocoFolder) -> float:
     """Calibrate the scores of the detector in `folder` on validation images, and save it.
 
-    If the detector uses mirrored views (`head.mirrored`), scores are calibrated with and without them.
+    If the detector has mirrored views (`head.mirrored`), scores are calibrated with and without them.
 
     Returns
     -------
@@ -41,9 +41,9 @@ def set_operating_point(folder: Path, validation: CocoFolder) -> float:
     """
     config = weights.load_config(folder)
     set_to: dict[str, float] = {}
-    for unmirrored in (True, False) if config.head.mirrored != "none" else (True,):
-        model = weights.load(folder, unmirrored=unmirrored)
-        set_to |= _best_head_shifts(model, validation, "" if unmirrored else "mirrored_")
+    for mirrored in (False, True) if config.head.mirrored != "none" else (False,):
+        model = weights.load(folder, mirrored=mirrored)
+        set_to |= _best_head_shifts(model, validation, "mirrored_" if mirrored else "")
     model.config = weights.with_head(config, **set_to)
     weights.save(model, folder)  # without the optimizer's state
     return float(model.config.head.shifts[0])

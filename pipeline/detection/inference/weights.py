@@ -58,9 +58,17 @@ def with_head(config: DetectorConfig, **values: Any) -> DetectorConfig:
     return config.model_copy(update={"head": config.head.model_copy(update=values)})
 
 
-def check_detector(folder: Path) -> None:
-    """Raise InputError if the folder holds no valid detector, as far as can be checked without loading the network."""
-    load_config(folder)
+def check_detector(folder: Path, *, mirrored: bool = False) -> None:
+    """Raise InputError if the folder holds no valid detector, as far as can be checked without loading the network.
+
+    With `mirrored`, the detector's config must also state mirrored views.
+    """
+    if load_config(folder).head.mirrored == "none" and mirrored:
+        raise InputError(
+            "the detector has no mirrored views (`head.mirrored: none`)",
+            where=str(folder / CONFIG),
+            remedy="set `head.mirrored: both` there, or search without mirrored views",
+        )
     with check_file(folder / WEIGHTS, remedy=_REMEDY).open("rb") as file:
         if file.read(len(_HDF5)) != _HDF5:
             raise InputError("the file is not HDF5", where=str(folder / WEIGHTS), remedy=_REMEDY)
@@ -96,14 +104,14 @@ def _check_contents(path: Path) -> None:
         raise InputError(f"the file claims {claimed:,} bytes of weights but has {size:,} bytes", where=str(path), remedy=_REMEDY)
 
 
-def load(folder: Path, *, image_px: int | None = None, unmirrored: bool = False) -> Any:
+def load(folder: Path, *, image_px: int | None = None, mirrored: bool = False) -> Any:
     """Load a detector.
 
     Parameters
     ----------
     folder : Folder of the detector.
     image_px : Side of the images, px; None: as in the config.
-    unmirrored : Whether to use no mirrored views, whatever `head.mirrored` says.
+    mirrored : Whether to average over the mirrored views that `head.mirrored` states.
 
     Returns
     -------
@@ -112,13 +120,13 @@ def load(folder: Path, *, image_px: int | None = None, unmirrored: bool = False)
     Raises
     ------
     InputError
-        If the weights are missing, damaged or of another network.
+        If the weights are missing, damaged or of another network, or if there are no mirrored views to use.
     """
     from pipeline.detection.inference.mirrored import build_network
 
-    check_detector(folder)
+    check_detector(folder, mirrored=mirrored)
     config = load_config(folder)
-    if unmirrored:
+    if not mirrored:
         config = with_head(config, mirrored="none")
     model = build_network(config, image_px)
     take_weights(model, folder)

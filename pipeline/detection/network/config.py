@@ -73,8 +73,8 @@ class HeadConfig(Config):
     )
     mirrored: Mirroring = Field(
         "none",
-        description="mirrored views over which detection averages, besides the map itself: left-right, or left-right, up-down "
-        "and both ways; used in detection only, see training.flips",
+        description="mirrored views over which `detect --mirrored` averages, besides the map itself: left-right, or left-right, "
+        "up-down and both ways; used in detection only, see training.flips",
     )
     score_shift: float = Field(
         0.0,

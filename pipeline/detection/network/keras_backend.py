@@ -66,6 +66,7 @@ def computing_precision(precision: Literal["float32", "bfloat16"]) -> Iterator[N
             f"bfloat16 does not work with KERAS_BACKEND={backend}",
             where="training.precision",
             allowed="bfloat16 on tensorflow, float32 on every backend",
+            remedy="set training.precision to float32, or KERAS_BACKEND to tensorflow",
         )
     import tensorflow as tf
 

@@ -54,7 +54,7 @@ class BoxTargets:
 
     @property
     def positives(self) -> int:
-        """Number of places for positives."""
+        """Number of places for positive proposals, which belong to a block, in each image."""
         return int(self.code.shape[1])
 
 

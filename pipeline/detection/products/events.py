@@ -62,7 +62,7 @@ _PLACE = ("world_x_m", "world_y_m", "world_z_m")
 
 
 def event(item: Detection, number: int, image: str, difference: NDArray[np.float32], grid: Grid) -> Event:
-    """Measure the event of a detection.
+    """Measure place, size and volume of a detected rockfall in its difference map.
 
     Parameters
     ----------

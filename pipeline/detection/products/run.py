@@ -47,18 +47,18 @@ def detector_folder(model: str) -> Path:
     return configs_folder() / "detectors" / DEFAULT if model == DEFAULT else Path(model)
 
 
-def detector(model: str, *, unmirrored: bool = False) -> Detector:
-    """Load a detector: `baseline`, or a name as in `detector_folder`; unmirrored: without mirrored views."""
+def detector(model: str, *, mirrored: bool = False) -> Detector:
+    """Load a detector: `baseline`, or a name as in `detector_folder`; mirrored: with the mirrored views of its config."""
     if model == BASELINE:
-        if unmirrored:
-            raise InputError(f"the option needs a network, not '{BASELINE}'", where="--unmirrored", remedy="leave it out")
+        if mirrored:
+            raise InputError(f"the option needs a network, not '{BASELINE}'", where="--mirrored", remedy="leave it out")
         return baseline.detect
     from pipeline.detection.network.keras_backend import import_keras
 
     import_keras()
     from pipeline.detection.inference import inference, weights
 
-    network = weights.load(detector_folder(model), unmirrored=unmirrored)
+    network = weights.load(detector_folder(model), mirrored=mirrored)
     return lambda difference: inference.detect(network, difference, LOWEST_SCORE)
 
 
@@ -89,7 +89,10 @@ def find_inputs(places: Sequence[Path]) -> list[InputMap]:
         files = sorted(place.glob("difference_*.tif")) if place.is_dir() else [place]
         if not files:
             raise InputError(
-                "no difference map found", where=str(place), allowed="a TIFF, a run folder, or a folder with annotations.json"
+                "no difference map found",
+                where=str(place),
+                allowed="a TIFF, a run folder, or a folder with annotations.json",
+                remedy="name a difference map, or a folder that contains some",
             )
         result += [InputMap(file, file.name, {"file_name": file.name}) for file in files]
     for path, count in Counter(item.path for item in result).items():
@@ -124,7 +127,7 @@ def detect(
     pictures: bool = True,
     progress: Progress | None = None,
     *,
-    unmirrored: bool = False,
+    mirrored: bool = False,
 ) -> list[events.Event]:
     """Detect blocks in difference maps and write the results.
 
@@ -140,7 +143,7 @@ def detect(
     confidences : Lowest scores of the output files.
     pictures : Whether to write masks and pictures.
     progress : Receives the progress; None: nothing is shown.
-    unmirrored : Whether a network uses no mirrored views, which takes less time if `head.mirrored` asks for them.
+    mirrored : Whether a network also searches the mirrored views of `head.mirrored`, which takes more time.
 
     Returns
     -------
@@ -148,7 +151,7 @@ def detect(
     """
     inputs, progress = find_inputs(places), progress or Progress()
     with progress.stage("network"):
-        find = detector(model, unmirrored=unmirrored)
+        find = detector(model, mirrored=mirrored)
     results: list[_Result] = []
     progress.plan({"detection": 1.0, "results": 0.2 if pictures else 0.01})
     with progress.stage("detection"):

@@ -75,7 +75,7 @@ def stereo_pair(found: MetashapeCameras, left: str | None, right: str | None, wh
     for label in (label for label in (left, right) if label is not None and label not in found.cameras):
         why = "is not aligned" if label in found.unaligned else "is not in the file"
         why = "belongs to a rig, whose relative poses cannot be read" if label in found.rigged else why
-        raise InputError(f"camera '{label}' {why}", where=where, allowed=known)
+        raise InputError(f"camera '{label}' {why}", where=where, allowed=known, remedy="choose one of these cameras")
     if left is not None and right is not None:
         return CameraPair(found.cameras[left], found.cameras[right])
     if left is not None or right is not None or len(found.cameras) != 2:

@@ -49,10 +49,16 @@ def read_colmap(folder: Path) -> dict[str, Camera]:
     cameras = {}
     for words, where in _records(folder / "images.txt", 10, 2):
         if words[8] not in interiors:
-            raise InputError(f"names the camera {words[8]}, which is not in cameras.txt", where=where)
+            raise InputError(
+                f"names the camera {words[8]}, which is not in cameras.txt",
+                where=where,
+                remedy="export cameras.txt and images.txt of the same model",
+            )
         quaternion, translation = np.split(_numbers(words[1:8], where), [4])
         if np.abs(quaternion).max() < 1e-9:
-            raise InputError("the quaternion is zero", where=where)
+            raise InputError(
+                "the rotation (quaternion) of the image is zero", where=where, remedy="export the model again as text"
+            )
         rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix().T
         cameras[" ".join(words[9:])] = _camera(*interiors[words[8]], (-rotation @ translation, rotation))
     return cameras
@@ -102,11 +108,13 @@ def read_map(path: Path) -> NDArray[np.float32]:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path)) from None
+        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
     header = _MAP_HEADER.match(data)
     width, height, depth = (int(number) for number in header.groups()) if header else (0, 0, 0)
     if header is None or len(data) != header.end() + 4 * width * height * depth:
-        raise InputError("is not a complete depth or normal map of COLMAP", where=str(path))
+        raise InputError(
+            "is not a complete depth or normal map of COLMAP", where=str(path), remedy="run the reconstruction again"
+        )
     planes = np.frombuffer(data, "<f4", offset=header.end()).reshape(depth, height, width)
     return planes[0] if depth == 1 else np.moveaxis(planes, 0, 2)
 
@@ -126,7 +134,12 @@ def _records(path: Path, words: int, stride: int) -> list[tuple[list[str], str]]
     records = [(line.split(), f"{path}, line {number}") for number, line in numbered[::stride]]
     for found, where in records:
         if len(found) < words:
-            raise InputError(f"has {len(found)} words", where=where, allowed=f"at least {words}")
+            raise InputError(
+                f"has {len(found)} words",
+                where=where,
+                allowed=f"at least {words}",
+                remedy="correct the line, or export the model again as text",
+            )
     return records
 
 
@@ -134,10 +147,19 @@ def _camera(words: list[str], where: str, pose: Pose) -> Camera:
     """Return the camera of a line of cameras.txt."""
     model = words[1]
     if model not in MODELS:
-        raise InputError(f"the camera model {model} is not supported", where=where, allowed=", ".join(MODELS))
+        raise InputError(
+            f"the camera model {model} is not supported",
+            where=where,
+            allowed=", ".join(MODELS),
+            remedy="undistort the images in COLMAP, or estimate one of these models",
+        )
     values = _numbers(words[2:], where)
     if len(values) != 2 + len(MODELS[model]) or min(values[:3]) <= 0:
-        raise InputError(f"{model} needs width, height and {', '.join(MODELS[model])}", where=where)
+        raise InputError(
+            f"the camera model {model} needs width, height and {', '.join(MODELS[model])}",
+            where=where,
+            remedy="export the model again as text",
+        )
     named = dict(zip(MODELS[model], values[2:].tolist(), strict=True))
     distortion = shared_distortion({name: value for name, value in named.items() if name not in _PLACE}, where)
     fx, fy = named.get("fx", named.get("f", 0.0)), named.get("fy", named.get("f", 0.0))
@@ -171,5 +193,10 @@ def _numbers(words: list[str], where: str) -> FloatArray:
     except ValueError:
         values = np.array([np.nan])
     if not (np.abs(values) <= _LARGEST).all():
-        raise InputError(f"expected numbers, got '{' '.join(words)[:60]}'", where=where, allowed=f"up to {_LARGEST:g}")
+        raise InputError(
+            f"expected numbers, got '{' '.join(words)[:60]}'",
+            where=where,
+            allowed=f"up to {_LARGEST:g}",
+            remedy="correct the line, or export the model again as text",
+        )
     return values

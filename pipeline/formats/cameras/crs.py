@@ -17,8 +17,18 @@ def wkt_of(name: str, where: str) -> str:
         crs = CRS.from_user_input(name)
     except (CRSError, UnicodeError) as error:
         problem = f"is not understood: {name!r:.60} ({' '.join(str(error).split())[:100]})"
-        raise InputError(problem, where=where, allowed="an EPSG code such as EPSG:28356, or WKT") from None
+        raise InputError(
+            problem,
+            where=where,
+            allowed="an EPSG code such as EPSG:28356, or WKT",
+            remedy="correct the code, or leave the key out",
+        ) from None
     if any(axis.unit_conversion_factor != 1 or "degree" in axis.unit_name for axis in crs.axis_info):
         problem = f"'{crs.name}' has the unit {crs.axis_info[0].unit_name}"
-        raise InputError(problem, where=where, allowed="a projected coordinate system, m")
+        raise InputError(
+            problem,
+            where=where,
+            allowed="a projected coordinate system, m",
+            remedy="name the system in which the coordinates are eastings and northings in metres",
+        )
     return str(crs.to_wkt("WKT1_GDAL"))

@@ -37,7 +37,7 @@ class Projection:
     where: str
 
     def pose(self, matrix: FloatArray) -> FloatArray:
-        """Convert a pose (4, 4) from camera to geocentric coordinates to one to easting, northing, height.
+        """Convert the pose (4, 4) of a camera from geocentric coordinates to easting, northing and height.
 
         The height is ellipsoidal; a scale is kept.
         """

@@ -73,7 +73,11 @@ def read_metashape(path: Path) -> MetashapeCameras:
             raise InputError(f"two cameras are labelled '{label}'", where=str(path), remedy="rename one of them in Metashape")
         sensor = sensors.get(element.get("sensor_id", ""))
         if sensor is None:
-            raise InputError(f"the sensor of camera '{label}' is not in the file", where=str(path))
+            raise InputError(
+                f"the sensor of camera '{label}' is not in the file",
+                where=str(path),
+                remedy="export the cameras again with File > Export > Export Cameras",
+            )
         in_chunk = _numbers(transform, 16, f"{path}: camera {label}").reshape(4, 4)
         pose = to_world.get(element.get("component_id", ""), default) @ in_chunk
         if projection is not None and is_geocentric(pose[:3, 3]):
@@ -109,9 +113,18 @@ def read_calibration(path: Path) -> Camera:
     """Read a calibration XML; the camera is placed at the origin."""
     root = read_root(path)
     if root.tag != "calibration":
-        raise InputError(f"is not a calibration XML of Metashape (its root is <{root.tag}>)", where=str(path))
+        raise InputError(
+            f"is not a calibration XML of Metashape (its root is <{root.tag}>)",
+            where=str(path),
+            remedy="export it with Tools > Camera Calibration > Save",
+        )
     if (projection := root.findtext("projection", "frame")) != "frame":
-        raise InputError(f"has the projection '{projection}'", where=str(path), allowed="frame")
+        raise InputError(
+            f"has the projection '{projection}'",
+            where=str(path),
+            allowed="frame",
+            remedy="use a camera of type frame in Metashape",
+        )
     width, height = (_whole(root.findtext(tag, "0"), str(path)) for tag in ("width", "height"))
     return _camera(root, (width, height), np.eye(4), str(path))
 
@@ -150,7 +163,12 @@ def _similarity(element: ElementTree.Element, path: Path) -> FloatArray:
     where = f"{path}: transform"
     scale = float(_numbers(transform.findtext("scale", "1"), 1, where)[0])
     if scale <= 0:
-        raise InputError(f"has the scale {scale:g}", where=where, allowed="greater than 0")
+        raise InputError(
+            f"has the scale {scale:g}",
+            where=where,
+            allowed="greater than 0",
+            remedy="export the cameras again with File > Export > Export Cameras",
+        )
     matrix[:3, :3] = scale * _numbers(transform.findtext("rotation", "1 0 0 0 1 0 0 0 1"), 9, where).reshape(3, 3)
     matrix[:3, 3] = _numbers(transform.findtext("translation", "0 0 0"), 3, where)
     return matrix
@@ -165,7 +183,9 @@ def _sensor_camera(sensor: ElementTree.Element, pose: FloatArray, where: str) ->
         raise InputError("has no resolution or no calibration", where=where, remedy="align the cameras before the export")
     for kind in (sensor.get("type", "frame"), adjusted[0].get("type", "frame")):
         if kind != "frame":
-            raise InputError(f"has the model '{kind}'", where=where, allowed="frame")
+            raise InputError(
+                f"has the model '{kind}'", where=where, allowed="frame", remedy="use a camera of type frame in Metashape"
+            )
     width, height = (_whole(resolution.get(side, "0"), where) for side in ("width", "height"))
     return _camera(adjusted[0], (width, height), pose, where)
 
@@ -212,10 +232,19 @@ def _camera(calibration: ElementTree.Element, size: tuple[int, int], pose: Float
     _check_parameters(calibration, where)
     interior = {name: float(_numbers(calibration.findtext(tag, "0"), 1, where)[0]) for tag, name in _TAGS.items()}
     if interior["f_px"] <= 0 or min(size) <= 0:
-        raise InputError("has no frame size or no f", where=where, allowed="width, height and f greater than 0")
+        raise InputError(
+            "has no frame size or no f",
+            where=where,
+            allowed="width, height and f greater than 0",
+            remedy="align the cameras, and export the file again",
+        )
     left, scales, right = np.linalg.svd(pose[:3, :3])  # the nearest rotation, without the similarity's scale
     if np.linalg.det(left @ right) < 0 or np.ptp(scales) > 1e-6 * scales[0]:
-        raise InputError("a camera's transform is not a rotation with one scale", where=where)
+        raise InputError(
+            "a camera's transform is not a rotation with one scale",
+            where=where,
+            remedy="export the cameras again with File > Export > Export Cameras",
+        )
     return checked_camera(where, size, interior, (pose[:3, 3], left @ right))
 
 
@@ -241,7 +270,7 @@ def _whole(text: str, where: str) -> int:
     """Parse a whole number."""
     value = float(_numbers(text, 1, where)[0])
     if value != int(value):
-        raise InputError(f"expected a whole number of pixels, got '{text}'", where=where)
+        raise InputError(f"expected a whole number of pixels, got '{text}'", where=where, remedy="export the file again")
     return int(value)
 
 
@@ -252,5 +281,7 @@ def _numbers(text: str, count: int, where: str) -> FloatArray:
     except ValueError:
         values = np.empty(0)
     if len(values) != count or not (np.abs(values) <= _LARGEST).all():
-        raise InputError(f"expected {count} numbers, got '{' '.join(text.split())[:60]}'", where=where)
+        raise InputError(
+            f"expected {count} numbers, got '{' '.join(text.split())[:60]}'", where=where, remedy="export the file again"
+        )
     return values

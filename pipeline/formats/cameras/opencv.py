@@ -115,12 +115,20 @@ def read_opencv(path: Path) -> Camera:
         parts = {part: _first(storage, names) for part, names in _NAMES.items()}
         storage.release()
     except (cv2.error, SystemError):  # OpenCV 5 may return with an error set, for which Python raises SystemError
-        raise InputError("is not a complete file of OpenCV's FileStorage", where=str(path)) from None
+        raise InputError(
+            "is not a complete file of OpenCV's FileStorage", where=str(path), remedy="save it again with cv2.FileStorage"
+        ) from None
     for part, value in parts.items():
         if value is None:
-            raise InputError(f"has no {part}", where=str(path), allowed=", ".join(_NAMES[part]))
+            raise InputError(
+                f"has no {part}", where=str(path), allowed=", ".join(_NAMES[part]), remedy="add it under one of these names"
+            )
     if np.ndim(parts["width"]) or np.ndim(parts["height"]):
-        raise InputError("width and height are not numbers", where=str(path))
+        raise InputError(
+            "width and height are not numbers",
+            where=str(path),
+            remedy="write image_width and image_height as whole numbers",
+        )
     return _camera(
         (parts["width"], parts["height"]), np.asarray(parts["matrix"], float), np.ravel(parts["distortion"]), str(path)
     )
@@ -148,10 +156,15 @@ def read_opencv_text(path: Path) -> Camera:
     try:
         values = np.array([float(word) for word in words])
     except ValueError as error:
-        raise InputError(f"contains something that is not a number ({error})", where=str(path)) from None
+        raise InputError(
+            f"contains something that is not a number ({error})", where=str(path), remedy="remove what is no number"
+        ) from None
     if len(values) < 15:
         raise InputError(
-            f"has {len(values)} numbers", where=str(path), allowed="2 (size), 9 (camera matrix), 4 to 14 (distortion)"
+            f"has {len(values)} numbers",
+            where=str(path),
+            allowed="2 (size), 9 (camera matrix), 4 to 14 (distortion)",
+            remedy="write the size, the camera matrix and the distortion, in this order",
         )
     return _camera((values[0], values[1]), values[2:11].reshape(3, 3), values[11:], str(path))
 
@@ -168,11 +181,25 @@ def _first(storage: Any, names: tuple[str, ...]) -> Any:
 def _camera(size: tuple[float, float], matrix: FloatArray, distortion: FloatArray, where: str) -> Camera:
     """Return the camera of a calibration."""
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or min(size) <= 0 or min(matrix[0, 0], matrix[1, 1]) <= 0:
-        raise InputError("has no camera matrix with positive fx, fy and frame size", where=where)
+        raise InputError(
+            "has no camera matrix with positive fx, fy and frame size",
+            where=where,
+            remedy="calibrate the camera again, and save the matrix and the image size",
+        )
     if matrix[0, 1] != 0:
-        raise InputError(f"the camera matrix has the skew {matrix[0, 1]:g}", where=where, allowed="0, as in OpenCV's own model")
+        raise InputError(
+            f"the camera matrix has the skew {matrix[0, 1]:g}",
+            where=where,
+            allowed="0, as in OpenCV's own model",
+            remedy="calibrate without skew",
+        )
     if len(distortion) not in _LENGTHS:
-        raise InputError(f"has {len(distortion)} distortion coefficients", where=where, allowed="4, 5, 8, 12 or 14")
+        raise InputError(
+            f"has {len(distortion)} distortion coefficients",
+            where=where,
+            allowed="4, 5, 8, 12 or 14",
+            remedy="save all coefficients that OpenCV returned",
+        )
     coefficients = dict(zip(DISTORTION, distortion.astype(float).tolist(), strict=False))
     fx, fy, cx, cy = (float(value) for value in matrix[[0, 1, 0, 1], [0, 1, 2, 2]])
     return OpencvInterior(fx, fy, cx + 0.5, cy + 0.5, **shared_distortion(coefficients, where)).camera(*size, where)

@@ -105,7 +105,7 @@ def noting() -> Iterator[list[Path]]:
 
 
 def note(path: Path) -> None:
-    """Add a file to the list of the surrounding `noting` block."""
+    """Add a file to the list of written files that the surrounding `noting` block collects."""
     found = _noted.get()
     if found is not None:
         found.append(path)

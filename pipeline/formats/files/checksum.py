@@ -19,4 +19,6 @@ def sha256(path: Path) -> str:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path)) from None
+        raise InputError(
+            f"cannot be read ({error.strerror})", where=str(path), remedy="check the path and its permissions"
+        ) from None

@@ -14,12 +14,19 @@ def inside(folder: Path, name: Any, where: Path | str) -> Path:
     Raises InputError for a name that leads out of the folder: an absolute path, one with `..`, or a link to elsewhere.
     """
     if not isinstance(name, str) or not name.strip() or not name.isprintable():
-        raise InputError(f"contains {name!r:.80} where the name of a file is expected", where=str(where), allowed="a file name")
+        raise InputError(
+            f"contains {name!r:.80} where the name of a file is expected",
+            where=str(where),
+            allowed="a file name",
+            remedy="restore the file from a copy, or make it again",
+        )
     pure, path = PurePosixPath(name), folder / name
     try:
         leads_out = pure.is_absolute() or ".." in pure.parts or not path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError) as error:  # too long, a loop of links
-        raise InputError(f"names the file '{name:.80}', which is impossible ({error})", where=str(where)) from None
+        raise InputError(
+            f"names the file '{name:.80}', which is impossible ({error})", where=str(where), remedy="correct the name"
+        ) from None
     if leads_out:
         raise InputError(
             f"names the file '{name:.80}', which lies outside of its folder",

@@ -7,11 +7,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Discriminator, Tag
 
 from pipeline.change.areas import Area, in_areas
 from pipeline.formats.cameras.camera_files import read_oriented, stereo_pair
@@ -29,6 +28,7 @@ from pipeline.formats.measurements.checks import (
     finite,
 )
 from pipeline.formats.measurements.config import MeasurementConfig, ScanPattern
+from pipeline.formats.measurements.model_file import read_model
 from pipeline.formats.measurements.reference_points import ReferencePoints
 from pipeline.formats.measurements.rounded_points import check_rounded_points
 from pipeline.formats.measurements.scanner_poses import Face, Pose, Scanned, ScannerPose, set_ups
@@ -38,7 +38,7 @@ from pipeline.formats.measurements.surroundings import Surroundings
 from pipeline.formats.point_cloud import SCAN, PointCloud, joined
 from pipeline.formats.points.points import read_points
 from pipeline.registration.rigid import rotation_matrix
-from scene.common.config import Config, load_yaml, parse
+from scene.common.config import load_yaml, parse
 from scene.common.errors import InputError
 from scene.geometry.frame import WallFrame
 from scene.geometry.mesh import FloatArray, TriangleMesh
@@ -55,20 +55,18 @@ from sensors.signal_chain.surface_places import ShapedSurface
 FILE = "measurement.yaml"
 
 
-def _kind(values: Any) -> str:
-    """Return the sensor of a model."""
-    return str(values.get("sensor") if isinstance(values, dict) else getattr(values, "sensor", None))
-
-
-class _ModelFile(Config):
-    """Content of model.yaml."""
-
-    sensor: Annotated[Annotated[StereoModel, Tag("stereo")] | Annotated[TlsModel, Tag("tls")], Discriminator(_kind)]
-
-
 @dataclass(frozen=True, kw_only=True)
 class MeasurementBase(ABC):
-    """A measurement and all that predicts it, wall frame. stable_areas: where the scene did not change (empty: everywhere)."""
+    """Measured points, with the reference surface and the sensor model that predict them.
+
+    Attributes
+    ----------
+    cloud, reference : The measured points and the reference surface, wall frame, m.
+    frame : Transform between the world frame and the wall frame.
+    model : The sensor model that is tested.
+    stable_areas : Where the scene did not change, wall frame, m; empty: everywhere.
+    notes : Sentences for the report.
+    """
 
     sensor: ClassVar[Sensor]
     cloud: PointCloud
@@ -133,10 +131,15 @@ class MeasurementBase(ABC):
 class TlsMeasurement(MeasurementBase):
     """A laser scan, or several epochs of it.
 
-    station, face: pose of the first scan (scanner to wall frame) and its face; scans: several scans, whose numbers are the
-    points' channel `scan`; pattern: nominal directions, if known; pulses: (m,) pulses of the pattern that the points are part of
-    (None: all); order: (n,) scan line and (n,) share of the scan's duration, if known (see `with_order`); planes: through the
-    reference's vertices, for incidence angles (None: triangles); reference_error_m: sigma of each vertex along the rays, m.
+    Attributes
+    ----------
+    station, face : Pose of the first scan (scanner to wall frame), and the face of the instrument in which it was made.
+    scans : Pose and face of each of several scans; the points' channel `scan` has their numbers. Empty for one scan.
+    pattern : Nominal directions of the pulses; None if unknown.
+    pulses : (m,) mask of the pattern's pulses among which the points are; None: all.
+    order : (n,) scan line and (n,) elapsed share of the scan's duration of each point, if known.
+    planes : Planes through the reference's vertices, to which incidence angles refer; None: its triangles.
+    reference_error_m : Standard deviation of each vertex of the reference along the rays, m.
     """
 
     sensor = "tls"
@@ -196,10 +199,14 @@ class TlsMeasurement(MeasurementBase):
 
 @dataclass(frozen=True, kw_only=True)
 class StereoMeasurement(MeasurementBase):
-    """A surface from a stereo pair.
+    """Points that were measured by a stereo pair with known cameras.
 
-    cameras: nominal calibration, world frame; shaped_px: (n,) disparity that effects of neighbouring pixels add at each point,
-    and surroundings: the reference around the points, both for cameras near the present pose, None if not computed.
+    Attributes
+    ----------
+    cameras : Nominal calibration and poses, world frame.
+    shaped_px : (n,) change of each point's disparity, px, by effects that depend on neighbouring pixels, such as smoothing. It
+        holds for poses close to the present one; None if it was not computed.
+    surroundings : What the cameras see around each point, for the same poses; None if it was not computed.
     """
 
     sensor = "stereo"
@@ -287,24 +294,17 @@ class SurfaceMeasurement(MeasurementBase):
 Measurement = TlsMeasurement | StereoMeasurement | SurfaceMeasurement
 
 
-def read_model(path: Path) -> TlsModel | StereoModel:
-    """Read a model.yaml; raise InputError that names the wrong key."""
-    return sensor_model(load_yaml(path), str(path))
-
-
-def sensor_model(values: Any, where: str) -> TlsModel | StereoModel:
-    """Return the sensor model of a mapping of keys; where: name of the file, for errors."""
-    if not isinstance(values, dict) or values.get("sensor") not in ("tls", "stereo"):
-        raise InputError("names no sensor", where=where, allowed="sensor: tls, sensor: stereo")
-    return parse(_ModelFile, {"sensor": values}, where).sensor
-
-
 @dataclass(frozen=True)
 class Material:
-    """The parts of a measurement in memory, which `assembled` joins.
+    """The parts of a measurement in memory, from which `assembled` makes the measurement.
 
-    reference, cameras: world frame, m (None: unknown); points: clouds by file name, one for each epoch, in the frame of the
-    config; notes: on the reference.
+    Attributes
+    ----------
+    reference : The reference surface, world frame, m.
+    points : Point clouds by file name, one for each epoch, in the frame that the config states.
+    model : The sensor model.
+    cameras : The stereo pair, world frame; None if there is none or it is unknown.
+    notes : Notes on the reference for the report.
     """
 
     reference: TriangleMesh
@@ -407,7 +407,8 @@ def _scanner_pose(config: MeasurementConfig, where: str) -> ScannerPose:
 
 def _check_sensor(config: MeasurementConfig, model: TlsModel | StereoModel, where: str) -> None:
     if model.sensor != config.sensor:
-        raise InputError(f"model is of sensor {model.sensor}, the measurement of {config.sensor}", where=where)
+        what = f"the model is of sensor {model.sensor}, the measurement of {config.sensor}"
+        raise InputError(what, where=where, remedy="name a model of the same sensor")
 
 
 def _check(found: Measurement, cloud: PointCloud, config: MeasurementConfig, where: str) -> None:

@@ -132,7 +132,12 @@ def recover_pattern(points: FloatArray, position: FloatArray | None = None, rota
 def _check(local: FloatArray) -> None:
     """Raise InputError for too few points, or coordinates that are not numbers."""
     if len(local) < _FEWEST**2:
-        raise InputError(f"{len(local)} points are too few to find a pattern in", where="scan", allowed=f"at least {_FEWEST**2}")
+        raise InputError(
+            f"{len(local)} points are too few to find the pattern of the scan",
+            where="scan",
+            allowed=f"at least {_FEWEST**2}",
+            remedy="use all points of the scan",
+        )
     if not np.isfinite(local).all():
         raise InputError("has coordinates that are not numbers", where="scan", remedy="leave out the missing returns")
 

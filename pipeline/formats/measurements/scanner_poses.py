@@ -53,7 +53,7 @@ class ScannerScan(ScannerPose):
 
 @dataclass(frozen=True)
 class Scanned:
-    """One of several scans.
+    """Pose and face of one of several scans in a measurement.
 
     Attributes
     ----------

@@ -27,7 +27,7 @@ def datum_columns(away: FloatArray, normal: FloatArray) -> FloatArray:
 
 
 def told_datum(away: FloatArray, normal: FloatArray) -> FloatArray:
-    """Return the (7, k) components of the datum that a surface determines, from places and normals (n, 3).
+    """Return the (7, k) components of the datum (shift, rotation, scale) that places and normals (n, 3) of a surface determine.
 
     They are unit vectors if it determines all seven values, else combinations of them.
     """

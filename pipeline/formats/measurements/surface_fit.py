@@ -50,7 +50,7 @@ class SurfaceFit:
         return self.near >= _FEWEST_NEAR
 
     def check(self, where: str) -> None:
-        """Raise InputError if they do not."""
+        """Raise InputError if the points do not belong to this surface."""
         if self.good:
             return
         raise InputError(

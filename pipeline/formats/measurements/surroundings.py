@@ -13,7 +13,7 @@ from scene.geometry.mesh import FloatArray
 
 @dataclass(frozen=True)
 class Surroundings:
-    """The reference at n pixels.
+    """What the cameras see of the reference around n pixels.
 
     Attributes
     ----------

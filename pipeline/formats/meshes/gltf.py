@@ -29,7 +29,9 @@ def write_gltf(path: Path, parts: Sequence[GltfPart]) -> None:
     Positions are float32, as glTF requires: 4 micrometres at 60 m. Raises InputError for another suffix.
     """
     if path.suffix.lower() != ".glb":
-        raise InputError(f"unknown format '{path.suffix}'", where=str(path), allowed=".glb")
+        raise InputError(
+            f"unknown format '{path.suffix}'", where=str(path), allowed=".glb", remedy="choose a file name that ends in .glb"
+        )
     import trimesh
 
     scene = trimesh.Scene()

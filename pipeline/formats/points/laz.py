@@ -21,10 +21,13 @@ from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points.las_statements import check_box, check_counts, flagged, stated_units
 from scene.common.errors import InputError
 from scene.common.regular_file import check_file
+from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
 
 _CHUNK = 1_000_000
 """Points in memory at a time while writing; a multiple of the 50,000 points of a LAZ chunk."""
+_FILLED_AT_ONCE = 1 << 15
+"""Points that a thread converts at a time; their arrays then stay in the processor's cache."""
 _COUNTS = 65535
 """Largest stored intensity."""
 _LARGEST = 2**31 - 1
@@ -133,12 +136,20 @@ class StoredCloud:
     def records(self, rows: slice | NDArray[np.integer]) -> laspy.ScaleAwarePointRecord:
         """Return the points of these rows as LAS records."""
         places, intensity = self.cloud.points[rows], self.cloud.intensity
+        intensity = None if intensity is None else intensity[rows]
+        fields = {name: values if values.ndim == 0 else values[rows] for name, values in self.fields.items()}
         record = laspy.ScaleAwarePointRecord.zeros(len(places), header=self.header)
-        _fill(record.array, self.header, places)
-        for name, values in self.fields.items():
-            record.array[name] = values if values.ndim == 0 else values[rows]
-        if intensity is not None:
-            record.array["intensity"] = np.rint(intensity[rows] * (_COUNTS / self.full_scale))
+
+        def fill(start: int) -> None:
+            part = slice(start, start + _FILLED_AT_ONCE)
+            array = record.array[part]
+            _fill(array, self.header, places[part])
+            for name, values in fields.items():
+                array[name] = values if values.ndim == 0 else values[part]
+            if intensity is not None:
+                array["intensity"] = np.rint(intensity[part] * (_COUNTS / self.full_scale))
+
+        map_in_threads(fill, range(0, len(places), _FILLED_AT_ONCE))
         return record
 
 

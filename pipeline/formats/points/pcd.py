@@ -43,7 +43,12 @@ def _stored(column: NDArray[Any], where: str) -> NDArray[Any]:
     if column.dtype.kind == "b":
         return column.astype("<u1")
     if column.dtype.kind not in _LETTERS or column.ndim != 1:
-        raise InputError(f"has the type {column.dtype}", where=where, allowed="one number for each point")
+        raise InputError(
+            f"has the type {column.dtype}",
+            where=where,
+            allowed="one number for each point",
+            remedy="leave the channel out, or write LAZ",
+        )
     little = column.dtype.newbyteorder("<")
     return column.astype("<f4") if column.dtype.itemsize == 2 and column.dtype.kind == "f" else column.astype(little)
 

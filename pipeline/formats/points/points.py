@@ -11,7 +11,6 @@ import numpy as np
 from pipeline.formats.meshes.ply import read_ply_points
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points.fillers import without_fillers
-from pipeline.formats.points.laz import read_laz
 from pipeline.formats.points.ptx import orthonormal, read_ptx
 from pipeline.formats.points.xyz import read_xyz
 from pipeline.formats.units import AxisUnits, agreed_units
@@ -117,6 +116,8 @@ def _read(path: Path, columns: Sequence[str]) -> list[PlacedScan]:
     if suffix in TEXT:
         cloud = read_xyz(path, columns)
     elif suffix in (".laz", ".las"):
+        from pipeline.formats.points.laz import read_laz  # laspy takes a fifth of a second to load
+
         cloud = read_laz(path)
     elif suffix == ".ply":
         cloud = read_ply_points(path)
@@ -131,10 +132,20 @@ def _read_plugged(path: Path) -> PointCloud:
     reader = further.get(path.suffix.lower()[1:])
     if reader is None:
         allowed = " ".join([*SUFFIXES, *(f".{name}" for name in further)])
-        raise InputError(f"unknown format '{path.suffix}'", where=str(path), allowed=allowed)
+        raise InputError(
+            f"unknown format '{path.suffix}'",
+            where=str(path),
+            allowed=allowed,
+            remedy="export the points in one of these formats",
+        )
     cloud = reader(path)
     if not isinstance(cloud, PointCloud):
-        raise InputError(f"its reader returned a {type(cloud).__name__}", where=str(path), allowed="a PointCloud")
+        raise InputError(
+            f"its reader returned a {type(cloud).__name__}",
+            where=str(path),
+            allowed="a PointCloud",
+            remedy="correct the reader in the package that provides it",
+        )
     return cloud
 
 

@@ -15,7 +15,7 @@ _NO_DATA = "181,181,181,255"
 
 @dataclass(frozen=True)
 class Stop:
-    """A colour (#rrggbb) at a value of the raster, and its label in the legend."""
+    """A fixed point of a colour scale: a value of the raster, its colour (#rrggbb) and its label in the legend."""
 
     value: float
     colour: str

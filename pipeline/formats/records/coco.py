@@ -108,7 +108,11 @@ def read_coco(path: Path, *, masks: bool = True) -> Coco:
         if not isinstance(content.get(name), list):
             raise _no_coco(path, f"'{name}' is {'not a list' if name in content else 'missing'}")
     if not content["images"]:
-        raise InputError("its list 'images' is empty", where=str(path), remedy="give the annotations of the maps that are meant")
+        raise InputError(
+            "its list 'images' is empty",
+            where=str(path),
+            remedy="give the annotations file of the maps or tiles that are read here",
+        )
     images = [entry for entry, _ in _parsed(_Image, content["images"], "image", path)]
     for image in images:
         _check_pixels(image, path)

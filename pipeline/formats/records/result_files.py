@@ -8,7 +8,6 @@ import numpy as np
 
 from pipeline.formats.meshes.ply import read_ply
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.formats.points.laz import read_laz
 from pipeline.formats.points.points import check_reach
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray, TriangleMesh
@@ -27,6 +26,8 @@ def read_surface(path: Path) -> TriangleMesh:
 
 def read_own_points(path: Path) -> PointCloud:
     """Read points (LAZ); raise InputError as `read_laz` does, and for an empty file or impossible coordinates."""
+    from pipeline.formats.points.laz import read_laz  # laspy takes a fifth of a second to load
+
     cloud = read_laz(path)
     if not len(cloud.points):
         raise InputError("has no points", where=str(path), remedy=_REMEDY)

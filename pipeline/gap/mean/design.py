@@ -33,6 +33,8 @@ _NULL_ROWS = 8_000
 class CandidateFamilies:
     """All candidates of a search, divided into those with fixed design columns and sines whose period is searched.
 
+    A family is the set of all variants of one explanation, such as an effect with different cameras or periods.
+
     Attributes
     ----------
     plain : Candidates with fixed columns; effects of the catalogue come before non-parametric terms.
@@ -50,7 +52,7 @@ class CandidateFamilies:
 
     @cached_property
     def by_name(self) -> dict[str, tuple[list[int], list[int]]]:
-        """For each family, the indices of its members in `plain`, and the indices of its sines counted over all grids."""
+        """For the name of each family, two lists of indices: its candidates in `plain`, and its sines counted over all grids."""
         families: dict[str, tuple[list[int], list[int]]] = {}
         for row, candidate in enumerate(self.plain):
             families.setdefault(candidate.family, ([], []))[0].append(row)
@@ -177,7 +179,7 @@ class Design:
         return [self.column_numbers[candidate] for candidate in self.families.plain]
 
     def conditioned_on(self, candidate: Candidate) -> Design:
-        """Return the design that can score further candidates beside the given one.
+        """Return the design in which further candidates can be scored in addition to the given one.
 
         A sine is held at its period, refined to the maximum of the likelihood.
         """

@@ -58,7 +58,7 @@ _NOTHING = 1e-14
 
 @dataclass(frozen=True, eq=False)
 class CellCovariance:
-    """One trial covariance of the m cell means: correlated error of the reference plus noise.
+    """One trial covariance of the means of m cells of the wall: correlated error of the reference plus noise.
 
     It is held by its eigenvalues, in units in which the noise of a cell mean is independent with variance 1.
 
@@ -161,7 +161,9 @@ class MeanModel:
     def restrict(
         self, designs: list[ProjectedColumns], value: ProjectedColumns, most_sigma: float = np.inf
     ) -> tuple[MeanModel, list[CellCovariance], list[int]]:
-        """Drop covariances under which the residuals are unlikely with each of the given designs, to save time later.
+        """Drop trial covariances of the reference error under which the residuals are unlikely, to save time later.
+
+        A covariance is kept if the residuals are likely under it with at least one of the given sets of columns fitted.
 
         Parameters
         ----------
@@ -196,7 +198,7 @@ class MeanModel:
 
     @property
     def covariances(self) -> list[CellCovariance]:
-        """Every combination of a remaining correlation function and an amplitude of the reference error."""
+        """Every combination of a remaining correlation function of the reference error and a trial amplitude."""
         return [self._covariance(basis, float(ratio)) for basis in range(len(self._bases)) for ratio in self._ratios]
 
     def _orthonormal_planes(self, offsets: list[FloatArray]) -> sparse.csr_array:
@@ -245,7 +247,7 @@ class MeanModel:
         return np.asarray(weighted[rows] - self._across[rows] @ planes)
 
     def in_bases(self, means: FloatArray) -> list[FloatArray]:
-        """Transform cell means to the eigenvectors of each correlation function, in which their covariance is diagonal.
+        """Transform cell means to the eigenvectors of each trial correlation function, in which their covariance is diagonal.
 
         Parameters
         ----------
@@ -338,12 +340,14 @@ _CORRELATIONS: list[Callable[[FloatArray], FloatArray]] = [
 class ProjectedColumns:
     """k design columns (or residuals), divided into their parts within and between the m cells of the wall.
 
+    The reference's error varies little within a cell, so only the part between cells depends on its covariance.
+
     Attributes
     ----------
     within : (n, k) deviations within cells.
     within_weighted : (n, k) deviations times the inverse covariance of their noise, so that a.within.T @ b.within_weighted are
         the inner products of two sets of columns.
-    between : For each correlation function of the reference error, the (m, k) cell means in its eigenvectors.
+    between : For each trial correlation function of the reference error, the (m, k) cell means in its eigenvectors.
     """
 
     within: FloatArray
@@ -352,7 +356,7 @@ class ProjectedColumns:
 
     @classmethod
     def concatenate(cls, parts: Sequence[ProjectedColumns]) -> ProjectedColumns:
-        """Join the columns of several sets, in their order."""
+        """Join the columns of several sets of the same points, in their order."""
         if len(parts) == 1:
             return parts[0]
         within = np.concatenate([each.within for each in parts], axis=1)
@@ -362,17 +366,17 @@ class ProjectedColumns:
         return cls(within, weighed, [np.concatenate(basis, axis=1) for basis in bases])
 
     def select(self, columns: list[int]) -> ProjectedColumns:
-        """Return the columns with these numbers."""
+        """Return the columns with the given numbers, from 0, in that order."""
         within = self.within[:, columns]
         weighed = within if self.within_weighted is self.within else self.within_weighted[:, columns]
         return ProjectedColumns(within, weighed, [part[:, columns] for part in self.between])
 
     def in_bases(self, bases: list[int]) -> ProjectedColumns:
-        """Keep the cell means for only some of the correlation functions, given by their indices."""
+        """Keep the cell means for only some of the trial correlation functions of the reference error, given by their indices."""
         return ProjectedColumns(self.within, self.within_weighted, [self.between[basis] for basis in bases])
 
     def append(self, other: ProjectedColumns) -> ProjectedColumns:
-        """Return these columns followed by those of another set."""
+        """Return these columns followed by the columns of another set of the same points."""
         return ProjectedColumns.concatenate([self, other])
 
 

@@ -31,10 +31,10 @@ _AT_ONCE = 8
 
 @dataclass(frozen=True)
 class SineProducts:
-    """Inner products of w searched sines (2 w columns) with other columns, of which normal equations are made.
+    """Inner products of the columns of w searched sines with other columns, from which normal equations are built.
 
-    The part within cells is weighted by the inverse covariance of the noise. The part between cells depends on the covariance of
-    the cell means and is added by `at`.
+    Each sine has two columns. The part within cells of the wall is weighted by the inverse covariance of the noise. The part
+    between cells depends on the covariance of the cell means and is added by `at`.
 
     Attributes
     ----------
@@ -42,7 +42,8 @@ class SineProducts:
     own : (w, 2, 2) products of each sine's two columns with each other, within cells.
     right : (2 w, v) products with v columns of residuals, within cells.
     noise : (2 w, d) products with d draws of noise, within cells.
-    between : For each correlation function of the reference error, the (m, 2 w) cell means in its eigenvectors.
+    between : For each trial correlation function of the reference error, the (m, 2 w) means of the sines in m cells, in its
+        eigenvectors.
     """
 
     fixed: FloatArray
@@ -55,13 +56,13 @@ class SineProducts:
     def of(
         cls, model: MeanModel, grids: list[SineGrid], fixed: FloatArray, value: ProjectedColumns, noise: NoiseDraws
     ) -> SineProducts:
-        """Compute the products of all sines of some grids.
+        """Compute the inner products of all searched sines with other columns.
 
         Parameters
         ----------
         model : The mean model.
         grids : Grids with w sines in all.
-        fixed : (n, k) deviations of the fixed columns within cells, times the inverse covariance of the noise.
+        fixed : (n, k) columns of other candidates: their deviations within cells, times the inverse covariance of the noise.
         value : v columns of residuals.
         noise : d draws of the noise within cells.
         """
@@ -107,7 +108,7 @@ class SineProducts:
         return found
 
     def own_at(self, covariances: list[CellCovariance]) -> FloatArray:
-        """Return the (C, w, 2, 2) products of each sine's two columns with each other, under each of C covariances."""
+        """Return the (C, w, 2, 2) inner products of each sine's two columns with each other, under each of C covariances."""
         found = np.empty((len(covariances), *self.own.shape))
         for basis, rows in _by_basis(covariances).items():
             weights = np.stack([covariances[row].weight for row in rows])
@@ -127,13 +128,15 @@ def _by_basis(covariances: list[CellCovariance]) -> dict[int, list[int]]:
 
 @dataclass(frozen=True, eq=False)
 class NoiseDraws:
-    """Simulated noise within cells, from which the noise of any design column's coefficient is computed.
+    """Simulated noise, from which the noise of the coefficient of any design column is computed.
+
+    The noise consists of white noise and of noise at q grid nodes that neighbouring points share.
 
     Attributes
     ----------
     rows : Slice of n' of the points on which white noise is drawn.
     white : (n', d) white noise of d draws, in single precision, which is enough here.
-    on_nodes : (q, d) contribution of grid-correlated noise at its q nodes (see `WithinCellNoise.draw`).
+    on_nodes : (q, d) contribution of the noise at the nodes (see `WithinCellNoise.draw`).
     """
 
     rows: slice
@@ -179,7 +182,7 @@ def _squares(columns: FloatArray) -> FloatArray:
 
 
 def sine_products(grids: list[SineGrid], weighed: FloatArray, root: FloatArray) -> FloatArray:
-    """Compute the inner products within cells of all searched sines with other columns.
+    """Compute the inner products of all searched sines with other columns, for the part within cells of the wall.
 
     Parameters
     ----------
@@ -189,7 +192,7 @@ def sine_products(grids: list[SineGrid], weighed: FloatArray, root: FloatArray) 
 
     Returns
     -------
-    (2 w, k) products.
+    (2 w, k) products: sine and cosine column of each sine with each other column.
     """
     found = map_in_threads(lambda part: part.columns(root).T @ weighed, [part for grid in grids for part in grid.chunks])
     return np.concatenate(found) if found else np.zeros((0, weighed.shape[1]))
@@ -200,7 +203,7 @@ class NormalEquations:
     """Normal equations X' V^-1 X b = X' V^-1 y of pose and all candidates, under each of C covariances V.
 
     From them, any set of candidates is scored without returning to the points. Searched sines have products only with themselves
-    and with the h held columns: those of the pose and of effects beside which others are scored.
+    and with the h held columns. These belong to the pose and to effects that stay in the model while others are scored.
 
     Attributes
     ----------
@@ -224,7 +227,7 @@ class NormalEquations:
     held_columns: tuple[int, ...] = ()
 
     def with_precision(self, precision: FloatArray) -> NormalEquations:
-        """Add (k,) prior inverse variances of the fixed columns' coefficients, for priors with mean 0."""
+        """Add a Gaussian prior with mean 0 for the coefficients of the k fixed columns, given its (k,) inverse variances."""
         return replace(self, fixed=self.fixed + np.diag(precision))
 
     def with_values(self, right: FloatArray, constant: FloatArray, wave_right: FloatArray) -> NormalEquations:
@@ -239,7 +242,7 @@ class NormalEquations:
         return replace(self, right=right, constant=constant, wave_right=wave_right)
 
     def with_sine_products(self, columns: list[int], products: FloatArray) -> NormalEquations:
-        """Hold `a` more fixed columns, so that sines can be scored beside them.
+        """Hold `a` more fixed columns, so that sines can be scored in addition to them.
 
         Parameters
         ----------
@@ -264,7 +267,16 @@ class NormalEquations:
         return replace(self, covariances=at, **{name: getattr(self, name)[rows] for name in names})
 
     def log_likelihood(self, base: list[int]) -> FloatArray:
-        """Return the (C, v) log-likelihoods of fits of the fixed columns with the numbers `base`."""
+        """Return the log-likelihoods of fits of some fixed columns.
+
+        Parameters
+        ----------
+        base : Numbers of the columns to fit.
+
+        Returns
+        -------
+        (C, v) log-likelihoods under each of C covariances, for each of v columns of residuals.
+        """
         right = self.right[:, base]
         return np.asarray(self.constant + 0.5 * np.einsum("ckv,ckv->cv", right, self.solved(base, right)))
 
@@ -276,11 +288,11 @@ class NormalEquations:
         return np.asarray(np.linalg.solve(regular, right * scale[:, :, None]) * scale[:, :, None])
 
     def profile_log_likelihood(self, base: list[int], fixed: list[list[int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Compute the profile log-likelihood of each candidate beside a base: the maximum over the C covariances.
+        """Compute the profile log-likelihood with each candidate added to a base model: the maximum over the C covariances.
 
         Parameters
         ----------
-        base : Numbers of the columns that every fit contains; they must be held.
+        base : Numbers of the columns of the base model; they must be held.
         fixed : For each of f candidates the numbers of its columns.
 
         Returns
@@ -340,13 +352,13 @@ def _explained(rest: FloatArray, own: FloatArray, left: FloatArray) -> FloatArra
 def assemble(
     model: MeanModel, at: list[CellCovariance], fixed: ProjectedColumns, value: ProjectedColumns, waves: SineProducts
 ) -> NormalEquations:
-    """Build the normal equations of pose and candidates; no column is held yet.
+    """Build the normal equations of pose and candidates, in which no column is held yet.
 
     Parameters
     ----------
     model : The mean model.
     at : The C covariances of the cell means.
-    fixed : The fixed columns.
+    fixed : The columns of the pose and of all candidates but the searched sines.
     value : Columns of residuals.
     waves : Inner products of the searched sines.
     """
@@ -367,7 +379,7 @@ def assemble(
 def extend(
     equations: NormalEquations, had: list[ProjectedColumns], value: ProjectedColumns, added: ProjectedColumns
 ) -> NormalEquations:
-    """Append fixed columns to normal equations.
+    """Return normal equations with further fixed columns appended.
 
     Parameters
     ----------

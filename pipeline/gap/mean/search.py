@@ -34,7 +34,7 @@ _ALIKE = 100.0
 
 
 class MeanSearch:
-    """Scores every candidate explanation of some residuals, alone or beside effects that are already selected.
+    """Scores every candidate explanation of some residuals, alone or in addition to effects that are already selected.
 
     `select` runs the forward selection with these scores.
 
@@ -81,14 +81,14 @@ class MeanSearch:
 
         Returns
         -------
-        The selected effects, and the scores that all families have beside them.
+        The selected effects, and the scores of all families in addition to them.
         """
         found = ForwardSelection(self).select()
         self._designs = {(): self.design}  # frees memory: each conditioned design is as large as the search itself
         return found
 
     def score_families(self, members: EffectSet) -> tuple[FamilyScore, ...]:
-        """Score every family beside some effects.
+        """Score every family as an addition to some effects.
 
         Parameters
         ----------
@@ -133,7 +133,7 @@ class MeanSearch:
         return self._null.p_value(score)
 
     def goodness_of_fit_p_value(self, family_scores: Sequence[FamilyScore]) -> float | None:
-        """Test whether anything is left to explain: return the p-value of the best score beside the selected effects.
+        """Test whether the selected effects leave anything to explain, by the p-value of the best score of a further candidate.
 
         The null simulations draw the reference's error from a Gaussian process. A real reference may have larger single waves.
         How much larger is estimated along oblique directions on the wall, where no sensor has an axis, and all sines are
@@ -141,7 +141,7 @@ class MeanSearch:
 
         Parameters
         ----------
-        family_scores : Scores of all families beside the selected effects.
+        family_scores : Scores of all families in addition to the selected effects.
 
         Returns
         -------
@@ -189,7 +189,7 @@ class MeanSearch:
 
         Parameters
         ----------
-        family_scores : Scores of all families beside the selected effects.
+        family_scores : Scores of all families in addition to the selected effects.
 
         Returns
         -------
@@ -211,7 +211,12 @@ class MeanSearch:
         return float(with_them - without - sum(member.log_likelihood_ratio - member.score for member in members))
 
     def correlated_covariates(self, form: FamilyScore) -> set[str]:
-        """Return the covariates that are so highly correlated with that of a non-parametric term that they could replace it."""
+        """Return the covariates that are so highly correlated with that of a non-parametric term that they could replace it.
+
+        Parameters
+        ----------
+        form : The non-parametric term with its score.
+        """
         found = self.design.residuals.covariates
         covariates = {name: values for name, values in found.items() if np.ptp(values) > 0}
         parts = form.name.split(" and ")
@@ -219,7 +224,7 @@ class MeanSearch:
         return {name for name, row in zip(covariates, correlation, strict=False) if row.max() > thresholds().mean.same_covariate}
 
     def with_harmonics(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
-        """Return the form of a periodic non-parametric term that fits best beside some effects.
+        """Return the form of a periodic non-parametric term that fits best in addition to some effects.
 
         A wave gets overtones if they fit clearly better, because a periodic error need not be a sine. A spline becomes a wave if
         that fits as well. Among patterns that repeat every few lines, the one with the fewest lines is taken, because multiples

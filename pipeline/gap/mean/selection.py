@@ -24,7 +24,9 @@ _NOT_SPATIAL = ("intensity", "disparity_fraction")
 
 @dataclass(frozen=True)
 class FamilyScore:
-    """How well one family of candidates explains the residuals beside given effects, judged by its best variant.
+    """How well one family of candidates (the variants of one explanation) explains residuals in addition to given effects.
+
+    The best variant represents the family.
 
     Attributes
     ----------
@@ -59,9 +61,9 @@ class SelectedEffect:
     candidate : The best variant of the effect.
     indistinguishable : Names of the other effects in its equivalence class, which would score as well in its place.
     p_value : p-value of the score, corrected for multiple testing over all families.
-    log_likelihood_ratio : Log-likelihood with it minus that without it, beside the other selected effects.
+    log_likelihood_ratio : Log-likelihood with it minus that without it; the other selected effects are in the model both times.
     score : Penalised log-likelihood ratio.
-    family_scores : Scores of all families beside the other selected effects.
+    family_scores : Scores of all families in addition to the other selected effects.
     """
 
     candidate: Candidate
@@ -156,7 +158,7 @@ class CandidateScorer(Protocol):
     """The scores that `ForwardSelection` needs. `MeanSearch` computes them; tests may use a simple stand-in."""
 
     def score_families(self, members: EffectSet) -> tuple[FamilyScore, ...]:
-        """Return the score of every family's best variant beside the effects `members`, best score first."""
+        """Return the score of every family's best variant in addition to the effects `members`, best score first."""
 
     def p_value(self, score: float) -> float:
         """Return the p-value of a score, under the null distribution of the largest score over all families."""
@@ -168,10 +170,10 @@ class CandidateScorer(Protocol):
         """Return the covariates that are so highly correlated with that of a non-parametric term that they could replace it."""
 
     def with_harmonics(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
-        """Return the form of a periodic term that fits best beside the effects `members`; other terms are returned unchanged."""
+        """Return the form of a periodic term that fits best in addition to the effects `members`; other terms stay unchanged."""
 
     def may_be_reference_error(self, members: EffectSet, form: FamilyScore) -> bool:
-        """Tell whether a wave, beside the effects `members`, is so small that it may be part of the reference's error."""
+        """Tell whether a wave, with the effects `members` in the model, is small enough to be part of the reference's error."""
 
 
 @dataclass(frozen=True)
@@ -190,7 +192,7 @@ class ForwardSelection:
 
         Returns
         -------
-        The selected effects, among them at most one non-parametric term, and the scores that all families have beside them.
+        The selected effects, among them at most one non-parametric term, and the scores of all families in addition to them.
         """
         empty = _Set((), 0.0, self.search.score_families(()))
         levels, scores = [[empty]], SetScores()

@@ -73,7 +73,7 @@ class WithinCellNoise:
         return self.nodes.shape[1] == 0
 
     def to_nodes(self, columns: FloatArray, means: FloatArray | None = None) -> FloatArray:
-        """Return the product Z' times k columns, with Z as in the class.
+        """Multiply columns by Z', the transposed weights with which noise at q grid nodes acts on the n deviations.
 
         Parameters
         ----------
@@ -88,21 +88,26 @@ class WithinCellNoise:
         return found if means is None else found - self.means.T @ means
 
     def solve(self, on_nodes: FloatArray) -> FloatArray:
-        """Return K^-1 times (q, k) columns, with K as in the class."""
+        """Return K^-1 times (q, k) columns over the q grid nodes.
+
+        K = w C^-1 + Z'Z is the information matrix of the node values, times the white variance w.
+        """
         return np.asarray(cho_solve((self.root, True), on_nodes)) if len(self.root) else on_nodes
 
     def whiten(self, on_nodes: FloatArray) -> FloatArray:
-        """Return L^-1 times (q, k) columns, with K = L L' as in the class.
+        """Transform (q, k) columns over the q grid nodes so that their inner products are weighted by K^-1.
 
-        Inner products of the results are inner products weighted by K^-1.
+        The result is L^-1 times the columns, with K = w C^-1 + Z'Z = L L', the information matrix of the node values, times the
+        white variance w.
         """
         return np.asarray(solve_triangular(self.root, on_nodes, lower=True)) if len(self.root) else on_nodes
 
     def draw(self, white: FloatArray, rows: slice, cell_sums: FloatArray, random: KeyedRandom) -> FloatArray:
-        """Draw the part of simulated noise that depends on the nodes, for inner products c' R^-1 r of columns c with noise r.
+        """Draw the part of simulated noise that acts through the grid nodes, once for any number of design columns.
 
-        With white noise e and node values n, the noise is r = sqrt(w) e + Z n. Its product with a column is c' R^-1 r = c' e /
-        sqrt(w) + (Z' c)' K^-1 (C^-1 n - Z' e / sqrt(w)). Returned is the factor behind (Z' c)'.
+        The noise r = sqrt(w) e + Z n has white noise e and node values n with covariance C. Its inner product with a column c,
+        weighted by the inverse of the covariance R = w I + Z C Z', is c' R^-1 r = c' e / sqrt(w) + (Z' c)' f. Returned is f =
+        K^-1 (C^-1 n - Z' e / sqrt(w)) with K = w C^-1 + Z'Z.
 
         Parameters
         ----------
@@ -113,7 +118,7 @@ class WithinCellNoise:
 
         Returns
         -------
-        (q, d) factor of each draw.
+        (q, d) vectors f, one for each draw.
         """
         own = random.generator().standard_normal((len(self.root), white.shape[1]))
         if not self.is_white:

@@ -92,7 +92,7 @@ class SelectionResult:
     noise_ratio: float
     detectable: tuple[DetectableSize, ...]
 
-    def p_beside(self, named: Sequence[NamedEffect]) -> float | None:
+    def p_value_given(self, named: Sequence[NamedEffect]) -> float | None:
         """Return the p-value of the misfit that remains if only some of the selected effects are kept in the model.
 
         Parameters
@@ -119,8 +119,8 @@ def select_effects(
 ) -> tuple[list[NamedEffect], SelectionResult]:
     """Select the systematic effects and noise terms that explain the residuals.
 
-    The effects that a linearised search finds are put into the model, residuals are computed again, and the search is repeated
-    beside them. Strong effects are refitted without linearising (`nonlinear_refit`). Noise terms are fitted to the remaining
+    The effects that a linearised search finds are put into the model, residuals are computed again, and further effects are
+    searched. Strong effects are refitted without linearising (`nonlinear_refit`). Noise terms are fitted to the remaining
     residuals and weight the next search.
 
     Parameters
@@ -131,8 +131,8 @@ def select_effects(
     random : source of random numbers for the null distributions.
     excluded : families (name, empirical) that are not tried, or `NONPARAMETRIC_TERMS` for all empirical ones. A family whose best
         value is out of bounds is added, and the selection is repeated.
-    grid_noise : grid-correlated noise that an earlier selection left. The selection is repeated beside it, because such noise
-        imitates non-parametric terms and errors of the reference.
+    grid_noise : grid-correlated noise that an earlier selection left. The selection is repeated with it in the model, because
+        such noise imitates non-parametric terms and errors of the reference.
 
     Returns
     -------
@@ -188,7 +188,7 @@ def select_effects(
     if implausible and not _explains_everything(found):
         wrong |= implausible
     design = found.search.design
-    left = design.residuals_after([each.candidate for each in found.beside])
+    left = design.residuals_after([each.candidate for each in found.further])
     if found.chosen and not wrong:
         noise_terms, variance_tried, note = _fit_variance(measurement, found.residuals, design.cells, left, random, excluded)
     if noise_terms in ([], [grid_noise]) and (_GRID_NOISE, False) not in excluded:
@@ -220,7 +220,7 @@ def select_effects(
     table = {"names": [f"{part.sensor}.{name}" for name in names], "cosines": cosines.tolist(), "survival": survival.tolist()}
     tried = found.chosen[0].family_scores if found.chosen else found.tried
     without_nulls = tuple(item for item in tried if not item.name.startswith(SPATIAL_NULL))
-    sigma = design.reference_sigma([each.candidate for each in found.beside])
+    sigma = design.reference_sigma([each.candidate for each in found.further])
     noise_ratio_left = nmad(left / found.residuals.sigma, 0.0)
     result = SelectionResult(
         without_nulls,
@@ -248,7 +248,7 @@ def _detectable_sizes(
 
     left: (n,) residuals after the systematic effects.
     """
-    members = [each.candidate for each in found.beside]
+    members = [each.candidate for each in found.further]
     systematic = found.search.detectable_sizes(members, found.tried, random.child("power"))
     noise = detectable_noise(found.residuals, found.search.design.cells, left, noise_terms, random)
     return (*systematic, *noise)
@@ -286,7 +286,9 @@ def keep_implausible_in_class(
         sensor, name = item.name.split(".", 1)
         instead = item.kind == "physical" and item.effect.shows_in == ShowsIn.MEAN and name not in before
         alike = {f"{sensor}.{each.candidate.name}" for each in implausible if instead or name in each.indistinguishable}
-        found.append(replace(item, alike=(*item.alike, *sorted(alike - {item.name, *item.alike}))))
+        found.append(
+            replace(item, indistinguishable=(*item.indistinguishable, *sorted(alike - {item.name, *item.indistinguishable})))
+        )
     return found
 
 

@@ -55,17 +55,17 @@ class NamedEffect:
     kind : "physical" for an effect of the catalogue, "empirical" for a term without a physical cause.
     entry : entry for the model's `effects`: name and parameter values.
     std : standard deviations of the parameters, by key.
-    alike : names of the other effects that this measurement cannot distinguish from it.
+    indistinguishable : names of the other effects that this measurement cannot distinguish from it.
     p_value : p-value from the simulated null distribution; None if none was simulated.
     gain : log-likelihood ratio of the models with and without it; on validation blocks once it was validated.
-    split_by : further measurement that would tell it from those in `alike`; "" without any.
+    split_by : further measurement that would tell it from those in `indistinguishable`; "" without any.
     """
 
     name: str
     kind: str
     entry: dict[str, Any]
     std: dict[str, float]
-    alike: tuple[str, ...]
+    indistinguishable: tuple[str, ...]
     p_value: float | None
     gain: float
     split_by: str = ""
@@ -85,7 +85,7 @@ class NamedEffect:
         parameters = {key: {"value": value, "std": self.std.get(key)} for key, value in self.entry.items() if key != "name"}
         return {
             "name": self.name,
-            "cannot_be_told_from": list(self.alike),
+            "cannot_be_told_from": list(self.indistinguishable),
             "split_by": self.split_by,
             "kind": self.kind,
             "parameters": parameters,
@@ -185,7 +185,7 @@ def relative_size(entry: dict[str, Any]) -> float:
 
 
 def effect_from_range_step(comb: RangeStep, part: Residuals) -> NamedEffect:
-    """Name the rounding of ranges (range quantisation) as an effect.
+    """Convert the rounding of ranges to a named effect (range quantisation), as an entry of gap.json.
 
     Its log-likelihood ratio is set to at least 1 for each range, because rounded ranges leave no doubt.
 
@@ -200,7 +200,7 @@ def effect_from_range_step(comb: RangeStep, part: Residuals) -> NamedEffect:
 
 
 def effect_from_locking(found: Locking) -> NamedEffect:
-    """Name pixel locking that was found in the measured disparities as an effect."""
+    """Convert pixel locking that was found in measured disparities to a named effect, as an entry of gap.json."""
     entry = {
         "name": PixelLocking.tag(),
         "amplitude_px": found.amplitude_px,
@@ -219,8 +219,14 @@ def effect_from_seams(found: TileSeams) -> NamedEffect:
 
 
 def effect_from_variance(found: VarianceTerm, sensor: str) -> NamedEffect:
-    """Name a fitted noise term as an effect of the sensor ("tls" or "stereo")."""
-    alike = tuple(f"{sensor}.{name}" for name in found.alike)
+    """Convert a fitted noise term to a named effect, as an entry of gap.json.
+
+    Parameters
+    ----------
+    found : the noise term.
+    sensor : "tls" or "stereo".
+    """
+    alike = tuple(f"{sensor}.{name}" for name in found.indistinguishable)
     empirical = found.empirical or effect_of(found.effect).empirical
     entry = {"name": found.effect, **found.parameters}
     name, kind = f"{sensor}.{found.effect}", "empirical" if empirical else "physical"
@@ -228,13 +234,13 @@ def effect_from_variance(found: VarianceTerm, sensor: str) -> NamedEffect:
 
 
 def effect_from_edges(found: EdgeEffect) -> NamedEffect:
-    """Name an effect that was found at depth steps."""
+    """Convert an effect that was found at depth steps to a named effect, as an entry of gap.json."""
     entry = {"name": found.name, **found.effect.model_dump(mode="json", exclude_unset=True)}
     return NamedEffect(f"{found.effect.sensor}.{found.name}", "physical", entry, found.std, (), None, found.gain)
 
 
 def effect_from_tails(part: Residuals, sigma: float, gain: float) -> NamedEffect:
-    """Name heavy tails as additional white noise marked empirical, because the catalogue has no effect for them.
+    """Describe heavy tails as additional white noise marked empirical, because the catalogue has no effect for them.
 
     Parameters
     ----------
@@ -247,7 +253,7 @@ def effect_from_tails(part: Residuals, sigma: float, gain: float) -> NamedEffect
 
 
 def effect_from_losses(found: LossExplanation, intensity: FloatArray | None) -> NamedEffect:
-    """Name the effect that explains missing returns of laser pulses.
+    """Convert an explanation of missing laser returns to a named effect, as an entry of gap.json.
 
     Parameters
     ----------
@@ -352,13 +358,13 @@ def _angle_term(candidate: Candidate, error: FloatArray, item: SelectedEffect, p
 def merge_angle_curves(
     angles: list[NamedEffect], later: list[NamedEffect], part: Residuals
 ) -> tuple[list[NamedEffect], list[NamedEffect]]:
-    """Add up curves of the same angle's error that two successive selections found along the same covariate.
+    """Add up error curves of a recorded angle that two successive selections found for the same angle and covariate.
 
     Parameters
     ----------
     angles : curves of the first selection.
-    later : effects that were found with those curves in the model.
-    part : residuals, for the range of the covariates.
+    later : effects that the second selection found with those curves in the model.
+    part : residuals, which give the range of each covariate.
 
     Returns
     -------

@@ -61,7 +61,7 @@ class SearchInput:
 
 @dataclass(frozen=True)
 class SearchOutcome:
-    """An explanation of the residuals: the effects of one search, and those of a second search beside them.
+    """An explanation of the residuals: the effects of one search, and those that a second search adds.
 
     In the second search the effects of the first are in the model without linearisation.
 
@@ -71,15 +71,15 @@ class SearchOutcome:
     estimates : effects of both searches with their coefficients.
     search : the second search.
     residuals : residuals of the second search.
-    beside : effects that the second search selected.
-    tried : scores of all candidates of the second search, beside the selected effects.
+    further : effects that the second search selected.
+    tried : scores of all candidates in addition to all selected effects.
     """
 
     chosen: list[SelectedEffect]
     estimates: list[Estimate]
     search: MeanSearch
     residuals: Residuals
-    beside: list[SelectedEffect]
+    further: list[SelectedEffect]
     tried: tuple[FamilyScore, ...]
 
     @property
@@ -164,7 +164,8 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
 
     The linearised model is inexact for a large effect, and forward selection then adds spurious effects that absorb the
     linearisation error. The strongest effects are therefore refitted alone without linearising, and the selection is repeated
-    beside the best one. It is also repeated at the joint fit of all effects. The explanation with the fewest effects is kept.
+    with the best one in the model. It is also repeated at the joint fit of all effects. The explanation with the fewest effects
+    is kept.
 
     Parameters
     ----------
@@ -377,15 +378,15 @@ def _converged(given: SearchInput, first: MeanSearch, alone: _SingleFit) -> _Sin
 
 
 def _search_beside(given: SearchInput, chosen: SearchOutcome) -> SearchOutcome | None:
-    """Repeat the search beside the selected effects; None where there are none, or where one is out of bounds."""
+    """Search for effects in addition to the selected ones; None if there are none, or if one is out of bounds."""
     physical = [each for each in chosen.estimates if not each.candidate.empirical]
     if not physical or out_of_bounds(given.measurement, chosen.estimates, chosen.residuals):
         return None
     again = _repeat_search(given, physical, chosen.search.single_effect_ratios)
     if again is None:
         return None
-    search, at, estimates, beside, tried = again
-    return replace(chosen, estimates=estimates, search=search, residuals=at, beside=beside, tried=tried)
+    search, at, estimates, further, tried = again
+    return replace(chosen, estimates=estimates, search=search, residuals=at, further=further, tried=tried)
 
 
 def _estimates_of(search: MeanSearch, chosen: list[SelectedEffect]) -> list[Estimate]:

@@ -145,7 +145,7 @@ class PassInput:
 
 @dataclass(frozen=True)
 class SelectionPass:
-    """One run of the selection.
+    """One run of the selection of effects, with its input and its result.
 
     Attributes
     ----------
@@ -219,7 +219,7 @@ class PassInputs:
         """The input without any edge effect."""
         return self.with_these([])
 
-    def edge_effects_beside(self, named: list[NamedEffect]) -> list[EdgeEffect]:
+    def edge_effects_given(self, named: list[NamedEffect]) -> list[EdgeEffect]:
         """Return the edge effects that the residuals show once some named effects are in the model."""
         seen = aligned_with(self.measurement, named, self.plain.index[~self.held_out_points[self.plain.index]])
         return _find_edge_effects(seen.measurement, seen.residuals, self.held_out_points)
@@ -232,9 +232,10 @@ class PassInputs:
 def best_pass(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]) -> SelectionPass:
     """Run the selection with several inputs and return the simplest pass that explains the residuals.
 
-    An effect that moves all rays can hide or imitate an edge effect. Edge effects are therefore searched again beside what was
-    named, and, if some were found, also beside what is named without them. Smoothing can shift the estimated pose, so a pass at
-    the initial pose is tried too if the first pass needs an empirical term and no single effect explains everything.
+    An effect that moves all rays can hide or imitate an edge effect. Edge effects are therefore searched again with the named
+    effects in the model. If some were found, they are also searched with what is named without them. Smoothing can shift the
+    estimated pose, so a pass at the initial pose is tried too if the first pass needs an empirical term and no single effect
+    explains everything.
 
     Among the passes whose noise is close to the lowest, the one of least complexity wins. The noise is compared because enough
     noise can take the place of any effect.
@@ -252,7 +253,7 @@ def best_pass(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple
             return found
         # a small error of the rays' directions looks like smoothing
         imitated = {Smoothing.tag()} - found.edge_effect_names
-        edge_effects = [each for each in inputs.edge_effects_beside(found.named) if each.name not in imitated]
+        edge_effects = [each for each in inputs.edge_effects_given(found.named) if each.name not in imitated]
         if {each.name for each in edge_effects} == found.edge_effect_names:
             return found
         return SelectionPass.of(inputs.with_these(edge_effects), random, excluded)

@@ -31,10 +31,10 @@ def with_separating_measurements(measurement: Measurement, named: list[NamedEffe
     -------
     list : the effects with `split_by` filled in.
     """
-    if not any(item.alike for item in named):
+    if not any(item.indistinguishable for item in named):
         return named
     found = identifiability(measured_survey(measurement, _POINTS))
-    return [replace(item, split_by=_separating_measurement(found, item)) if item.alike else item for item in named]
+    return [replace(item, split_by=_separating_measurement(found, item)) if item.indistinguishable else item for item in named]
 
 
 def measurement_separating_noises(item: NamedEffect, sensor: str) -> str:
@@ -45,7 +45,7 @@ def measurement_separating_noises(item: NamedEffect, sensor: str) -> str:
     item : a named noise term with its equivalence class.
     sensor : "tls" or "stereo".
     """
-    told = (effect_of(name).told_by for name in (item.name, *item.alike))
+    told = (effect_of(name).told_by for name in (item.name, *item.indistinguishable))
     return " or ".join(filter(None, told)) or _IN_GENERAL[sensor]
 
 
@@ -53,8 +53,8 @@ def _separating_measurement(found: Identifiability, item: NamedEffect) -> str:
     """Return the additional measurement after which the signatures of a class are no longer alike."""
     if item.adds_variance:
         return measurement_separating_noises(item, found.sensor)
-    known = [found.names.index(name) for name in item.alike if name in found.names]
-    if item.name not in found.names or len(known) < len(item.alike):
+    known = [found.names.index(name) for name in item.indistinguishable if name in found.names]
+    if item.name not in found.names or len(known) < len(item.indistinguishable):
         return _IN_GENERAL[found.sensor]  # effects on returns and edge effects have no signature in the mean
     own = found.names.index(item.name)
     cosine = {each.name: max(float(each.cosines[own, other]) for other in known) for each in found.extensions}

@@ -34,7 +34,7 @@ class ValidatedEffects:
     ----------
     named : effects that improve them, with their log-likelihood ratio on validation blocks.
     failed : effects that do not.
-    weak : effects that improve them beside the others, but by too little to be named.
+    weak : effects that improve them in addition to the others, but by too little to be named.
     """
 
     named: list[NamedEffect]

@@ -146,7 +146,7 @@ def verdict_of(named: Sequence[NamedEffect], evidence: Evidence) -> str:
         return "unknown"
     if len(named) > 1:
         return "several"
-    return "ambiguous" if named[0].alike else "named"
+    return "ambiguous" if named[0].indistinguishable else "named"
 
 
 def verdict_sentence(verdict: str, named: Sequence[NamedEffect], evidence: Evidence) -> str:
@@ -177,7 +177,7 @@ def verdict_sentence(verdict: str, named: Sequence[NamedEffect], evidence: Evide
 
 
 def describe_misfit(named: Sequence[NamedEffect], evidence: Evidence) -> str:
-    """Return a sentence on the misfit that remains beside the named effects; "" if it may be chance."""
+    """Return a sentence on the misfit that the named effects leave; "" if it may be chance."""
     if not named or not evidence.misfit_is_significant:
         return ""
     return f"That does not explain everything: the remaining misfit has a p-value of {evidence.p_value:.2g}."

@@ -195,7 +195,7 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     overdispersion = 1.0 if any(item.adds_variance for item in result.named) else selection.unexplained_noise.value
     evidence = Evidence(
         result.gap,
-        selection.p_beside(result.named),
+        selection.p_value_given(result.named),
         selection.unexplained_noise.at_most_one,
         outlier_share,
         overdispersion=overdispersion,

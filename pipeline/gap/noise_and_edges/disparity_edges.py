@@ -134,7 +134,7 @@ def find_disparity_edge_effects(
 ) -> list[EdgeEffect]:
     """Find effects of the stereo matcher at depth steps: edge fattening, smoothing and filled occlusions.
 
-    Effects are searched one after another, each beside those found before.
+    Effects are searched one after another, each with those found before in the model.
 
     Parameters
     ----------

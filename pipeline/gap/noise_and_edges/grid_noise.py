@@ -239,7 +239,7 @@ def _describe_reference_error(fit: _VariogramFit, step: float, unit_m: float) ->
 
 def _name_noise(white: VarianceTerm, part: StereoResiduals, value: FloatArray, model: StereoModel) -> VarianceTerm:
     """The term of white noise, of grid noise, or of white noise with grid noise in its class."""
-    both = replace(white, alike=tuple(sorted({*white.alike, RegularizationNoise.tag()})))
+    both = replace(white, indistinguishable=tuple(sorted({*white.indistinguishable, RegularizationNoise.tag()})))
     variogram = _variogram(part, value, model)
     if variogram is None:
         return both
@@ -249,13 +249,13 @@ def _name_noise(white: VarianceTerm, part: StereoResiduals, value: FloatArray, m
     resolved = (
         thresholds().grid_noise.finest_grid * variogram.step <= _GRID_STEPS_PX[0]
     )  # otherwise a grid may be too fine for this raster
-    white = replace(both, alike=white.alike) if resolved else both
+    white = replace(both, indistinguishable=white.indistinguishable) if resolved else both
     best = variogram.best_grid()
     if best is None or white_fit.chi2 < best[0].chi2 - thresholds().grid_noise.margin:
         return white
     if best[0].variance <= 0 or white_fit.chi2 < best[0].chi2 + thresholds().grid_noise.margin:
         return both
-    grid = replace(white, name=RegularizationNoise.tag(), effect=RegularizationNoise.tag(), alike=())
+    grid = replace(white, name=RegularizationNoise.tag(), effect=RegularizationNoise.tag(), indistinguishable=())
     return _as_grid_noise(grid, *best)
 
 

@@ -67,7 +67,7 @@ class Locking:
 
 @dataclass(frozen=True)
 class NoiseBounds:
-    """What is known about the matching noise beside pixel locking, px.
+    """Bounds of the matching noise, px, for estimating pixel locking in its presence.
 
     The noise must be bounded, because a small amplitude cannot be told from another amplitude with other noise.
 
@@ -84,8 +84,8 @@ class NoiseBounds:
         """Convert the bounds to pixels of the image that was matched. `frequency` is the number of these in one px."""
         return NoiseBounds(self.predicted * frequency, self.measured * frequency)
 
-    def range_beside(self, amplitude: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the lowest and the highest plausible standard deviation of the noise.
+    def noise_range(self, amplitude: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the lowest and the highest plausible standard deviation of the noise for given amplitudes of the locking.
 
         Parameters
         ----------
@@ -214,7 +214,7 @@ def _amplitude(strength: FloatArray, count: int, noise: NoiseBounds | None) -> t
         found = np.asarray(np.sum((predicted - strength) ** 2, axis=2) * 2 * count)
         if noise is None:
             return found
-        least, most = noise.range_beside(share)
+        least, most = noise.noise_range(share)
         beyond = np.maximum(least[:, None] - blur, 0) + np.maximum(blur - most[:, None], 0)
         return np.asarray(found + (beyond / (_NOISE_UNCERTAINTY * noise.predicted)) ** 2)
 

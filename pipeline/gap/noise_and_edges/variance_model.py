@@ -80,7 +80,7 @@ class VarianceTerm:
     ----------
     name : name of the effect, or of an empirical term with the covariate on which it depends.
     effect : the effect of the catalogue that represents the term in a model.
-    alike : names of other effects that would explain the variance as well.
+    indistinguishable : names of other effects that would explain the variance as well.
     p_value : p-value from the simulated null distribution.
     gain : log-likelihood ratio of the models with and without it.
     parameters, std : values of the effect's parameters and their standard deviations, by key.
@@ -90,7 +90,7 @@ class VarianceTerm:
 
     name: str
     effect: str
-    alike: tuple[str, ...]
+    indistinguishable: tuple[str, ...]
     p_value: float
     gain: float
     parameters: dict[str, float]

@@ -41,7 +41,7 @@ _COVARIATES = {
 
 def title(found: GapDiagnosis) -> str:
     """Return the outcome of a diagnosis as a headline."""
-    names = [" or ".join([effect.name, *effect.alike]) for effect in found.effects if effect.kind == "physical"]
+    names = [" or ".join([effect.name, *effect.indistinguishable]) for effect in found.effects if effect.kind == "physical"]
     match found.verdict:
         case "no_gap" | "unknown" if found.evidence.only_noise_too_large(found.effects):
             return "No missing effect was found, but the model is too noisy"
@@ -185,7 +185,7 @@ def _outcome_of_effect(found: GapDiagnosis, effect: str) -> str:
     physical = [each for each in found.effects if each.kind == "physical"]
     if any(each.name == name for each in physical):
         return "named"
-    alike = {other for each in physical for other in each.alike}
+    alike = {other for each in physical for other in each.indistinguishable}
     return "cannot be told from the named one" if name in alike else "rejected"
 
 
@@ -264,7 +264,9 @@ def _describe_effect(effect: NamedEffect) -> str:
         return f"The disagreement {_describe_empirical(effect)}; {effect.name} describes it but does not explain it."
     said = f"It is {effect.name} ({format_parameters(effect)})."
     return (
-        f"{said} It cannot be told from {', '.join(effect.alike)}; to separate them: {effect.split_by}." if effect.alike else said
+        f"{said} It cannot be told from {', '.join(effect.indistinguishable)}; to separate them: {effect.split_by}."
+        if effect.indistinguishable
+        else said
     )
 
 

@@ -120,7 +120,7 @@ class DisparityRaster:
         return replace(self, disparity=disparity, hidden=hidden, row=place[self.row[points]], column=self.column[points]), points
 
     def at_points(self, raster: NDArray[Any]) -> NDArray[Any]:
-        """Return the (n,) values of a (rows, columns) raster at the points."""
+        """Look up the values of a raster (rows, columns) in the cells of the n measured points; return (n,) values."""
         return np.asarray(raster[self.row, self.column])
 
     def near_border(self, sigma_px: float) -> BoolArray:

@@ -56,7 +56,12 @@ _ON_RAY = 0.1
 
 @dataclass(frozen=True)
 class StereoResiduals(Residuals):
-    """Residuals of a stereo pair: measured minus predicted disparities, px. Attributes as in `Residuals`."""
+    """Residuals of a stereo pair: measured minus predicted disparities, px. Further attributes are those of `Residuals`.
+
+    Attributes
+    ----------
+    geometry : The pixels of the points.
+    """
 
     sensor = "stereo"
     position_covariates = ("image_x", "image_y")

@@ -74,10 +74,12 @@ class SurfaceGeometry(SurfacePlaces):
 class SurfaceResiduals(Residuals):
     """Residuals of a cloud without cameras: distances from the reference along its normal, m, positive out of the rock.
 
-    The pose Jacobian is evaluated at the places on the reference, because the noise of the points would bias the scale.
+    The pose Jacobian is evaluated at the places on the reference, because the noise of the points would bias the scale. Further
+    attributes are those of `Residuals`.
 
     Attributes
     ----------
+    geometry : For each point the place on the reference below it.
     pose_jacobian : (n, k) derivatives by those k combinations of shift, rotation and scale that the reference can determine.
     datum : (7, k) these combinations in terms of shift (m), rotation (rad) and scale.
     """

@@ -34,10 +34,11 @@ _LEAST_POWER = 1e-9
 
 @dataclass(frozen=True)
 class TlsResiduals(Residuals):
-    """Residuals of a laser scan: measured minus predicted ranges, m.
+    """Residuals of a laser scan: measured minus predicted ranges, m. Further attributes are those of `Residuals`.
 
     Attributes
     ----------
+    geometry : The rays of the points.
     reference_error_m : Standard deviation of each vertex of the reference along the rays, m.
     error_is_relief : Whether that error is mostly relief between the reference's points, which is independent from ray to ray.
     """

@@ -41,7 +41,7 @@ from scene.geometry.mesh import FloatArray
 NAMING_SNR = 8.0
 """Signal-to-noise ratio, times the sine of the angle to the nearest other signature, from which an effect can be named."""
 SIMILAR_COSINE = 0.9
-"""Cosine from which two signatures count as alike."""
+"""Cosine from which two signatures count as similar."""
 REFERENCE_ERRORS_M = {"tls": 0.001, "stereo": 0.005}
 """Default standard deviation of the reference's correlated error, m."""
 
@@ -220,7 +220,7 @@ def format_table(found: Identifiability) -> str:
     The columns are the share of the signature that the pose fit leaves, the detectable size, and the most similar effect.
     """
     cosines = found.cosines - np.eye(len(found.names))
-    lines = [f"{'effect':<32}{'survives pose':>14}  {'seen from (S/N 5)':<32}most alike (cosine)"]
+    lines = [f"{'effect':<32}{'left by pose':>14}  {'detectable from (S/N 5)':<32}most similar (cosine)"]
     for row, (name, share) in enumerate(zip(found.names, found.survival, strict=True)):
         other = int(np.argmax(cosines[row]))
         value = f"{found.parameters[row]} {found.detectable_size[row]:.2g}"

@@ -55,7 +55,7 @@ class KnownPoints:
 
 
 def known_points(view: TlsView | StereoView) -> KnownPoints:
-    """Return observations of known points that a survey could add.
+    """Return observations of points with known positions that a survey could add as control.
 
     They are targets around a laser scanner, or check points in front of a stereo pair.
 

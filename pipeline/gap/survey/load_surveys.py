@@ -29,7 +29,9 @@ def load_surveys(path: Path, overrides: Sequence[str] = (), sensor: SensorName |
         measurement = read_measurement(path)
         if overrides or sensor not in (None, measurement.sensor):
             raise InputError(
-                "--set and another --sensor need a config, and this is a measurement", where=str(path), remedy="omit them"
+                "a measurement takes neither --set nor another --sensor",
+                where=str(path),
+                remedy="leave them out, or give a config",
             )
         return [measured_survey(measurement)]
     config = load_config(path, overrides, sensor, None)

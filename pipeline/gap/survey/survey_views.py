@@ -93,7 +93,13 @@ class SurveyView:
 
 @dataclass(frozen=True)
 class TlsView(SurveyView):
-    """What one scanner station sees of the wall. Attributes as in `SurveyView`."""
+    """What one scanner station sees of the wall.
+
+    Attributes
+    ----------
+    residuals : Geometry of the rays of a subsample of the points; the residual values have no meaning.
+    measurement : A measurement with the pose of the station.
+    """
 
     residuals: TlsResiduals
     measurement: TlsMeasurement
@@ -101,7 +107,13 @@ class TlsView(SurveyView):
 
 @dataclass(frozen=True)
 class StereoView(SurveyView):
-    """What one stereo pair sees of the wall. Attributes as in `SurveyView`."""
+    """What one stereo pair sees of the wall.
+
+    Attributes
+    ----------
+    residuals : Geometry of the pixels of a subsample of the points; the residual values have no meaning.
+    measurement : A measurement with the cameras of the pair.
+    """
 
     residuals: StereoResiduals
     measurement: StereoMeasurement
@@ -116,6 +128,7 @@ class TlsSurvey:
     views : What each station sees.
     centre : (3,) centre of the wall, wall frame, m.
     observe : Function that makes a view from a measurement with its pose and the number of the pose.
+    sensor, place : "tls", and what a place of observation is called in texts.
     """
 
     views: tuple[TlsView, ...]
@@ -171,6 +184,7 @@ class StereoSurvey:
     views : What each pair sees.
     centre : (3,) centre of the wall, wall frame, m.
     observe : Function that makes a view from a measurement with its cameras and the number of the pose.
+    sensor, place : "stereo", and what a place of observation is called in texts.
     """
 
     views: tuple[StereoView, ...]

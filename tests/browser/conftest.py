@@ -1,0 +1,49 @@
+"""Chromium for the tests of what a person looks at, and small outputs of the commands that make a page."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from browser_pages import WatchedPage, make_outputs
+from shared_outputs import build_site, made_once
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+OFFLINE = "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[object]:
+    """Chromium without network; of a module, because Playwright's event loop would disturb those of other tests."""
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium on this machine; `make setup-all` installs it where it may")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS, OFFLINE])
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def page(browser: object) -> Iterator[WatchedPage]:
+    """Return an empty page; whatever its console, its network or its scripts complained of fails the test at the end."""
+    watched = WatchedPage(browser)
+    yield watched
+    watched.close()
+    assert not watched.complaints
+
+
+@pytest.fixture(scope="session")
+def outputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the outputs of each command, by its name."""
+    return made_once(tmp_path_factory, "outputs", make_outputs)
+
+
+@pytest.fixture(scope="session")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The built documentation."""
+    return made_once(tmp_path_factory, "site", build_site)

@@ -1,0 +1,112 @@
+"""The viewer in a browser: each kind of folder is drawn, and its controls work by mouse and by keyboard."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from browser_pages import NARROW, WIDE, WatchedPage
+
+from pipeline.view.server import make_page_server, open_results, open_second
+
+TOKEN = "a-token_of-24-bytes"
+KINDS = {
+    "run": ("simulate_tls",),
+    "pair": ("simulate_tls", "simulate_stereo"),
+    "gap": ("gap",),
+    "data set": ("dataset/test",),
+    "monitor": ("monitor",),
+}
+
+
+@contextmanager
+def served(folder: Path, second: Path | None = None) -> Iterator[str]:
+    """Serve a folder; yield its address."""
+    results = open_results(folder)
+    server = make_page_server(results, 0, TOKEN, open_second(second, results) if second else None)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_port}/?token={TOKEN}"
+    server.shutdown()
+    thread.join()
+
+
+def drawn(page: WatchedPage, address: str) -> Any:
+    """Open the viewer and wait until wall and map are drawn."""
+    opened = page.open(address)
+    opened.wait_for_selector("#map .heatmaplayer image")
+    opened.wait_for_selector("#wall canvas")
+    opened.wait_for_load_state("networkidle")
+    return opened
+
+
+def says(opened: Any, selector: str, text: str) -> None:
+    """Wait until an element contains a text; the page's policy lets no string run as a script, so this is no script."""
+    opened.locator(selector, has_text=text).wait_for()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_folder_in_the_viewer(kind: str, outputs: Path, page: WatchedPage) -> None:
+    with served(*(outputs / name for name in KINDS[kind])) as address:
+        opened = drawn(page, address)
+        assert page.barriers() == []
+        for width in (WIDE, NARROW):
+            opened.set_viewport_size({"width": width, "height": 900})
+            page.wait_for(lambda: page.overflow_px() <= 0)
+        if kind == "pair":
+            assert "simulate_stereo" in opened.locator("#note").inner_text()
+        if kind != "gap":  # no scene change is in it
+            opened.click("#next")
+            opened.wait_for_selector("#facts table")
+        opened.close()
+
+
+def test_the_controls_by_mouse(outputs: Path, page: WatchedPage) -> None:
+    with served(outputs / "simulate_tls") as address:
+        opened = drawn(page, address)
+        assert "Share chart" not in opened.content()  # Plotly's own button would upload the chart
+        opened.click("#next")
+        says(opened, "#facts h2", "block 1")
+        opened.click("#previous")
+        says(opened, "#facts h2", "block 3")
+        opened.click("#whole")
+        opened.click("#shown label:has-text('points')")
+        says(opened, "#note", "points are shown")
+        opened.click("#step")
+        opened.click("[role=listbox] >> text=epoch 2")
+        says(opened, "#step-value", "epoch 2")
+        opened.click("#play")
+        says(opened, "#step-value", "epoch 1")
+        opened.click("#play")
+        says(opened, "#play", "play")
+        opened.close()
+
+
+def test_the_controls_by_keyboard(outputs: Path, page: WatchedPage) -> None:
+    """Every control is reached with Tab alone, in the order of the page, and works with arrows, space and Enter."""
+    with served(outputs / "simulate_tls") as address:
+        opened = drawn(page, address)
+        opened.keyboard.press("Tab")
+        assert opened.evaluate("document.activeElement.id") == "step"
+        for key in ("Enter", "ArrowDown", "Space"):
+            opened.keyboard.press(key)
+            opened.wait_for_timeout(200)
+        says(opened, "#step-value", "epoch 2")
+        seen = []
+        while "next" not in seen and len(seen) < 30:
+            opened.keyboard.press("Tab")
+            name = opened.evaluate("document.activeElement.id || document.activeElement.value || document.activeElement.role")
+            seen.append(name)
+            if name == "points":
+                opened.keyboard.press("Space")
+            if name == "slider":
+                opened.keyboard.press("ArrowRight")
+        says(opened, "#note", "points are shown")
+        assert opened.evaluate("document.querySelector('#border [role=slider]').ariaValueNow") == "51"
+        opened.keyboard.press("Enter")
+        says(opened, "#facts h2", "block 1")
+        opened.close()

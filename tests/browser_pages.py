@@ -1,0 +1,99 @@
+"""A page in Chromium that remembers every complaint, and small outputs of the commands that make something to look at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from gap_cases import write_scan
+from monitor_cases import STATION, las, points
+from tiny_dataset import tiny_set
+
+from pipeline.cli.main import main
+
+WIDE, NARROW = 1400, 420
+"""Widths of a desktop's window and of a phone, px."""
+SEVERE = ("serious", "critical")
+_RULES = {"runOnly": ["wcag2a", "wcag2aa", "wcag21aa", "best-practice"], "preload": False, "resultTypes": ["violations"]}
+_SITE = """\
+seed: 3
+epochs: 2
+wall: {style: glendale, width_m: 6.0, height_m: 4.0, resolution_m: 0.1, seed: 1}
+rockfall: {count: 3, size_m: {kind: gaussian, mean: 0.5, sigma: 0.05, minimum: 0.3}}
+station: {distance_m: 20.0}
+scanner: {azimuth_step_rad: 0.003, zenith_step_rad: 0.003}
+cameras: {distance_m: 20.0, base_m: 5.0, width: 368, height: 246}
+depth_map: high
+difference: {gsd_m: 0.05}
+icp: {max_iteration: 5}
+planning: {gsd_m: 0.4}
+calibration: {windows: 6, window_px: 16, simulations: 60}
+"""
+
+
+class WatchedPage:
+    """A page of Chromium, with what its console, network and scripts complained of in `complaints`."""
+
+    def __init__(self, browser: Any) -> None:
+        self.page = browser.new_context(viewport={"width": WIDE, "height": 900}, reduced_motion="reduce").new_page()
+        self.complaints: list[str] = []
+        self.page.on("console", lambda said: said.type == "error" and self.complaints.append(said.text))
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("requestfailed", lambda asked: self.complaints.append(f"{asked.url}: {asked.failure}"))
+        self.page.on("response", lambda answer: answer.status >= 400 and self.complaints.append(f"{answer.url}: {answer.status}"))
+
+    def open(self, address: str, width: int = WIDE) -> Any:
+        """Open an address in a window of a width, px; return Playwright's page."""
+        self.page.set_viewport_size({"width": width, "height": 900})
+        self.page.goto(address)
+        return self.page
+
+    def barriers(self) -> list[str]:
+        """Return the serious barriers that axe-core finds for people who see little or use no mouse."""
+        from axe_playwright_python.sync_playwright import Axe
+
+        found = Axe().run(self.page, options=_RULES).response["violations"]
+        return [f"{each['id']}: {each['nodes'][0]['html'][:200]}" for each in found if each["impact"] in SEVERE]
+
+    def overflow_px(self) -> int:
+        """Return by how much the page is wider than its window, px."""
+        return int(self.page.evaluate("document.documentElement.scrollWidth - window.innerWidth"))
+
+    def wait_for(self, condition: Callable[[], bool]) -> None:
+        """Wait at most ten seconds until a condition holds."""
+        for _ in range(100):
+            if condition():
+                return
+            self.page.wait_for_timeout(100)
+        raise AssertionError("the condition did not come true within ten seconds")
+
+    def close(self) -> None:
+        """Close the page."""
+        self.page.context.close()
+
+
+def make_outputs(folder: Path) -> None:
+    """Fill a folder with the outputs of small commands, each in a folder of its own."""
+    folder.mkdir()
+    site = folder / "site.yaml"
+    site.write_text(_SITE)
+    scan = folder / "scan"
+    scan.mkdir()
+    write_scan(scan, 1, step_rad=0.012, ranges=lambda seen: seen.R + 0.02)
+    before = las(folder / "2026-03-01.las", points(60_000, 1))
+    after = las(folder / "2026-04-01.las", points(60_000, 2, ((5.0, 5.0, 1.0, 0.3),)))
+    commands: dict[str, list[Any]] = {
+        "simulate_tls": ["simulate", "--sensor", "tls", "--config", site],
+        "simulate_stereo": ["simulate", "--sensor", "stereo", "--config", site, "--set", "epochs=1"],
+        "compare": ["compare", site, "--epochs", "2", "--sizes-m", "0.3", "0.6"],
+        "inspect": ["inspect", site],
+        "icp-study": ["icp-study", folder / "simulate_tls"],
+        "calibrate": ["calibrate", folder / "simulate_tls", "--no-greedy"],
+        "gap": ["gap", scan],
+        "identifiability": ["gap", "--identifiability", scan],
+        "monitor": ["monitor", before, after, "--position", ",".join(STATION.split())],
+    }
+    for name, words in commands.items():
+        assert main([*map(str, words), "--out", str(folder / name)]) == 0, name
+    tiny_set(folder / "dataset")
