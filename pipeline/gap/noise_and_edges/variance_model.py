@@ -209,6 +209,8 @@ def fit_variance_model(
     for first_round in (True, False):
         # in the second round points have the weight of their fitted noise, as noisy points would shift the plane of their cell
         z = standardised_deviations(weighted, cells, value)
+        if not np.isfinite(z).any():  # no cell has enough points for a plane and a deviation from it
+            return [], [], ""
         used = np.isfinite(z) & (np.abs(z) < thresholds().variance.clip_sigmas * max(1.0, nmad(z, 0.0)))
         squares = (z * weighted.sigma)[used] ** 2 / predicted[used]
         shapes = [candidate.variance[used] / predicted[used, None] for candidate in candidates]
@@ -328,6 +330,8 @@ class NoiseRatio:
         """
         z = standardised_deviations(residuals, cells, value)
         used = np.isfinite(z)
+        if not used.any():
+            return cls(1.0, False)
         squares = np.minimum(z[used] ** 2, _CLIP_SIGMAS**2) / _expected_mean_square(residuals, cells, random)
         means = np.bincount(
             np.unique(wall_block_numbers(residuals.wall_xy[used], cells.side_m), return_inverse=True)[1], squares - 1
