@@ -28,15 +28,15 @@ from sensors.signal_chain.pulses import direction
 PULSES = 5_000_000
 
 
-def prepared() -> tuple[LaserScanner, RayCaster, KeyedRandom]:
-    """Return a scanner in front of a wall, the wall's ray caster, and the source of random numbers."""
+def prepared(pulses: int) -> tuple[LaserScanner, RayCaster, KeyedRandom]:
+    """Return a scanner of about so many pulses in front of a wall, the wall's ray caster, and the source of random numbers."""
     random = KeyedRandom(1)
     world = ProceduralWall(style="glendale", resolution_m=0.0697).mesh(random)
     station = StationConfig().place(Target(world))
     frame = WallFrame.fit(world.vertices, station[0])
     mesh = world.with_vertices(frame.to_wall(world.vertices))
     coarse = LaserScanner.aimed(station, frame, mesh.vertices, ScannerConfig(), TlsModel())
-    step = ScannerConfig().azimuth_step_rad * np.sqrt(coarse.pattern.lines * coarse.pattern.pulses / PULSES)
+    step = ScannerConfig().azimuth_step_rad * np.sqrt(coarse.pattern.lines * coarse.pattern.pulses / pulses)
     scanner = LaserScanner.aimed(
         station, frame, mesh.vertices, ScannerConfig(azimuth_step_rad=step, zenith_step_rad=step), TlsModel()
     )
@@ -46,7 +46,7 @@ def prepared() -> tuple[LaserScanner, RayCaster, KeyedRandom]:
 def cold() -> None:
     """Time the first observation of a process that finds no compiled kernel, and the second."""
     narrow_vectors()
-    scanner, caster, random = prepared()
+    scanner, caster, random = prepared(PULSES)
     first, second = (seconds(lambda: scanner.observe(caster, random)) for _ in range(2))
     print(f"first observation, empty kernel cache {first:6.3f} s   (the second {second:.3f} s)", flush=True)
 
@@ -55,7 +55,7 @@ def main() -> None:
     with empty_kernel_cache() as environment:
         subprocess.run([sys.executable, __file__, "--cold", *sys.argv[1:]], check=True, env=environment)
     lanes = ", 8 lanes" if narrow_vectors() else ""
-    scanner, caster, random = prepared()
+    scanner, caster, random = prepared(PULSES)
     mesh, count = caster.mesh, scanner.pattern.lines * scanner.pattern.pulses
 
     pulses = scanner.emit()

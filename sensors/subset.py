@@ -32,7 +32,7 @@ class ChosenCells(StereoPair):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(n, 1), the shape of an observation."""
+        """(rows, columns) of the observation: (n, 1), a column of the n chosen cells."""
         return len(self.chosen), 1
 
     def cells(self) -> tuple[mi.UInt32, mi.Float64, mi.Float64]:
@@ -49,7 +49,7 @@ class ChosenPulses(LaserScanner):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(n, 1), the shape of an observation."""
+        """(rows, columns) of the observation: (n, 1), a column of the n chosen pulses."""
         return len(self.chosen), 1
 
     def emit(self) -> Pulses:

@@ -61,12 +61,12 @@ class WatchedPage:
         return int(self.page.evaluate("document.documentElement.scrollWidth - window.innerWidth"))
 
     def wait_for(self, condition: Callable[[], bool]) -> None:
-        """Wait at most ten seconds until a condition holds."""
-        for _ in range(100):
+        """Wait at most thirty seconds until a condition holds."""
+        for _ in range(300):
             if condition():
                 return
             self.page.wait_for_timeout(100)
-        raise AssertionError("the condition did not come true within ten seconds")
+        raise AssertionError("the condition did not come true within thirty seconds")
 
     def close(self) -> None:
         """Close the page."""

@@ -120,6 +120,7 @@ SCRIPTS: dict[str, Tiny] = {
     "niche_texture": Tiny(("--set", "tiny")),
     "noise_table": Tiny(("--maps", "2", "--levels", "high", "--out", "noise"), overrides=SMALL_SITE),
     "reconstruction": Tiny(keys=COARSE_WALL | {"RigConfig": {"width": 1472, "height": 984, "distance_m": 25.0}}),
+    "scale": Tiny(("--only", "surface:points"), values={"POINTS": 5000}),
     "sgbm": Tiny(keys=COARSE_WALL | SMALL_FRAME),
     "soak": Tiny(arguments=("tls", 3), overrides=SMALL_SITE),
     "startup": Tiny(values={"_REPEATS": 1}),
@@ -127,6 +128,7 @@ SCRIPTS: dict[str, Tiny] = {
     "tls": Tiny(values={"PULSES": 2000}, keys=COARSE_WALL),
     "tls_beam": Tiny(values={"PULSES": 500}, keys=COARSE_WALL),
     "tls_process": Tiny(values={"PULSES": 2000, "SUB_RAYS": {"one ray": 1}}),
+    "tls_steps": Tiny(values={"PULSES": 2000, "ROUNDS": 1}),
     "upper_bound": Tiny(("--width", "6", "--height", "4"), values={"WAYS": (("vertices", "low", "relief"),)}),
 }
 

@@ -81,8 +81,8 @@ def _measurement_folder(arguments: argparse.Namespace, out: Path) -> Path:
         raise InputError(
             "is a raw file, and no reference is given to compare it with",
             where=str(given[0]),
-            remedy="add --reference (a mesh, a cloud, or half) and --scanner, or --photographs for a cloud from photographs "
-            "without cameras; or give the folder of a measurement",
+            remedy="add --reference (a mesh, a cloud or the word half) and --scanner, or --photographs for a cloud from "
+            "photographs without cameras; or give the folder of a measurement",
         )
     return build_measurement_folder(arguments, given, out / "measurement").folder
 

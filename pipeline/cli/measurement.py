@@ -112,7 +112,11 @@ def _request(arguments: argparse.Namespace, scans: list[Path]) -> Request:
     from pipeline.measurement.request import Request
 
     if arguments.reference is None:
-        raise InputError("is missing", where="--reference", remedy="give a mesh, a cloud, another epoch, or half")
+        raise InputError(
+            "is missing",
+            where="--reference",
+            remedy="give a mesh, a cloud or another epoch, or the word half: half of the points then serve as reference",
+        )
     return Request(
         scans,
         arguments.reference,

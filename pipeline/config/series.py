@@ -38,9 +38,9 @@ Times = Annotated[
 
 
 class ConditionsConfig(Config):
-    """What changes from epoch to epoch beside the rock: each is a course (random_walk, drift, cycle, table)."""
+    """What changes from epoch to epoch besides the rock. Each is a course: random_walk, drift, cycle or table over time."""
 
-    pose: PoseCourses | None = Field(None, description="real against surveyed pose of the sensor")
+    pose: PoseCourses | None = Field(None, description="real minus surveyed pose of the sensor")
     effects: EffectCourses = Field(
         {}, description="parameters of effects, as `range_scale: {cycle: {amplitude: 5}}` or `wobble: {amplitude_m: ..}`"
     )
@@ -60,7 +60,8 @@ class SeriesConfig(Config):
     surfaces: tuple[Path, ...] = Field((), description="instead of rockfalls: own meshes, one an epoch, the reference first")
     conditions: ConditionsConfig = ConditionsConfig()
     kinds: bool = Field(
-        False, description="annotations of three categories: missing, moved, deposit; else those of missing rock alone, as block"
+        False,
+        description="categories of annotations: `true`: missing, moved and deposited rock; `false`: missing rock only, as block",
     )
 
     @field_validator("deposits", mode="before")
@@ -111,7 +112,7 @@ class SeriesConfig(Config):
         return np.array([self.hours_of(self.when(number)) for number in range(self.count)])
 
     def falls_h(self) -> Sequence[float]:
-        """Return when each of `events` falls, h after the first epoch."""
+        """Return when each rockfall given by hand (`events`) falls, h after the first epoch."""
         return [self.hours_of(event.time) if event.time is not None else event.after_h or 0.0 for event in self.events]
 
 

@@ -71,10 +71,10 @@ class MadeEpoch:
 
 
 class StageCache:
-    """Keeps the stage that a worker has set up last: wall, frame, ray-tracing scene and reference epoch.
+    """Keeps the stage that a worker has set up last. A stage is a wall, its frame, its ray-tracing scene and its reference epoch.
 
-    It keeps only one, which already takes much of a worker's memory; plans put the epochs of a stage next to each other. `made`
-    counts the stages set up so far.
+    Epochs of the same wall and sensor share a stage. The cache keeps only one, because a stage takes much of a worker's memory,
+    and plans put the epochs of a stage next to each other. `made` counts the stages set up so far.
     """
 
     def __init__(self, config: DatasetConfig) -> None:
@@ -84,7 +84,7 @@ class StageCache:
         self.made = 0
 
     def of(self, epoch: PlannedEpoch, progress: Progress) -> EpochStage:
-        """Return the stage of an epoch, setting it up if it is not the last one."""
+        """Return the stage (wall, scene, reference epoch) of an epoch; set it up unless the last call was for the same stage."""
         if self._kept is None or self._key != epoch.stage:
             self._kept = None  # free the memory before the new one is made
             self._kept, self._key = _set_up(self._config, epoch, progress), epoch.stage

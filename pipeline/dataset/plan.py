@@ -208,7 +208,8 @@ def check_tiles_filled(split: Split, where: TileRegion, grid: Grid, config: Tile
     raise InputError(
         f"{wall}, and {part} is {columns} wide: it fills {tile.format(f'to {100 * filled:.0f} % at most')}",
         where="validation_region",
-        remedy="change the share, or use smaller tiles (tiles.size_px), a finer difference.gsd_m or a longer wall",
+        remedy=f"{'raise' if split == 'val' else 'lower'} validation_region, the share of the wall for validation, or use "
+        "smaller tiles (tiles.size_px), a finer difference.gsd_m or a longer wall",
     )
 
 

@@ -30,7 +30,7 @@ _TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 
 
 def run_with_watchdog(work: Callable[[T], Result], seconds: float, argument: T) -> Result:
-    """Return work(argument); end this process if it stands still for so many seconds."""
+    """Return work(argument); end this process if it uses no processor time for so many seconds, as in a deadlock."""
     with exit_if_stalled(seconds):
         return work(argument)
 
@@ -76,7 +76,7 @@ def watch_workers(seconds: float = STALLED_S) -> Iterator[None]:
 
 @contextmanager
 def _check_regularly(check: Callable[[], None], seconds: float) -> Iterator[None]:
-    """Call look() regularly from another thread during the block, _LOOKS times within so many seconds."""
+    """Call check() regularly from another thread during the block, ten times within so many seconds."""
     over = threading.Event()
 
     def watch() -> None:
@@ -100,7 +100,7 @@ class _Activity:
     ----------
     used : Processor time, s.
     since : Time of the last activity, s.
-    looked : Time of the last check, s.
+    checked : Time of the last check, s.
     """
 
     used: float = -1.0

@@ -76,9 +76,9 @@ class PerspectiveView:
         needed = np.maximum(across, down / _TALLEST) / _HALF_VIEW
         if needed.max() <= _LEAST_SHARE * np.ptp(own[:, 2]):
             raise InputError(
-                "all points lie on one line of sight, so no picture of the wall can be drawn",
+                "all points of the surface lie on one line of sight, so no picture of the wall can be drawn",
                 where="export",
-                remedy="make the run again",
+                remedy="check the run's surface in a viewer; if its file is damaged, make the run again",
             )
         distance = float((np.maximum(needed, _LEAST_SHARE * needed.max()) - ahead).max())
         focal_px = width / 2 / _HALF_VIEW

@@ -60,7 +60,7 @@ def save_yolo(folder: Path, out: Path, limit_m: float | None, progress: Progress
     limit_m : float or None
         Difference at the ends of the grey scale, m; None: six times the median noise of the images.
     progress : Progress
-        Is told the stages.
+        Receives the progress.
 
     Raises
     ------

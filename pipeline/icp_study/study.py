@@ -280,7 +280,7 @@ def study(
     repeats : int
         Number of subsamples drawn for each ratio.
     progress : Progress, optional
-        Is told the stages.
+        Receives the progress.
     """
     progress = progress or Progress()
     progress.plan({"truth": 2.0, "subsample ratio": float(len(RATIOS) * repeats), "outlier threshold": 2.0 * len(_THRESHOLDS)})

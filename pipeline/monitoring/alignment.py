@@ -1,4 +1,4 @@
-"""Register an epoch on the reference by what did not move, and say how uncertain that is.
+"""Register an epoch on the reference by the rock that did not move, and estimate the uncertainty of the registration.
 
 ICP brings the points near the reference. A robust least-squares fit of the two rasters then removes what is left: a small shift t
 and rotation w of the epoch change its height at a place (x, y), to first order, by
@@ -65,7 +65,8 @@ _UNDETERMINED = 1e-7
 class RasterPair:
     """Heights of the reference and of an epoch on one grid, those of one view of the wall.
 
-    from_wall: from the wall frame, in which the epoch moves, to the frame of the grid; both are the same where there is one view.
+    A view is a part of the wall with a frame and a grid of its own. from_wall: transform from the wall frame, in which the epoch
+    is registered, to the view's frame; the identity if the wall is a single view.
     """
 
     reference: HeightRaster
@@ -74,11 +75,11 @@ class RasterPair:
 
     @property
     def difference(self) -> NDArray[np.float32]:
-        """(h, w) reference minus epoch as it lies, m."""
+        """(h, w) height of the reference minus that of the epoch before registration, m; NaN without data."""
         return self.reference.height - self.epoch.height
 
     def design(self, centre: FloatArray) -> NDArray[np.float32]:
-        """(6, h, w) change of the epoch's heights with its shift and rotation about `centre`, wall frame; NaN without data."""
+        """(6, h, w) derivatives of the epoch's heights by shift, m, and rotation, rad, about `centre` (3,); NaN without data."""
         found = _design(self.epoch, self.from_wall.apply(centre))
         if self.from_wall is SAME:
             return found
@@ -86,7 +87,7 @@ class RasterPair:
         return np.concatenate([np.tensordot(turned, part, 1) for part in (found[:3], found[3:])])
 
     def points(self, where: NDArray[np.bool_]) -> FloatArray:
-        """(n, 3) pixels of the epoch, wall frame, m."""
+        """(n, 3) surface points of the epoch at the n pixels selected by the mask `where` (h, w), wall frame, m."""
         x, y = _places(self.epoch.grid)
         found = np.stack([x[where], y[where], self.epoch.height[where].astype(np.float64)], axis=1)
         return self.from_wall.inverse().apply(found)
@@ -94,14 +95,14 @@ class RasterPair:
 
 @dataclass(frozen=True)
 class Alignment:
-    """How an epoch was brought to the reference.
+    """Result of registering an epoch on the reference.
 
     Attributes
     ----------
     transform : RigidTransform
-        From the epoch's points to the reference, wall frame.
+        Moves the epoch's points to the reference, wall frame.
     covariance : (6, 6) array
-        Of shift (m) and rotation (rad) about `centre`, wall frame.
+        Covariance of shift (m) and rotation (rad) about `centre`, wall frame.
     centre : (3,) array
         Centre of the rotation, wall frame, m.
     stable : tuple of (h, w) bool arrays
@@ -109,7 +110,7 @@ class Alignment:
     rms_m : float
         Root mean square of the differences on these pixels.
     notes : tuple of str
-        What the user should know.
+        Remarks on the registration for the user.
     """
 
     transform: RigidTransform
@@ -120,13 +121,13 @@ class Alignment:
     notes: tuple[str, ...] = ()
 
     def sigma(self, pair: RasterPair) -> NDArray[np.float32]:
-        """Standard deviation of the registration's effect on each pixel's height, (h, w), m; NaN without data."""
+        """Return the standard deviation (h, w), m, that the registration's uncertainty gives each height; NaN without data."""
         design = pair.design(self.centre)
         variance = (design * np.tensordot(self.covariance.astype(np.float32), design, 1)).sum(axis=0)
         return np.sqrt(np.maximum(variance, 0.0)).astype(np.float32)
 
     def to_dict(self) -> dict[str, Any]:
-        """As monitor.json holds it."""
+        """Return the registration as monitor.json stores it."""
         sigma = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         return {
             **self.transform.to_dict(),
@@ -139,7 +140,7 @@ class Alignment:
 
 
 def reference_surface(rasters: Sequence[HeightRaster], from_wall: Sequence[RigidTransform] = (SAME,)) -> ReferenceSurface:
-    """Index the pixels of the reference's views with their normals, in the wall frame, for ICP."""
+    """Build the search index for ICP from the pixels of the reference's views and their normals, wall frame."""
     points, normals = [], []
     step = max(sum(int(raster.known.sum()) for raster in rasters) // _MOST_REFERENCE, 1)
     for raster, transform in zip(rasters, from_wall, strict=True):
@@ -153,26 +154,43 @@ def reference_surface(rasters: Sequence[HeightRaster], from_wall: Sequence[Rigid
 
 
 def coarse(surface: ReferenceSurface, points: FloatArray, gsd_m: float, seed: int) -> RigidTransform:
-    """Bring points (n, 3), wall frame, m, near the reference by ICP. Raises InputError where they do not meet."""
+    """Bring an epoch's points near the reference by ICP.
+
+    Parameters
+    ----------
+    surface : ReferenceSurface
+        Search index of the reference, wall frame.
+    points : (n, 3) array
+        Points of the epoch, wall frame, m.
+    gsd_m : float
+        Side of a pixel of the maps, m, from which the distances of ICP follow.
+    seed : int
+        Seed of the random subsets of the points.
+
+    Raises
+    ------
+    InputError
+        If the points do not overlap the reference.
+    """
     config = IcpConfig(outlier_distance_threshold=max(0.1, 3 * gsd_m))
     moving = points[:: max(len(points) // _MOST_MOVING, 1)]
     return register_to(surface, moving, config, KeyedRandom(seed)).transform
 
 
 def refine(pairs: Sequence[RasterPair], areas: Sequence[Area]) -> Alignment:
-    """Fit what ICP left, by the pixels that are stable; `transform` is from the gridded points to the reference, wall frame.
+    """Estimate the small shift and rotation that ICP left, from the stable pixels of all views, wall frame.
 
     Parameters
     ----------
     pairs : sequence of RasterPair
         One for each view of the wall.
     areas : sequence of Area
-        Where the wall is stable, as the user says, wall frame; empty: found here.
+        Areas of stable rock given by the user, wall frame; empty: stable pixels are found here.
 
     Raises
     ------
     InputError
-        Where too few pixels are stable.
+        If too few pixels are stable.
     """
     compared = [_compared(pair, areas) for pair in pairs]
     count = sum(int(each.sum()) for each in compared)
@@ -198,7 +216,7 @@ def refine(pairs: Sequence[RasterPair], areas: Sequence[Area]) -> Alignment:
 
 
 def applied(alignment: Alignment, pair: RasterPair) -> NDArray[np.float32]:
-    """Return the epoch's heights, (h, w), m, once the fit of `refine` is applied, to first order in its small motion."""
+    """Return the epoch's heights (h, w), m, moved by the shift and rotation that `refine` found, to first order in them."""
     shift = alignment.transform.apply(alignment.centre) - alignment.centre
     parameters = np.concatenate([shift, alignment.transform.rotation_vector])
     return np.asarray(pair.epoch.height + np.tensordot(parameters.astype(np.float32), pair.design(alignment.centre), 1))

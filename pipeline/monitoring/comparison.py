@@ -1,4 +1,4 @@
-"""Compare one epoch with the reference: register, difference, level of detection, regions that changed."""
+"""Compare one epoch with the reference: register it, and compute differences, levels of detection and changed regions."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from scene.geometry.mesh import FloatArray
 
 @dataclass(frozen=True)
 class ReferenceHeights:
-    """The reference epoch: the heights of each view of the wall, and their pixels as a surface that ICP pairs points with.
+    """The reference epoch: the heights of each view (part) of the wall, and their pixels as a surface for ICP.
 
     Attributes
     ----------
     rasters : tuple of HeightRaster
-        One for each view.
+        Heights of each view.
     from_wall : tuple of RigidTransform
-        From the wall frame to that of each view.
+        Transforms from the wall frame to the frame of each view.
     partition : Partition or None
-        Which points belong to which view, wall frame; None for a single view.
+        Says which points belong to which view, wall frame; None for a single view.
     surface : ReferenceSurface
-        Wall frame.
+        Search index of the pixels of all views, wall frame.
     """
 
     rasters: tuple[HeightRaster, ...]
@@ -48,29 +48,29 @@ class ReferenceHeights:
         from_wall: Sequence[RigidTransform] = (SAME,),
         partition: Partition | None = None,
     ) -> ReferenceHeights:
-        """Prepare the reference from its points, wall frame; one grid and transform for each view."""
+        """Prepare the reference from its points, wall frame. `grids` and `from_wall` have an element for each view."""
         rasters = _gridded(points.chunks(), grids, from_wall, partition)
         return cls(tuple(rasters), tuple(from_wall), partition, reference_surface(rasters, from_wall))
 
     def gridded(self, chunks: Iterable[FloatArray]) -> list[HeightRaster]:
-        """Heights of another epoch from chunks of its points, wall frame, m, on the grids of the reference."""
+        """Grid another epoch like the reference, one raster a view. chunks: points (n, 3) of the epoch, wall frame, m."""
         return _gridded(chunks, [raster.grid for raster in self.rasters], self.from_wall, self.partition)
 
 
 @dataclass(frozen=True)
 class EpochChange:
-    """What one epoch shows against the reference.
+    """Result of comparing one epoch with the reference.
 
     Attributes
     ----------
     transform : RigidTransform
-        From the epoch's points as they were read to the reference, wall frame.
+        Moves the epoch's points, as they were read, to the reference, wall frame.
     alignment : Alignment
-        The last fit, with its uncertainty.
+        The final registration, with its uncertainty.
     changes : list of Change
         Difference map and level of detection of each view.
     regions : list of ChangedRegion
-        What changed, the largest volume first.
+        Regions that changed, the largest volume first.
     """
 
     transform: RigidTransform
@@ -87,18 +87,20 @@ def compare_epoch(
     Parameters
     ----------
     reference : ReferenceHeights
+        The reference epoch.
     points : WallPoints
+        Points of the epoch, wall frame, m.
     stable : sequence of Area
-        Stable rock as the user says, wall frame; empty: found here.
+        Areas of stable rock given by the user, wall frame; empty: stable rock is found here.
     seed : int
-        Of the subsets that ICP begins with.
+        Seed of the random subsets of points for ICP.
     start : RigidTransform, optional
-        Brings the points near the reference, wall frame, instead of ICP.
+        Transform that brings the points near the reference, wall frame; None: ICP finds one.
 
     Raises
     ------
     InputError
-        Where the two do not meet, or too little is stable.
+        If the epoch does not overlap the reference, or too few pixels are stable.
     """
     gsd = reference.rasters[0].grid.gsd
     first = coarse(reference.surface, points.sample, gsd, seed) if start is None else start
@@ -123,7 +125,7 @@ def _change(pair: RasterPair, alignment: Alignment, view: int) -> Change:
 def _gridded(
     chunks: Iterable[FloatArray], grids: Sequence[Grid], from_wall: Sequence[RigidTransform], partition: Partition | None
 ) -> list[HeightRaster]:
-    """Heights of each view from chunks of points (n, 3), wall frame, m."""
+    """Return the heights of each view from chunks of points (n, 3), wall frame, m."""
     sums = [PointSums.over(grid) for grid in grids]
     for chunk in chunks:
         if partition is None:

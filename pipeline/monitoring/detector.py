@@ -1,4 +1,4 @@
-"""Events of a detector in place of regions beyond the level of detection."""
+"""Find changed regions with a detector of `scarpsim detect` instead of the level of detection."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ _WRONG_INPUT = 2
 
 
 def regions_of_detector(detector: str, difference: Path, change: Change) -> list[ChangedRegion]:
-    """Search a difference map with a detector and measure what it finds, the largest volume first.
+    """Search a difference map with a detector, and return its detections as measured regions, the largest volume first.
+
+    detector: name or folder, as for `scarpsim detect`. difference: the map's GeoTIFF. change: the same map with its levels of
+    detection, in which the regions are measured.
 
     The detector works in a process of its own, as TensorFlow and the ray tracer's compiler do not belong into one. Raises
     InputError for a detector that cannot be used.

@@ -61,22 +61,23 @@ class ChangedRegion:
     row, column : int
         Top-left pixel of the mask in the map.
     mask : (m, n) bool array
+        Pixels of the region, within its bounding box.
     x_m, y_m, z_m : float
         Centre of the mask and the reference's height there, wall frame.
     width_m, height_m, area_m2 : float
         Size of the mask, in the plane of the wall.
     depth_median_m, depth_largest_m : float
-        Of the change along the wall's normal, positive whatever the kind.
+        Median and largest change along the wall's normal, m, positive for both kinds.
     volume_m3, volume_std_m3 : float
-        Positive whatever the kind, and its standard deviation.
+        Volume, positive for both kinds, and its standard deviation.
     significance : float
         Mean change over its standard deviation.
     score : float
-        A detector's, NaN without one.
+        Score of the detection, 0 to 1; NaN without a detector.
     marks : tuple of str
-        "edge", "vegetation", "thin": what else may explain the change; "insignificant": a detector's that noise may explain.
+        "edge", "vegetation", "thin": another explanation of the change; "insignificant": a detection that may be noise.
     identity : int
-        Number of the event; 0 as yet unknown.
+        Number of the event; 0 if it is not yet known.
     view : int
         Number of the view of the wall in whose map it lies, from 1 on.
     """
@@ -103,12 +104,12 @@ class ChangedRegion:
 
     @property
     def window(self) -> tuple[slice, slice]:
-        """Rows and columns of the mask in the map."""
+        """Slices of the map's rows and columns that the mask covers."""
         height, width = self.mask.shape
         return slice(self.row, self.row + height), slice(self.column, self.column + width)
 
     def numbers(self) -> dict[str, Any]:
-        """All but the mask, as JSON and tables hold it."""
+        """Return all attributes except the mask by name, as JSON and tables store them."""
         names = (
             "kind", "row", "column", "x_m", "y_m", "z_m", "width_m", "height_m", "area_m2", "depth_median_m", "depth_largest_m",
             "volume_m3", "volume_std_m3", "significance", "score",
@@ -122,9 +123,10 @@ class ChangedRegion:
 
 @dataclass(frozen=True)
 class Change:
-    """All that is known of the change between the reference and one epoch, on one grid.
+    """Change between the reference and one registered epoch on the grid of one view, with its uncertainty.
 
-    difference: (h, w) float32, reference minus epoch, m; registration: (h, w) standard deviation of the registration's effect, m.
+    difference: (h, w) float32, reference minus epoch, m. registration: (h, w) standard deviation of the difference that is due to
+    the registration, m.
     """
 
     difference: NDArray[np.float32]
@@ -135,12 +137,12 @@ class Change:
 
     @property
     def grid(self) -> Grid:
-        """Where the pixels lie."""
+        """The grid of the maps."""
         return self.reference.grid
 
 
 def find_regions(change: Change) -> list[ChangedRegion]:
-    """Find the regions that changed, the largest volume first."""
+    """Find the regions whose change is significant, the largest volume first."""
     standard = change.difference / change.significance.one_sigma
     beyond = np.abs(change.difference) > _GROWS * change.significance.level
     regions: list[ChangedRegion] = []
@@ -155,7 +157,19 @@ def find_regions(change: Change) -> list[ChangedRegion]:
 
 
 def region_of_mask(mask: NDArray[np.bool_], row: int, column: int, score: float, change: Change) -> ChangedRegion | None:
-    """Measure a detector's mask; None where the map has no data in it."""
+    """Measure a detection as a region of change; None if the map has no data in its mask.
+
+    Parameters
+    ----------
+    mask : (m, n) bool array
+        Pixels of the detection, within its bounding box.
+    row, column : int
+        Top-left pixel of the mask in the map.
+    score : float
+        Score of the detection.
+    change : Change
+        The map.
+    """
     window = change.difference[row : row + mask.shape[0], column : column + mask.shape[1]]
     known = mask & np.isfinite(window)
     if not known.any():
@@ -280,13 +294,13 @@ def _is_thin(mask: NDArray[np.bool_]) -> bool:
 
 
 class Catalogue:
-    """Events over all epochs: a region where an event was before is the same event."""
+    """Numbers the events over all epochs: a region that overlaps one of an earlier epoch belongs to the same event."""
 
     def __init__(self) -> None:
         self._last: dict[int, ChangedRegion] = {}
 
     def identified(self, regions: Sequence[ChangedRegion]) -> list[ChangedRegion]:
-        """Give the regions of the next epoch their events' numbers, the largest first; new events count on."""
+        """Return the regions of the next epoch with the numbers of their events; new events take the next free numbers."""
         named, taken = [], set()
         for region in sorted(regions, key=lambda each: -each.volume_m3):
             shared = {

@@ -1,4 +1,4 @@
-"""Go on with each new file of a permanent scanner, once it is whole."""
+"""Watch a folder into which a permanent scanner writes, and compare each new file once it is complete."""
 
 from __future__ import annotations
 
@@ -32,33 +32,33 @@ def follow(
     ended: Callable[[], bool] = lambda: False,
     told: Callable[[str], None] = print,
 ) -> Result:
-    """Compare the files of a folder with the reference, and go on as more come.
+    """Compare the files of a folder with the reference, and wait for further files.
 
     Parameters
     ----------
     paths : sequence of Path
-        The reference, and epochs that are there already.
+        The reference, and epochs that exist already.
     folder : Path
-        Where new files come, in the order of their names.
+        Folder into which new files are written; they are compared in the order of their names.
     out, options, times, workers, resume
-        As `monitor_paths` has them. What is finished in `out` is taken over after every interruption.
+        As in `monitor_paths`. Epochs that are finished in `out` are kept after an interruption.
     every_s : float
         Time between two looks at the folder, s.
     ended : callable
-        Says when to stop; the default never does, and an interruption ends the command.
+        Returns True when watching shall stop. The default never does, so that only an interruption (Ctrl-C) ends it.
     told : callable
-        Gets a line for each epoch.
+        Receives a line of text for each epoch.
 
     Returns
     -------
     Result
-        Of all epochs, when `ended` says so.
+        The result of all epochs, once `ended` returns True.
 
     Raises
     ------
     InputError
-        For a folder that is not there, and for a reference that cannot be used. A new file that cannot be used is told and left
-        out.
+        For a folder that does not exist, and for a reference that cannot be used. A new file that cannot be used is reported to
+        `told` and left out.
     """
     if not folder.is_dir():
         raise InputError("is not a folder", where=f"--follow {folder}", remedy="name the folder in which new scans come")

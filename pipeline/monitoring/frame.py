@@ -27,9 +27,9 @@ _FINEST_M = 0.002
 
 
 def towards_sensor(data: EpochData, options: MonitorOptions, name: str) -> tuple[FloatArray, str]:
-    """Return a place before the wall, survey coordinates, m, and how it is known.
+    """Return a place in front of the wall, (3,), survey coordinates, m, and in words how it is known.
 
-    Raises InputError where nothing tells from which side the wall was measured.
+    Raises InputError if neither the options nor the file `name` tell from which side the wall was measured.
     """
     if options.position is not None:
         return options.position, "as given by --position"
@@ -49,7 +49,10 @@ def towards_sensor(data: EpochData, options: MonitorOptions, name: str) -> tuple
 
 
 def wall_frame(points: FloatArray, towards: FloatArray, direction: FloatArray | None) -> WallFrame:
-    """Fit the wall frame to points (n, 3), survey coordinates, m: z along `direction`, else along the mean plane's normal."""
+    """Fit the wall frame to points (n, 3), survey coordinates, m.
+
+    z is along `direction`; without one, it is along the normal of the points' mean plane, to the side of the place `towards`.
+    """
     few = points[:: max(len(points) // _SAMPLE, 1)]
     if direction is None:
         return WallFrame.fit(few, towards)
@@ -61,7 +64,7 @@ def raster_of(points: FloatArray, gsd_m: float | None, count: int | None = None)
 
     count: number of points in the files, of which `points` are a sample; None: all.
 
-    Raises InputError for a pixel that gives no raster, or too large a one.
+    Raises InputError if the raster of this pixel is empty or too large.
     """
     bounds = np.array([points.min(axis=0), points.max(axis=0)])
     gsd = gsd_m if gsd_m is not None else _usual_gsd(points, count or len(points))
@@ -78,7 +81,7 @@ def raster_of(points: FloatArray, gsd_m: float | None, count: int | None = None)
 
 
 def _usual_gsd(points: FloatArray, count: int) -> float:
-    """A round number of metres somewhat above the mean distance of neighbouring points."""
+    """Return a round pixel size, m, somewhat above the mean distance of neighbouring points."""
     few = points[:: len(points) // _MOST_COUNTED + 1, :2]
     apart, cell = _CELL_M, _CELL_M
     for _ in range(_ROUNDS):

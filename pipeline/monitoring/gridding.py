@@ -34,19 +34,19 @@ _BAND = 64
 
 @dataclass(frozen=True)
 class HeightRaster:
-    """Heights of one epoch over the wall.
+    """Heights of one epoch over one view of the wall, from planes fitted to the points round each pixel.
 
     Attributes
     ----------
     grid : Grid
-        Where the pixels lie, wall frame.
+        Raster of h x w pixels, wall frame.
     height, sigma, scatter : (h, w) float32, m
         Height at the pixel's centre, its standard deviation, and the standard deviation of the points about the plane. NaN where
         there are too few points.
     slope_x, slope_y : (h, w) float32
-        Change of height with x and y.
+        Slopes of the surface: change of height by x and by y, m/m.
     count : (h, w) int32
-        Points in the pixel itself.
+        Number of points in the pixel itself.
     """
 
     grid: Grid
@@ -59,7 +59,7 @@ class HeightRaster:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """(h, w) where there is a height."""
+        """(h, w) whether the pixel has a height."""
         return np.isfinite(self.height)
 
     @property
@@ -70,14 +70,14 @@ class HeightRaster:
 
 @dataclass(frozen=True)
 class WallPoints:
-    """Points of an epoch, wall frame, m, that need not fit into memory.
+    """Points of an epoch, wall frame, m, which are read chunk by chunk if they do not fit into memory.
 
     Attributes
     ----------
     sample : (n, 3) array
-        Points spread over all of the epoch.
+        A subset of the points, spread over all of the epoch.
     chunks : callable
-        Gives all points, chunk by chunk, each time it is called.
+        Function that yields all points, in chunks (k, 3), each time it is called.
     """
 
     sample: FloatArray
@@ -85,7 +85,7 @@ class WallPoints:
 
     @classmethod
     def of(cls, points: FloatArray) -> WallPoints:
-        """Points (n, 3) that are in memory."""
+        """Wrap points (n, 3), wall frame, m, that are in memory."""
         return cls(points, lambda: [points])
 
 
@@ -102,23 +102,23 @@ def gridded(points: FloatArray | Iterable[FloatArray], grid: Grid) -> HeightRast
 
 @dataclass(frozen=True)
 class PointSums:
-    """Sums over the points of each pixel, (10, h w), to which points are added; they are all that planes need."""
+    """Sums over the points of each pixel, (10, h w), from which the planes follow; points can be added in chunks."""
 
     grid: Grid
     sums: FloatArray
 
     @classmethod
     def over(cls, grid: Grid) -> PointSums:
-        """Sums without a point."""
+        """Return sums over no points on a grid."""
         return cls(grid, np.zeros((10, grid.height * grid.width)))
 
     def add(self, points: FloatArray) -> None:
-        """Add points (n, 3), m; those outside the grid are left out."""
+        """Add points (n, 3), frame of the grid, m; those outside the grid are left out."""
         for start in range(0, len(points), _CHUNK):
             _add_moments(self.sums, points[start : start + _CHUNK], self.grid)
 
     def heights(self) -> HeightRaster:
-        """Planes through all that was added."""
+        """Return the heights of planes fitted to all points that were added."""
         return _fitted(self.sums.reshape(10, self.grid.height, self.grid.width), self.grid)
 
 

@@ -13,7 +13,10 @@ _FEWEST = 8
 
 @dataclass(frozen=True)
 class PowerLaw:
-    """N(> V) = n (V / smallest)^-exponent for V >= smallest, with the 95 % interval of the exponent; n: events that large."""
+    """Power law N(> V) = n (V / smallest)^-exponent: the number of rockfalls larger than a volume V, for V >= smallest, m3.
+
+    The exponent has a 95 % interval; n is the number of events of the smallest volume or more.
+    """
 
     exponent: float
     low: float

@@ -1,4 +1,4 @@
-"""What a laser scanner's model predicts for the level of detection, to be set beside the measured one."""
+"""Predict the level of detection with a laser scanner's model, to compare it with the measured one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DISAGREES = 1 / 3
 
 
 def scanner_model(options: MonitorOptions) -> TlsModel | None:
-    """The model that the options name, None where they name none. Raises InputError for one of a stereo pair."""
+    """Return the scanner's model that the options name; None if they name none. Raises InputError for a stereo pair's model."""
     if options.model is not None:
         model = read_model(options.model)
         if not isinstance(model, TlsModel):
@@ -28,15 +28,16 @@ def scanner_model(options: MonitorOptions) -> TlsModel | None:
 
 
 def predicted_level(model: TlsModel, reference: HeightRaster, epoch: HeightRaster, station: FloatArray) -> float:
-    """Median level of detection at 95 %, m, that white noise of range and angles gives.
+    """Predict the median level of detection at 95 %, m, from a scanner's white noise of range and angles.
 
     Parameters
     ----------
     model : TlsModel
+        The scanner's noise.
     reference, epoch : HeightRaster
-        Their planes say how many points share in each pixel.
+        The two epochs, whose slopes and numbers of points in each pixel are used.
     station : (3,) array
-        The scanner's place, wall frame, m.
+        Position of the scanner, wall frame, m.
     """
     grid = reference.grid
     x = grid.x_min + (np.arange(grid.width) + 0.5) * grid.gsd - station[0]
@@ -52,7 +53,7 @@ def predicted_level(model: TlsModel, reference: HeightRaster, epoch: HeightRaste
 
 
 def compared_in_words(measured_m: float, predicted_m: float) -> str:
-    """Say how the measured level of detection compares with the predicted one, and what to do where they disagree."""
+    """Say how the measured level of detection compares with the predicted one (both m), and what to do if they disagree."""
     told = f"Level of detection: measured {1e3 * measured_m:.1f} mm, predicted by the model {1e3 * predicted_m:.1f} mm"
     if abs(measured_m / predicted_m - 1) <= DISAGREES:
         return f"{told}. They agree within a third."

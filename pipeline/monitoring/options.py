@@ -1,4 +1,4 @@
-"""What `monitor` is asked to do."""
+"""Define the options of `scarpsim monitor`, and read its file of stable areas."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ NO_DETECTOR = "none"
 
 @dataclass(frozen=True)
 class MonitorOptions:
-    """All options beside the epochs and the folder of the results.
+    """Options of `scarpsim monitor`, except for the epochs and the folder of the results.
 
     Attributes
     ----------
     reference : Path or None
-        Another reference than the first epoch.
+        File of the reference epoch; None: the first epoch.
     position : (3,) array or None
-        Where the sensor stood, or any place before the wall, survey coordinates, m.
+        Where the sensor stood, or any place in front of the wall, survey coordinates, m; None: as the files state.
     direction : (3,) array or None
         Direction along which change is measured, towards the sensor; None: the normal of the mean plane.
     views : int or None
         Number of views of the wall, each along a direction of its own; None: as many as its shape needs.
     gsd_m : float or None
-        Side of a pixel of the maps; None: by the density of the reference.
+        Side of a pixel of the maps, m; None: derived from the density of the reference's points.
     stable : tuple of Area
-        Stable rock, wall frame, m; empty: found by itself.
+        Areas of stable rock, wall frame, m; empty: `monitor` finds stable rock itself.
     unit : str or None
-        Of the coordinates, a key of METRES; None: as the files state.
+        Unit of the coordinates, a key of METRES such as "foot"; None: as the files state.
     columns : tuple of str
-        Of text files.
+        Names of the columns of text files, in order; empty: as their header states.
     scanner, model : str and Path, or None
-        What is believed about the scanner: a preset, or a model.yaml.
+        Scanner for which a level of detection is also predicted: name of a preset, or path of a model.yaml; None: no prediction.
     photographs : bool
-        The epochs are from photographs.
+        Whether the epochs were reconstructed from photographs.
     detector : str
-        "none": regions beyond the level of detection; else a detector of `scarpsim detect`.
+        "none": events are regions beyond the level of detection; else the name or folder of a detector of `scarpsim detect`.
     seed : int
-        Of the random subsets of the registration.
+        Seed of the random numbers that choose subsets of the points for the registration.
     """
 
     reference: Path | None = None
@@ -63,7 +63,7 @@ class MonitorOptions:
     seed: int = 1
 
     def to_dict(self) -> dict[str, Any]:
-        """As monitor.json holds it."""
+        """Return the options as monitor.json stores them: by name, as JSON types."""
         values = {name: getattr(self, name) for name in self.__dataclass_fields__}
         plain = {name: value.tolist() if hasattr(value, "tolist") else value for name, value in values.items()}
         return {name: str(value) if isinstance(value, Path) else value for name, value in plain.items()}

@@ -1,4 +1,4 @@
-"""Outlines of regions: rings around their pixels, in the wall frame and in survey coordinates."""
+"""Compute the outlines of regions: rings around their pixels, in the wall frame and in survey coordinates."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ _FINER = 2
 
 
 def rings(mask: NDArray[np.bool_]) -> list[FloatArray]:
-    """(n, 2) column and row of the corners of each part of a mask, closed, in pixels from its top-left corner."""
+    """Return the outline of each connected part of a mask as a closed ring (n, 2).
+
+    A ring has the column and row of each corner, in pixels from the mask's top-left corner.
+    """
     fine = np.kron(mask.astype(np.uint8), np.ones((_FINER, _FINER), np.uint8))
     found, _ = cv2.findContours(fine, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     corners = [(each.reshape(-1, 2) + 0.5) / _FINER for each in found if len(each) > 2]
@@ -24,7 +27,10 @@ def rings(mask: NDArray[np.bool_]) -> list[FloatArray]:
 
 
 def in_survey(region: ChangedRegion, grid: Grid, heights: NDArray[np.float32], frame: WallFrame) -> list[FloatArray]:
-    """(n, 3) corners of a region's outline, survey coordinates, m, on the reference's surface (h, w), wall frame, m."""
+    """Return a region's outlines as rings (n, 3) on the reference's surface, survey coordinates, m.
+
+    heights: (h, w) heights of the reference on `grid`, m. frame: the frame of the grid.
+    """
     result = []
     for ring in rings(region.mask):
         column, row = ring[:, 0] + region.column, ring[:, 1] + region.row

@@ -1,4 +1,4 @@
-"""Write what a monitoring found: monitor.json, tables and outlines of events, registered points, COCO, the report."""
+"""Write the results of `monitor`: monitor.json, tables and outlines of events, registered points, COCO, the report."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _SCALE_M = 1e-4
 
 @dataclass(frozen=True)
 class Followed:
-    """One epoch with its events numbered. regions: the same as those of the record, with their events' numbers."""
+    """The result of one epoch after its events were numbered. regions: those of the record, with the numbers of their events."""
 
     source: EpochSource
     record: EpochRecord
@@ -51,13 +51,13 @@ class Followed:
 
     @property
     def number(self) -> int:
-        """Of the epoch."""
+        """Number of the epoch; the reference is 0."""
         return self.record.number
 
 
 @dataclass(frozen=True)
 class Result:
-    """A finished monitoring. folder: of the products; sources: the reference first; epochs: all others."""
+    """Result of a finished `monitor`: folder, files of all epochs (the reference first), and results of the later epochs."""
 
     folder: Path
     sources: tuple[EpochSource, ...]
@@ -66,7 +66,7 @@ class Result:
     options: MonitorOptions
 
     def rows(self) -> list[dict[str, Any]]:
-        """A row for each event and epoch, as `COLUMNS` has them; None for what is not known."""
+        """The table of events: a row for each event and epoch with the columns `COLUMNS`; None for an unknown value."""
         first = self._first_seen()
         rows = []
         for epoch in self.epochs:
@@ -81,7 +81,7 @@ class Result:
         return rows
 
     def outlines(self) -> list[list[FloatArray]]:
-        """The rings of each row's event, survey coordinates, m."""
+        """Outlines of the event of each row of the table, as rings (n, 3), survey coordinates, m."""
         found = []
         for epoch in self.epochs:
             for region in epoch.regions:
@@ -90,7 +90,7 @@ class Result:
         return found
 
     def _first_seen(self) -> dict[int, tuple[str, str]]:
-        """Between which two epochs, by time or by name, each event began."""
+        """The two epochs, by time or by name, between which each event began, by the event's number."""
         names = [source.time.text or source.name for source in self.sources]
         first: dict[int, tuple[str, str]] = {}
         for epoch in self.epochs:
@@ -100,7 +100,7 @@ class Result:
 
 
 def write_points(epoch: Followed, data: EpochData, site: ReferenceSite, out: Path) -> None:
-    """Write an epoch's points, registered, in survey coordinates, with what the maps say at each."""
+    """Write an epoch's registered points, survey coordinates, with difference, level of detection and event at each point."""
     maps = [_maps_of(epoch, view, out) for view in site.views]
     partition = site.reference.partition
 
@@ -126,7 +126,7 @@ def _maps_of(epoch: Followed, view: WallView, out: Path) -> list[NDArray[np.floa
 
 
 def write_results(result: Result) -> None:
-    """Write the tables, the outlines, COCO, the report, and monitor.json at the end."""
+    """Write the tables, outlines, COCO annotations and report, and last monitor.json, which marks the folder as complete."""
     from pipeline.monitoring.report import write_report
 
     rows = result.rows()
@@ -140,7 +140,7 @@ def write_results(result: Result) -> None:
 
 
 def event_raster(regions: Sequence[ChangedRegion], view: WallView) -> NDArray[np.int32]:
-    """(h, w) the number of the event at each pixel of a view, 0 where there is none; smaller events lie over larger ones."""
+    """Return the number of the event at each pixel (h, w) of a view, 0 for none; smaller events are drawn over larger ones."""
     raster = np.zeros(view.grid.shape, dtype=np.int32)
     inside = (region for region in regions if region.view == view.number)
     for region in sorted(inside, key=lambda each: -each.area_m2):

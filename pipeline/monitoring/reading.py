@@ -41,17 +41,18 @@ _ANY = (*SUFFIXES, *DEMS, ".obj", ".stl", ".glb", ".off")
 
 @dataclass(frozen=True)
 class EpochSource:
-    """Where an epoch is read from.
+    """The files from which one epoch is read, and its time.
 
     Attributes
     ----------
     path : Path
-        What the user named.
+        The path that the user gave.
     files : tuple of Path
-        One file, or the scans of one epoch.
+        The one file, or the scans of the epoch.
     time : EpochTime
+        When it was measured.
     run : dict or None
-        run.json of the run of `simulate` that the epoch belongs to.
+        Content of run.json if the epoch belongs to a run of `simulate`.
     """
 
     path: Path
@@ -61,7 +62,7 @@ class EpochSource:
 
     @property
     def name(self) -> str:
-        """As people call it."""
+        """Name of the epoch in reports and messages."""
         return self.path.name if self.run is None else f"{self.path.parent.name}/{self.path.name}"
 
     def checksums(self) -> dict[str, str]:
@@ -71,21 +72,22 @@ class EpochSource:
 
 @dataclass(frozen=True)
 class LargeFiles:
-    """LAS and LAZ files of one epoch that are read chunk by chunk.
+    """The LAS and LAZ files of one epoch, which are read chunk by chunk.
 
     Attributes
     ----------
     files : tuple of Path
+        The files.
     unit : str or None
-        As the user gives it.
+        Unit of the coordinates given by the user; None: as the files state.
     count : int
-        Points that are in use.
+        Number of points, without those that the files flag as withheld, synthetic or noise.
     first : (n, 3) array
         The first points, survey coordinates, m.
     bounds : (2, 3) array
         Corners of the box about all points, survey coordinates, m.
     kept : tuple of (n, 3) int32 arrays
-        All points in steps of 0.01 mm from the first one, where they fit into memory easily; else none.
+        All points as steps of 0.01 mm from the first one, if they fit into memory easily; else empty.
     """
 
     files: tuple[Path, ...]
@@ -104,21 +106,22 @@ class LargeFiles:
 
 @dataclass(frozen=True)
 class EpochData:
-    """What an epoch's files hold.
+    """Content of an epoch's files.
 
     Attributes
     ----------
     points : (n, 3) array
         Survey coordinates, m; the vertices of a mesh. For large files a sample, spread over the files.
     mesh : TriangleMesh or None
-        The surface, where the files hold one.
+        The surface, if the files contain one.
     position : (3,) array or None
-        Where the sensor stood, survey coordinates, m, where the files say so.
+        Position of the sensor, survey coordinates, m, if the files state it.
     crs : str
-        WKT of the coordinate system, empty where it is not stated.
+        WKT of the coordinate system; empty if it is not stated.
     notes : tuple of str
+        Remarks on the files for the user.
     large : LargeFiles or None
-        Where the points are read from again, chunk by chunk.
+        The files if they are too large for memory; the points are then read from them again, chunk by chunk.
     """
 
     points: FloatArray
@@ -135,7 +138,7 @@ class EpochData:
 
     @property
     def in_order(self) -> FloatArray:
-        """(n, 3) points in the order of the file; of large files the first ones."""
+        """(n, 3) points in the order of the file, survey coordinates, m; of large files only the first ones."""
         return self.points if self.large is None else self.large.first
 
     @property
@@ -148,7 +151,17 @@ class EpochData:
         return iter(np.array_split(self.points, -(-len(self.points) // CHUNK))) if self.large is None else self.large.chunks()
 
     def wall_points(self, frame: WallFrame, gsd_m: float, *, several: bool = False) -> WallPoints:
-        """Points in the wall frame, m; those of a mesh lie on it, four to a pixel, on all sides of it for `several` views."""
+        """Return the points in the wall frame, m; those of a mesh are drawn at random on it.
+
+        Parameters
+        ----------
+        frame : WallFrame
+            The wall frame.
+        gsd_m : float
+            Side of a pixel of the maps, m; a mesh gets about four points a pixel.
+        several : bool
+            Whether the wall has several views, so that points are also drawn on triangles that are steep in the wall frame.
+        """
         if self.mesh is None:
             return WallPoints(frame.to_wall(self.points), lambda: map(frame.to_wall, self.chunks()))
         if several:
@@ -164,7 +177,7 @@ class EpochData:
 
 
 def _spread_over(mesh: TriangleMesh, apart_m: float) -> FloatArray:
-    """(n, 3) points at random on a mesh, as many as squares of that side have room on it, m."""
+    """Return points (n, 3) at random on a mesh, one for each square of side `apart_m` on its surface, m."""
     corners = mesh.vertices[mesh.faces]
     sides = corners[:, 1:] - corners[:, :1]
     ends = np.cumsum(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2)
@@ -183,7 +196,7 @@ def find_epochs(paths: Sequence[Path], times: Sequence[str] = ()) -> list[EpochS
     paths : sequence of Path
         A file is an epoch, a folder of scans is one, and a run of `simulate` is all of its epochs.
     times : sequence of str
-        One for each epoch, ISO 8601; none: as files say.
+        Time of each epoch, ISO 8601; empty: as the files state.
 
     Raises
     ------
@@ -217,7 +230,7 @@ def find_epochs(paths: Sequence[Path], times: Sequence[str] = ()) -> list[EpochS
 
 
 def read_epoch(source: EpochSource, options: MonitorOptions) -> EpochData:
-    """Read an epoch. Raises InputError for whatever is wrong in its files."""
+    """Read the files of an epoch. Raises InputError if a file cannot be used."""
     if source.run is not None:
         return _of_run(source, source.run)
     if all(file.suffix.lower() in _LAS for file in source.files) and sum(map(count_points, source.files)) > WHOLE_POINTS:
@@ -238,7 +251,7 @@ def read_epoch(source: EpochSource, options: MonitorOptions) -> EpochData:
 
 
 def _sampled(files: tuple[Path, ...], unit: str | None) -> EpochData:
-    """Read large files once, for a sample of their points and what they state."""
+    """Read large files once, to get a sample of their points and their number, extent and coordinate system."""
     stated = sum(map(count_points, files))
     step, count = -(-stated // _SAMPLE), 0
     sample, kept, lows, highs, first = [], [], [], [], None
@@ -261,7 +274,7 @@ def _sampled(files: tuple[Path, ...], unit: str | None) -> EpochData:
 
 
 def epoch_files(folder: Path) -> list[Path]:
-    """Files of a folder that hold scans, clouds, meshes or elevation models, by name."""
+    """Return the files of a folder that contain scans, clouds, meshes or elevation models, sorted by name."""
     return sorted(each for each in folder.iterdir() if each.suffix.lower() in _ANY and each.is_file())
 
 
@@ -316,14 +329,14 @@ def _read_file(path: Path, options: MonitorOptions) -> EpochData:
 
 
 def _before(mesh: TriangleMesh) -> FloatArray:
-    """A place before a mesh, on the side to which its triangles face."""
+    """Return a place in front of a mesh (3,), m, on the side to which its triangles face."""
     corners = mesh.vertices[mesh.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
     return np.asarray(mesh.vertices.mean(axis=0) + _BEFORE_M * normal / max(float(np.linalg.norm(normal)), 1e-12))
 
 
 def _crs_of(path: Path) -> str:
-    """WKT of the coordinate system of a LAS file, empty where it states none that is understood."""
+    """Return the WKT of a LAS file's coordinate system; empty if it states none that can be read."""
     if path.suffix.lower() not in _LAS:
         return ""
     import laspy

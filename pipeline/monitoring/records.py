@@ -1,4 +1,4 @@
-"""What is kept of each epoch while a monitoring goes on, so that an interrupted one goes on where it stopped."""
+"""Store the result of each epoch while `monitor` works, so that an interrupted one can be resumed."""
 
 from __future__ import annotations
 
@@ -27,21 +27,23 @@ class EpochRecord:
     Attributes
     ----------
     number : int
-        Of the epoch; the reference is 0.
+        Number of the epoch; the reference is 0.
     inputs : dict
         SHA-256 of its files by path.
     points : int
+        Number of its points.
     notes : tuple of str
+        Remarks on the epoch for the user.
     transform : RigidTransform
-        From the points as read to the reference, wall frame.
+        Moves the points, as they were read, to the reference, wall frame.
     registration : dict
-        As monitor.json holds it.
+        Shift, rotation and their uncertainty, as monitor.json stores them.
     level_m, predicted_level_m : float
-        Median level of detection, and what the sensor's model predicts (NaN without a model).
+        Median level of detection, measured and predicted by the sensor's model (NaN without one), m.
     area_m2 : float
-        Of the wall that is compared.
+        Area of the wall that was compared, m2.
     regions : tuple of ChangedRegion
-        Without numbers of events.
+        Regions that changed; their events do not have numbers yet.
     """
 
     number: int
@@ -56,7 +58,17 @@ class EpochRecord:
     regions: tuple[ChangedRegion, ...]
 
     def write(self, folder: Path, fingerprint: str, shapes: Sequence[tuple[int, ...]]) -> None:
-        """Keep the record; fingerprint: of the reference and the options; shapes: of the maps of all views."""
+        """Write the record into the folder of the results.
+
+        Parameters
+        ----------
+        folder : Path
+            Folder of the results.
+        fingerprint : str
+            Checksum of the reference and the options, with which a later call tells whether the record still applies.
+        shapes : sequence of (int, int)
+            Rows and columns of each view's maps.
+        """
         values = {name: getattr(self, name) for name in ("number", "inputs", "points", "notes", "registration", "area_m2")}
         levels = {
             "level_m": self.level_m,
@@ -70,7 +82,19 @@ class EpochRecord:
 
 
 def kept(folder: Path, number: int, inputs: Mapping[str, str], fingerprint: str) -> EpochRecord | None:
-    """The record of an epoch of these files, made with these options and this reference; None where there is none."""
+    """Read the record of an epoch; None if there is none, or if it was made from other files, options or another reference.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the results.
+    number : int
+        Number of the epoch.
+    inputs : mapping
+        SHA-256 of the epoch's files by path.
+    fingerprint : str
+        Checksum of the reference and the options.
+    """
     path = _file(folder, number)
     if not path.is_file():
         return None
@@ -94,7 +118,7 @@ def kept(folder: Path, number: int, inputs: Mapping[str, str], fingerprint: str)
 
 
 def without_numbers(region: ChangedRegion) -> ChangedRegion:
-    """The region as yet of no event."""
+    """Return the region without the number of its event."""
     return replace(region, identity=0)
 
 

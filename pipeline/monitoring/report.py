@@ -1,4 +1,4 @@
-"""The page that a person reads after `scarpsim monitor`: maps, events, volumes over time, what was registered on what."""
+"""Write the report of `scarpsim monitor`: maps, events, volumes over time, and the registration of each epoch."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def write_report(result: Result) -> None:
 
 
 def headline(result: Result) -> list[str]:
-    """One sentence an epoch: what fell, what was added, how small a change would show."""
+    """Return one sentence for each epoch: what fell, what was added, and the smallest change that would be noticed."""
     told = []
     for epoch in result.epochs:
         when = f" ({epoch.source.time.text})" if epoch.source.time.when else ""
@@ -72,7 +72,7 @@ def headline(result: Result) -> list[str]:
 
 
 def law_in_words(law: PowerLaw) -> str:
-    """The exponent with its interval."""
+    """Return the exponent of a magnitude-frequency law with its 95 % interval, as text."""
     return (
         f"{law.count} rockfalls of {law.smallest_m3:.3g} m³ and more follow N(> V) ~ V^-{law.exponent:.2f} "
         f"(95 % interval {law.low:.2f} to {law.high:.2f})."

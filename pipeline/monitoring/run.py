@@ -1,4 +1,4 @@
-"""`monitor` from files to events: read, register, difference, level of detection, events, products.
+"""Run `monitor` from files to events: read, register, compute differences and levels of detection, find events, write results.
 
 The reference is read once. Each further epoch is compared with it by itself, in this process or in several, and its record is
 kept, so that an interrupted monitoring goes on. Events get their numbers at the end, in the order of the epochs.
@@ -45,7 +45,7 @@ def monitor_paths(
     resume: bool = False,
     progress: Progress | None = None,
 ) -> Result:
-    """Find the epochs that paths name, the reference first, and compare them as `monitor` does."""
+    """Find the epochs that the paths name, the reference first, and compare them. Further arguments as in `monitor`."""
     return monitor(find_epochs(paths, times), out, options, workers=workers, resume=resume, progress=progress)
 
 
@@ -63,20 +63,22 @@ def monitor(
     Parameters
     ----------
     sources : sequence of EpochSource
-        The reference first.
+        Files of all epochs, the reference first.
     out : Path
-        New or empty folder, or with `resume` that of an interrupted monitoring.
+        New or empty folder, or with `resume` the folder of an interrupted run.
     options : MonitorOptions
+        All other options.
     workers : int
-        Processes; the results do not depend on it.
+        Number of processes; the results do not depend on it.
     resume : bool
-        Take over the epochs that are finished in `out`.
+        Whether to keep the epochs that are finished in `out`.
     progress : Progress, optional
+        Receives the progress.
 
     Raises
     ------
     InputError
-        For whatever is wrong in the files, and for epochs that do not meet.
+        If a file cannot be used, or if an epoch does not overlap the reference.
     """
     progress = progress or Progress()
     if not resume:
@@ -157,14 +159,35 @@ class _Frozen:
 
 @lru_cache(1)
 def _site_of_worker(reference: EpochSource, frozen: _Frozen) -> ReferenceSite:
-    """The reference, prepared once in each process."""
+    """Return the reference site, prepared once in each process."""
     return prepared(reference, frozen.options)
 
 
 def processed(
     number: int, source: EpochSource, site: ReferenceSite, out: Path, options: MonitorOptions, fingerprint: str
 ) -> tuple[EpochRecord, EpochData]:
-    """Compare one epoch, write its maps and its record; returns the record and what was read."""
+    """Compare one epoch with the reference, and write its maps and its record.
+
+    Parameters
+    ----------
+    number : int
+        Number of the epoch.
+    source : EpochSource
+        Its files.
+    site : ReferenceSite
+        The reference.
+    out : Path
+        Folder of the results.
+    options : MonitorOptions
+        All other options.
+    fingerprint : str
+        Checksum of the reference and the options, which is stored with the record.
+
+    Returns
+    -------
+    (EpochRecord, EpochData)
+        The record, and the content of the files.
+    """
     data = read_epoch(source, options)
     notes = [*data.notes, *_check_same_site(data, site, source)]
     points = data.wall_points(site.frame, site.grid.gsd, several=len(site.views) > 1)
@@ -203,7 +226,7 @@ def _predicted(options: MonitorOptions, site: ReferenceSite, found: EpochChange)
 
 
 def _check_same_site(data: EpochData, site: ReferenceSite, source: EpochSource) -> list[str]:
-    """Notes on an epoch's coordinates and density. Raises InputError where it lies elsewhere, or is in another unit."""
+    """Return remarks on an epoch's coordinates and density. Raises InputError if it lies elsewhere or is in another unit."""
     wall = site.frame.to_wall(data.points[:: max(len(data.points) // 100_000, 1)])
     if site.reference.partition is not None:
         wall = wall[site.reference.partition.of(wall) == 0]

@@ -1,4 +1,4 @@
-"""Say which differences are larger than noise: a level of detection for each pixel, and the error of means over regions.
+"""Estimate how large differences are by noise: a level of detection for each pixel, and the error of means over regions.
 
 The variance that a pixel's difference should have is that of the two heights and of the registration. How the differences on
 stable rock really scatter is set against it: the level of detection is the 95 % quantile of |difference| / predicted standard
@@ -41,14 +41,15 @@ _FILLED = 0.5
 
 @dataclass(frozen=True)
 class Significance:
-    """How large differences are by chance.
+    """Size of the differences that noise alone causes.
 
     Attributes
     ----------
     level : (h, w) float32, m
-        Level of detection at 95 % of each pixel; NaN without data.
+        Level of detection (95 %) of each pixel; NaN without data.
     side_px, sigma : (k,) arrays
-        Standard deviation, on stable rock, of means over squares of that side of differences in units of their pixel's.
+        Sides of squares, px, and the standard deviation on stable rock of means over such squares. Before averaging, each
+        difference is divided by the standard deviation of its pixel.
     """
 
     level: NDArray[np.float32]
@@ -61,7 +62,7 @@ class Significance:
         return np.asarray(self.level / np.float32(NORMAL_95))
 
     def sigma_of_mean(self, pixels: float | NDArray[np.floating]) -> FloatArray:
-        """Standard deviation of a mean of standardised differences over so many pixels; beyond the largest square, that of it."""
+        """Return the standard deviation of a mean of standardised differences over so many pixels, at most the largest square."""
         side = np.sqrt(np.maximum(pixels, 1.0))
         return np.asarray(np.exp(np.interp(np.log(side), np.log(self.side_px), np.log(self.sigma))))
 
@@ -72,13 +73,14 @@ def significance(difference: NDArray[np.float32], predicted: NDArray[np.float32]
     Parameters
     ----------
     difference, predicted : (h, w) float32, m
-        Reference minus epoch, and the standard deviation that it should have; NaN without data.
+        Reference minus epoch, and its predicted standard deviation; NaN without data.
     stable : (h, w) bool
-        Where nothing moved.
+        Pixels of stable rock.
 
     Returns
     -------
     Significance
+        Levels of detection, and standard deviations of means.
     """
     level = predicted * _factor(difference, predicted, stable)
     standard = np.where(stable, difference / (level / NORMAL_95), np.nan)

@@ -1,4 +1,4 @@
-"""The site of a monitoring: its reference epoch, prepared for comparisons."""
+"""Prepare the reference epoch of `monitor`: its views, frames and rasters, with which all other epochs are compared."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ class WallView:
     Attributes
     ----------
     number : int
-        From 1 on; the first is the largest, and its frame is the wall frame.
+        Number of the view, from 1 on; the first is the largest, and its frame is the wall frame.
     frame : WallFrame
-        z along the direction of change, towards the sensor.
+        Frame of the view; z is the direction in which change is measured, towards the sensor.
     raster : HeightRaster
         Heights of the reference.
     """
@@ -44,31 +44,35 @@ class WallView:
 
     @property
     def grid(self) -> Grid:
-        """Of its maps."""
+        """The grid of the view's maps."""
         return self.raster.grid
 
     @property
     def suffix(self) -> str:
-        """What the names of its files end in."""
+        """Ending of the names of the view's files; empty for the first view."""
         return "" if self.number == 1 else f"_view{self.number}"
 
 
 @dataclass(frozen=True)
 class ReferenceSite:
-    """The reference, prepared for comparisons.
+    """The reference epoch, prepared for comparisons.
 
     Attributes
     ----------
     source : EpochSource
+        Its files.
     views : tuple of WallView
-        One, or several where the wall turns a corner or overhangs.
+        The view of the whole wall, or several views if the wall turns a corner or overhangs.
     station : (3,) array
-        Where the sensor stood, or a place before the wall, wall frame, m.
+        Position of the sensor, or a place in front of the wall, wall frame, m.
     reference : ReferenceHeights
+        Heights of all views.
     points : int
+        Number of points.
     crs : str
-        WKT, empty where the file states none.
+        WKT of the coordinate system; empty if the file states none.
     notes : tuple of str
+        Remarks on the reference for the user.
     """
 
     source: EpochSource
@@ -86,12 +90,12 @@ class ReferenceSite:
 
     @property
     def grid(self) -> Grid:
-        """Of the maps of the first view."""
+        """The grid of the first view's maps."""
         return self.views[0].grid
 
 
 def prepared(source: EpochSource, options: MonitorOptions) -> ReferenceSite:
-    """Read the reference and choose views, frames and rasters."""
+    """Read the reference epoch, and choose its views, frames and rasters. Raises InputError if it cannot be used."""
     data = read_epoch(source, options)
     towards, how = towards_sensor(data, options, source.name)
     frames, partition = _frames(data, towards, options)

@@ -30,19 +30,19 @@ _ISO = "a time in ISO 8601, such as 2026-03-14T15:30:00Z"
 
 @dataclass(frozen=True)
 class EpochTime:
-    """When an epoch was measured, in UTC, and where that is from in words; `when` is None where nothing says it."""
+    """When an epoch was measured, in UTC (`when`; None if unknown), and in words where this is stated."""
 
     when: datetime | None
     source: str
 
     @property
     def text(self) -> str:
-        """ISO 8601, or an empty text."""
+        """The time in ISO 8601; empty if it is unknown."""
         return "" if self.when is None else self.when.isoformat().replace("+00:00", "Z")
 
 
 def time_of(path: Path, given: str | None = None) -> EpochTime:
-    """Return the time of an epoch's file or folder; given: as the user says. Raises InputError for a text that is no time."""
+    """Return the time of an epoch's file or folder; given: the user's text. Raises InputError if it is no time."""
     if given is not None:
         return EpochTime(parsed_time(given, "--times"), "as given by --times")
     beside = path.with_name(path.name + SIDECAR)

@@ -32,14 +32,14 @@ _FEWEST = 50
 
 
 def unchanged_pixels(standard: NDArray[np.floating], candidates: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which of the candidates, (h, w), did not change sign-consistently.
+    """Return which candidates (h, w) are unchanged: no area round them has differences of mainly one sign.
 
     Parameters
     ----------
     standard : (h, w) array
-        Differences over the standard deviation that they should have, with mean zero where nothing changed; NaN without data.
+        Differences over their predicted standard deviation, with mean zero where nothing changed; NaN without data.
     candidates : (h, w) bool
-        Pixels that may be stable: all with data, or those in the user's stable areas.
+        Pixels that may be stable: all with data, or those in the stable areas that the user gave.
     """
     unchanged = candidates & np.isfinite(standard)
     means = {side: _mean_over_squares(standard, side) for side in _SQUARES_PX}

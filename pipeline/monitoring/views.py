@@ -32,16 +32,16 @@ _CELLS = 128
 
 @dataclass(frozen=True)
 class Partition:
-    """Which view each place in space belongs to.
+    """Assigns each place in space to one of the n views (parts) of a wall, by means of cells of space.
 
     Attributes
     ----------
     to_cells : RigidTransform
-        From the frame of the points to one whose axes the cells follow.
+        Transform from the frame of the points to the frame along whose axes the cells lie.
     origin : (3,) array
         Corner of the cells, m, in that frame.
     cell_m : float
-        Side of a cell.
+        Side of a cell, m.
     view : (i, j, k) int8 array
         Number of the view, from 0 on, of each cell.
     directions : (n, 3) array
@@ -55,29 +55,29 @@ class Partition:
     directions: FloatArray
 
     def of(self, points: FloatArray) -> NDArray[np.int8]:
-        """(n,) the view of points (n, 3), m; beside the cells that of the nearest one."""
+        """Return the view (k,) of points (k, 3), m; outside the cells, the view of the nearest cell."""
         cell = np.floor((self.to_cells.apply(points) - self.origin) / self.cell_m).astype(np.int64)
         cell = np.clip(cell, 0, np.array(self.view.shape) - 1)
         return np.asarray(self.view[cell[:, 0], cell[:, 1], cell[:, 2]])
 
     def for_points(self, to_cells: RigidTransform) -> Partition:
-        """The same views for points in another frame, from which `to_cells` leads to that of the cells."""
+        """Return the same partition for points in another frame; `to_cells` transforms from that frame to the cells' frame."""
         return replace(self, to_cells=to_cells)
 
 
 def divided(points: FloatArray, towards: FloatArray, main: FloatArray, count: int | None) -> Partition | None:
-    """Divide a wall into views; None where one is enough.
+    """Divide a wall into views; None if a single view is enough.
 
     Parameters
     ----------
     points : (n, 3) array
-        Of the reference, m; a sample will do.
+        Points of the reference, m; a subset suffices.
     towards : (3,) array
         A place on the outer side of all parts, m.
     main : (3,) array
         Unit vector along which a single view would look.
     count : int or None
-        Number of views as the user says; None: as many as the normals need, one included.
+        Number of views given by the user; None: as many as the surface normals need, perhaps one.
     """
     if count == 1:
         return None

@@ -25,7 +25,7 @@ _HEAD = """# The site of {name}, as `scarpsim monitor` saw it: simulate it with
 def write_site(result: Result, path: Path) -> None:
     """Write the config, and the wall's mesh beside it, from the reference epoch.
 
-    Raises InputError where the reference has no surface, and for a name that is taken.
+    Raises InputError if the reference has no surface, or if a file of that name exists.
     """
     site = result.site
     wall = path.with_name(f"{path.stem}_wall.ply")

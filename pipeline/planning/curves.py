@@ -29,16 +29,16 @@ _LARGEST_INCIDENCE_RAD = np.radians(85)
 class Curve:
     """Detection probability of a fallen block as a function of one quantity, such as the range.
 
-    It is the median over places in the middle of the wall. All other quantities are as they are there.
+    It is the median over places in the middle of the wall. All other quantities have their values at these places.
 
     Attributes
     ----------
     label : str
         The quantity, with its unit.
     x : (k,) array
-        Its values.
+        Values of the quantity.
     at : float
-        Its value in the planned set-up, one of x.
+        Value of the quantity in the planned set-up, one of x.
     probability : dict of (k,) arrays
         Detection probability at each value, by the side of the block, m.
     """
@@ -188,7 +188,7 @@ def probability_curves(
 
 
 def _median(found: tuple[Sampling, BoolArray], size: float, config: PlanningConfig) -> float:
-    """Return the median probability over places. A place that the sensor does not reach counts as 0."""
+    """Return the median over places of the detection probability of a block of side `size`, m; 0 where nothing is seen."""
     return float(np.median(np.where(found[1], detection_probability(found[0], size, config), 0.0)))
 
 

@@ -69,7 +69,7 @@ def write_plans(out: Path, config: SimulationConfig, found: Sequence[Plan], seri
     found : sequence of Plan
         The plans.
     series : sequence of SeriesPlan
-        Promises of series, for plan.json and the report.
+        Predictions for series of epochs, for plan.json and the report.
 
     Returns
     -------

@@ -108,7 +108,7 @@ def write_plan_report(path: Path, plans: Sequence[Plan], config: Mapping[str, An
     config : mapping
         The resolved config, which the page lists.
     series : sequence of SeriesPart
-        Promises of series.
+        What the page shows of predictions for series of epochs.
     """
     page = template("planning/report.html.jinja").render(
         title=f"{plans[0].wall.replace('_', ' ').capitalize()}: a plan",

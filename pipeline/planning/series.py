@@ -1,4 +1,4 @@
-"""Promise what a series of epochs will show: the smallest rockfall, and how early a block that moves is noticed.
+"""Predict what a series of epochs will show: the smallest rockfall, and how early a moving block is noticed.
 
 Trial epochs of the config's wall are simulated with its sensor and the conditions of its series, and compared with the reference
 as `monitor` does. In some, blocks of many sizes are missing; in others, they have moved out by different amounts. Logistic
@@ -67,18 +67,20 @@ _CURVE_POINTS = 60
 
 @dataclass(frozen=True)
 class DetectionLaw:
-    """Probability that a change is listed: logit P = coefficients . (1, ln V, ln u); without u for missing rock.
+    """Probability that `monitor` lists a change of volume V, from a logistic regression on trial blocks.
+
+    logit P = coefficients . (1, ln V, ln u), with the displacement u of a block that moved; missing rock has no term in u.
 
     Attributes
     ----------
     coefficients : (2,) or (3,) array
-        Best fit; V in m3, u in m.
+        Coefficients of the best fit, for V in m3 and u in m.
     resampled : (b, 2) or (b, 3) array
-        Fits of bootstrap samples.
+        Coefficients fitted to b bootstrap samples of the trial blocks.
     blocks : int
-        Number of blocks of which enough is seen.
+        Number of trial blocks of which the sensor sees enough.
     seen_share : float
-        Their share of all blocks.
+        Their share of all trial blocks.
     """
 
     coefficients: FloatArray
@@ -87,7 +89,7 @@ class DetectionLaw:
     seen_share: float
 
     def probability(self, volume_m3: FloatArray, moved_m: FloatArray | float = 1.0) -> FloatArray:
-        """Return the probability for volumes, m3, and displacements, m."""
+        """Return the probability (k,) for volumes (k,), m3, and displacements, m (ignored for missing rock)."""
         return _logistic(_design(np.asarray(volume_m3), np.asarray(moved_m), len(self.coefficients)) @ self.coefficients)
 
     def volume_m3(self, probability: float = PROBABILITY) -> tuple[float, float, float]:
@@ -103,7 +105,11 @@ class DetectionLaw:
 
 @dataclass(frozen=True)
 class EpochPromise:
-    """What epochs of some scans show. scans: number of scans; level_m: median level of detection, m."""
+    """What an epoch shows that consists of one or more scans, whose points are joined.
+
+    scans: number of scans in the epoch. level_m: its median level of detection, m. The laws are the detection probabilities of
+    missing rock and of blocks that moved.
+    """
 
     scans: int
     level_m: float
@@ -113,22 +119,22 @@ class EpochPromise:
 
 @dataclass(frozen=True)
 class SeriesPlan:
-    """The promise of a series.
+    """What a series of epochs is predicted to show.
 
     Attributes
     ----------
     sensor : str
         "stereo" or "tls".
     gsd_m : float
-        Pixel of the maps, m.
+        Side of a pixel of the maps, m.
     every_h : float or None
         The config's own interval, h; None: its times are not regular.
     promises : tuple of EpochPromise
-        By number of scans.
+        What an epoch shows, for each number of scans that it may consist of.
     volumes_m3 : tuple of float
-        Volumes of blocks whose motion is judged.
+        Volumes, m3, of the moving blocks for which lead times are predicted.
     motion : Motion
-        How they move.
+        How these blocks move before they fall.
     """
 
     sensor: SensorName
@@ -140,18 +146,31 @@ class SeriesPlan:
 
     @property
     def schedules_h(self) -> list[float]:
-        """Intervals of the promised schedules, h."""
+        """Intervals between epochs, h, for which lead times are predicted."""
         own = () if self.every_h is None else (self.every_h,)
         return sorted({*SCHEDULES_H, *own})
 
     def lead_h(self, volume_m3: float, every_h: float, promise: EpochPromise) -> tuple[float, float]:
-        """Return the lead time, h, that is reached in 95 % of cases whenever epochs fall, and the median one; 0: none."""
+        """Return how long before its fall a moving block is noticed, h, as a cautious and a median value.
+
+        The cautious value is reached in 95 % of cases even if the last epoch was a whole interval ago when the motion became
+        large enough. Both are 0 if the motion is not noticed before the fall.
+
+        Parameters
+        ----------
+        volume_m3 : float
+            Volume of the block, m3.
+        every_h : float
+            Interval between epochs, h.
+        promise : EpochPromise
+            What an epoch shows.
+        """
         late = self.motion.time_left(promise.moved.displacement_m(volume_m3)[0]) - every_h
         usual = self.motion.time_left(promise.moved.displacement_m(volume_m3, 0.5)[0]) - every_h / 2
         return max(late, 0.0), max(usual, late, 0.0)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return everything for JSON."""
+        """Return the prediction as plan.json stores it."""
         return {
             "sensor": self.sensor,
             "gsd_m": self.gsd_m,
@@ -192,21 +211,21 @@ class SeriesPlan:
 
 
 def plan_series(config: SimulationConfig, sensor: SensorName, progress: Progress | None = None) -> SeriesPlan:
-    """Promise what the series of a config shows with a sensor.
+    """Predict what the series of a config will show with a sensor, from trial epochs that are compared as `monitor` does.
 
     Parameters
     ----------
     config : SimulationConfig
-        With a section `series` without `surfaces`.
+        A config with a section `series` that has no `surfaces`.
     sensor : str
         "stereo" or "tls".
     progress : Progress, optional
-        Is told the stages.
+        Receives the progress.
 
     Raises
     ------
     InputError
-        If the config has no such section, or the wall has no room for trial blocks.
+        If the config has no such section, if the wall has no room for trial blocks, or if the sensor sees too few of them.
     """
     if config.series is None or config.series.surfaces:
         raise InputError(
@@ -274,9 +293,10 @@ class _Sample:
         size = 3 if self._moved else 2
         if len(used) < _FEWEST:
             raise InputError(
-                f"the sensor sees enough of only {len(used)} of {len(rows)} trial blocks",
+                f"the sensor sees enough of only {len(used)} of {len(rows)} blocks that were placed on the wall as a trial",
                 where="inspect --series",
-                remedy="show it more of the wall: see scarpsim inspect without --series",
+                allowed=f"{_FEWEST} blocks or more",
+                remedy="move or turn the sensor so that it sees more of the wall; the map of scarpsim inspect shows what it sees",
             )
         design, listed = _design(used[:, 0], used[:, 1], size), used[:, 3]
         best = _fit(design, listed)

@@ -1,4 +1,4 @@
-"""Say in words and pictures what a series promises."""
+"""Describe in words and pictures what a series of epochs is predicted to show."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _CURVE_POINTS = 80
 
 @dataclass(frozen=True)
 class SeriesPart:
-    """What the report's page shows of one series: sentences, curves as PNG, and the rows of a table with its heads."""
+    """What the report's page shows of one series: sentences, curves as PNG, and a table's header and rows."""
 
     title: str
     sentences: list[str]
@@ -27,7 +27,7 @@ class SeriesPart:
 
 
 def series_summary(plan: SeriesPlan) -> str:
-    """Describe the promise of a series as lines of text."""
+    """Describe the prediction for a series as lines of text for the terminal."""
     part = series_part(plan)
     widths = [max(len(row[place]) for row in [part.heads, *part.rows]) for place in range(len(part.heads))]
     table = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in [part.heads, *part.rows]]
@@ -35,7 +35,7 @@ def series_summary(plan: SeriesPlan) -> str:
 
 
 def series_part(plan: SeriesPlan) -> SeriesPart:
-    """Collect what the page shows of a series."""
+    """Collect what the report's page shows of one series."""
     return SeriesPart(
         title=f"{_SENSORS[plan.sensor]}, series, maps of {plan.gsd_m * 1e3:g} mm a pixel",
         sentences=_sentences(plan),
@@ -98,5 +98,5 @@ def _hours(hours: float) -> str:
 
 
 def series_parts(plans: Sequence[SeriesPlan]) -> list[SeriesPart]:
-    """Collect the parts of several series."""
+    """Collect what the report's page shows of several series."""
     return [series_part(plan) for plan in plans]

@@ -76,7 +76,7 @@ def detection_trials(
     side_m : float
         Side of the cubes, m.
     config : PlanningConfig
-        The test.
+        Critical value, least number of points and registration error of the test.
     random : KeyedRandom
         Source of random numbers.
     count : int

@@ -146,9 +146,10 @@ def lattice(step_a: FloatArray, step_b: FloatArray, normals: FloatArray, sights:
 
 
 def detection_probability(sampling: Sampling, side_m: FloatArray | float, config: PlanningConfig) -> FloatArray:
-    """Return the probability that the fall of a block is detected: its change exceeds the level of detection.
+    """Return the probability that the fall of a cube is detected: the change of the niche's floor exceeds the level of detection.
 
-    The module's docstring has the equations.
+    Change and level of detection are those of M3C2. The probability is the mean over the places of the sampling lattice relative
+    to the niche.
 
     Parameters
     ----------
@@ -157,7 +158,7 @@ def detection_probability(sampling: Sampling, side_m: FloatArray | float, config
     side_m : (n,) array or float
         Side of the cube that fell, m.
     config : PlanningConfig
-        The test.
+        Critical value, least number of points and registration error of the test; ratio of the niche's depth to the side.
 
     Returns
     -------
@@ -187,7 +188,7 @@ def smallest_block(sampling: Sampling, config: PlanningConfig) -> FloatArray:
     sampling : Sampling
         How the sensor samples the surface at n places.
     config : PlanningConfig
-        The test.
+        Critical value, least number of points and registration error of the test; ratio of the niche's depth to the side.
 
     Returns
     -------
@@ -208,7 +209,7 @@ def smallest_clear_block(sampling: Sampling, config: PlanningConfig) -> FloatArr
     sampling : Sampling
         How the sensor samples the surface at n places.
     config : PlanningConfig
-        The test.
+        Critical value, least number of points and registration error of the test; ratio of the niche's depth to the side.
 
     Returns
     -------
@@ -219,7 +220,10 @@ def smallest_clear_block(sampling: Sampling, config: PlanningConfig) -> FloatArr
 
 
 def signal_to_noise(sampling: Sampling, side_m: FloatArray | float, config: PlanningConfig) -> FloatArray:
-    """Return the mean change that a fallen block causes, divided by its standard deviation (f h / tau in the module's docstring).
+    """Return the signal-to-noise ratio of a fallen cube: the mean change on the niche's floor over its standard deviation.
+
+    The mean change is the niche's depth times the share of the beams that hit its floor. The standard deviation is that of the
+    difference of two epochs' means over the floor, including the error of their registration.
 
     Parameters
     ----------
@@ -228,7 +232,7 @@ def signal_to_noise(sampling: Sampling, side_m: FloatArray | float, config: Plan
     side_m : (n,) array or float
         Side of the cube that fell, m.
     config : PlanningConfig
-        The test.
+        Ratio of the niche's depth to the cube's side, and standard deviation of the registration.
 
     Returns
     -------

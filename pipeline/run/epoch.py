@@ -71,13 +71,13 @@ class LaterEpoch:
     surface : TriangleMesh
         The reconstructed surface before registration.
     registration : Registration, optional
-        To the reference.
+        Registration of the surface to the reference; None without ICP.
     raster : SurfaceRaster
         The registered surface.
     difference : (h, w) float32 array
         Reference minus epoch, m.
     statistics : BlockStatistics
-        Of the difference map.
+        Statistics of the difference map.
     m3c2 : M3c2Map, optional
         Distances of the registered surface's vertices, if the config asks for them.
     since_last : SinceLast, optional
@@ -120,7 +120,7 @@ class EpochScene:
     solids : Blocks
         The blocks.
     records : list of dict
-        Their records, by label.
+        Records of the blocks, in the order of their labels.
     labels : int
         Largest label of a missing block.
     """
@@ -170,7 +170,7 @@ def observe_epoch(
     random : KeyedRandom
         The run's source of random numbers.
     progress : Progress
-        Is told the stages.
+        Receives the progress.
     """
     with progress.stage(f"epoch {number}: carve"):
         blocks = place_blocks(config.rockfall, site.mesh, random.child("epoch", number, "blocks"), reference.caster)
@@ -205,7 +205,7 @@ def observe_scene(
     random : KeyedRandom
         The run's source of random numbers.
     progress : Progress
-        Is told the stages.
+        Receives the progress.
     """
     keyed, blocks, records = random.child("epoch", number), scene.solids, scene.records
     carved = replace(scene.carved, mesh=with_wetness(config, scene.carved.mesh))

@@ -67,7 +67,7 @@ class EpochReport:
     number, points : int
         Number of the epoch, and of its points.
     inside, outside : Statistics
-        Of the difference map, inside and outside the blocks.
+        Statistics of the difference map inside and outside the blocks.
     sigma_m : float
         Noise level that sets the colour scale of the difference map, m.
     blocks : sequence of BlockRow

@@ -1,4 +1,4 @@
-"""Make the epochs of a series: the wall at each time, the sensor in the conditions of that time, and the truth, series.json."""
+"""Make the epochs of a series: the wall and the conditions of the sensor at each time, and the truth (series.json)."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ class SeriesConditions:
     Attributes
     ----------
     poses : list of PoseShift
-        Real against surveyed pose.
+        Real minus surveyed pose of the sensor, for each of n epochs.
     effects : dict of dicts of (n,) arrays
-        Departure of parameters, by effect and parameter.
+        Increase of each parameter of the sensor's effects, by effect and parameter.
     covers : list of Cover
-        Snow and vegetation.
+        Snow and vegetation at each epoch.
     """
 
     poses: list[PoseShift]
@@ -88,9 +88,9 @@ class Series:
     config : SimulationConfig
         Config of the run.
     series : SeriesConfig
-        Its section `series`.
+        Section `series` of the config.
     site : SensorSite
-        The untouched wall and the sensor as modelled.
+        The untouched wall, and the sensor with the config's model.
     random : KeyedRandom
         The run's source of random numbers.
     conditions : SeriesConditions
@@ -114,7 +114,7 @@ class Series:
         return self.site.frame.direction_to_wall(np.array([0.0, 0.0, 1.0]))
 
     def site_at(self, number: int) -> SensorSite:
-        """Return the wall, with its cover, and the sensor in the conditions of an epoch."""
+        """Return the wall with its snow and vegetation, and the sensor with its pose and effects, at an epoch."""
         shift = self.conditions.poses[number]
         values = {
             name: {key: float(course[number]) for key, course in each.items()} for name, each in self.conditions.effects.items()
@@ -145,7 +145,7 @@ class Series:
         return self.conditions.covers[number].on(mesh, self.up, self.random.child("series", "cover"))
 
     def rules(self) -> Rules:
-        """Draw the rockfalls. Raises InputError if the wall has no room for any."""
+        """Draw the rockfalls, and collect what is the same at all epochs. Raises InputError if the wall has no room for any."""
         keyed, given = self.random.child("series", "rockfalls"), self.series
         rockfalls = given_rockfalls(given.events, given.falls_h())
         if given.rockfall is not None:
@@ -174,7 +174,7 @@ class Series:
             before = state
 
     def _scene(self, state: WallState, rules: Rules, number: int) -> EpochScene:
-        """Return what a sensor meets at an epoch."""
+        """Return the wall, with its snow and vegetation, as a sensor sees it at an epoch."""
         fallen = state.fallen
         solids = join_blocks([each.block for each in fallen]) if fallen else no_blocks()
         volumes = np.array([each.volume_m3 for each in fallen])
@@ -186,7 +186,7 @@ class Series:
         return EpochScene(carved, solids, records, len(rules.rockfalls))
 
     def _surface(self, number: int) -> SeriesScene:
-        """Read the mesh of an epoch of a series of own surfaces."""
+        """Read the mesh that the user gave for an epoch (`surfaces`), wall frame."""
         path = self.series.surfaces[number]
         wall = self.config.wall
         if not isinstance(wall, ImportedWall):
@@ -207,11 +207,11 @@ class SeriesScene:
     number : int
         Number of the epoch.
     scene : EpochScene
-        What a sensor meets.
+        The wall as the sensor observes it, with the records of its blocks.
     state : WallState, optional
-        The wall; None for own surfaces, as is `rules`.
+        The wall with its niches and loose rocks; None, as is `rules`, if the user gives the meshes (`surfaces`).
     rules : Rules, optional
-        What happens in the series.
+        Rockfalls and their placement, which are the same for the whole series.
     new : (k,) int32 array
         Block labels of what has changed since the epoch before.
     """
@@ -239,11 +239,11 @@ def observe_series_epoch(
     reference : ReferenceEpoch
         The reference epoch.
     scene : SeriesScene
-        The wall.
+        The wall at this epoch.
     before : (h, w) array, optional
         Registered heights of the epoch before, m; None: the change since then is not computed.
     progress : Progress
-        Is told the stages.
+        Receives the progress.
     """
     site, number = series.site_at(scene.number), scene.number
     found = observe_scene(series.config, site, reference, number, scene.scene, series.random, progress)
@@ -269,7 +269,7 @@ def _new_labels(state: WallState, before: WallState, rules: Rules) -> IntArray:
 
 @dataclass
 class SeriesTruth:
-    """Collects the truth of a series while its epochs are made."""
+    """Collects the true rockfalls and motions of a series for series.json while its epochs are made."""
 
     series: Series
     rules: Rules | None = None
@@ -277,7 +277,7 @@ class SeriesTruth:
     volumes: list[dict[str, float]] | None = None
 
     def add(self, scene: SeriesScene) -> None:
-        """Take note of an epoch."""
+        """Add the true state of an epoch."""
         if scene.state is None:
             return
         self.rules = scene.rules

@@ -68,7 +68,7 @@ class _Run:
     identity : dict
         Sensor, seed, config and inputs, which distinguish it from other runs.
     progress : Progress
-        Is told the stages.
+        Receives the progress.
     products : dict
         Checksums by epoch folder, as in run.json.
     site : SensorSite, optional
@@ -113,7 +113,7 @@ def simulate(
     resume : bool
         Whether to continue an interrupted run.
     progress : Progress, optional
-        Is told the stages.
+        Receives the progress.
 
     Raises
     ------

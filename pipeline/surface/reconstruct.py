@@ -120,9 +120,10 @@ def colmap_surface(
         fused = read_ply_points(folder / "fused.ply").points
         if len(fused) < 100:
             raise InputError(
-                f"COLMAP fused {len(fused)} points of {len(points):,} per depth map",
+                f"COLMAP kept {len(fused)} points when it fused two depth maps of about {len(points):,} points each",
                 where="reconstruction: colmap",
-                remedy="raise fusion.maximum_depth_ratio, maximum_reprojection_px or maximum_normal_angle_rad",
+                allowed="100 points or more",
+                remedy="raise fusion.maximum_depth_ratio, fusion.maximum_reprojection_px or fusion.maximum_normal_angle_rad",
             )
         depth = surface.poisson_depth or octree_depth(fused)
         options = pycolmap.PoissonMeshingOptions(

@@ -53,7 +53,7 @@ class JoinedStations:
     surface : TriangleMesh
         The merged surface.
     registrations : tuple of Registration
-        Of the second station and those after it; empty without registration.
+        Registrations of the second and further stations to the first; empty without registration.
     """
 
     observations: tuple[Observation, ...]

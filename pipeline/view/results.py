@@ -109,7 +109,7 @@ class Item:
     name : str
         Title.
     box : tuple
-        x0, x1, y0, y1, z0, z1, m; z is NaN if unknown.
+        x0, x1, y0, y1, z0, z1, wall frame, m; z is NaN if unknown.
     facts : mapping of str
         Properties by name.
     """
@@ -128,7 +128,10 @@ class Item:
 
 
 class Results(Protocol):
-    """Base class of the folders that the page can show.
+    """Base class of the result folders that the page of `scarpsim view` can show, one class for each kind of folder.
+
+    A step is one of the states between which the user moves, such as an epoch. A surface is a raster of heights that the page
+    can draw, such as that of the first or of the second epoch.
 
     Attributes
     ----------
@@ -136,8 +139,8 @@ class Results(Protocol):
         Title of the page.
     step_name : str
         What a step is called, such as "epoch".
-    steps, surfaces : mapping
-        Keys and labels; the first is shown first.
+    steps, surfaces : mapping of str to str
+        Label on the page by key, where the key is the argument of the methods; the first is shown first.
     """
 
     title: str
@@ -154,7 +157,7 @@ class Results(Protocol):
         ...
 
     def layers(self, step: str) -> Sequence[Layer]:
-        """Return the quantities that can give the colours."""
+        """Return the quantities that can give the colours of a step, given by its key."""
         ...
 
     def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
@@ -181,7 +184,7 @@ class Results(Protocol):
         ...
 
     def items(self, step: str) -> Sequence[Item]:
-        """Return blocks, detections and the like of a step."""
+        """Return the blocks, detections, events or changes of a step, given by its key, that the user can select."""
         ...
 
 

@@ -50,7 +50,7 @@ class Carved:
 
 @dataclass(frozen=True)
 class BlockMeshes:
-    """The four meshes of one block (thesis, section 3.3), wall frame.
+    """The meshes that show how one block is cut out of the wall (thesis, section 3.3), wall frame.
 
     Attributes
     ----------
@@ -147,7 +147,17 @@ def block_records(blocks: Blocks, removed_volume_m3: FloatArray) -> list[dict[st
 
 
 def block_meshes(mesh: TriangleMesh, blocks: Blocks, index: int) -> BlockMeshes:
-    """Compute the four meshes of the block with this index (label index + 1) from the patch of the wall around it."""
+    """Compute wall difference, intersection, niche and removed block of one block, from the patch of the wall around it.
+
+    Parameters
+    ----------
+    mesh : TriangleMesh
+        The intact wall, wall frame.
+    blocks : Blocks
+        All blocks.
+    index : int
+        Index of the block, from 0. The meshes carry its block label, index + 1.
+    """
     block = blocks.only(index)
     rows = faces_under_boxes(mesh, block.bbox, _HALO_M)
     wall, _ = close_patch(mesh, rows, float(block.bbox[0, 0, 2]))

@@ -83,7 +83,10 @@ class RayCaster:
             raise InputError("the mesh has no triangles", where="ray casting", remedy="use a mesh with triangles")
         if not np.abs(mesh.bounds).max() < _LARGEST_COORDINATE:
             raise InputError(
-                f"coordinates reach {np.abs(mesh.bounds).max():.0f} m", where="ray casting", remedy="work in the wall frame"
+                f"coordinates reach {np.abs(mesh.bounds).max():.0f} m, too far from the origin for single precision",
+                where="ray casting",
+                allowed=f"less than {_LARGEST_COORDINATE:.0f} m",
+                remedy="check the mesh's unit, or subtract its centre from the coordinates of mesh and sensor",
             )
         self.mesh = mesh
         shape = mi.Mesh("surface", len(mesh.vertices), len(mesh.faces))

@@ -19,7 +19,7 @@ _LEAF_M, _PATCH_M = 0.08, 1.5
 
 @dataclass(frozen=True)
 class Cover:
-    """What lies or grows on the rock.
+    """Snow and vegetation on the rock at one epoch.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class Cover:
     vegetation_m: float = 0.0
 
     def on(self, mesh: TriangleMesh, up: FloatArray, random: KeyedRandom) -> TriangleMesh:
-        """Return a wall with its cover. up: (3,) direction against gravity. `random` decides where vegetation grows."""
+        """Return the wall with its snow and vegetation added. up: (3,) unit vector against gravity. random: where plants grow."""
         if self.snow_m <= 0 and self.vegetation_m <= 0:
             return mesh
         normals = np.nan_to_num(mesh.vertex_normals())

@@ -98,7 +98,7 @@ def lay_fragments(
     wall : TriangleMesh
         The wall without the rock.
     ground : Ground
-        Where down is.
+        The ground at the wall's foot, and the direction of gravity.
     earlier : sequence of Deposit
         Fragments that lie there already.
     config : DepositsConfig

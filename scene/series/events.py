@@ -22,15 +22,15 @@ class Rockfall:
     number : int
         Number of the rockfall, from 1, in the order of the first motion.
     key : str
-        Names the rockfall as the source of random numbers, whatever the others are.
+        Key of the rockfall's random numbers, which does not depend on the other rockfalls.
     falls_h : float
-        When it falls.
+        Time of the fall, h.
     volume_m3 : float
         Volume of the rock.
     position_m : (x, y), optional
-        Where, wall frame, m; None: at random.
+        Place of the block, wall frame, m; None: at random.
     motion : Motion, optional
-        How it moves before; None: not at all.
+        How the block moves before it falls; None: not at all.
     """
 
     number: int
@@ -42,7 +42,7 @@ class Rockfall:
 
     @property
     def starts_h(self) -> float:
-        """When it begins to move, or falls."""
+        """When the block begins to move, or falls if it does not move before, h."""
         return self.falls_h - (0.0 if self.motion is None else self.motion.lead_h)
 
     def displacement_m(self, time_h: float) -> float | None:

@@ -29,7 +29,7 @@ KINDS = ("missing", "moved", "deposit")
 
 @dataclass(frozen=True)
 class Rules:
-    """What stays the same in a time series of one wall: the rockfalls to come and how blocks are placed.
+    """What stays the same in a time series of one wall: all rockfalls, and how their blocks are shaped and placed.
 
     Attributes
     ----------
@@ -38,9 +38,9 @@ class Rules:
     shapes : RockfallConfig
         Shapes and placement of the blocks.
     deposits : DepositsConfig, optional
-        Fragments of fallen rocks; None: they disappear.
+        Number and sizes of the fragments of fallen rocks; None: fallen rocks disappear.
     ground : Ground
-        Where they come to rest.
+        The ground at the foot of the wall, on which fragments come to rest.
     rockfalls : tuple of Rockfall
         All rockfalls.
     random : KeyedRandom
@@ -71,7 +71,7 @@ class Loose:
     Attributes
     ----------
     rockfall : Rockfall
-        Its time and motion.
+        Time, volume and motion of the rockfall.
     block : Blocks
         The block that cut it out.
     volume_m3 : float

@@ -120,7 +120,8 @@ class Camera:
     width, height : int
         Size of the frame, px.
     f_px, cx_px, cy_px, b1, b2, k1, k2, k3, k4, p1, p2
-        Interior orientation; see the module.
+        Interior orientation in Metashape's model: principal distance, principal point from the frame's centre, affinity and skew
+        (all px), and radial and tangential distortion.
     position : (3,) array
         Perspective centre, m.
     rotation : (3, 3) array

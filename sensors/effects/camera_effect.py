@@ -7,7 +7,10 @@ from sensors.effects.base import Effect, ShowsIn, Stage
 
 
 class CameraEffect(Effect):
-    """An effect on the pair of cameras (`CameraPair`). Its effect on disparities follows from projecting through both pairs."""
+    """An effect by which the real camera pair differs from the nominal (calibrated) one; `camera` says which camera it alters.
+
+    Its effect on disparities is the difference between projecting the rock into the real and into the nominal pair.
+    """
 
     sensor = "stereo"
     stage = Stage.CAMERA

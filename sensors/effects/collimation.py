@@ -27,6 +27,6 @@ class Collimation(AimEffect):
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
         """Return recorded minus true azimuth and zenith, rad: the collimation error over sin(zenith), and zero.
 
-        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
         """
         return p.angle_rad / m.sin(at.zenith), 0.0

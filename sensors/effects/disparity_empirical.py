@@ -42,13 +42,13 @@ class DisparityEmpirical(Effect):
         return not any(map(any, self.values_px))
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        """Add the value at each match's covariates, px, to its disparity."""
+        """Add c(x, y), px, the curve or surface `values_px` interpolated at each match, to the match's disparity."""
         x, y = (self._of(state, each) for each in (self.covariate, self.second or self.covariate))
         return replace(state, disparity=state.disparity + interpolate(x, y, self.along, self.across, self.values_px))
 
     @staticmethod
     def _of(matches: Matches, covariate: Covariate) -> mi.Float64:
-        """Return a quantity (n,) by its name."""
+        """Return a covariate x or y (n,) of the matches by its name, px; depth in m."""
         match covariate:
             case "image_x":
                 return matches.u

@@ -29,6 +29,6 @@ class HorizontalEccentricity(AimEffect):
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
         """Return recorded minus true azimuth, a sine of the azimuth, and zenith, which is zero; rad.
 
-        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
         """
         return p.amplitude_rad * m.sin(at.azimuth + p.phase_rad), 0.0

@@ -32,9 +32,9 @@ class AimEffect(Effect):
 
     @abstractmethod
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
-        """Return recorded minus true azimuth and zenith, rad.
+        """Return recorded minus true azimuth and zenith, (n,) each, rad; a number if it is the same for all pulses.
 
-        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
         """
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
@@ -57,9 +57,9 @@ class RangeEffect(Effect):
 
     @abstractmethod
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
-        """Return recorded minus true range, m.
+        """Return recorded minus true range (n,), m; a number if it is the same for all pulses.
 
-        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
         """
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
@@ -81,9 +81,9 @@ class RangeSpread(Effect):
 
     @abstractmethod
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
-        """Return the standard deviation of the range, m.
+        """Return the standard deviation of the range (n,), m; a number if it is the same for all pulses.
 
-        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
         """
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:

@@ -38,7 +38,7 @@ class RangeCyclic(RangeEffect):
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
         """Return the range error (n,), m, a sine of the range.
 
-        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
         """
         return p.amplitude_m * m.sin(2 * math.pi * at.range_m / p.period_m + p.phase_rad)
 

@@ -26,6 +26,6 @@ class RangeIncidenceBias(RangeEffect):
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
         """Return the range error (n,), m, in proportion to 1 / cos i - 1.
 
-        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
         """
         return p.coefficient_m * slant(at.cos_incidence, m)

@@ -40,23 +40,23 @@ class RangeIntensityBias(RangeEffect):
     )
 
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
-        """Return the range error (n,), m, in proportion to the logarithm of the received power over I_0.
+        """Return the range error (n,), m, in proportion to the logarithm of the received power over the reference power.
 
-        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
         """
         return p.coefficient_m * m.log(at.power / p.reference_power)
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Add the range error, m; if no I_0 is given, it is the median power of all pulses that return."""
+        """Add the range error, m. If no reference power is given, it is the median power of all pulses that return."""
         if self.reference_power:
             return super().evaluate(state, random)
         state = state.evaluated()
         return self._about(np.array(state.power)[np.array(state.returned)]).evaluate(state, random)
 
     def mean(self, at: PulseGeometry) -> FloatArray:
-        """Return the range error (n,), m; if no I_0 is given, it is the median power of the given pulses."""
+        """Return the range error (n,), m. If no reference power is given, it is the median power of the given pulses."""
         return super().mean(at) if self.reference_power else self._about(at.power).mean(at)
 
     def _about(self, power: FloatArray) -> RangeIntensityBias:
-        """Return the same effect with the median of some powers as I_0."""
+        """Return the same effect with the median of some powers as reference power."""
         return self.model_copy(update={"reference_power": (float(np.median(power)) if power.size else 0.0) or 1.0})

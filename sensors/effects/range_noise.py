@@ -21,6 +21,6 @@ class RangeNoise(RangeSpread):
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
         """Return the standard deviation of the range, m, the same for all pulses.
 
-        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
         """
         return p.sigma_m

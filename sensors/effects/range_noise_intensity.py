@@ -41,6 +41,6 @@ class RangeNoiseIntensity(RangeSpread):
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
         """Return the standard deviation of the range (n,), m, a power of the received power.
 
-        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
         """
         return p.a_m * at.power**p.exponent

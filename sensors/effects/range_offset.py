@@ -26,6 +26,6 @@ class RangeOffset(RangeEffect):
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
         """Return the range error, m, the same for all pulses.
 
-        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
         """
         return p.offset_m

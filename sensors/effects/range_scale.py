@@ -31,6 +31,6 @@ class RangeScale(RangeEffect):
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
         """Return the range error (n,), m, in proportion to the range.
 
-        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
         """
         return p.scale_ppm * 1e-6 * at.range_m

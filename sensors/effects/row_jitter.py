@@ -38,9 +38,10 @@ class RowJitter(Effect):
     phase_rad: float = parameter("phase at the frame's top", unit="rad", source="empirical", null=None, default=0.0)
 
     def shift(self, row: Any, m: Functions, p: Any) -> Any:
-        """Return recorded minus ideal column (n,), px, of pixels at `row`, px.
+        """Return recorded minus ideal column (n,), px: the sine wave dx of the row.
 
-        row: row of the pixels, px; m: functions for this kind of array; p: the effect's parameters.
+        row: (n,) px from the top of the frame; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's
+        parameters.
         """
         return p.amplitude_px * m.sin(2 * math.pi * row / p.rows_per_cycle + p.phase_rad)
 

@@ -43,7 +43,7 @@ class TiltDrift(AimEffect):
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
         """Return recorded minus true azimuth and zenith, rad, which grow with the elapsed share of the scan.
 
-        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
         """
         turn_x, turn_y = p.rate_x_rad * at.share, p.rate_y_rad * at.share
         sin_azimuth, cos_azimuth = m.sin(at.azimuth), m.cos(at.azimuth)

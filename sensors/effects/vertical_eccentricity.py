@@ -29,6 +29,6 @@ class VerticalEccentricity(AimEffect):
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
         """Return recorded minus true azimuth, which is zero, and zenith, a sine of the zenith; rad.
 
-        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
         """
         return 0.0, p.amplitude_rad * m.sin(at.zenith + p.phase_rad)

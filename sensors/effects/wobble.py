@@ -39,7 +39,7 @@ class Wobble(AimEffect):
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
         """Return recorded minus true azimuth, which is zero, and zenith, a sine of the scan line; rad.
 
-        at: geometry of the pulses; m: functions for this kind of array; p: the effect's parameters.
+        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
         """
         return 0.0, p.amplitude_rad * m.sin(2 * math.pi * at.line / p.lines_per_cycle + p.phase_rad)
 

@@ -25,11 +25,17 @@ AxisCourses = Annotated[
     Annotated[Course, Tag("all axes")] | Annotated[tuple[Course, Course, Course], Tag("per axis")],
     Discriminator(lambda value: "per axis" if isinstance(value, list | tuple) else "all axes"),
 ]
-"""One course for each of the three axes, or a list of three; random walks are drawn for each axis."""
+"""One course (a quantity over time: random walk, drift, cycle or table) for all three axes, or a list of three, x, y, z.
+
+A random walk is drawn for each axis independently.
+"""
 
 
 class PoseCourses(Config):
-    """How the sensor's real pose departs from the surveyed one."""
+    """How the sensor's real pose departs from the surveyed one over a series of epochs.
+
+    Each quantity is a course, that is a function of time: a random walk, a drift, a cycle or a table.
+    """
 
     position_m: AxisCourses | None = Field(None, description="real minus surveyed position, world x, y, z [m]")
     rotation_rad: AxisCourses | None = Field(
@@ -45,7 +51,7 @@ def _parameters(values: Any) -> Any:
 
 
 def _of_effect(name: str, courses: Any) -> Any:
-    """Return the courses of an effect by parameter."""
+    """Return the courses (changes over time) of one effect's parameters, by parameter."""
     names = [effect.tag() for effect in EFFECTS]
     if name.rpartition(".")[2] not in names:
         raise ValueError(f"unknown effect '{name}'; {nearest(name, names) or 'see the effects of the reference'}")
@@ -63,12 +69,15 @@ def _of_effect(name: str, courses: Any) -> Any:
 
 
 EffectCourses = Annotated[dict[str, dict[str, Course]], BeforeValidator(_parameters)]
-"""Courses by effect and parameter."""
+"""Changes of effects' parameters over time: a course for each parameter, by effect and parameter."""
 
 
 @dataclass(frozen=True)
 class PoseShift:
-    """Real against surveyed pose at one epoch. position_m, rotation_rad: (3,) along and about the world's axes."""
+    """Real minus surveyed pose at one epoch, along and about the axes of the world frame.
+
+    position_m: (3,) displacement, m. rotation_rad: (3,) rotation, rad.
+    """
 
     position_m: FloatArray
     rotation_rad: FloatArray
@@ -80,7 +89,7 @@ class PoseShift:
 
 
 def pose_shifts(courses: PoseCourses | None, hours: FloatArray, random: KeyedRandom) -> list[PoseShift]:
-    """Return the pose's departure at each time (n,), h."""
+    """Return the real minus the surveyed pose at n times `hours`, h after the first epoch; null without a course."""
     found = np.zeros((2, len(hours), 3))
     for row, name in enumerate(("position_m", "rotation_rad")):
         given: AxisCourses | None = None if courses is None else getattr(courses, name)
@@ -92,7 +101,7 @@ def pose_shifts(courses: PoseCourses | None, hours: FloatArray, random: KeyedRan
 
 
 def effect_values(courses: EffectCourses, hours: FloatArray, random: KeyedRandom) -> dict[str, dict[str, FloatArray]]:
-    """Return the departure (n,) of each parameter at each time (n,), h, by effect and parameter."""
+    """Return by how much each parameter of an effect is larger at n times `hours`, h: arrays (n,) by effect and parameter."""
     return {
         name: {key: course.values(hours, random.child(name, key)) for key, course in parameters.items()}
         for name, parameters in courses.items()
@@ -119,7 +128,7 @@ def with_stereo_effects(model: StereoModel, values: Mapping[str, Mapping[str, fl
 
 
 def _changed(effects: tuple[Any, ...], sensor: str, values: Mapping[str, Mapping[str, float]]) -> tuple[Effect, ...]:
-    """Return effects with changed parameters."""
+    """Return the effects with the parameters of those of one sensor increased by `values`, by effect and parameter."""
     found: list[Effect] = list(effects)
     for name, parameters in values.items():
         kind = effect_of(name)

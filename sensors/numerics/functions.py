@@ -15,7 +15,8 @@ from scene.common.backend import dr, mi
 class Functions:
     """Elementary functions for one kind of array: those of the ray-tracing device or NumPy's.
 
-    select(condition, a, b) is a where the condition holds, else b.
+    The equations of the effects take it as argument `m`, so that one equation serves the simulation (`DEVICE`) and the
+    diagnosis (`HOST`). select(condition, a, b) is a where the condition holds, else b.
     """
 
     sin: Callable[[Any], Any]

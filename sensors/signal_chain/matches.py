@@ -98,7 +98,7 @@ class Matches:
         return np.where(self.matched.numpy(), self.albedo.numpy(), np.nan).reshape(self.shape)
 
     def sampled(self, raster: FloatArray) -> mi.Float64:
-        """Return the values (n,) of a raster (rows, columns) at the matches."""
+        """Return the values (n,) of a raster (rows, columns) over the depth map, one for each cell, row by row."""
         return on_device(mi.Float64, raster)
 
     def with_raster(self, disparity: FloatArray) -> Matches:

@@ -20,9 +20,9 @@ metres.
 
 
 def slant(cos_incidence: Any, m: Functions) -> Any:
-    """Return 1 / cos i - 1 (n,), the relative stretch of the echo from an inclined surface.
+    """Return 1 / cos i - 1 (n,), the relative stretch of the echo from an inclined surface; incidence i is limited to 84 degrees.
 
-    m: functions of host or device arrays.
+    cos_incidence: (n,) NumPy or Dr.Jit array. m: elementary functions for it, `HOST` for NumPy or `DEVICE` for Dr.Jit.
     """
     return 1 / m.select(cos_incidence < 1 / _STEEPEST, 1 / _STEEPEST, cos_incidence) - 1
 

@@ -87,7 +87,7 @@ def _projected(camera: Camera, point: mi.Array3f64) -> tuple[mi.Float64, mi.Floa
 
 
 def _kept(mesh: TriangleMesh, kept: np.ndarray) -> TriangleMesh:
-    """Return the mesh of the triangles whose vertices are all kept."""
+    """Return the mesh of the triangles whose vertices are all `kept` (n,). Raises InputError if there is none."""
     chosen = kept[mesh.faces].all(axis=1)
     if not chosen.any():
         raise InputError(
@@ -110,7 +110,7 @@ def _kept(mesh: TriangleMesh, kept: np.ndarray) -> TriangleMesh:
 
 
 class _TracedCells:
-    """The ray-traced depth map of the same observation, computed only if an effect needs it."""
+    """The ray-traced depth map of the observation whose vertices are simulated, computed only if an effect needs it."""
 
     def __init__(self, pair: StereoPair, scene: RayCaster, effects: tuple[Effect, ...], random: KeyedRandom) -> None:
         self._look = pair, scene, effects, random
@@ -124,37 +124,44 @@ class _TracedCells:
 
 @dataclass(frozen=True)
 class VertexMatches(Matches):
-    """Matches of n vertices instead of cells: `index` is the vertex, (u, v) its position in the left image.
+    """Matches of the n vertices of the wall's mesh instead of a depth map's cells; `index` is the vertex, (u, v) its left pixel.
+
+    An effect that depends on neighbouring pixels, such as smoothing, cannot act on vertices. It acts on the ray-traced depth map
+    of the same observation, and each vertex takes over the change of disparity that the effect made at its pixel.
 
     Attributes
     ----------
     cells : _TracedCells
-        The depth map for effects that depend on neighbours.
+        The ray-traced depth map, computed when an effect first needs it.
     before : (rows, columns) array, optional
-        Its disparities after the effects so far; None before the first.
+        Disparities of that depth map after the effects so far, px; None before the first.
     """
 
     cells: _TracedCells
     before: FloatArray | None = None
 
     def raster(self) -> FloatArray:
-        """Return the disparities of the depth map after the effects so far."""
+        """Return the disparities (rows, columns), px, of the depth map after the effects so far; NaN without a match."""
         return self.cells.matches.raster() if self.before is None else self.before
 
     def albedo_raster(self) -> FloatArray | None:
-        """Return the albedo of the depth map."""
+        """Return the albedo (rows, columns) of the rock that each cell of the depth map sees; None for a wall without albedo."""
         return self.cells.matches.albedo_raster()
 
     def sampled(self, raster: FloatArray) -> mi.Float64:
-        """Return the values (n,) of a raster (rows, columns) at the vertices."""
+        """Return the values (n,) of a raster (rows, columns) over the depth map, each from the cell in which the vertex lies."""
         columns, rows = (cell_index(place / self.reduction, count) for place, count in self._axes())
         return dr.gather(mi.Float64, on_device(mi.Float64, raster), rows * dr.opaque(mi.UInt32, self.shape[1]) + columns)
 
     def with_raster(self, disparity: FloatArray) -> Matches:
-        """Add the change of the surrounding cells' disparities to the vertices.
+        """Transfer an effect on the depth map to the vertices: return matches whose disparities contain the effect's change.
 
-        A vertex takes the bilinear mean of the change if all four cells are on its surface, else that of the cell whose
-        disparity is closest to the vertex's. Half-occluded cells count as background.
+        The change of a cell is `disparity` minus `raster()`. A vertex takes the bilinear mean of the changes of the four cells
+        round its pixel if all four see the vertex's surface, that is if their disparities differ from its own by less than one
+        cell. Otherwise, as at a depth step, it takes the change of the cell whose disparity is closest. Cells without a match,
+        which are half-occluded, count as background.
+
+        disparity: (rows, columns) disparities of the depth map after the effect, px; NaN without a match.
         """
         was = fill_gaps(self.raster(), np.inf)
         change = on_device(mi.Float64, np.nan_to_num(disparity - was))
@@ -177,12 +184,12 @@ class VertexMatches(Matches):
         return replace(self, disparity=self.disparity + dr.select(one_surface, mean, nearest), before=disparity)
 
     def _beside(self, place: mi.Float64, count: int, side: int) -> tuple[mi.UInt32, mi.Float64]:
-        """Return the neighbouring cell for a linear interpolation at `place`, and its weight.
+        """Return the neighbouring cell (n,) along one axis for a linear interpolation, and its weight (n,).
 
         Parameters
         ----------
         place : mi.Float64, (n,)
-            Position, cells.
+            Position of the vertices along the axis, in cells from the edge of the frame.
         count : int
             Number of cells.
         side : int
@@ -193,6 +200,6 @@ class VertexMatches(Matches):
         return cell_index(first + side, count), share if side else 1 - share
 
     def _axes(self) -> tuple[tuple[mi.Float64, int], tuple[mi.Float64, int]]:
-        """Return the position in the left image and the number of cells, for each axis."""
+        """Return (u, number of columns) and (v, number of rows): left pixels of the vertices, px, and size of the depth map."""
         u, v = (dr.select(self.matched, place, 0.0) for place in (self.u, self.v))
         return (u, self.shape[1]), (v, self.shape[0])

@@ -92,9 +92,10 @@ def test_the_controls_by_keyboard(outputs: Path, page: WatchedPage) -> None:
         opened = drawn(page, address)
         opened.keyboard.press("Tab")
         assert opened.evaluate("document.activeElement.id") == "step"
-        for key in ("Enter", "ArrowDown", "Space"):
+        for key, chosen in (("Enter", "1"), ("ArrowDown", "2")):
             opened.keyboard.press(key)
-            opened.wait_for_timeout(200)
+            page.wait_for(lambda value=chosen: opened.evaluate("document.activeElement.value") == value)
+        opened.keyboard.press("Space")
         says(opened, "#step-value", "epoch 2")
         seen = []
         while "next" not in seen and len(seen) < 30:

@@ -13,7 +13,7 @@ from scene.geometry.frame import WallFrame
 from scene.meshes.cleaning import clean, triangle_areas
 from scene.walls.imported import ImportedWall
 from scene.walls.procedural import SITES, ProceduralWall
-from scene.walls.rock import SplineNoise
+from scene.walls.rock import SplineNoise, Table
 from scene.walls.wall import WallConfig, build_wall
 
 STYLES = get_args(ProceduralWall.model_fields["style"].annotation)
@@ -149,3 +149,9 @@ def test_wrong_keys_are_answered_with_the_right_ones():
         parse(Run, {"wall": {"resolution_m": -1.0}}, "c")
     with pytest.raises(InputError, match="did you mean 'unit'"):
         parse(Run, {"wall": {"mesh": "a.ply", "units": "m"}}, "c")
+
+
+def test_a_table_is_the_linear_interpolation_between_its_knots_and_constant_beyond() -> None:
+    knots, values = np.array([-1.5, 0.25, 2.0]), np.array([0.3, -0.8, 1.1])
+    x = np.linspace(-3.0, 4.0, 1001, dtype=np.float32)[None]
+    assert Table.through(knots, values).at(x) == pytest.approx(np.interp(x, knots, values), abs=0.01)  # kinks within a sample

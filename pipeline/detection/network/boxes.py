@@ -112,7 +112,10 @@ def mirrored_codes(codes: Tensor, axes: Axes) -> Tensor:
 
 
 def doublings(boxes: Tensor) -> Tensor:
-    """Return (...) the base-2 logarithm of the sides of boxes (..., 4), the roots of their areas (at least 1 px), over 16 px."""
+    """Return log2(s / 16 px) (...), the size of boxes in doublings, where s is the root of the box's area, at least 1 px.
+
+    The detector corrects its scores by size with it. boxes: (..., 4) y0, x0, y1, x1, px.
+    """
     return 0.5 * ops.log2(ops.maximum(_area(boxes), 1.0)) - 4.0
 
 

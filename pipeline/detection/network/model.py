@@ -82,7 +82,18 @@ class MaskRCNN(keras.Model):
         self.built = True  # all layers are functional models with known shapes
 
     def call(self, inputs: dict[str, Tensor], training: bool = False) -> dict[str, Tensor]:
-        """Return the losses by name if the inputs have blocks, else the boxes, scores and masks of `_detections`."""
+        """Run the network on b images: the losses if the inputs have ground truth, else the detections.
+
+        Parameters
+        ----------
+        inputs : `image` (b, h, w, c); for training also `boxes`, `labels` and `valid`, as `network_input` makes them, batched.
+        training : Whether the layers, such as batch normalisation, are in training mode; only with ground truth for the heads.
+
+        Returns
+        -------
+        The losses by name, or n detections an image, best first: `boxes` (b, n, 4) y0, x0, y1, x1, px; `scores` (b, n), -1 where
+        there are fewer; `masks` (b, n, m, m), probabilities; and `mask_boxes` (b, n, 4), px, the areas that the masks cover.
+        """
         first = self.first_stage(inputs["image"], training=training)
         proposals = self._proposals(first.logits, first.codes)
         if "boxes" in inputs:

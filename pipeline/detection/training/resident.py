@@ -26,19 +26,19 @@ from scene.common.errors import InputError
 Array = Any
 """An array of JAX."""
 Batch = dict[str, Array]
-"""As `data.Batch`, on the device."""
+"""Inputs of the network by name for a batch of tiles, in the device's memory."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ResidentSet:
-    """n tiles of side s as the network takes them, on the device.
+    """n tiles of s x s pixels with c channels and up to g blocks each, as the network takes them, in the device's memory.
 
     Attributes
     ----------
     images : (n, s, s, c) float16.
     labels : (n, s, s) uint16, 1 + the index of a pixel's block, 0 for none.
-    boxes : (n, g, 4) float32 y0, x0, y1, x1, px.
+    boxes : (n, g, 4) float32 y0, x0, y1, x1 of the blocks, px; places without a block are empty.
     valid : (n, g) 1 for a block, -1 for one left out of the loss, 0 for an empty place.
     areas : (n, g) pixels of each block.
     """

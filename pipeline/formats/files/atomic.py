@@ -93,7 +93,11 @@ def explained(path: Path) -> Iterator[None]:
 
 @contextmanager
 def noting() -> Iterator[list[Path]]:
-    """Collect the files that `writing` completes in the block, in this thread; blocks may be nested."""
+    """Collect the paths of the files that this thread completes in the block, so that a failed command can remove them.
+
+    A file counts when it has its final name (see `writing` and `note`). Blocks may be nested: when the inner one ends, its files
+    are added to the outer list.
+    """
     outer, found = _noted.get(), list[Path]()
     token = _noted.set(found)
     try:

@@ -69,7 +69,11 @@ def write_copc(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, he
     remaining points takes all of them. Raises InputError for an empty cloud, or if the file cannot be written.
     """
     if not len(cloud.points):
-        raise InputError("has no points to write", where=str(path), remedy="write LAZ")
+        raise InputError(
+            "there are no points to write, and a COPC file cannot be empty",
+            where=str(path),
+            remedy="write a LAZ file, which can be empty, or check why there are no points",
+        )
     stored = StoredCloud.of(cloud, pulses, header)
     tree = octree(stored.steps())
     with writing(path) as temporary, temporary.open("w+b") as file:

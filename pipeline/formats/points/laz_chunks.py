@@ -44,7 +44,9 @@ def count_points(path: Path) -> int:
 
 
 def read_chunks(path: Path, unit: str | None = None) -> Iterator[FloatArray]:
-    """Yield the points (n, 3), m, of a LAS or LAZ file, chunk by chunk, without those that the file takes out of use.
+    """Yield the points (n, 3), m, of a LAS or LAZ file, chunk by chunk.
+
+    Points are left out if they are flagged as withheld or synthetic, classified as noise, or at 0 0 0 (no return).
 
     Parameters
     ----------

@@ -338,9 +338,11 @@ _CORRELATIONS: list[Callable[[FloatArray], FloatArray]] = [
 
 @dataclass(frozen=True)
 class ProjectedColumns:
-    """k design columns (or residuals), divided into their parts within and between the m cells of the wall.
+    """k design columns (or residuals) at n points, divided into their parts within and between the m cells of the wall.
 
-    The reference's error varies little within a cell, so only the part between cells depends on its covariance.
+    The wall is divided into at most about 800 square cells (`WallCells`), each with several points. The part between cells is
+    the mean of a column in each cell, the part within cells the deviation from it. The reference's error varies little within a
+    cell, so only the part between cells depends on its covariance.
 
     Attributes
     ----------
@@ -356,7 +358,7 @@ class ProjectedColumns:
 
     @classmethod
     def concatenate(cls, parts: Sequence[ProjectedColumns]) -> ProjectedColumns:
-        """Join the columns of several sets of the same points, in their order."""
+        """Join the design columns of several sets of effects for the same n points, in the order of the sets."""
         if len(parts) == 1:
             return parts[0]
         within = np.concatenate([each.within for each in parts], axis=1)
@@ -372,11 +374,11 @@ class ProjectedColumns:
         return ProjectedColumns(within, weighed, [part[:, columns] for part in self.between])
 
     def in_bases(self, bases: list[int]) -> ProjectedColumns:
-        """Keep the cell means for only some of the trial correlation functions of the reference error, given by their indices."""
+        """Return the same columns, with `between` only for the trial correlation functions that have these indices."""
         return ProjectedColumns(self.within, self.within_weighted, [self.between[basis] for basis in bases])
 
     def append(self, other: ProjectedColumns) -> ProjectedColumns:
-        """Return these columns followed by the columns of another set of the same points."""
+        """Return these design columns followed by those of another set of effects for the same n points."""
         return ProjectedColumns.concatenate([self, other])
 
 

@@ -69,7 +69,7 @@ class Gap:
 
     @property
     def scores(self) -> dict[str, float]:
-        """The scores before, after and floor, by name."""
+        """The scores of input model, model with the named effects and noise floor, as `before`, `after` and `floor`."""
         return {"before": self.before, "after": self.after, "floor": self.floor}
 
     @property
@@ -87,12 +87,12 @@ class Gap:
 
     @property
     def above_floor(self) -> bool:
-        """Whether the score before exceeds the floor by more than its uncertainty."""
+        """Whether the score of the input model (`before`) exceeds the noise floor by more than its uncertainty, `floor_error`."""
         return self.before - self.floor > thresholds().verdict.floor_sigmas * self.floor_error
 
     @property
     def left_open(self) -> bool:
-        """Whether the score after exceeds the floor by more than its uncertainty."""
+        """Whether the score with the named effects (`after`) exceeds the floor by more than the uncertainty `floor_error`."""
         return self.after - self.floor > thresholds().verdict.floor_sigmas * self.floor_error
 
     @property

@@ -149,7 +149,7 @@ class SelectionPass:
 
     Attributes
     ----------
-    pass_input : the measurement and its residuals, with certain edge effects in the model.
+    pass_input : the measurement and its residuals, with certain effects at depth steps (edge effects) in the model.
     named : effects that were selected.
     selection : the rest of the result.
     """
@@ -172,7 +172,7 @@ class SelectionPass:
 
     @property
     def edge_effect_names(self) -> set[str]:
-        """Names of the edge effects in the model of the input."""
+        """Names of the effects at depth steps (edge fattening, smoothing, beam footprint) in the model at the pass's start."""
         return {each.name for each in self.pass_input.edge_effects}
 
     @property

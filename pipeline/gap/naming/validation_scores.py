@@ -45,11 +45,11 @@ class ValidatedEffects:
 def validate_effects(
     measurement: Measurement, residuals: Residuals, named: list[NamedEffect], training: BoolArray, reference_sigma: float
 ) -> ValidatedEffects:
-    """Score each effect on the validation blocks, with all other effects in the model.
+    """Test on the validation blocks whether each effect improves the likelihood, with all other effects in the model.
 
     Two systematic effects may only compensate each other, and then each seems to be needed. The log-likelihood ratio of all of
-    them together is therefore tested first. If it fails, the least important effect is removed, an empirical term before any
-    other.
+    them together is therefore tested first. If it fails, the effect with the smallest ratio of its own is removed, an empirical
+    term before any other, and the remaining effects are tested again in the same way.
 
     Parameters
     ----------
@@ -61,7 +61,8 @@ def validate_effects(
 
     Returns
     -------
-    ValidatedEffects : accepted, failed and weak effects.
+    ValidatedEffects : accepted effects; failed ones, which do not improve the likelihood; and weak ones, which improve it, but
+        not significantly (their ratio is within its standard error, or their size within its standard deviation of zero).
     """
     scorable = [item for item in named if item.effect.scored()]
     if not scorable or (~training).sum() < 100:

@@ -108,7 +108,7 @@ class Evidence:
 
     @property
     def effects_unsupported(self) -> bool:
-        """Whether the score is worse with the named effects, and no test of the misfit speaks for them."""
+        """Whether the named effects enlarge the gap on validation points, and no goodness-of-fit test could be computed."""
         return self.gap is not None and self.gap.after > self.gap.before and self.p_value is None
 
     @property

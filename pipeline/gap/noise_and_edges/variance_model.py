@@ -36,7 +36,7 @@ _FISHER_ROUNDS = 25
 
 @dataclass(frozen=True)
 class VarianceCandidate:
-    """A noise term to try: a variance at each of n points that k factors theta can scale.
+    """A noise effect to try: the variance that it adds at each of n points, with k fitted factors theta (one for each parameter).
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class VarianceCandidate:
     fixed: Mapping[str, float] = field(default_factory=dict)
 
     def parameters(self, theta: FloatArray) -> dict[str, float]:
-        """Return the effect's parameters by name, given the (k,) factors theta of its variances."""
+        """Return the effect's parameters by name. theta: (k,) fitted factors; 1 is the variance at a parameter's typical size."""
         return dict(zip(self.names, map(float, np.sqrt(theta) * np.array(self.scale)), strict=True)) | dict(self.fixed)
 
     def standard_deviations(self, theta: FloatArray, error: FloatArray) -> dict[str, float]:
@@ -64,7 +64,7 @@ class VarianceCandidate:
 
         Parameters
         ----------
-        theta : (k,) factors of the variances.
+        theta : (k,) fitted factors; 1 stands for the variance at a parameter's typical size.
         error : (k,) standard deviations of theta.
         """
         root = np.sqrt(theta)

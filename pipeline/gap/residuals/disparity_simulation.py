@@ -27,11 +27,12 @@ _SAME_STEP = 0.5
 def simulate_disparities(
     measurement: StereoMeasurement, model: StereoModel, residuals: StereoResiduals, randoms: Sequence[KeyedRandom]
 ) -> FloatArray:
-    """Simulate the disparity of each measured pixel, with the depth map whose raster fits the pixels best.
+    """Simulate the disparity of each measured pixel by tracing the cell of a depth map in which the pixel lies.
 
-    The cells of a depth map are at least two pixels wide. The difference of the reference's disparity between the centre of a
-    cell and the pixel is corrected. Effects of the matcher on neighbouring pixels are applied on the measurement's own raster if
-    its spacing differs from that of the depth map.
+    Of the qualities high, medium and low, the depth map is used whose cell centres are nearest to the pixels on average. Its
+    cells are at least two pixels wide, so the pixel is not at the cell's centre. The disparity is therefore corrected by the
+    nominal disparity of the reference surface at the pixel minus that at the centre. Effects of the matcher on neighbouring
+    pixels are applied on the measurement's own raster if its spacing differs from that of the depth map.
 
     Parameters
     ----------

@@ -267,12 +267,18 @@ def planned_survey(config: SimulationConfig, sensor: SensorName) -> Survey:
 
 
 def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Survey:
-    """Describe the survey of an existing measurement. Only the positions of its points count, not their residuals.
+    """Describe from where a measurement saw the wall, to find out which sensor effects it could detect and tell apart.
+
+    Each scanner station, or the stereo pair, becomes one view. Only the positions of its points count, not their residuals.
 
     Parameters
     ----------
     measurement : The measurement.
     most : Largest number of points in the subsample of each view.
+
+    Returns
+    -------
+    Survey : the views, the wall's centre, and a function that simulates views from further stations.
 
     Raises
     ------
