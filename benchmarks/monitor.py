@@ -61,6 +61,8 @@ SITES = {
     "stereo pair, 50 m": ("stereo", None, {}),
     "laser scanner, 50 m, another wall": ("tls", None, {"wall__style": "bulga", "wall__seed": 3}),
 }
+SPECK = {"rockfall__count": 1, "rockfall__size_m": {"kind": "gaussian", "mean": 0.002, "sigma": 0.0, "minimum": 0.001}}
+"""A single rockfall of 2 mm, far below what any pixel shows: next to nothing."""
 STEP_RAD = 2.618e-4
 POINTS = 20_000_000
 NORMAL_95 = 1.96
@@ -126,7 +128,7 @@ def nothing(count: int) -> Iterator[str]:
     for name, (sensor, config, keys) in SITES.items():
         with tempfile.TemporaryDirectory() as folder:
             run, scans = Path(folder) / "run", Path(folder) / "scans"
-            simulate(config, sensor, out=run, seed=78, epochs=count, progress=False, **keys, rockfall__count=0)
+            simulate(config, sensor, out=run, seed=78, epochs=count, progress=False, **keys, **SPECK)
             scans.mkdir()
             files = epochs_of(run, scans, 6)
             position = np.array([12.0, -50.0, 5.0]) + UTM

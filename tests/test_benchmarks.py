@@ -22,6 +22,8 @@ import yaml
 from tiny_dataset import tiny as tiny_config
 from tiny_dataset import tiny_set
 
+from pipeline.planning import series as planning_series
+
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "benchmarks"
 LIBRARIES = {"measure", "documents", "coverage_contexts", "matcher_cases", "varied", "workshop"}
@@ -79,6 +81,16 @@ SMALL_SITE = (
     "depth_map=high",
 )
 SMALL_KEYS = [each.split("=") for each in SMALL_SITE if "=" in each]
+TINY_SERIES = {
+    "wall": {"width_m": 8.0, "height_m": 5.0, "resolution_m": 0.08, "seed": 1},
+    "station": {"distance_m": 15.0},
+    "scanner": {"azimuth_step_rad": 0.002, "zenith_step_rad": 0.002},
+    "series": {
+        "times": {"start": "2026-03-01", "every_h": 6, "count": 3},
+        "rockfall": {"rate_per_day": 8, "volume_m3": {"power_law": {"smallest": 0.02, "largest": 0.05}}},
+        "precursor": {},
+    },
+}
 SCRIPTS: dict[str, Tiny] = {
     "calibrate_recovery": Tiny(("--trials", "1", "--out", "recovery")),
     "calibrate_speed": Tiny(
@@ -121,6 +133,13 @@ SCRIPTS: dict[str, Tiny] = {
     "noise_table": Tiny(("--maps", "2", "--levels", "high", "--out", "noise"), overrides=SMALL_SITE),
     "reconstruction": Tiny(keys=COARSE_WALL | {"RigConfig": {"width": 1472, "height": 984, "distance_m": 25.0}}),
     "scale": Tiny(("--only", "surface:points"), values={"POINTS": 5000}),
+    "series": Tiny(
+        ("--speed-epochs", "1"),
+        values={
+            "CONFIG": TINY_SERIES,
+            "LARGE": TINY_SERIES,
+        },
+    ),
     "sgbm": Tiny(keys=COARSE_WALL | SMALL_FRAME),
     "soak": Tiny(arguments=("tls", 3), overrides=SMALL_SITE),
     "startup": Tiny(values={"_REPEATS": 1}),
@@ -167,6 +186,9 @@ def test_a_benchmark_runs_at_a_tiny_size(
         monkeypatch.setattr(cases, "RigConfig", _with_keys(cases.RigConfig, frame))
     if name == "gap":
         monkeypatch.setattr(script, "empty_kernel_cache", lambda: nullcontext(dict(os.environ)))
+    if name == "series":
+        monkeypatch.setattr(planning_series, "_ENOUGH", 10)
+        monkeypatch.setattr(planning_series, "AVERAGED", (1,))
     if name == "tls":  # starts itself anew with an empty kernel cache, where it would not be small
         monkeypatch.setattr(script.subprocess, "run", lambda *_, **__: script.cold())
     script.main(*tiny.arguments)

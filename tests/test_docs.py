@@ -86,8 +86,18 @@ def test_the_site_builds_without_a_warning(tmp_path_factory: pytest.TempPathFact
         assert not without_words.search(text), f"{page}: a picture without alternative text"
 
 
-CHECKED_ELSEWHERE = ("add_effect", "add_sensor", "add_wall_style", "export", "monitor", "plan_survey", "plug_ins", "view")
-"""How-tos whose commands and code other tests check (test_docs_commands.py, monitor/, test_plug_ins.py, api/test_building.py)."""
+CHECKED_ELSEWHERE = (
+    "add_effect",
+    "add_sensor",
+    "add_wall_style",
+    "export",
+    "monitor",
+    "plan_survey",
+    "plug_ins",
+    "series",
+    "view",
+)
+"""How-tos that other tests check: test_docs_commands.py, monitor/, test_plug_ins.py, test_building.py, test_series.py."""
 
 
 def test_every_how_to_has_its_picture() -> None:

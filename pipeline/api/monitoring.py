@@ -57,8 +57,8 @@ def monitor(
     progress : "auto" or bool
         Whether progress is shown; "auto": in notebooks and on terminals.
     **options
-        Fields of `MonitorOptions`: position, direction, views, gsd_m, stable, unit, columns, scanner, model, photographs,
-        detector, seed.
+        Fields of `MonitorOptions`: position, direction, views, gsd_m, stable, targets, unit, columns, scanner, model,
+        photographs, detector, seed.
 
     Returns
     -------

@@ -54,6 +54,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", type=Path, metavar="FILE", help="sensor model (model.yaml) instead of --scanner")
     parser.add_argument("--photographs", action="store_true", help="the epochs are from photographs")
     parser.add_argument("--stable", type=Path, metavar="FILE", help="stable rock: YAML list of boxes or polygons, wall frame, m")
+    parser.add_argument(
+        "--targets", type=Path, metavar="FILE", help="targets of each epoch: CSV with the columns epoch, target, x, y, z; m"
+    )
     parser.add_argument("--times", type=comma_separated_words, default=[], metavar="T,T,...", help="time of each epoch, ISO 8601")
     parser.add_argument(
         "--gsd", type=between(1e-4, 100.0), metavar="M", help="side of a pixel, m (default: from the points' density)"
@@ -124,6 +127,7 @@ def _options(arguments: argparse.Namespace) -> MonitorOptions:
         views=None if arguments.views is None else int(arguments.views),
         gsd_m=arguments.gsd,
         stable=() if arguments.stable is None else read_areas(arguments.stable),
+        targets=arguments.targets,
         unit=arguments.unit,
         columns=tuple(arguments.columns),
         scanner=arguments.scanner,

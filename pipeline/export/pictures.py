@@ -30,6 +30,8 @@ _DPI = 100
 _TITLE_PX, _BAR_PX = 46, 78
 _MOST_NUMBERED = 60
 _EPOCH_MS, _SCAN_MS, _LAST_MS = 1200, 80, 2500
+_WHOLE_MS, _LEAST_MS = 20_000, 200
+"""Duration at which the epochs of a long series are shown faster, and the shortest for one."""
 _SCAN_FRAMES, _SCAN_POINTS = 48, 400_000
 _ANIMATED_PX, _COLOURS_OF_GIF = 900, 96
 _LONGEST_SCAN_S = 1e6
@@ -56,7 +58,8 @@ def save_epochs(run: ExportedRun, path: Path, progress: Progress) -> None:
     for number in numbers:
         with progress.stage(f"epoch {number}"):
             frames.append(_epoch_picture(run, number, view, limit))
-    _write_gif(path, frames, [_EPOCH_MS] * len(numbers) + [_LAST_MS])
+    each = int(np.clip(_WHOLE_MS / len(numbers), _LEAST_MS, _EPOCH_MS))
+    _write_gif(path, frames, [each] * len(numbers) + [_LAST_MS])
 
 
 def save_scan(run: ExportedRun, number: int, path: Path) -> None:
@@ -120,7 +123,9 @@ def _epoch_picture(run: ExportedRun, number: int, view: PerspectiveView, limit: 
     values, grid = run.difference(number)
     blocks = run.blocks(number)
     volume, noise = sum(block["volume_m3"] for block in blocks), millimetres(run.limit_m(number) / SCALE_SIGMAS)
-    title = f"Epoch {number}: {counted(len(blocks), 'block')} of {litres(volume)} l fell; noise {noise} (NMAD)"
+    time = str(run.record["epochs"][number].get("time", ""))[:16].replace("T", " ")
+    named = f"Epoch {number}, {time}" if time else f"Epoch {number}"
+    title = f"{named}: {counted(len(blocks), 'block')} of {litres(volume)} l fell; noise {noise} (NMAD)"
     labels = {block["label"]: np.array(block["position_m"]) for block in blocks[:_MOST_NUMBERED]}
     pixels = draw_wall(view, run.surface(number), values, grid, limit)
     return _framed(pixels, title, limit, {label: view.project(place[None])[0][0] for label, place in labels.items()})

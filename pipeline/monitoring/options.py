@@ -34,6 +34,8 @@ class MonitorOptions:
         Side of a pixel of the maps, m; None: derived from the density of the reference's points.
     stable : tuple of Area
         Areas of stable rock, wall frame, m; empty: `monitor` finds stable rock itself.
+    targets : Path or None
+        Targets measured in each epoch, which replace ICP: a file that `read_targets` reads.
     unit : str or None
         Unit of the coordinates, a key of METRES such as "foot"; None: as the files state.
     columns : tuple of str
@@ -54,6 +56,7 @@ class MonitorOptions:
     views: int | None = None
     gsd_m: float | None = None
     stable: tuple[Area, ...] = ()
+    targets: Path | None = None
     unit: str | None = None
     columns: tuple[str, ...] = ()
     scanner: str | None = None

@@ -17,6 +17,7 @@ import numpy as np
 
 from pipeline.dataset.cluster import map_on_workers
 from pipeline.formats.files.atomic import empty_folder
+from pipeline.formats.files.checksum import sha256
 from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.monitoring.comparison import EpochChange, compare_epoch
 from pipeline.monitoring.detector import regions_of_detector
@@ -27,6 +28,7 @@ from pipeline.monitoring.products import Followed, Result, write_points, write_r
 from pipeline.monitoring.reading import EpochData, EpochSource, find_epochs, read_epoch
 from pipeline.monitoring.records import EpochRecord, kept
 from pipeline.monitoring.site import ReferenceSite, prepared
+from pipeline.monitoring.targets import TargetFit, fit_targets, read_targets
 from pipeline.report.progress import Progress
 from scene.common.errors import InputError
 
@@ -118,6 +120,10 @@ def _fingerprint(site: ReferenceSite, options: MonitorOptions) -> str:
     return hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()
 
 
+def _checksum(path: Path | None) -> str:
+    return "" if path is None else sha256(path)
+
+
 def _compared_in_processes(
     left: Sequence[tuple[int, EpochSource]],
     site: ReferenceSite,
@@ -191,7 +197,11 @@ def processed(
     data = read_epoch(source, options)
     notes = [*data.notes, *_check_same_site(data, site, source)]
     points = data.wall_points(site.frame, site.grid.gsd, several=len(site.views) > 1)
-    found = compare_epoch(site.reference, points, options.stable, options.seed)
+    by_targets = _by_targets(options, site, source)
+    start = None if by_targets is None else by_targets.transform
+    found = compare_epoch(site.reference, points, options.stable, options.seed, start)
+    if by_targets is not None:
+        notes.append(f"{by_targets.count} targets brought it near the reference, with an RMS of {1e3 * by_targets.rms_m:.1f} mm")
     regions = found.regions if options.detector == NO_DETECTOR else []
     for view, change in zip(site.views, found.changes, strict=True):
         difference = out / f"difference_{number:03d}{view.suffix}.tif"
@@ -216,6 +226,12 @@ def processed(
     )
     record.write(out, fingerprint, [view.grid.shape for view in site.views])
     return record, data
+
+
+def _by_targets(options: MonitorOptions, site: ReferenceSite, source: EpochSource) -> TargetFit | None:
+    if options.targets is None:
+        return None
+    return fit_targets(read_targets(options.targets), site.source.name, source.name, site.frame)
 
 
 def _predicted(options: MonitorOptions, site: ReferenceSite, found: EpochChange) -> float:

@@ -43,7 +43,7 @@ class RunResults:
             raise InputError("contains no finished epoch", where=str(folder), remedy="continue it with simulate --resume")
         self.world_to_wall = np.array(record["wall_frame"]["matrix_world_to_wall"]) if "wall_frame" in record else np.eye(4)
         self.title = f"{folder.name}: {INSTRUMENTS[record['sensor']]}, {record['wall']['name']}"
-        self.steps = {key: f"epoch {key}" for key in self._epochs}
+        self.steps = {key: _step_name(each) for key, each in self._epochs.items()}
         self.surfaces = {"surface": "as measured", "reference": "reference, as measured", "truth": "as it really is"}
         self._found = _detections(detections) if detections else {}
         if detections and not set(self._found) & set(self.steps):
@@ -65,9 +65,11 @@ class RunResults:
         return max(grid.width, grid.height) * grid.gsd
 
     def layers(self, step: str) -> list[Layer]:
-        """Return the layers of an epoch: difference, M3C2 if it was computed, shaded rock and relief."""
+        """Return the layers of an epoch: difference, change in a series, M3C2 if computed, shaded rock and relief."""
         limit = SCALE_SIGMAS * self._epochs[step]["statistics"]["sigma_m"] * _MM
         maps = [Layer("difference", "reference minus epoch (missing rock positive)", "mm", _MM, diverging=True, limit=limit)]
+        if self._map_path("change", step).exists():
+            maps.append(Layer("change", "epoch before minus epoch", "mm", _MM, diverging=True, limit=limit))
         if self._map_path("m3c2", step).exists():
             maps.append(Layer("m3c2", "M3C2 distance", "mm", _MM, diverging=True, limit=limit))
         return [*maps, _ROCK, _HEIGHT]
@@ -118,6 +120,12 @@ class RunResults:
     def _raster_of(self, path: Path, grid: Grid) -> SurfaceRaster:
         """Rasterise a surface."""
         return surface_raster(read_surface(path), grid)
+
+
+def _step_name(epoch: dict[str, Any]) -> str:
+    """Name an epoch, with its time in a series."""
+    time = str(epoch.get("time", ""))[:16].replace("T", " ")
+    return f"epoch {epoch['epoch']}, {time}" if time else f"epoch {epoch['epoch']}"
 
 
 def _channels(cloud: PointCloud) -> dict[str, NDArray[Any]]:

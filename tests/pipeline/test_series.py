@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from pipeline.config.simulation import SimulationConfig
+from pipeline.config.simulation import SimulationConfig, load_config
+from pipeline.export.exported_run import ExportedRun
+from pipeline.export.pictures import save_epochs
 from pipeline.formats.meshes.ply import read_ply, write_ply
 from pipeline.formats.points.laz import gps_seconds, read_laz
 from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.monitoring.reading import find_epochs
 from pipeline.report.progress import Progress
 from pipeline.run.simulation import simulate
+from pipeline.view.run_results import RunResults
 from scene.common.config import parse
 from scene.common.course import Course
 from scene.common.errors import InputError
@@ -209,9 +214,29 @@ def test_mistakes_are_named(series: dict[str, Any], message: str) -> None:
         config(series)
 
 
+def test_view_and_export_name_the_times(finished: Path, tmp_path: Path) -> None:
+    results = RunResults(finished)
+    assert results.steps["2"] == "epoch 2, 2026-03-01 12:00"
+    assert [layer.key for layer in results.layers("2")][:2] == ["difference", "change"]
+    save_epochs(ExportedRun(finished), tmp_path / "series.gif", Progress())
+    with Image.open(tmp_path / "series.gif") as animation:
+        assert animation.n_frames == 4
+
+
 def test_truth_and_points_show_a_deposit(finished: Path) -> None:
     truth = read_ply(finished / "epoch_001/truth.ply")
     without = read_ply(finished / "epoch_000/truth.ply")
     box = np.array(json.loads((finished / "series.json").read_text())["events"][0]["deposit_bbox_m"]).reshape(2, 3)
     inside = [((mesh.vertices >= box[0]) & (mesh.vertices <= box[1])).all(axis=1).sum() for mesh in (truth, without)]
     assert inside[0] > inside[1] + 60
+
+
+def test_the_how_to_s_config_is_short_and_loads(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs/howto/series.md").read_text()
+    (text,) = re.findall(r"```yaml title=\"series.yaml\"\n(.*?)```", page, re.DOTALL)
+    assert len(text.splitlines()) <= 25
+    (tmp_path / "series.yaml").write_text(text)
+    series = load_config(tmp_path / "series.yaml", [], "tls", None).series
+    assert series is not None
+    assert series.count == 31
+    assert series.falls_h() == [28.5]

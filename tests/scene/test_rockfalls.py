@@ -98,6 +98,23 @@ def test_niches_in_niches_balance_and_keep_labels_and_manifold() -> None:
     assert deepest > 1.3 * (wall.vertices[:, 2].min() - one.base.vertices[:, 2].min())
 
 
+def test_a_hundred_epochs_of_niches_in_niches_balance() -> None:
+    wall = rough_wall(8, 6, 0.07, seed=4)
+    law = VolumeLaw(power_law=MagnitudeFrequency(smallest=0.01, largest=0.3))
+    motion = PrecursorConfig(share=0.3, lead_h=10.0)
+    rockfalls = numbered(drawn_rockfalls(RockfallRate(rate_per_day=40.0, volume_m3=law), motion, 100.0, RANDOM))
+    series = Rules(safe_zone(RayCaster(wall), 0.3), RockfallConfig(), None, Ground.below(wall, UP), rockfalls, RANDOM)
+    base = float(wall.vertices[:, 2].min()) - 2.0
+    before, state = volume_above(wall, base), WallState(0.0, wall)
+    for hour in range(1, 101):
+        state = advanced(state, float(hour), series)
+        lost = sum(each.volume_m3 for each in state.loose)
+        assert volume_above(state.base, base) + lost == pytest.approx(before, rel=1e-9)
+    assert len(state.fallen) > 130
+    edges = np.sort(np.concatenate([state.base.faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])]), axis=1)
+    assert np.unique(edges, axis=0, return_counts=True)[1].max() == 2
+
+
 def test_a_block_moves_out_along_the_normal_before_it_falls() -> None:
     wall = plane_wall(6, 5)
     motion = {"law": "linear", "lead_h": 10.0, "displacement_m": 0.04}

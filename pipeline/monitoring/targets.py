@@ -1,0 +1,104 @@
+"""Register epochs by targets that were measured in each of them, before the fit on stable rock."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.registration.rigid import RigidTransform
+from scene.common.errors import InputError
+from scene.common.regular_file import read_text
+from scene.geometry.frame import WallFrame
+from scene.geometry.mesh import FloatArray
+
+_COLUMNS = ("epoch", "target", "x", "y", "z")
+_FEWEST = 3
+_LINE = 1e-3
+"""Extent of the targets across a line, relative to that along it, below which a rotation about it is unknown."""
+_FAR_M = 0.1
+"""Residual above which a target was mistaken or moved, m."""
+
+Targets = Mapping[str, Mapping[str, FloatArray]]
+"""Coordinates (3,), m, of each target by name, for each epoch by the name of its file or folder."""
+
+
+@dataclass(frozen=True)
+class TargetFit:
+    """From an epoch to the reference, wall frame, with the number of targets and their residuals' root mean square, m."""
+
+    transform: RigidTransform
+    count: int
+    rms_m: float
+
+
+def read_targets(path: Path) -> Targets:
+    """Read a CSV file with the columns epoch, target, x, y, z: epoch is the name of a file, x, y, z are its coordinates, m.
+
+    Raises InputError for other columns and for values that are no numbers.
+    """
+    table = csv.DictReader(io.StringIO(read_text(path)))
+    if not set(_COLUMNS) <= set(table.fieldnames or ()):
+        raise InputError(
+            f"has the columns {', '.join(table.fieldnames or ()) or 'none'}", where=str(path), allowed=", ".join(_COLUMNS)
+        )
+    found: dict[str, dict[str, FloatArray]] = {}
+    for line, row in enumerate(table, start=2):
+        try:
+            place = np.array([float(row[axis]) for axis in "xyz"])
+        except (TypeError, ValueError):
+            place = np.full(3, np.nan)
+        if not np.isfinite(place).all():
+            raise InputError("coordinates are no numbers", where=f"{path}, line {line}", remedy="give x, y and z in metres")
+        found.setdefault(row["epoch"], {})[row["target"]] = place
+    return found
+
+
+def fit_targets(targets: Targets, reference: str, epoch: str, frame: WallFrame) -> TargetFit:
+    """Fit the rigid motion that brings an epoch's targets to those of the reference (Kabsch 1976).
+
+    Parameters
+    ----------
+    targets : mapping
+        As `read_targets` gives them.
+    reference, epoch : str
+        Names of the epochs' files.
+    frame : WallFrame
+        Of the result.
+
+    Raises
+    ------
+    InputError
+        Where fewer than three targets are common, they lie on a line, or one is far from its place.
+    """
+    before, after = targets.get(reference, {}), targets.get(epoch, {})
+    common = sorted(set(before) & set(after))
+    if len(common) < _FEWEST:
+        raise InputError(
+            f"{len(common)} targets are measured in both {reference} and {epoch}",
+            where="--targets",
+            allowed=f"at least {_FEWEST}",
+            remedy="name the epochs as their files are named",
+        )
+    to, moved = (frame.to_wall(np.array([each[name] for name in common])) for each in (before, after))
+    centre_to, centre = to.mean(axis=0), moved.mean(axis=0)
+    extent = np.linalg.svd(to - centre_to, compute_uv=False)
+    if extent[1] < _LINE * extent[0]:
+        raise InputError("the targets lie on one line", where="--targets", remedy="add a target beside it")
+    left, _, right = np.linalg.svd((moved - centre).T @ (to - centre_to))
+    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(right.T @ left.T))])
+    rotation = right.T @ flip @ left.T
+    transform = RigidTransform(rotation, centre_to - rotation @ centre)
+    apart = np.linalg.norm(transform.apply(moved) - to, axis=1)
+    if apart.max() > _FAR_M:
+        worst = common[int(np.argmax(apart))]
+        raise InputError(
+            f"target {worst} of {epoch} is {apart.max():.2f} m from its place in {reference}",
+            where="--targets",
+            remedy="leave out targets that moved or were mistaken",
+        )
+    return TargetFit(transform, len(common), float(np.sqrt(np.mean(apart**2))))
