@@ -42,7 +42,7 @@ PARTS: dict[str, list[tuple[Any, str]]] = {
 
 
 @dataclass(frozen=True)
-class Cost:
+class DiagnosisCost:
     """Processor seconds of one diagnosis. parts: by part of the workflow."""
 
     name: str
@@ -79,17 +79,17 @@ def counted() -> Iterator[Counter[str]]:
         yield spent
 
 
-def cost_of(folder: Path) -> Cost:
+def cost_of(folder: Path) -> DiagnosisCost:
     """Diagnose a measurement and return what it cost."""
     measurement, start = read_measurement(folder), time.process_time()
     with counted() as spent:
         found = workflow.diagnose(measurement)
     whole = time.process_time() - start
     spent["rest"] = whole - sum(spent.values())
-    return Cost(folder.name, found.verdict, len(found.residuals), whole, spent)
+    return DiagnosisCost(folder.name, found.verdict, len(found.residuals), whole, spent)
 
 
-def table(costs: list[Cost]) -> str:
+def table(costs: list[DiagnosisCost]) -> str:
     """Return the slowest diagnoses as text, each with the parts that take more than a twentieth of its time."""
     lines = []
     for each in sorted(costs, key=lambda cost: -cost.seconds)[:MOST_ROWS]:

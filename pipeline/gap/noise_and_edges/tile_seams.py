@@ -50,7 +50,7 @@ class TileSeams:
 
 
 @dataclass(frozen=True)
-class _Differences:
+class _SeamDifferences:
     """Differences of neighbouring cells along one axis, 0 where one is missing.
 
     Attributes
@@ -62,7 +62,7 @@ class _Differences:
     known: BoolArray
 
     @classmethod
-    def of(cls, raster: FloatArray, axis: int) -> _Differences:
+    def of(cls, raster: FloatArray, axis: int) -> _SeamDifferences:
         """Compute them from a raster (rows, columns), NaN where there is no point."""
         found = np.diff(raster, axis=axis)
         known = ~np.isnan(found)
@@ -90,17 +90,17 @@ def find_tile_seams(residuals: StereoResiduals, registered_residuals: FloatArray
     (u, column), (v, row) = (_axis(x, step) for x in (at.u, at.v))
     raster = np.full((len(v), len(u)), np.nan)
     raster[row, column] = registered_residuals
-    across, down = _Differences.of(raster, 1), _Differences.of(raster, 0)
+    across, down = _SeamDifferences.of(raster, 1), _SeamDifferences.of(raster, 0)
     sides = _sides(u, v, step)
     if not len(sides) or not across.variance or not down.variance:
         return None
-    trials = [_Trials.of(part, u, v, across, down) for part in np.array_split(sides, -(-len(sides) // _AT_ONCE))]
+    trials = [_TileTrials.of(part, u, v, across, down) for part in np.array_split(sides, -(-len(sides) // _AT_ONCE))]
     coarse = max(trials, key=lambda each: abs(each.sigmas[each.best]))
     p_value = min(2 * len(sides) * float(norm.sf(abs(coarse.sigmas[coarse.best]))), 1.0)
     if p_value > thresholds().locking.significance:
         return None
     reach = 2 * float(sides[1] / sides[0] - 1)
-    found = _Trials.of(coarse.sides[coarse.best] * np.linspace(1 - reach, 1 + reach, _REFINED), u, v, across, down)
+    found = _TileTrials.of(coarse.sides[coarse.best] * np.linspace(1 - reach, 1 + reach, _REFINED), u, v, across, down)
     sigmas, information = float(found.sigmas[found.best]), float(found.information[found.best])
     near = found.sides[np.abs(found.sigmas) > abs(sigmas) - 1]
     return TileSeams(
@@ -114,7 +114,7 @@ def find_tile_seams(residuals: StereoResiduals, registered_residuals: FloatArray
 
 
 @dataclass(frozen=True)
-class _Trials:
+class _TileTrials:
     """Sides of a tile that were tried.
 
     Attributes
@@ -128,7 +128,7 @@ class _Trials:
     information: FloatArray
 
     @classmethod
-    def of(cls, sides: FloatArray, u: FloatArray, v: FloatArray, across: _Differences, down: _Differences) -> _Trials:
+    def of(cls, sides: FloatArray, u: FloatArray, v: FloatArray, across: _SeamDifferences, down: _SeamDifferences) -> _TileTrials:
         """Evaluate sides (k,) with the differences along rows and columns of a raster with coordinates u and v, px."""
         column, row = (1.0 - 2.0 * (np.floor(x[None] / sides[:, None]) % 2) for x in (u, v))
         total, information = np.zeros(len(sides)), np.zeros(len(sides))
