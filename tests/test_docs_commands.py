@@ -193,6 +193,12 @@ RESOLVED = (
 """Take minutes, or work on results: their words are parsed, their configs read, and each --set must be seen in the config."""
 
 PARSED = (
+    "simulate --sensor tls --config series.yaml --out runs/series",
+    "scarpsim export runs/series epochs --out series.gif",
+    "scarpsim inspect series.yaml --series --sensor tls --out plan",
+    "scarpsim monitor runs/series --out found",
+    "scarpsim view runs/my_series",
+    "scarpsim view runs/series",
     "scarpsim view april",
     "scarpsim monitor march.laz april.laz --out april",
     "scarpsim monitor scans/2026-*.laz --workers 2 --out year",

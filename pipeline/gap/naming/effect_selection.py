@@ -331,7 +331,7 @@ def _select_beside_angle_terms(
 
 
 def _note_repetition(estimates: list[Estimate]) -> list[str]:
-    """Notes on terms that repeat after a few scan lines."""
+    """Return remarks for the report on terms that repeat after a few scan lines."""
     lines = [each.candidate.fixed["lines"] for each in estimates if each.candidate.form.startswith(LINE_PATTERN)]
     return [
         f"the empirical term repeats after exactly {each} lines: think of the facets of a mirror, or of a read-out in blocks"
@@ -391,7 +391,7 @@ def _implausible_variance(measurement: Measurement, noise_terms: list[VarianceTe
 
 
 def _note_left_out(excluded: frozenset[tuple[str, bool]]) -> list[str]:
-    """Notes on families that were excluded."""
+    """Return remarks for the report on families of effects that were not tried."""
     said = (
         f"non-parametric terms of {name}" if empirical else name for name, empirical in sorted(excluded - {NONPARAMETRIC_TERMS})
     )
