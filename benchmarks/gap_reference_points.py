@@ -33,11 +33,17 @@ PAGE, MARKS = Path("docs/validation/gap_reference_points.md"), ("<!-- reference 
 STEP_DEG = 0.2
 MODEL = {"sensor": "tls", "noise": {"range_sigma_m": 0.001, "angle_sigma_rad": 5e-5}}
 PUT: dict[str, tuple[str, dict[str, float]]] = {
-    "a cyclic error of 2 mm, 0.6 m": ("range_cyclic", {"amplitude_m": 0.002, "period_m": 0.6, "phase_rad": 0.8}),
-    "an incidence bias of 3 mm": ("range_incidence_bias", {"coefficient_m": 0.003}),
-    "an offset of 4 mm": ("range_offset", {"offset_m": 0.004}),
-    "a wobble of 400 microradians, 9 lines": ("wobble", {"amplitude_rad": 0.0004, "lines_per_cycle": 9, "phase_rad": 0.5}),
-    "a vertical index of 1 mrad": ("vertical_index", {"offset_rad": 0.001}),
+    "a cyclic range error with an amplitude of 2 mm and a period of 0.6 m": (
+        "range_cyclic",
+        {"amplitude_m": 0.002, "period_m": 0.6, "phase_rad": 0.8},
+    ),
+    "a bias of 3 mm at an incidence angle of 60 degrees": ("range_incidence_bias", {"coefficient_m": 0.003}),
+    "a range offset of 4 mm": ("range_offset", {"offset_m": 0.004}),
+    "a wobble of the mirror of 400 µrad, with a period of 9 scan lines": (
+        "wobble",
+        {"amplitude_rad": 0.0004, "lines_per_cycle": 9, "phase_rad": 0.5},
+    ),
+    "a vertical index error of 1 mrad": ("vertical_index", {"offset_rad": 0.001}),
 }
 
 

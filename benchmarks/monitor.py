@@ -123,7 +123,7 @@ def compared(run: Path, result: Result) -> tuple[list[Found], list[bool], float]
 
 def nothing(count: int) -> Iterator[str]:
     """Rows of the table of epochs in which nothing fell."""
-    yield "| site | compared, m² | events: all, unmarked | in 1,000 m²: all, unmarked |"
+    yield "| site | compared area of all epochs, m² | false events: all, of which unmarked | the same in 1,000 m² |"
     yield "|---|---|---|---|"
     for name, (sensor, config, keys) in SITES.items():
         with tempfile.TemporaryDirectory() as folder:
@@ -147,7 +147,8 @@ def _overlap(low: FloatArray, high: FloatArray, other_low: FloatArray, other_hig
 def simulated(count: int) -> Iterator[str]:
     """Rows of the table of simulated epochs."""
     heads = [f"{low:g} to {high:g} l" if np.isfinite(high) else f"above {low:g} l" for low, high in CLASSES_L]
-    yield f"| site | found of {' | '.join(heads)} | false in 1,000 m²: all, unmarked | volume, bias | 95 % intervals that hold |"
+    last = "false events in 1,000 m²: all, of which unmarked | volume, bias | 95 % intervals that hold the true volume"
+    yield f"| site | found of {' | '.join(heads)} | {last} |"
     yield "|---" * (5 + len(heads)) + "|"
     for name, (sensor, config, keys) in SITES.items():
         with tempfile.TemporaryDirectory() as folder:
@@ -278,9 +279,10 @@ class BothWays:
 
 def _reason(mask: NDArray[np.bool_], ours: Sequence[ChangedRegion], change: Change, other: M3c2Map) -> str:
     """Why monitor and M3C2 differ on a region that M3C2 has."""
+    if len(ours) == 1:
+        return "both"
     if ours:
-        parts = "" if len(ours) == 1 else f"; {len(ours)} events, as the change between them is below half of the level"
-        return f"both{parts}"
+        return f"both; `monitor` has {len(ours)} events, because between them the change is below half of its level"
     known = mask & np.isfinite(change.difference)
     if not known.any():
         return "too few points for a plane through 3 x 3 pixels, which M3C2's larger cylinder has"
@@ -311,7 +313,7 @@ def against_m3c2() -> Iterator[str]:
 
 def regions() -> Iterator[str]:
     """Rows of the table of regions of the real pair, as both methods have them."""
-    yield "| place on the wall, m | M3C2, m³ | monitor, m³ | found by, and why |"
+    yield "| place on the wall: x, y, m | M3C2, m³ | monitor, m³ | found by, and why |"
     yield "|---|---|---|---|"
     if PAIR.is_dir():
         yield from BothWays.of(PAIR_FILES, PAIR_FROM).regions()
@@ -319,7 +321,7 @@ def regions() -> Iterator[str]:
 
 def speed() -> Iterator[str]:
     """Rows of the table of times, with a process of its own for its memory."""
-    yield "| points in each of two epochs | time | processor time | largest memory | others' load on the two cores |"
+    yield "| points in each of two epochs | time | processor time | largest memory | load average of other programs |"
     yield "|---|---|---|---|---|"
     with tempfile.TemporaryDirectory() as folder:
         for number in (1, 2):

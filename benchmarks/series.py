@@ -176,7 +176,7 @@ def _outcome(
 
 def found_rows(outcomes: Sequence[Outcome], false: Sequence[tuple[bool, str]], days: float) -> Iterator[str]:
     """Rows of the table of what was found."""
-    yield "| volume | found | in the first epoch | volume, bias | 95 % intervals that hold |"
+    yield "| volume | found | in the first epoch | volume, bias | 95 % intervals that hold the true volume |"
     yield "|---|---|---|---|---|"
     for low, high in CLASSES_L:
         inside = [each for each in outcomes if low <= 1e3 * each.volume < high and each.seen >= 0.5]
@@ -215,7 +215,8 @@ def promised_rows(outcomes: Sequence[Outcome], plan: SeriesPlan) -> Iterator[str
 
 def lead_rows(outcomes: Sequence[Outcome], plan: SeriesPlan) -> Iterator[str]:
     """Rows of the table of lead times."""
-    yield "| volume | blocks that moved | listed before | promised lead, 95 % | reached by | median lead: promised, found |"
+    heads = "promised lead, 95 % | reached by | median lead: promised, found"
+    yield f"| volume | blocks that moved | listed before the fall | {heads} |"
     yield "|---|---|---|---|---|---|"
     promise, every = plan.promises[0], plan.every_h or 1.0
     for low, high in CLASSES_L:

@@ -252,7 +252,8 @@ semi-global matching, with and without least-squares refinement. The model state
 and no effects. Values are in pixels of the frame; a pixel of the matched pictures is 4 px of the frame.
 [Matching](../explanation/matching.md) has the errors of the matchers.
 
-The answers find the locking of the plain matcher and the low-pass of the refined one, and blame no camera.
+The answers find the pixel locking of the plain matcher and the smoothing (a low-pass filter) of the refined one, and blame no
+camera.
 
 Made by
 

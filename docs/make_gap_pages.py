@@ -279,12 +279,16 @@ def make_symptoms() -> None:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Content of a verdict's page: when it is given, what to do, and an example that gets it (made by tests/gap_cases.py)."""
+    """Content of a verdict's page: when it is given, what to do, an example that gets it (made by tests/gap_cases.py).
+
+    The remark, if there is one, explains the answer to the example.
+    """
 
     when: str
     what_to_do: str
     case: str
     make: Callable[[Path], None]
+    remark: str = ""
 
 
 def _wobble(azimuth: Any, zenith: Any, line: Any) -> Any:
@@ -334,17 +338,21 @@ def verdicts() -> dict[str, Verdict]:
         ),
         "unknown": Verdict(
             "The model is rejected, but the catalogue does not explain why. There are three cases:\n\n"
-            "1. An empirical curve of one covariate, such as the azimuth or the time, explains clearly more (a score higher by "
-            "5) than any effect of the catalogue.\n"
+            "1. An empirical curve of one covariate, such as the azimuth or the time, explains clearly more than any effect of "
+            "the catalogue: its score, a penalised log-likelihood, is higher by at least 5.\n"
             "2. Nothing that was tried passes the test on validation blocks, although the gap exceeds the floor by more than "
             "its uncertainty, or the misfit has a p-value of at most 0.01. The report then says where the misfit is and how "
             "large.\n"
-            "3. Effects were named, but they leave most of the gap open. Or they leave a misfit with such a p-value, and the "
-            "gap is too small to show what the effects are worth.",
+            "3. Effects were named, but they leave most of the gap open. Or they leave a misfit with a p-value of at most 0.01 "
+            "although the gap before them was within its uncertainty of the floor, so that closing it proves little.",
             "See in the report on which covariate the disagreement depends, and in what form. model_after.yaml holds an "
             "empirical term that reproduces it in simulations, but only within the measured range of the covariate.",
             "The ranges of a scanner jump by 4 mm in the middle of the scan, as after a knock.",
             _case(seed=18, ranges=lambda scan: scan.R + 0.002 * np.where(scan.az > 1.6, 1.0, -1.0)),
+            "The second line of the terminal is the empirical term: a curve through 65 points between the azimuths 0.9508 and "
+            "2.049 rad, with values from -1.53 to 3.75 mm. The curve closes the whole gap, which compares means and standard "
+            "deviations over patches of the wall. The p-value tests for finer patterns. One remains, because a curve through 65 "
+            "points cannot follow a jump exactly.",
         ),
         "no_gap": Verdict(
             "Three things hold. No effect was named. The gap differs from the floor by no more than its uncertainty. The misfit "
@@ -396,6 +404,7 @@ def verdict_page(name: str, verdict: Verdict, found: GapDiagnosis) -> str:
         f"## Example\n\n{verdict.case} The report says of this simulated measurement:",
         f"> {paragraph(found, rank_disagreements(found))}",
         f"The terminal shows:\n\n```text\n{summarise(found)}\n```",
+        *([verdict.remark] if verdict.remark else []),
         *(pictures if found.gap is not None else []),
         "[From symptom to cause](symptoms.md) shows the pattern of each effect. `docs/make_gap_pages.py` writes this page; do not"
         " edit it.",

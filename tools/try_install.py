@@ -150,7 +150,7 @@ def page(record: dict[str, Any]) -> str:
 This page is for users who install scarpsim without its repository. It lists each way that was tried and what came of it.
 
 Each trial started with an empty environment and an empty folder, and with no variable of the shell but the path, the home and the
-package index. The program then simulated a small wall with the laser scanner, or imported what the extra adds. Times hold the
+package index. The program then simulated a small wall with the laser scanner, or imported what the extra adds. Times include the
 installation, mostly from a local cache of packages.
 
 Tried at commit {record["commit"]} on {record["machine"]}.

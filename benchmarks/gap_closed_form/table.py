@@ -40,19 +40,33 @@ _LABELS = {
     "real change blamed on the sensor": "false alarms where only rock fell",
     "gap closed on held-out data, effects named (median)": "share of the gap that the named effects close on validation blocks "
     "(median)",
-    "gap closed, all cases' metres summed": "the same, of the sum of all gaps in metres",
+    "gap closed, all cases' metres summed": "the same share, of the gaps of all measurements added up",
     "gap closed by the best wrong effect outside the class (median)": "share of the gap that the best wrong effect outside the "
     "class closes (median)",
     "the same, as the angle to the nearest other effect lets it (1 - sin^2, median)": "its expectation from the angle to the "
     "nearest other effect, 1 - sin^2 (median)",
     "the same, where that angle leaves it 5 % at most": "the share that it closes where the expectation is 5 % at most",
-    "rightly named, but the gap is within its uncertainty": "right names whose gap is within its uncertainty",
+    "rightly named, but the gap is within its uncertainty": "right names although the gap is within its uncertainty of the floor",
 }
 """Rows of the results whose names need more words on the page."""
 
+_OUTSIDE = """| error outside the catalogue | what it is |
+| --- | --- |
+| off_jump, off_column_step | a step of the ranges at one azimuth, of the disparities at one column |
+| off_facets | range errors that repeat with the scan lines, as from the facets of a mirror |
+| off_square_wave | a square wave of the range error over the range |
+| off_azimuth_waves, off_column_waves | a sine over the azimuth, over the columns |
+| off_column_banding | a square wave over the columns |
+| off_quadratic, off_intensity_square | errors that grow with the square of the range, of the logarithm of the received power |
+| off_drift | an error that decays during the scan |
+| off_saddle, off_cubic, off_bump | smooth two-dimensional shapes over the scan or the image |
+| off_spread_sector, off_spread_time | additional noise in a sector of azimuths, in two thirds of the time |
+| off_spread_half, off_spread_radius | additional noise in half of the image, far from the middle of the image |
+| off_loss_sector | lost returns in a sector of azimuths |"""
+
 _READING = """"Undecided" means that the 95 % interval (Wilson) contains values that reach the goal and values that do not. The
 best wrong effect closes much of the gap wherever two signatures are alike: fitted freely, an effect at the angle a to the true
-one takes 1 - sin^2 a of its square, whatever the method."""
+one takes 1 - sin^2 a of its square, whatever the method. "(of 24)" is the number of measurements over which a median is taken."""
 
 
 def markdown(found: Json) -> str:
@@ -70,7 +84,10 @@ def markdown(found: Json) -> str:
         "if it is ahead by more than 10.\n\n" + _baselines(found),
         "## Answers by effect\n\nEach true effect counts once, also those of measurements with several effects, "
         "which the figures above leave out. Weak effects,\nwith S/N x sin(angle) below 8, are in brackets. "
-        "A name that begins with `off_` is an error outside the catalogue.\n\n" + _by_effect(found["by_effect"]),
+        "A name that begins with `off_` is an error outside the catalogue.\n\n"
+        + _OUTSIDE
+        + "\n\n"
+        + _by_effect(found["by_effect"]),
         '## Detection by strength\n\nThe measurements have one effect each. "Found at all" is sorted by S/N, and "right class" '
         "by S/N x sin(angle).\n\n" + _curves(found["detection"]),
         "## Coverage of the 90 % intervals\n\nHow many of the intervals of each parameter contain its true value.\n\n"

@@ -37,7 +37,7 @@ _WORDS = """| kind of measurement | what it contains |
 |---|---|
 | none | no effect |
 | change | no effect, but rock that fell or moved |
-| off | one error that is not in the catalogue |
+| off | one error outside the catalogue, such as second_wall (echoes by way of a second wall), matcher_tiles, rough_rows |
 | one, two | one or two effects of the catalogue |
 
 | outcome | what the answer says |
