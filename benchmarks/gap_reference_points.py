@@ -80,10 +80,12 @@ def main() -> None:
     first, found = row("nothing", folder)
     lines = ["| put into the half that is compared | verdict | named | gap, mm |", "|---|---|---|---|", first]
     after = found.model_after.model_dump(mode="json")
-    lines.append(row("nothing, on its own model_after", changed(folder, arguments.out / "after", after))[0])
+    lines.append(
+        row("nothing; compared with the corrected model of the first row", changed(folder, arguments.out / "after", after))[0]
+    )
     unsaid = ("incidence", "reference_error_m", "notes")
     mesh = changed(folder, arguments.out / "mesh", MODEL, unsaid)
-    lines.append(row("nothing, the reference as a mesh that says nothing of itself", mesh)[0])
+    lines.append(row("nothing; the error of the reference is not stated", mesh)[0])
     for number, (title, (effect, values)) in enumerate(PUT.items()):
         put_scanned(folder, arguments.out / effect, effect, values, number)
         lines.append(row(title, arguments.out / effect)[0])

@@ -22,6 +22,8 @@ STAGES = {
 _SYMBOLS: dict[str, tuple[tuple[str, str], ...]] = {
     "tls": (
         (r"dR\b", "dR: recorded minus true range, m"),
+        (r"\ba (sin|cos)\b", "a: amplitude, see the parameters below"),
+        (r"\bA sin\b", "A: amplitude, see the parameters below"),
         (
             r"(?<![a-z])d?az\b|azimuth error",
             "az: azimuth, the angle about the vertical axis; daz: recorded minus true azimuth, rad",
@@ -35,7 +37,10 @@ _SYMBOLS: dict[str, tuple[tuple[str, str], ...]] = {
         (r"\bN\(", "N(0, s): normally distributed random error of mean 0 and standard deviation s"),
     ),
     "stereo": (
-        (r"\bd\b|\bdd\b|isparit", "d: disparity; dd: recorded minus true disparity, px"),
+        (r"\bd\b|\bd_|\bdd\b", "d: disparity, px"),
+        (r"\bdd\b", "dd: recorded minus true disparity, px"),
+        (r"\bsigma_d\b", "sigma_d: standard deviation of the disparity, px"),
+        (r"\bA sin\b", "A: amplitude, see the parameters below"),
         (
             r"_real\b",
             "_real: of the camera that takes the picture; _nominal: of its calibration or survey;"

@@ -154,7 +154,7 @@ def page(effect: type[Effect], comparison: Comparison) -> str:
         f"## Equation\n\n```text\n{inspect.cleandoc(effect.__doc__ or '')}\n```",
         symbols(effect),
         f"When the program simulates a measurement, {STAGES[effect.stage]} (stage [`{stage}`](README.md#when-an-effect-acts)).",
-        f"## Parameters\n\n{_parameters(effect)}",
+        f"## Parameters\n\n{parameter_table(effect)}",
         "With the default values the effect is off. A unit of `[1]` marks a pure number, and the source"
         " `empirical` a value that no publication gives.",
         f"## In a config\n\n```yaml\n{yaml(shown)}\n```",
@@ -179,7 +179,8 @@ def yaml(shown: Effect) -> str:
     return text
 
 
-def _parameters(effect: type[Effect]) -> str:
+def parameter_table(effect: type[Effect]) -> str:
+    """Return the table of an effect's parameters: meaning, default, bounds and source."""
     rows = ["| parameter | meaning | default | allowed | source |", "|---|---|---|---|---|"]
     for key, info in effect.model_fields.items():
         if key == "name":

@@ -27,7 +27,7 @@ from PIL import Image
 from pipeline.config.simulation import SimulationConfig
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, TlsMeasurement, read_measurement
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.gap.naming.verdict import VERDICTS
+from pipeline.gap.naming.verdict import MUCH_MOVED, VERDICTS
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
 from pipeline.gap.report.covariate_ranking import quantile_bins, rank_disagreements
 from pipeline.gap.report.figures import gap_figure, maps_figure
@@ -137,7 +137,7 @@ def _mean_pattern(r: Residuals, left: FloatArray, kept: NDArray[np.bool_]) -> tu
         return "mean", f"the mean follows the {_WORDS[best[0]]}{also}"
     if _explained_by(_pixels(r)[kept], left[kept]) > _SMOOTH:
         return "smooth", "the mean varies smoothly over the wall, but follows no single covariate"
-    return "relief", f"the mean follows the relief, facet by facet; of single covariates the {_WORDS[best[0]]} explains most"
+    return "relief", f"the mean differs from facet to facet of the rock; the {_WORDS[best[0]]} explains most of this"
 
 
 def _other_pattern(r: Residuals, left: FloatArray, kept: NDArray[np.bool_], lost: NDArray[np.bool_]) -> tuple[str, str]:
@@ -204,7 +204,7 @@ def _picture(r: Residuals, millimetres: FloatArray, lost: NDArray[np.bool_]) -> 
 _KINDS = {
     "mean": "The mean of the residual follows one covariate",
     "smooth": "The mean varies smoothly over the wall",
-    "relief": "The mean follows the relief",
+    "relief": "The mean differs between facets of the rock",
     "spread": "The standard deviation differs from the model",
     "edges": "Residuals at depth edges",
     "lost": "Returns are missing",
@@ -227,11 +227,12 @@ def symptoms_page(found: list[Symptom], tables: dict[str, Identifiability]) -> s
         "",
         "| column | meaning |",
         "|---|---|",
-        "| pattern | what the residuals depend on: their mean, their standard deviation, or where there are none |",
+        "| pattern | what the residuals depend on: their mean, their standard deviation, or where there are none; a facet is a"
+        " nearly flat part of the rock |",
         "| left by the pose fit | share of the effect's pattern, as a root mean square, that no shift or rotation of the"
         " sensor imitates |",
         f"| looks like | effects whose pattern has a correlation (cosine) of at least {SIMILAR_COSINE:g} with this one on that"
-        " wall |",
+        " wall; noise, effects at depth edges and missing returns have no fixed pattern, so they are not compared |",
     ]
     for kind, title in _KINDS.items():
         rows = [each for each in found if each.kind == kind]
@@ -360,10 +361,10 @@ def verdicts() -> dict[str, Verdict]:
         "insufficient_data": Verdict(
             "There are three cases:\n\n"
             "1. Fewer than 800 points lie on smooth parts of the reference, where residuals are meaningful.\n"
-            "2. Nothing was named, and there are too few validation points to measure a gap.\n"
-            "3. Much of the wall moved, or the reference shows another place or time. Nothing closes the gap, and at least 30 % "
-            "of the points lie off the reference together with their neighbours, by more than 3 predicted standard deviations "
-            "and 20 mm.",
+            "2. No effect was named, and too few points could be kept for validation to measure a gap.\n"
+            "3. Much of the wall moved, or the reference shows another place or time, and no effect closes the gap. At least 30 "
+            "% of the points lie off the reference together with their neighbours, by both more than 3 predicted standard "
+            "deviations and more than 20 mm. The report then says instead: \"" + MUCH_MOVED + "\"",
             "Scan more densely, or use a reference that covers the scan. If much rock moved, add `stable_areas` where nothing "
             "moved to measurement.yaml, or use a reference of the same time.",
             "A scan has angular steps of 0.05 rad, so only few points lie on the wall.",

@@ -193,6 +193,12 @@ RESOLVED = (
 """Take minutes, or work on results: their words are parsed, their configs read, and each --set must be seen in the config."""
 
 PARSED = (
+    "simulate --sensor tls --config series.yaml --out runs/series",
+    "scarpsim export runs/series epochs --out series.gif",
+    "scarpsim inspect series.yaml --series --sensor tls --out plan",
+    "scarpsim monitor runs/series --out found",
+    "scarpsim view runs/my_series",
+    "scarpsim view runs/series",
     "scarpsim view april",
     "scarpsim monitor march.laz april.laz --out april",
     "scarpsim monitor scans/2026-*.laz --workers 2 --out year",
@@ -258,7 +264,6 @@ NAMED = (
     "scarpsim gap",
     "scarpsim gap --identifiability",
     "scarpsim gap --identifiability CONFIG",
-    "scarpsim gap MEASUREMENT --identifiability",
     "scarpsim init --mesh wall.ply --cameras cameras.xml --out my_site.yaml",
     "scarpsim icp-study RUN|CONFIG [--sensor stereo|tls] [--epochs N] [--offset-m 0.03] --out DIR",
     "scarpsim inspect",

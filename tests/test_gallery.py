@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from make_gallery import parameter_table
+
 from sensors.effects import FURTHER_EFFECTS, STEREO_EFFECTS, TLS_EFFECTS
 
 EFFECTS = (*TLS_EFFECTS, *STEREO_EFFECTS, *FURTHER_EFFECTS)
@@ -20,4 +22,4 @@ def test_every_effect_has_a_page_and_a_small_picture_and_nothing_else_does() -> 
 def test_every_page_states_the_effects_present_parameters() -> None:
     for effect in EFFECTS:
         page = (FOLDER / f"{effect.sensor}.{effect.model_fields['name'].default}.md").read_text()
-        assert all(f"| `{key}` |" in page for key in effect.model_fields if key != "name")
+        assert parameter_table(effect) in page

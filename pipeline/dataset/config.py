@@ -221,7 +221,7 @@ def _only_source(values: dict[str, Any], path: Path) -> dict[str, Any]:
         raise InputError(
             f"the set was merged from {len(configs)} sets, so it has no single config",
             where=str(path),
-            remedy="make each of them",
+            remedy="make each of these sets from its own config",
         )
     if not configs or not isinstance(configs[0], dict):
         raise InputError(

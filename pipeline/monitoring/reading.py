@@ -298,7 +298,7 @@ def _epochs_of_run(folder: Path) -> list[EpochSource]:
         raise InputError("does not state its wall frame", where=str(folder / RUN_FILE), remedy="make the run again")
     epochs = sorted(each for each in folder.glob("epoch_*") if (each / "points.laz").is_file())
     if not epochs:
-        raise InputError("contains no epoch with points", where=str(folder), remedy="make the run again")
+        raise InputError("is a run without a finished epoch", where=str(folder), remedy="finish the run, or make it again")
     return [EpochSource(each, (each / "points.laz",), EpochTime(None, ""), record) for each in epochs]
 
 

@@ -69,8 +69,13 @@ def _row(plan: SeriesPlan, promise: EpochPromise, volume_m3: float) -> list[str]
     shows = promise.moved.displacement_m(volume_m3)[0]
     visible = millimetres(shows) if shows <= plan.motion.displacement_m else "not before it falls"
     leads = [plan.lead_h(volume_m3, every, promise) for every in plan.schedules_h]
-    cells = [f"{least:.1f} h ({usual:.1f} h)" if usual > 0 else "none" for least, usual in leads]
+    cells = [f"{_lead(least)} ({_lead(usual)})" for least, usual in leads]
     return [str(promise.scans), f"{litres(volume_m3)} l", visible, *cells]
+
+
+def _lead(hours: float) -> str:
+    """Return a lead time; "none" where there is none."""
+    return f"{hours:.1f} h" if hours > 0 else "none"
 
 
 def _curves(plan: SeriesPlan) -> bytes:

@@ -103,7 +103,9 @@ def wall_raster(caster: RayCaster, gsd_m: float | None = None) -> WallRaster:
     found = np.array(valid)
     if not found.any():
         raise InputError(
-            "no part of the wall is visible along the normal of its mean plane", where="wall", remedy="check the mesh"
+            "no part of the wall is visible along the normal of its mean plane",
+            where="wall",
+            remedy="check that the mesh is one surface whose triangles face the sensor",
         )
     points, normals = (np.array(array, dtype=np.float64).T[found] for array in (point, normal))
     places = Places(points, normals, np.array(albedo, dtype=np.float64)[found])

@@ -81,6 +81,6 @@ def safe_zone(caster: RayCaster, offset_m: float) -> SafeZone:
         raise InputError(
             f"a margin of {offset_m:g} m leaves no room on a wall of {extent[0]:.3g} x {extent[1]:.3g} m",
             where="safe_zone_offset_m",
-            remedy="make it smaller",
+            remedy="choose a smaller margin, below half of the wall's shorter side",
         )
     return SafeZone(grid, free)

@@ -127,5 +127,6 @@ def test_types_are_shipped() -> None:
 if __name__ == "__main__":
     text = PAGE.read_text()
     head = text if "```text" in text else text + "```text\n"
-    PAGE.write_text(head[: head.index("```text\n") + len("```text\n")] + listed() + "```\n")
+    start = head.index("```text\n") + len("```text\n")
+    PAGE.write_text(head[:start] + listed() + "```\n" + head[start:].partition("```\n")[2])
     sys.exit()

@@ -210,7 +210,7 @@ def _no_coco(path: Path, problem: str) -> InputError:
         f"is not a COCO annotation file ({problem})",
         where=str(path),
         allowed="lists of images, annotations and categories",
-        remedy="make it again",
+        remedy="export the annotations as COCO again",
     )
 
 
@@ -228,7 +228,7 @@ def _parsed(model: type[EntryT], entries: Sequence[Any], kind: str, path: Path) 
                 f"is of the type {type(entry).__name__}",
                 where=where,
                 allowed=f"a mapping with {', '.join(name for name, field in model.model_fields.items() if field.is_required())}",
-                remedy="make the file again",
+                remedy="export the annotations as COCO again",
             )
         try:
             parse(model, entry, where)

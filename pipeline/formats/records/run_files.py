@@ -65,5 +65,9 @@ class RunFiles:
         """Return the path of an epoch's file; raise InputError if the run did not write it."""
         path = epoch_folder(self.folder, number) / name
         if not path.is_file():
-            raise InputError(f"the run did not write {name}", where=str(path.parent), remedy="see `products` in the config")
+            raise InputError(
+                f"the run did not write {name}",
+                where=str(path.parent),
+                remedy="ask for it in `products` of the config, and make the run again",
+            )
         return path

@@ -386,7 +386,7 @@ def _wave_frequencies(x: FloatArray, most_cycles: float, highest: float = np.inf
 
 
 def _wave(factor: FloatArray, x: FloatArray, tried: FloatArray) -> Wave:
-    """A wave of a non-parametric term, with its lowest frequency."""
+    """Make a wave for a non-parametric term in x, starting at the lowest of the frequencies `tried`."""
     return Wave("period", factor, x, float(tried[0]))
 
 
@@ -491,6 +491,6 @@ def spatial_null_candidates(at: FloatArray) -> list[Candidate | SineGrid]:
 
 
 def _nonparametric(covariate: str, form: str, matrix: FloatArray) -> Candidate:
-    """A non-parametric term with the given columns."""
+    """Make the candidate of a non-parametric term of a covariate. form: its kind, such as "spline"; matrix: (n, k) columns."""
     names = tuple(f"c{index}" for index in range(matrix.shape[1]))
     return Candidate(covariate, matrix, lambda c: dict(zip(names, map(float, c), strict=True)), names, {}, True, form)

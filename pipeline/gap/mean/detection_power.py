@@ -201,7 +201,7 @@ class DetectionPower:
 
 
 def _first_reaching(sizes: FloatArray, reached: Callable[[float], float], needed: float) -> float:
-    """The smallest size at which a rising function reaches a value, interpolated; infinite if none does."""
+    """Return the smallest size at which a rising function reaches `needed`, interpolated; infinite if no size does."""
     before = 0.0, 0.0
     for size in map(float, sizes):
         value = reached(size)
@@ -272,7 +272,7 @@ def _both(candidate: Candidate) -> bool:
 
 
 def _of_variants(variants: list[DetectableSize]) -> DetectableSize:
-    """Of each camera the set of parameters that shows the smallest size; of the cameras the one with the largest."""
+    """Return the detectable size of an effect with variants: the smallest of each camera's, and of these the largest."""
     cameras: dict[object, DetectableSize] = {}
     for each in variants:
         side = each.at.get("camera")

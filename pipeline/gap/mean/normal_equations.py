@@ -258,11 +258,11 @@ class NormalEquations:
         return self._of([self.covariances[index] for index in chosen], chosen)
 
     def _part(self, rows: slice) -> NormalEquations:
-        """The equations of consecutive covariances."""
+        """Return the equations for consecutive covariances, given as a slice."""
         return self._of(self.covariances[rows], rows)
 
     def _of(self, at: list[CellCovariance], rows: Any) -> NormalEquations:
-        """The equations of some rows, whose covariances are `at`."""
+        """Return the equations for some of the covariances: their indices are `rows`, and they are `at`."""
         names = ("fixed", "right", "constant", "wave_fixed", "wave_own", "wave_right")
         return replace(self, covariances=at, **{name: getattr(self, name)[rows] for name in names})
 
@@ -305,7 +305,7 @@ class NormalEquations:
         return plain, added, waves
 
     def _profile_chunk(self, base: list[int], fixed: list[list[int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The same for a few covariances."""
+        """Compute `profile_log_likelihood` for a few covariances at once."""
         count, whole = self.right.shape[2], self.fixed.shape[2]
         waves = self.wave_fixed[:, :, [self.held_columns.index(column) for column in base]]
         beside = self.fixed[:, base]

@@ -101,7 +101,7 @@ class MeanSearch:
         return self._score_families(members, self.single_effect_ratios)
 
     def _score_families(self, members: EffectSet, alone: Mapping[ExplanationKey, float]) -> tuple[FamilyScore, ...]:
-        """The same, with given log-likelihood ratios of each explanation alone."""
+        """Score every family as an addition to `members`. alone: log-likelihood ratio of each explanation without others."""
         plain, fixed, searched = self._profile(tuple(member.candidate for member in members))
         families, found = self.design.families, []
         for name, (rows, sines) in families.by_name.items():
@@ -123,7 +123,7 @@ class MeanSearch:
         return self._profiles[candidates]
 
     def _conditioned_on(self, candidates: tuple[Candidate, ...]) -> Design:
-        """The design conditioned on some candidates; cached."""
+        """Return the regression design with some candidates as nuisance columns; cached."""
         if candidates not in self._designs:
             self._designs[candidates] = self._conditioned_on(candidates[:-1]).conditioned_on(candidates[-1])
         return self._designs[candidates]
@@ -242,7 +242,7 @@ class MeanSearch:
         return self._with_overtones(members, form) if form.candidate.form == "wave" else form
 
     def _of_fewest_lines(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
-        """Of the line patterns that score nearly as well, the one with the fewest lines."""
+        """Return the pattern with the fewest scan lines a cycle among those whose score is nearly that of `form`."""
         patterns = [
             each
             for each in self.score_families(members)
@@ -252,7 +252,7 @@ class MeanSearch:
         return min(good, key=lambda each: each.candidate.period)
 
     def _wave_instead(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
-        """A wave of the same covariate, with its period refined, if it scores better than a spline; else the spline."""
+        """Return the wave of the same covariate with refined period if it scores better than the spline `form`, else `form`."""
         waves = [each for each in self.score_families(members) if each.candidate.form == "wave" and _same_covariate(each, form)]
         if not waves:
             return form
@@ -263,7 +263,7 @@ class MeanSearch:
         return replace(wave, candidate=sine, log_likelihood_ratio=ratio, score=score) if score > form.score else form
 
     def _with_overtones(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
-        """A wave with its overtones if these improve the score clearly; else the wave itself."""
+        """Return the wave `form` with its overtones if they improve the score clearly, else the wave itself."""
         (sine, *others), fit = self.design.fit_refined([form.candidate, *(member.candidate for member in members)])
         unit = float(self.design.residuals.covariates[form.name].std()) or 1.0
 
@@ -305,7 +305,7 @@ class MeanSearch:
         return self._fitted_std_and_fit(item, ())[0]
 
     def _fitted_std_and_fit(self, form: FamilyScore, members: EffectSet) -> tuple[float, MeanFit]:
-        """The same beside some effects, and the joint fit."""
+        """Return the standard deviation of the fitted values of `form`, fitted jointly with `members`, and the joint fit."""
         candidates, fit = self.design.fit_refined([form.candidate, *(member.candidate for member in members)])
         columns = candidates[0].columns
         values = self.design.split_coefficients(fit.coefficients, candidates)[0][: columns.shape[1]]

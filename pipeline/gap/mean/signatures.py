@@ -29,6 +29,7 @@ from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, Search, ShowsIn
 from sensors.effects.camera_effect import CameraEffect
 from sensors.effects.pixel_locking import PixelLocking
+from sensors.effects.tile_shift import TileShift
 
 _SIDES = ("left", "right", "both")
 """Cameras that an effect may belong to."""
@@ -66,7 +67,8 @@ def systematic_families(residuals: Residuals, measurement: Measurement) -> list[
     measurement : The measurement, whose model must be in the state for which the residuals were computed.
     """
     geometry = residuals.geometry
-    shown = [effect for effect in residuals.candidates if effect.shows_in == ShowsIn.MEAN and effect.known(geometry)]
+    possible = [effect for effect in residuals.candidates if effect is not TileShift]  # its seams are found before, by themselves
+    shown = [effect for effect in possible if effect.shows_in == ShowsIn.MEAN and effect.known(geometry)]
     cameras: list[type[CameraEffect]] = [effect for effect in shown if issubclass(effect, CameraEffect)]
     found: list[Candidate | SineGrid] = []
     if isinstance(residuals, StereoResiduals) and isinstance(measurement, StereoMeasurement) and cameras:
@@ -79,7 +81,7 @@ def systematic_families(residuals: Residuals, measurement: Measurement) -> list[
 
 
 def _families(effect: type[Effect], geometry: Geometry, fixed: dict[str, Any]) -> Iterator[Candidate | SineGrid]:
-    """The candidates of one effect, from its own equation at typical sizes."""
+    """Yield the candidates of one effect; their columns follow from its equation at typical parameter values."""
     if effect.searched is not None:
         yield from _searched(effect, effect.searched, geometry, fixed)
     elif _PHASE in effect.model_fields:
@@ -106,7 +108,7 @@ def _sine_and_cosine(effect: type[Effect], geometry: Geometry, fixed: dict[str, 
 
 
 def _searched(effect: type[Effect], search: Search, geometry: Geometry, fixed: dict[str, Any]) -> Iterator[SineGrid]:
-    """A grid of periods with the resolution that the extent of the sine's argument gives."""
+    """Yield the periods to try for a sine; the extent of its argument over the points sets their spacing."""
     (amplitude,) = effect.typical_sizes()
     x = np.asarray(effect(**fixed).argument(geometry), dtype=np.float64)
     reach = max(float(np.ptp(np.quantile(x, [0.01, 0.99]))), search.shortest)
@@ -131,7 +133,7 @@ def _shortest(search: Search, geometry: Geometry) -> float:
 def _of_cameras(
     effects: list[type[CameraEffect]], geometry: PixelGeometry, measurement: StereoMeasurement
 ) -> list[Candidate | SineGrid]:
-    """The candidates of camera effects, by finite differences: the disparities that the changed pair measures."""
+    """Return the candidates of camera effects; their columns are finite differences of the pair's disparities."""
     nominal = NominalPair.of(measurement)
     sets = {effect: effect.sets or (tuple(effect.nulls()),) for effect in effects}
     varied = [
@@ -160,7 +162,7 @@ def _of_cameras(
 
 
 def _by_name(names: tuple[str, ...], values: FloatArray) -> dict[str, float]:
-    """The parameters of coefficients, by name."""
+    """Return the coefficients by the names of their parameters."""
     return dict(zip(names, map(float, values), strict=True))
 
 

@@ -139,7 +139,7 @@ class _SingleFit:
 
 
 def _on_common_points(fits: list[_SingleFit], first: MeanSearch) -> list[_SingleFit]:
-    """The fits with likelihoods of the points that all of them use; a point that one leaves out would favour it."""
+    """Return the fits with their log-likelihoods on the points that all of them use, so that none gains by leaving out points."""
     common, design = np.all([each.used for each in fits], axis=0), first.design
     values = (np.where(common, each.value, 0.0) for each in fits)
     return [
@@ -149,7 +149,7 @@ def _on_common_points(fits: list[_SingleFit], first: MeanSearch) -> list[_Single
 
 
 def _ranked_on_common_points(fits: list[_SingleFit], first: MeanSearch) -> list[_SingleFit]:
-    """The same, best first."""
+    """Return the fits with log-likelihoods on the points that all of them use, best first."""
     return sorted(_on_common_points(fits, first), key=lambda each: -each.score)
 
 
@@ -356,7 +356,10 @@ def _search_beside_best(given: SearchInput, plain: SearchOutcome, alone: list[_S
 
 
 def _with_equivalence_class(converged: list[_SingleFit]) -> _SingleFit:
-    """The best single fit with its equivalence class; the linearised search decides for effects that were not refitted."""
+    """Return the best of the refitted single effects with the effects that cannot be told from it (its equivalence class).
+
+    For effects that were not refitted, the linearised search decides.
+    """
     best, *others = converged
     chosen = best.estimate.chosen
     least = best.score - equivalence_margin(chosen.log_likelihood_ratio)
@@ -470,12 +473,12 @@ def _merge_sines_with_overtones(estimates: list[Estimate]) -> list[Estimate]:
 
 
 def _still_present(at: Residuals, part: Residuals) -> BoolArray:
-    """Which points of `part` are left."""
+    """Return for each point of `part` whether `at` still contains it."""
     return np.isin(part.index, at.index)
 
 
 def _recomputed(candidate: Candidate, families: list[Candidate | SineGrid]) -> Candidate:
-    """The same candidate for other rays."""
+    """Return the same candidate with the design columns of other rays, found among `families`."""
     key = "" if candidate.wave is None else candidate.wave.key
     chosen = {name: value for name, value in candidate.fixed.items() if name != key}
     for family in families:

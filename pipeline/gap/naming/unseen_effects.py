@@ -46,7 +46,7 @@ def unseen_effects(residuals: Residuals, computed: Iterable[DetectableSize], nam
 
 
 def _plausible(item: DetectableSize, effect: type[Effect] | None) -> DetectableSize:
-    """The entry, without a size if the size is larger than any plausible one."""
+    """Return the detectable size of an effect, but without a value if it is larger than any plausible one."""
     typical = effect.typical_sizes().get(item.parameter, np.inf) if effect is not None else np.inf
     if item.size <= thresholds().mean.largest_size * typical and np.isfinite(item.size):
         return item

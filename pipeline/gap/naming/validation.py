@@ -175,7 +175,7 @@ class Validation:
 
 
 def _without_losses(named: list[NamedEffect]) -> list[NamedEffect]:
-    """The effects that change ranges on the wall; drops return early, which no range on the wall is like."""
+    """Return the effects without those that only remove or add returns, because these change no range on the wall."""
     return [item for item in named if item.effect.shows_in != ShowsIn.RETURNS]
 
 

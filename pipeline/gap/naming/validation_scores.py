@@ -126,7 +126,7 @@ def _is_consistent_with_zero(item: NamedEffect) -> bool:
 
 
 def _gain_needed_by(item: NamedEffect, expected: float) -> float:
-    """The gain at or below which an effect fails; some effects have a limit of their own."""
+    """Return the validation gain that an effect must exceed; some effects have a limit of their own."""
     return item.effect.held_out_gain or _gain_needed(expected)
 
 
