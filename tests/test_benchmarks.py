@@ -36,6 +36,7 @@ ELSEWHERE = {
     "gap_injections/run": "tests/test_gap_injections.py",
     "gap_second_generator/run": "tests/test_gap_second_generator.py",
     "gap_thresholds": "tests/test_varied.py",
+    "gap_cost": "tests/test_gap_cost.py",
     "mutation": "tests/test_mutation.py",
     "performance": "tests/test_performance.py",
     "readers/draw": "tests/test_generated_pages.py",

@@ -264,7 +264,6 @@ NAMED = (
     "scarpsim gap",
     "scarpsim gap --identifiability",
     "scarpsim gap --identifiability CONFIG",
-    "scarpsim gap MEASUREMENT --identifiability",
     "scarpsim init --mesh wall.ply --cameras cameras.xml --out my_site.yaml",
     "scarpsim icp-study RUN|CONFIG [--sensor stereo|tls] [--epochs N] [--offset-m 0.03] --out DIR",
     "scarpsim inspect",

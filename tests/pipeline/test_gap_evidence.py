@@ -22,7 +22,7 @@ from pipeline.gap.naming.named_effects import NamedEffect
 from pipeline.gap.naming.selection_passes import subsample
 from pipeline.gap.naming.validation_scores import describe_weakness, validate_effects
 from pipeline.gap.naming.workflow import diagnose
-from pipeline.gap.noise_and_edges.variance_model import fit_variance_model
+from pipeline.gap.noise_and_edges.variance_model import fit_variance_model, variance_candidates
 from pipeline.gap.residuals.alignment import align, fit_pose_robustly
 from pipeline.gap.residuals.wall_blocks import WallCells, in_validation_blocks
 from scene.common.keyed_random import KeyedRandom
@@ -98,6 +98,25 @@ def test_noise_differs_between_neighbours_and_an_error_of_the_reference_does_not
     value = fit_pose_robustly(replace(part, value=part.value + 0.002 * extra))[0]
     spread, _, _ = fit_variance_model(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
     assert len(spread) == count
+
+
+@pytest.mark.parametrize(("angle", "expected"), [(10.0, {"angle_noise", "range_noise"}), (1000.0, {"angle_noise"})])
+def test_a_second_noise_explains_more_than_the_inexact_part_of_the_first(
+    tmp_path: Path, angle: float, expected: set[str]
+) -> None:
+    """White noise of five times the predicted variance is named beside angle noise of ten times, and not of a thousand times it.
+
+    Beside the latter it gains less than a hundredth of what the angle noise gains.
+    """
+    write_scan(tmp_path, 3, step_rad=0.006)
+    _, residuals, _ = align(read_measurement(tmp_path))
+    part = residuals.part(residuals.usable)
+    form = next(each.variance.sum(axis=1) for each in variance_candidates(part) if each.name == "angle_noise")
+    own = float(np.median(part.sigma)) ** 2
+    variance = part.sigma**2 + own * (angle * form / form.mean() + 5.0)
+    value = np.sqrt(variance) * np.random.default_rng(4).standard_normal(len(part))
+    found, _, _ = fit_variance_model(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
+    assert {each.effect for each in found} == expected
 
 
 def test_what_a_free_form_misses_of_a_drift_gets_no_name(tmp_path: Path) -> None:

@@ -247,6 +247,8 @@ def test_the_registry_has_the_whole_catalogue() -> None:
             "occlusion_fill",
             "texture_noise",
             "row_jitter",
+            "tile_shift",
+            "fronto_parallel_bias",
         ),
     }
 

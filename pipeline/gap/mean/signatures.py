@@ -29,6 +29,7 @@ from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, Search, ShowsIn
 from sensors.effects.camera_effect import CameraEffect
 from sensors.effects.pixel_locking import PixelLocking
+from sensors.effects.tile_shift import TileShift
 
 _SIDES = ("left", "right", "both")
 """Cameras that an effect may belong to."""
@@ -66,7 +67,8 @@ def systematic_families(residuals: Residuals, measurement: Measurement) -> list[
     measurement : The measurement, whose model must be in the state for which the residuals were computed.
     """
     geometry = residuals.geometry
-    shown = [effect for effect in residuals.candidates if effect.shows_in == ShowsIn.MEAN and effect.known(geometry)]
+    possible = [effect for effect in residuals.candidates if effect is not TileShift]  # its seams are found before, by themselves
+    shown = [effect for effect in possible if effect.shows_in == ShowsIn.MEAN and effect.known(geometry)]
     cameras: list[type[CameraEffect]] = [effect for effect in shown if issubclass(effect, CameraEffect)]
     found: list[Candidate | SineGrid] = []
     if isinstance(residuals, StereoResiduals) and isinstance(measurement, StereoMeasurement) and cameras:

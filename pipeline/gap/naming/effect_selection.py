@@ -23,6 +23,7 @@ from pipeline.gap.naming.named_effects import (
     effect_from_estimate,
     effect_from_locking,
     effect_from_range_step,
+    effect_from_seams,
     effect_from_variance,
     merge_angle_curves,
     out_of_bounds,
@@ -38,6 +39,7 @@ from pipeline.gap.noise_and_edges.grid_noise import find_grid_noise, separate_wh
 from pipeline.gap.noise_and_edges.noise_power import detectable_noise
 from pipeline.gap.noise_and_edges.pixel_locking import NoiseBounds, find_locking
 from pipeline.gap.noise_and_edges.rounded_ranges import find_range_step
+from pipeline.gap.noise_and_edges.tile_seams import find_tile_seams
 from pipeline.gap.noise_and_edges.variance_model import NoiseRatio, VarianceScore, VarianceTerm, fit_variance_model
 from pipeline.gap.residuals.alignment import at_points_of, fit_pose_robustly
 from pipeline.gap.residuals.residuals import Residuals
@@ -52,6 +54,7 @@ from sensors.effects.base import ShowsIn
 from sensors.effects.pixel_locking import PixelLocking
 from sensors.effects.range_quantization import RangeQuantization
 from sensors.effects.regularization_noise import RegularizationNoise
+from sensors.effects.tile_shift import TileShift
 
 _GRID_NOISE = RegularizationNoise.tag()
 NONPARAMETRIC_TERMS = ("", True)
@@ -144,6 +147,11 @@ def select_effects(
         at = part.geometry
         allowed = NoiseBounds(float(np.median(part.sigma)), nmad(fit_pose_robustly(part)[0]))
         locking = find_locking(at.found, at.disparity, at.tangent, at.infinity, allowed)
+    tiles_known = (TileShift.tag(), False) in excluded or model_has(measurement, TileShift.tag())
+    if isinstance(part, StereoResiduals) and not tiles_known:
+        seams = find_tile_seams(part, fit_pose_robustly(part)[0])
+        if seams is not None:
+            return _select_beside_tiles(measurement, part, effect_from_seams(seams), random, excluded)
     if range_step is not None:
         named.append(effect_from_range_step(range_step, part))
         added, noise_ratio = range_step.step_m**2 / 12, 1.0
@@ -282,6 +290,16 @@ def keep_implausible_in_class(
             replace(item, indistinguishable=(*item.indistinguishable, *sorted(alike - {item.name, *item.indistinguishable})))
         )
     return found
+
+
+def _select_beside_tiles(
+    measurement: Measurement, part: Residuals, tiles: NamedEffect, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]
+) -> tuple[list[NamedEffect], SelectionResult]:
+    """Select effects with the shifts of tiles in the model."""
+    aligned, found, _ = aligned_with(measurement, [tiles], part.index)
+    at = at_points_of(found, part)
+    named, result = select_effects(aligned, at, fit_pose_robustly(at)[2], random, excluded)
+    return [tiles, *named], replace(result, systematic=result.systematic | {tiles.name})
 
 
 def _select_beside_angle_terms(

@@ -16,6 +16,7 @@ from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
 from pipeline.gap.noise_and_edges.missing_returns import LossExplanation
 from pipeline.gap.noise_and_edges.pixel_locking import Locking
 from pipeline.gap.noise_and_edges.rounded_ranges import RangeStep
+from pipeline.gap.noise_and_edges.tile_seams import TileSeams
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
 from pipeline.gap.residuals.alignment import AlignedMeasurement, align
 from pipeline.gap.residuals.residuals import Residuals
@@ -30,6 +31,7 @@ from sensors.effects.base import Effect, ShowsIn
 from sensors.effects.detection_limit import DetectionLimit
 from sensors.effects.pixel_locking import PixelLocking
 from sensors.effects.range_quantization import RangeQuantization
+from sensors.effects.tile_shift import TileShift
 from sensors.models.sensor_model import StereoModel, TlsModel
 from sensors.numerics.curve import Axis, interpolate_on_host
 
@@ -207,6 +209,13 @@ def effect_from_locking(found: Locking) -> NamedEffect:
         "tilt_rad": found.tilt_rad,
     }
     return NamedEffect(f"stereo.{PixelLocking.tag()}", "physical", entry, {"amplitude_px": found.std_px}, (), None, found.gain)
+
+
+def effect_from_seams(found: TileSeams) -> NamedEffect:
+    """Return tiles that are shifted against each other, as found from their seams, as a named effect."""
+    entry = {"name": TileShift.tag(), "amplitude_px": found.amplitude_px, "tile_px": found.tile_px}
+    std = {"amplitude_px": found.amplitude_std_px, "tile_px": found.tile_std_px}
+    return NamedEffect(f"stereo.{TileShift.tag()}", "physical", entry, std, (), found.p_value, found.gain)
 
 
 def effect_from_variance(found: VarianceTerm, sensor: str) -> NamedEffect:

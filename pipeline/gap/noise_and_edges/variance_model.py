@@ -209,6 +209,8 @@ def fit_variance_model(
     for first_round in (True, False):
         # in the second round points have the weight of their fitted noise, as noisy points would shift the plane of their cell
         z = standardised_deviations(weighted, cells, value)
+        if not np.isfinite(z).any():  # no cell has enough points for a plane and a deviation from it
+            return [], [], ""
         used = np.isfinite(z) & (np.abs(z) < thresholds().variance.clip_sigmas * max(1.0, nmad(z, 0.0)))
         squares = (z * weighted.sigma)[used] ** 2 / predicted[used]
         shapes = [candidate.variance[used] / predicted[used, None] for candidate in candidates]
@@ -238,7 +240,8 @@ def fit_variance_model(
     free_name, free_score, free = _best_binned_variance(squares, {name: v[used] for name, v in residuals.covariates.items()})
     # where one effect leaves a misfit, a second one of the catalogue is preferred to a binned variance
     ahead = max(by.nonparametric_margin, by.class_share * best.gain)
-    needed = by.second_gain if free_score > best.score + ahead else by.least_gain
+    # no form of a variance is exact, so a second effect must explain more than the inexact part of the first
+    needed = max(by.second_gain if free_score > best.score + ahead else by.least_gain, by.class_share * best.gain)
     agreed = pair.score > best.score + needed and _blocks_agree(squares, best.added(shapes), pair.added(shapes), block)
     chosen = pair if agreed and all(float(theta.max()) > 0 for theta in pair.theta) else best
     free_fits_better = free_score > chosen.score + ahead and _blocks_prefer_binned(squares, chosen.added(shapes), free, block)
@@ -327,6 +330,8 @@ class NoiseRatio:
         """
         z = standardised_deviations(residuals, cells, value)
         used = np.isfinite(z)
+        if not used.any():
+            return cls(1.0, False)
         squares = np.minimum(z[used] ** 2, _CLIP_SIGMAS**2) / _expected_mean_square(residuals, cells, random)
         means = np.bincount(
             np.unique(wall_block_numbers(residuals.wall_xy[used], cells.side_m), return_inverse=True)[1], squares - 1

@@ -42,6 +42,8 @@ class PixelGeometry:
     tangent : (n,) tangent of the angle between the rectified row and the rectified axis.
     infinity : (n,) disparity of a point at infinity, px.
     shaped : (n,) what effects of neighbouring pixels (edge fattening, smoothing) add to the reference's disparity, px.
+    along_row, along_column : (n,) change of the reference's disparity per px along the row and along the column of the left
+        image; None if not computed.
     """
 
     u: FloatArray
@@ -56,6 +58,8 @@ class PixelGeometry:
     tangent: FloatArray
     infinity: FloatArray
     shaped: FloatArray
+    along_row: FloatArray | None = None
+    along_column: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.u)

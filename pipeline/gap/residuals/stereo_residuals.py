@@ -200,20 +200,31 @@ def _reference(
     ray = pixel_rays(left, u, v)
     distance, face = scene.cast(left.position, ray)
     point = left.position + distance[:, None] * ray
-    right = project(camera, point)
+    right, normal = project(camera, point), scene.mesh.normals[np.maximum(face, 0)]
+    disparity = nominal.disparity((u, v), right)
+
+    def change(du: float, dv: float) -> FloatArray:
+        """Change of the disparity from a pixel to one beside it that sees the same plane, (n,), px."""
+        beside = pixel_rays(left, u + du, v + dv)
+        plane = np.einsum("ni,ni->n", point - left.position, normal) / np.einsum("ni,ni->n", beside, normal)
+        seen = project(camera, left.position + plane[:, None] * beside)
+        return nominal.disparity((u + du, v + dv), seen) - disparity
+
     geometry = PixelGeometry(
         u=u,
         v=v,
         v_right=right[1],
-        disparity=nominal.disparity((u, v), right),
+        disparity=disparity,
         found=measured,
         point=point,
-        normal=scene.mesh.normals[np.maximum(face, 0)],
+        normal=normal,
         radius=np.hypot(u - left.width / 2, v - left.height / 2),
         radius_right=np.hypot(right[0] - camera.width / 2, right[1] - camera.height / 2),
         tangent=nominal.tangent(u, v),
         infinity=np.full(len(u), nominal.geometry.offset),
         shaped=np.zeros(len(u)),
+        along_row=change(1.0, 0.0),
+        along_column=change(0.0, 1.0),
     )
     return geometry, distance
 

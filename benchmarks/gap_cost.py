@@ -1,0 +1,118 @@
+"""Where the processor time of `scarpsim gap` goes: diagnose measurements and print the slowest with the share of each part.
+
+    python benchmarks/gap_cost.py FOLDER [FOLDER ...]
+
+A FOLDER is a measurement or holds measurements. Times are processor seconds of all threads, each without the parts inside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import wraps
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+from pipeline.formats.measurements.measurement import FILE, read_measurement
+from pipeline.gap.mean.search import MeanSearch
+from pipeline.gap.naming import effect_selection, nonlinear_refit, selection_passes, workflow
+from pipeline.gap.naming.validation import Validation
+
+MOST_ROWS = 10
+PARTS: dict[str, list[tuple[Any, str]]] = {
+    "first residuals and pose": [(workflow, "compute_residuals"), (workflow, "align")],
+    "residuals beside effects": [(nonlinear_refit, "_aligned_with_estimates"), (selection_passes, "aligned_with")],
+    "edge effects": [(selection_passes, "_find_edge_effects"), (selection_passes, "_with_edge_effects")],
+    "scene changes": [(selection_passes, "find_scene_changes")],
+    "signatures": [(effect_selection, "candidate_families"), (nonlinear_refit, "candidate_families")],
+    "search: design and null": [(MeanSearch, "__init__")],
+    "search: selection": [(MeanSearch, "select")],
+    "refits": [(nonlinear_refit, "_strongest_single_fits"), (nonlinear_refit, "search_at_joint_fit")],
+    "noise": [(effect_selection, "_fit_variance"), (effect_selection, "find_grid_noise")],
+    "detectable sizes": [(effect_selection, "_detectable_sizes")],
+    "validation of effects": [(workflow, "validate_effects")],
+    "gap": [(Validation, "validate")],
+}
+"""Functions whose time is counted, by part of the workflow, in the modules that call them."""
+
+
+@dataclass(frozen=True)
+class DiagnosisCost:
+    """Processor seconds of one diagnosis. parts: by part of the workflow."""
+
+    name: str
+    verdict: str
+    points: int
+    seconds: float
+    parts: Counter[str]
+
+
+@contextmanager
+def counted() -> Iterator[Counter[str]]:
+    """Count the processor seconds of each part, without the parts that it calls."""
+    spent: Counter[str] = Counter()
+    inside = [0.0]
+
+    def wrapped(part: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(function)
+        def call(*values: Any, **named: Any) -> Any:
+            start = time.process_time()
+            inside.append(0.0)
+            try:
+                return function(*values, **named)
+            finally:
+                whole = time.process_time() - start
+                spent[part] += whole - inside.pop()
+                inside[-1] += whole
+
+        return call
+
+    with ExitStack() as stack:
+        for part, places in PARTS.items():
+            for owner, name in places:
+                stack.enter_context(patch.object(owner, name, wrapped(part, getattr(owner, name))))
+        yield spent
+
+
+def cost_of(folder: Path) -> DiagnosisCost:
+    """Diagnose a measurement and return what it cost."""
+    measurement, start = read_measurement(folder), time.process_time()
+    with counted() as spent:
+        found = workflow.diagnose(measurement)
+    whole = time.process_time() - start
+    spent["rest"] = whole - sum(spent.values())
+    return DiagnosisCost(folder.name, found.verdict, len(found.residuals), whole, spent)
+
+
+def table(costs: list[DiagnosisCost]) -> str:
+    """Return the slowest diagnoses as text, each with the parts that take more than a twentieth of its time."""
+    lines = []
+    for each in sorted(costs, key=lambda cost: -cost.seconds)[:MOST_ROWS]:
+        lines.append(f"{each.seconds:7.1f} s  {each.name} ({each.points:,} points, {each.verdict})")
+        large = [(part, seconds) for part, seconds in each.parts.most_common() if seconds > 0.05 * each.seconds]
+        lines += [f"    {seconds:7.1f} s  {part}" for part, seconds in large]
+    return "\n".join(lines)
+
+
+def main(words: list[str] | None = None) -> None:
+    """Diagnose the measurements that the command line names and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER")
+    given: list[Path] = parser.parse_args(words).folders
+    folders = [
+        path.parent for each in given for path in ([each / FILE] if (each / FILE).is_file() else sorted(each.glob(f"*/{FILE}")))
+    ]
+    costs = []
+    for folder in folders:
+        costs.append(cost_of(folder))
+        print(f"{costs[-1].seconds:.0f} s  {folder.name}", flush=True)
+    print(table(costs))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,170 @@
+"""Find tiles of a stereo matcher that are shifted against each other, by the differences of neighbours on both sides of a seam.
+
+For a checkerboard of amplitude A, the difference of two neighbouring cells is +-2 A across a seam and 0 elsewhere, whatever the
+pose and the smooth error of the reference are. Every side of a tile is tried.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from pipeline.change.robust import nmad
+from pipeline.gap.residuals.disparity_raster import raster_cell_px
+from pipeline.gap.residuals.residuals import BoolArray
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+from pipeline.gap.thresholds import thresholds
+from scene.geometry.mesh import FloatArray
+
+_SMALLEST_CELLS, _LARGEST_SHARE = 4.0, 0.5
+"""Smallest side of a tile, cells of the raster, and largest, share of the image's width."""
+_SHARE_OF_CELL = 0.25
+"""Share of a cell by which the last seam of neighbouring trials differs."""
+_CLIP_SIGMAS = 4.0
+"""Standard deviations at which differences are clipped, because of depth steps."""
+_AT_ONCE, _REFINED = 512, 201
+"""Sides that are tried together, and sides that are tried around the best one."""
+
+
+@dataclass(frozen=True)
+class TileSeams:
+    """Tiles that were found.
+
+    Attributes
+    ----------
+    tile_px, amplitude_px : side and shift of a tile, as in the effect `tile_shift`.
+    tile_std_px, amplitude_std_px : their standard deviations.
+    gain : log-likelihood ratio of the differences across seams.
+    p_value : Gaussian p-value of these, times the number of trials.
+    """
+
+    tile_px: float
+    amplitude_px: float
+    tile_std_px: float
+    amplitude_std_px: float
+    gain: float
+    p_value: float
+
+
+@dataclass(frozen=True)
+class _SeamDifferences:
+    """Differences of neighbouring cells along one axis, 0 where one is missing.
+
+    Attributes
+    ----------
+    value, known : (rows, columns) clipped differences, and where both cells hold a point.
+    """
+
+    value: FloatArray
+    known: BoolArray
+
+    @classmethod
+    def of(cls, raster: FloatArray, axis: int) -> _SeamDifferences:
+        """Compute them from a raster (rows, columns), NaN where there is no point."""
+        found = np.diff(raster, axis=axis)
+        known = ~np.isnan(found)
+        most = _CLIP_SIGMAS * nmad(found[known]) if known.any() else 0.0
+        return cls(np.where(known, np.clip(found, -most, most), 0.0), known)
+
+    @property
+    def variance(self) -> float:
+        """Variance of the differences."""
+        return float(np.sum(self.value**2) / max(self.known.sum(), 1))
+
+
+def find_tile_seams(residuals: StereoResiduals, registered_residuals: FloatArray) -> TileSeams | None:
+    """Find shifted tiles; None without any, or if the pixels lie on no raster.
+
+    Parameters
+    ----------
+    residuals : Residuals of n points, px.
+    registered_residuals : (n,) the same after a robust pose fit.
+    """
+    at = residuals.geometry
+    step = raster_cell_px(at.u, at.v)
+    if step is None:
+        return None
+    (u, column), (v, row) = (_axis(x, step) for x in (at.u, at.v))
+    raster = np.full((len(v), len(u)), np.nan)
+    raster[row, column] = registered_residuals
+    across, down = _SeamDifferences.of(raster, 1), _SeamDifferences.of(raster, 0)
+    sides = _sides(u, v, step)
+    if not len(sides) or not across.variance or not down.variance:
+        return None
+    trials = [_TileTrials.of(part, u, v, across, down) for part in np.array_split(sides, -(-len(sides) // _AT_ONCE))]
+    coarse = max(trials, key=lambda each: abs(each.sigmas[each.best]))
+    p_value = min(2 * len(sides) * float(norm.sf(abs(coarse.sigmas[coarse.best]))), 1.0)
+    if p_value > thresholds().locking.significance:
+        return None
+    reach = 2 * float(sides[1] / sides[0] - 1)
+    found = _TileTrials.of(coarse.sides[coarse.best] * np.linspace(1 - reach, 1 + reach, _REFINED), u, v, across, down)
+    sigmas, information = float(found.sigmas[found.best]), float(found.information[found.best])
+    near = found.sides[np.abs(found.sigmas) > abs(sigmas) - 1]
+    return TileSeams(
+        float(near.mean()),
+        float(found.total[found.best]) / information,
+        float(np.ptp(near) + np.diff(found.sides)[0]) / np.sqrt(12),
+        float(1 / np.sqrt(information)),
+        0.5 * sigmas**2,
+        p_value,
+    )
+
+
+@dataclass(frozen=True)
+class _TileTrials:
+    """Sides of a tile that were tried.
+
+    Attributes
+    ----------
+    sides : (k,) sides, px.
+    total, information : (k,) weighted sum of the signed differences across seams, and the information on the amplitude.
+    """
+
+    sides: FloatArray
+    total: FloatArray
+    information: FloatArray
+
+    @classmethod
+    def of(cls, sides: FloatArray, u: FloatArray, v: FloatArray, across: _SeamDifferences, down: _SeamDifferences) -> _TileTrials:
+        """Evaluate sides (k,) with the differences along rows and columns of a raster with coordinates u and v, px."""
+        column, row = (1.0 - 2.0 * (np.floor(x[None] / sides[:, None]) % 2) for x in (u, v))
+        total, information = np.zeros(len(sides)), np.zeros(len(sides))
+        for along, beside, value, known, variance in (
+            (column, row, across.value, across.known, across.variance),
+            (row, column, down.value.T, down.known.T, down.variance),
+        ):
+            jump = np.diff(along, axis=1)
+            total += np.sum((beside @ value) * jump, axis=1) / variance
+            information += jump**2 @ known.sum(axis=0) / variance
+        return cls(sides, total, information)
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(k,) amplitudes over their standard deviations."""
+        return np.divide(self.total, np.sqrt(self.information), out=np.zeros_like(self.total), where=self.information > 0)
+
+    @property
+    def best(self) -> int:
+        """Number of the side with the most significant amplitude."""
+        return int(np.argmax(np.abs(self.sigmas)))
+
+
+def _axis(x: FloatArray, step: float) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Coordinates of the raster's columns (or rows), px, and the (n,) index of each point's."""
+    low = float(x.min())
+    index = np.rint((x - low) / step).astype(np.int64)
+    return low + step * np.arange(index.max() + 1), index
+
+
+def _sides(u: FloatArray, v: FloatArray, step: float) -> FloatArray:
+    """Sides of a tile to try, px. The last seam, at about `last`, moves by a part of a cell from one to the next."""
+    last = float(max(u[-1], v[-1]))
+    smallest, largest = _SMALLEST_CELLS * step, _LARGEST_SHARE * last
+    if largest <= smallest:
+        return np.empty(0)
+    # side n has its last seam k n near `last`, and moves it by k dn = last / n dn
+    count = int(np.ceil(np.log(largest / smallest) * last / (_SHARE_OF_CELL * step)))
+    return np.geomspace(smallest, largest, count)

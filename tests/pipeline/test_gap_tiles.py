@@ -1,0 +1,55 @@
+"""Shifted tiles of a matcher are found from their seams, beside smooth errors and noise; nothing is found without them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.gap.noise_and_edges.tile_seams import find_tile_seams
+from pipeline.gap.residuals.nominal_pair import PixelGeometry
+from pipeline.gap.residuals.stereo_residuals import StereoResiduals
+
+STEP, COLUMNS, ROWS, SIGMA = 16.0, 150, 100, 0.3
+
+
+def residuals(seed: int, amplitude: float, tile: float) -> StereoResiduals:
+    """Return residuals of a checkerboard, white noise and a smooth error of 0.5 px, of which a tenth of the cells is missing."""
+    random = np.random.default_rng(seed)
+    u, v = (each.ravel() for each in np.meshgrid(100.0 + STEP * np.arange(COLUMNS), 60.0 + STEP * np.arange(ROWS)))
+    kept = random.random(len(u)) > 0.1
+    u, v = u[kept], v[kept]
+    checkerboard = (-1.0) ** (u // tile + v // tile)
+    smooth = 0.5 * np.sin(2 * np.pi * u / 900.0 + v / 300.0)
+    value = amplitude * checkerboard + smooth + SIGMA * random.standard_normal(len(u))
+    count, every = len(u), np.ones(len(u), dtype=bool)
+    geometry = PixelGeometry(u, v, *[np.zeros(count)] * 10)
+    at, sigma = np.stack([u, v], axis=1) / 50, np.full(count, SIGMA)
+    covariates = {"image_x": u, "image_y": v}
+    return StereoResiduals(value, sigma, sigma, every, every, np.ones((count, 1)), at, covariates, np.arange(count), geometry)
+
+
+@pytest.mark.parametrize(("amplitude", "tile"), [(0.2, 230.0), (-0.4, 131.0), (0.1, 512.0)])
+def test_tiles_are_found_with_their_side_and_shift(amplitude: float, tile: float) -> None:
+    part = residuals(1, amplitude, tile)
+    found = find_tile_seams(part, part.value)
+    assert found is not None
+    assert found.tile_px == pytest.approx(tile, abs=4 * found.tile_std_px)
+    assert found.tile_std_px < 0.01 * tile
+    assert found.amplitude_px == pytest.approx(amplitude, abs=5 * found.amplitude_std_px)
+
+
+def test_nothing_is_found_without_tiles() -> None:
+    """The significance level is 0.0001 a measurement, so one of 20 is a chance of 0.2 %."""
+    for seed in range(20):
+        part = residuals(seed, 0.0, 230.0)
+        assert find_tile_seams(part, part.value) is None
+
+
+def test_pixels_on_no_raster_have_no_seams() -> None:
+    part = residuals(1, 0.4, 230.0)
+    random = np.random.default_rng(2)
+    count = len(part)
+    geometry = PixelGeometry(*(random.uniform(0, 2000, (2, count))), *[np.zeros(count)] * 10)
+    from dataclasses import replace
+
+    assert find_tile_seams(replace(part, geometry=geometry), part.value) is None
