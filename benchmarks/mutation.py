@@ -253,11 +253,12 @@ def page(record: dict[str, Any]) -> str:
     lines = [
         "# What the tests reach, and what they notice",
         "",
-        "This page is for developers. It says which share of the code `make test` reaches, and how many small faults it notices.",
+        "This page is for developers. It says which share of the code the tests reach, and how many small faults they notice.",
         "",
         "## Lines and branches",
         "",
-        f"Measured with coverage.py at commit {record['reach']['commit']}, with the tests {', '.join(record['reach']['tests'])}.",
+        f"Measured with coverage.py at commit {record['reach']['commit']} with these tests, a part of `make test`:",
+        ", ".join(f"`{name}`" for name in record["reach"]["tests"]) + ".",
         "",
         "| part | lines | reached | branches | reached |",
         "|---|---|---|---|---|",
@@ -269,6 +270,7 @@ def page(record: dict[str, Any]) -> str:
         )
     outcomes = record["mutate"]["outcomes"]
     caught = sum(each["said"] == "caught" for each in outcomes)
+    equal = sum(each.get("remark", "").startswith("equal") for each in outcomes)
     lines += [
         "",
         "## Faults that the tests notice",
@@ -276,7 +278,10 @@ def page(record: dict[str, Any]) -> str:
         f"{len(outcomes)} lines were drawn (seed {record['mutate']['seed']}, commit {record['mutate']['commit']}), and each was",
         "changed in one place: another operator, number or truth value, or a statement left out. For each, at most",
         f"{TESTS_A_LINE} of the tests that reach it were run, for at most {SECONDS_A_LINE:.0f} s.",
-        f"**{caught} of {len(outcomes)} faults were noticed.**",
+        f"**{caught} of {len(outcomes)} faults were noticed.** {equal} of the others change no result; no test can notice them;",
+        f"without these it is {_share(caught, len(outcomes) - equal)}. Tests that were written after the draw count too.",
+        "Lines that none of the tests above reaches were tried with other tests of `make test`.",
+        "`unreached` says that none was found.",
         "",
         "| not noticed | line | changed to | why |",
         "|---|---|---|---|",
@@ -284,10 +289,17 @@ def page(record: dict[str, Any]) -> str:
     for each in outcomes:
         if each["said"] != "caught":
             of = each["mutation"]
-            code = (f"`{of[key]}`".replace("|", "\\|") for key in ("before", "after"))
+            code = (f"`{text}`".replace("|", "\\|") for text in _excerpts(of["before"], of["after"]))
             lines.append(f"| `{of['file']}:{of['line']}` | {' | '.join(code)} | {each.get('remark') or each['said']} |")
     lines += ["", "Written by `python benchmarks/mutation.py page`.", ""]
     return "\n".join(lines)
+
+
+def _excerpts(before: str, after: str) -> tuple[str, str]:
+    """Return where two lines differ, with a few characters round it."""
+    at = next((place for place, (old, new) in enumerate(zip(before, after, strict=False)) if old != new), 0)
+    part = slice(max(at - 45, 0), at + 45)
+    return before[part].strip(), after[part].strip()
 
 
 def commit() -> str:

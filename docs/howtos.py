@@ -37,11 +37,13 @@ TUTORIALS = {
     "simulate_and_look": "",
     "two_scans_to_a_finding": "finding/maps.png",
     "detector_for_my_site": "found/other_tls_usual_all_test0001_r00000_c00512_detections.png",
+    "close_the_circle": "spring/map_001.png",
 }
 """The tutorials, likewise; the first shows the pictures of the demo."""
 NEEDS = {
     "own_site": "site",
     "two_scans_to_a_finding": "site",
+    "close_the_circle": "site",
     "missing_effect": "measurement",
     "raw_scan": "measurement",
 }

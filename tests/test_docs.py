@@ -70,6 +70,17 @@ FURTHER = {
         "scarpsim detect": ["--no-pictures"],
         "simulate": [*SMALL_WALL, *FEW_POINTS, *FEW_BLOCKS],
     },
+    "close_the_circle": {
+        "simulate": ["--set", "scanner.azimuth_step_rad=0.003", "--set", "scanner.zenith_step_rad=0.003"],
+        "scarpsim calibrate": [
+            *("--set", "calibration.windows=6", "--set", "calibration.window_px=16", "--set", "calibration.simulations=60"),
+            "--no-greedy",
+        ],
+        "scarpsim dataset": [
+            *("--set", "tiles.size_px=32", "--set", "parts.0.train=1", "--set", "parts.0.val=1", "--set", "parts.0.test=0"),
+        ],
+        "scarpsim train": ["--set", "training.epochs=1"],
+    },
 }
 """What is added to the pages' commands, so that they are done in seconds."""
 
@@ -199,6 +210,14 @@ def a_detector_is_trained_and_used() -> None:
     assert Path("found_in_run/events_0.95.csv").is_file()
 
 
+def the_next_epoch_is_searched_by_the_detector() -> None:
+    found = read("spring/monitor.json")
+    assert [each["missing_m3"] > 0.1 for each in found["epochs"]] == [True, True]
+    june = read("june/monitor.json")
+    assert june["options"]["detector"] == "detector/best"
+    assert all(each["score"] > 0 for each in june["events"])
+
+
 CLAIMS = {
     "own_site": a_site_is_simulated,
     "training_set": a_set_is_made,
@@ -209,6 +228,7 @@ CLAIMS = {
     "simulate_and_look": four_runs_are_made,
     "two_scans_to_a_finding": the_bias_and_the_rockfall_are_found,
     "detector_for_my_site": a_detector_is_trained_and_used,
+    "close_the_circle": the_next_epoch_is_searched_by_the_detector,
 }
 """What the pages say that their commands do."""
 

@@ -53,7 +53,7 @@ def test_the_page_of_long_tests_is_that_of_their_list() -> None:
 
 def test_the_pages_of_scripts_run_by_hand_are_those_of_their_records(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "tools"))
-    for name in ("try_install",):
+    for name in ("try_install", "mutation"):
         script = importlib.import_module(name)
         record = json.loads(script.RECORD.read_text(encoding="utf-8"))
         assert script.PAGE.read_text(encoding="utf-8") == script.page(record), name

@@ -175,6 +175,6 @@ def _in_another_process(model: str, places: Sequence[Path], out: Path, confidenc
         message = (
             done.stderr.strip().splitlines()[-1].removeprefix("error: ")
             if done.stderr.strip()
-            else "the detector's process ended without a message"
+            else "the detector's process ended without a message; run `scarpsim detect` in a terminal to see more"
         )
         raise InputError(message) if done.returncode == _WRONG_INPUT else OutsideError(message)

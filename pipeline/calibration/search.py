@@ -1,6 +1,7 @@
 """Search for the noise parameters whose simulated maps have the same summary statistics as the measured maps.
 
-The cost of parameters theta (their logarithms x) is the squared Mahalanobis distance of the statistics s (`summary_statistics`),
+The cost of parameters theta (their logarithms x) is the squared Mahalanobis distance of the statistics s
+    (`summary_statistics`),
 
     J(x) = (s_obs - m(x))^T S^-1 (s_obs - m(x)),
 
@@ -8,17 +9,17 @@ with the mean m and the covariance S of the statistics over simulations of as ma
 inference (Gourieroux, Monfort and Renault 1993), or a synthetic likelihood (Wood 2010).
 
 m is a response surface: a quadratic polynomial fitted to simulations near the minimum. Rounds of simulations approach the
-minimum. The first covers all bounds (Sobol points); each later one draws around the last minimum with twice its standard
-deviations. J is minimised by SciPy's trust region method (Branch, Coleman and Li 1999). A polynomial over all bounds may lead to
-where a parameter is too small to matter, and the way out is then invisible. A minimum with a significant misfit is therefore
-searched for a second time, from more points, and the better of the two is kept.
+    minimum. The first covers all bounds (Sobol points); each later one draws around the last minimum with twice its
+    standard deviations. J is minimised by SciPy's trust region method (Branch, Coleman and Li 1999). A polynomial over all
+    bounds may lead to where a parameter is too small to matter, and the way out is then invisible. A minimum with a
+    significant misfit is therefore searched for a second time, from more points, and the better of the two is kept.
 
 Intervals come from a parametric bootstrap. Every simulation of the last round is estimated like the measurement, by a surface
 fitted without it (five folds). Estimate minus true value is the distribution of the estimate's error, bias included. The
 difference between the fast simulation in windows and the whole one (`MODEL_SIGMA`) is added in quadrature.
 
-Limits: a parameter to which no statistic responds gets an interval as wide as its bounds. Noise of another kind than the model's
-shows as a small `misfit_p`, the share of simulated sets that fit worse than the measurement does.
+Limits: a parameter to which no statistic responds gets an interval as wide as its bounds. Noise of another kind than the
+    model's shows as a small `misfit_p`, the share of simulated sets that fit worse than the measurement does.
 """
 
 from __future__ import annotations
@@ -97,8 +98,8 @@ class Simulations:
 class ResponseSurface:
     """Response surface: how the summary statistics depend on the noise parameters, and how they scatter.
 
-    The mean of the statistics is a quadratic polynomial of z = (x - centre) / scale, with x the logarithms of the parameters. The
-    cost of parameters is the squared Mahalanobis distance of the measured statistics from that mean.
+    The mean of the statistics is a quadratic polynomial of z = (x - centre) / scale, with x the logarithms of the
+    parameters. The cost of parameters is the squared Mahalanobis distance of the measured statistics from that mean.
 
     Attributes
     ----------
@@ -116,9 +117,15 @@ class ResponseSurface:
 
     @classmethod
     def fit(cls, sample: Simulations) -> ResponseSurface:
-        """Fit the surface to simulations by least squares.
+        """Fit the mean of the summary statistics, as a quadratic function of the logarithmic parameters, by least squares.
 
-        The covariance is that of the residuals, with its off-diagonal elements reduced (shrinkage).
+        The covariance (m, m) of the statistics is that of their residuals from the fit, with off-diagonal elements reduced
+        (shrinkage).
+
+        Parameters
+        ----------
+        sample : Simulations
+            Parameters of n simulations and the m statistics that each gave.
         """
         centre, scale = np.mean(sample.x, axis=0), np.maximum(np.std(sample.x, axis=0), 1e-6)
         design = _design((sample.x - centre) / scale)
@@ -154,7 +161,7 @@ class ResponseSurface:
         return -self.whitening @ (_gradient((x - self.centre) / self.scale) @ self.coefficients).T / self.scale
 
     def minimum(self, observed: FloatArray, start: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-        """Find the parameters of least cost within bounds.
+        """Find the parameters of least cost within bounds; the cost is the sum of the squares of `misfit`.
 
         Parameters
         ----------
@@ -187,7 +194,7 @@ class SearchResult:
     low, high : (k,) ends of its confidence interval.
     errors : (n, k) errors of the estimates when n simulations are treated like the measurement (parametric bootstrap).
     surface : Response surface of the last round.
-    cost : Cost at the minimum.
+    cost : Squared Mahalanobis distance of the measured from the expected statistics at the minimum.
     misfit_p : Share of simulations that fit worse than the measurement: a p-value of the goodness of fit.
     misfit : (m,) measured minus expected statistics, in standard deviations.
     history : After each round, the number of maps simulated so far and the minimum.
@@ -243,10 +250,10 @@ class NoiseSearch:
         self.terms = 1 + count + count * (count + 1) // 2
 
     def run(self, observed: FloatArray, simulations: int, confidence: float) -> SearchResult:
-        """Find the parameters of least cost and their intervals.
+        """Find the parameters of least cost and their confidence intervals.
 
-        If the misfit of the first minimum is significant, a second search with more starting points follows, and the better one
-        counts.
+        The cost is the squared Mahalanobis distance of the measured from the expected statistics. If the misfit of the
+        first minimum is significant, a second search with more starting points follows, and the better one counts.
 
         Parameters
         ----------
@@ -297,8 +304,8 @@ class NoiseSearch:
     def _approach(self, observed: FloatArray, density: int) -> tuple[FloatArray, FloatArray, list[tuple[int, FloatArray]]]:
         """Approach the minimum in rounds.
 
-        The sets have one later epoch each, which suffices for the mean of the statistics. Returns the minimum, its covariance and
-        the history.
+        The sets have one later epoch each, which suffices for the mean of the statistics. Returns the minimum, its
+        covariance and the history.
         """
         size = self._round_size
         generator = np.random.default_rng(self.random.child("sobol").key)
@@ -382,17 +389,18 @@ class NoiseSearch:
 def cost_of_new_simulations(
     search: NoiseSearch, surface: ResponseSurface, observed: FloatArray, x: FloatArray, sets: int = 4
 ) -> float:
-    """Estimate the cost of parameters from new simulations instead of the response surface.
+    """Compute the misfit of noise parameters from new simulations instead of the response surface.
 
-    It is the cost of the mean of their statistics, corrected for the scatter of that mean.
+    The cost is the squared Mahalanobis distance of the measured statistics from the mean statistics of the simulations, divided
+    by 1 + 1 / sets for the scatter of that mean.
 
     Parameters
     ----------
     search : Provides the simulator and the number of epochs.
     surface : Provides the covariance of the statistics.
     observed : (m,) statistics of the measurement.
-    x : (k,) logarithmic parameters.
-    sets : Number of simulations.
+    x : (k,) natural logarithms of the parameters.
+    sets : Number of simulations; each has as many epochs as the measurement.
     """
     source = replace(search.random, path=(*search.random.path, "fresh"))
     values = search.parameters.values(x)

@@ -64,7 +64,7 @@ class WindowSimulator:
     Parameters
     ----------
     config, site : Config and site as for a whole simulation.
-    windows : Windows on the grid of the measured maps.
+    windows : The k windows of n x n pixels, on the grid of the measured maps, in which measured and simulated maps are compared.
     of_points : Whether a pixel is the mean distance of its points from the wall; otherwise two surfaces are compared.
     reference_error : Error of the surface that the points are compared with; None for none.
 
@@ -141,7 +141,17 @@ class WindowSimulator:
         return self.windows.cut(values)
 
     def heights(self, model: Model, random: KeyedRandom) -> FloatArray:
-        """Simulate one observation and return the (k, n, n) heights of its surface in the windows, m; NaN without data."""
+        """Simulate one observation and return the heights of its surface in the windows given at construction.
+
+        Parameters
+        ----------
+        model : Sensor model with the noise to simulate.
+        random : Source of the random numbers.
+
+        Returns
+        -------
+        (k, n, n) heights in k windows of n x n pixels, wall frame, m; NaN without data.
+        """
         return self._raster(self._surface(self._registered(model, random)))
 
     def _registered(self, model: Model, random: KeyedRandom) -> FloatArray:
@@ -154,7 +164,7 @@ class WindowSimulator:
 
     @cached_property
     def noiseless_heights(self) -> FloatArray:
-        """(k, n, n) heights, m, of the surface that the sensor would give without noise."""
+        """(k, n, n) heights in the k windows, m, of the surface that the sensor would give without noise."""
         return self._raster(self._surface(self._observe(self.noiseless_model, KeyedRandom(0))))
 
     def _observe(self, model: Model, random: KeyedRandom) -> FloatArray:

@@ -69,7 +69,7 @@ class NoiseLevel(Config):
     tls: ScaledModel | None = Field(None, description="model of the laser scanner")
 
     def of(self, sensor: SensorName) -> ScaledModel | None:
-        """Return the model of a sensor."""
+        """Return the model of a sensor and the factor of its noise; None if this level has no model of that sensor."""
         return self.stereo if sensor == "stereo" else self.tls
 
 

@@ -199,7 +199,14 @@ class IcpStudy:
 
 @dataclass(frozen=True)
 class EpochSurfaces:
-    """What a sensor measured of an epoch, and the true wall, wall frame; applied: the run's transform, if any."""
+    """What a sensor measured of an epoch, and the true wall.
+
+    Attributes
+    ----------
+    number : Number of the epoch, from 0.
+    measured, truth : Surface that the sensor measured, and true surface, wall frame, m.
+    applied : Registration that `simulate` estimated and applied to the epoch; None if it applied none.
+    """
 
     number: int
     measured: TriangleMesh

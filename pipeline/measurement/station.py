@@ -129,8 +129,8 @@ def _unstated_station(points: FloatArray, name: str) -> Station:
     if found is None:
         raise InputError(
             "neither the file nor its scan lines say where the scanner stood", where=name,
-            remedy=f"give --position X,Y,Z (m, in the points' frame), to a few metres if need be; "
-            f"{_place(_place_in_front(points))} is in front of them, if the wall leans back",
+            remedy=f"give --position X,Y,Z (m, in the points' frame); a few metres of error do no harm. "
+            f"On a wall that leans back, {_place(_place_in_front(points))} is in front of the points",
         )  # fmt: skip
     word = f"position {_place(found.position)} found from the scan lines (± {_mm(found)} mm)"
     return _station(found, np.eye(3), (word,))

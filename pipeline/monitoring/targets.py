@@ -29,7 +29,14 @@ Targets = Mapping[str, Mapping[str, FloatArray]]
 
 @dataclass(frozen=True)
 class TargetFit:
-    """From an epoch to the reference, wall frame, with the number of targets and their residuals' root mean square, m."""
+    """Transform from an epoch to the reference that was fitted to targets, and how well it fits.
+
+    Attributes
+    ----------
+    transform : From the epoch's to the reference's coordinates, wall frame, m.
+    count : Number of targets.
+    rms_m : Root mean square of the distances between transformed and reference targets, m.
+    """
 
     transform: RigidTransform
     count: int
@@ -82,7 +89,7 @@ def fit_targets(targets: Targets, reference: str, epoch: str, frame: WallFrame) 
             f"{len(common)} targets are measured in both {reference} and {epoch}",
             where="--targets",
             allowed=f"at least {_FEWEST}",
-            remedy="name the epochs as their files are named",
+            remedy="measure three targets in both epochs; write the epochs' file names into the file's column `epoch`",
         )
     to, moved = (frame.to_wall(np.array([each[name] for name in common])) for each in (before, after))
     centre_to, centre = to.mean(axis=0), moved.mean(axis=0)

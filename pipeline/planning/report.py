@@ -46,7 +46,7 @@ class _PlanRow:
 
 @dataclass(frozen=True)
 class _Picture:
-    """One picture of the page. grey: what places without a value mean; "" if all have one."""
+    """One map in report.html of `scarpsim inspect`. grey: what places without a value mean; "" if all have one."""
 
     title: str
     png: bytes
@@ -55,7 +55,7 @@ class _Picture:
 
 @dataclass(frozen=True)
 class _Part:
-    """What the page shows of one sensor."""
+    """What report.html of `scarpsim inspect` shows of one sensor."""
 
     instrument: str
     answer: str
@@ -156,7 +156,7 @@ def map_picture(plan: Plan, found: PlanMap) -> bytes:
 
 
 def _picture(plan: Plan, found: PlanMap) -> _Picture:
-    """Draw a map for the page."""
+    """Draw a map for report.html."""
     png = map_picture(plan, found)
     none = found.name in ("smallest_block_m", "smallest_findable_m")
     grey = "not seen, or no block would be, however large" if none else "not seen"

@@ -44,7 +44,7 @@ class TlsGeometry:
     reached
         Whether the place is within the scan window, the range limits and the detection limit.
     sampling : Sampling
-        Input of the detection probability.
+        How densely and precisely the station samples the surface: what `detection_probability` of a fallen block needs.
     """
 
     range_m: FloatArray
@@ -66,10 +66,11 @@ class TlsGeometry:
 def tls_geometry(scanner: LaserScanner, places: Places) -> TlsGeometry:
     """Compute resolution and precision of a laser scanner at some places of a wall.
 
-    With u the beam's direction, e_az and e_ze the unit vectors towards increasing azimuth and zenith, and independent noise of
-    range R and angles, the covariance is s_R^2 u u' + (R sin z s_az)^2 e_az e_az' + (R s_ze)^2 e_ze e_ze'. On a plane, a beam
-    that leaves in another direction than recorded causes the same error along the normal as a point moved across the beam. If two
-    faces are averaged, the mean has half of these variances; each of its beams misses a niche's floor as often as a single one.
+    With u the beam's direction, e_az and e_ze the unit vectors towards increasing azimuth and zenith, and independent noise
+    of range R and angles, the covariance is s_R^2 u u' + (R sin z s_az)^2 e_az e_az' + (R s_ze)^2 e_ze e_ze'. On a plane, a
+    beam that leaves in another direction than recorded causes the same error along the normal as a point moved across the
+    beam. If two faces are averaged, the mean has half of these variances; each of its beams misses a niche's floor as often
+    as a single one.
 
     Parameters
     ----------

@@ -269,7 +269,22 @@ def _new_labels(state: WallState, before: WallState, rules: Rules) -> IntArray:
 
 @dataclass
 class SeriesTruth:
-    """Collects the true rockfalls and motions of a series for series.json while its epochs are made."""
+    """Collects the true rockfalls and motions of a series for series.json while its epochs are made.
+
+    The attributes but `series` are None until the first epoch is added.
+
+    Attributes
+    ----------
+    series : Series
+        The time series that is simulated.
+    rules : Rules
+        All rockfalls, and how their blocks are shaped and placed.
+    rocks : dict
+        By the number of a rockfall, the rock that has been cut out of the wall, and the bounds of its deposit (wall frame, m);
+        None for the bounds if it has left no deposit.
+    volumes : list of dict
+        For each epoch its number, and the fallen, moving and remaining volumes, m3.
+    """
 
     series: Series
     rules: Rules | None = None

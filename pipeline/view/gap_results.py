@@ -35,7 +35,7 @@ _QUANTILE = 0.98
 
 
 class GapResults:
-    """Result of `scarpsim gap` for the page.
+    """Result of `scarpsim gap`, as `scarpsim view` shows it in the browser.
 
     It shows the residuals: how much deeper the measured surface is than the predicted one; positive where rock is missing.
 
@@ -68,7 +68,10 @@ class GapResults:
         return self._cells(step, window, budget)
 
     def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
-        """Return the points in the window, with their residuals."""
+        """Return at most about `budget` of the measured points in a window, with their residuals, m; never None.
+
+        Arguments as in `Results.patch`.
+        """
         shown = np.flatnonzero(inside(self._local[step], window))
         shown = shown[:: max(1, int(np.ceil(len(shown) / budget)))]
         cloud = self._clouds[step]

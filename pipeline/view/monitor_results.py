@@ -25,7 +25,11 @@ _REMEDY = "run scarpsim monitor again"
 
 
 class MonitorResults:
-    """Result of `scarpsim monitor` for the page: its steps are the epochs in each view of the wall, its items the events."""
+    """Result of `scarpsim monitor`, as `scarpsim view` shows it in the browser.
+
+    The user moves between the epochs in each view of the wall (a `step` of `Results`) and selects events (an `item` of
+    `Results`).
+    """
 
     step_name = "epoch"
     surfaces = {"epoch": "as measured", "reference": "reference"}  # noqa: RUF012
@@ -86,7 +90,10 @@ class MonitorResults:
         return Patch(*centres(grid, rows, columns, factor), height, value, middle, factor)
 
     def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
-        """Return the registered points in the window, with their change and level of detection."""
+        """Return at most about `budget` registered points of an epoch, with their change and level of detection, m.
+
+        Returns None if the folder has no points of the epoch. Arguments as in `Results.patch`.
+        """
         path = self.folder / f"epoch_{_epoch(step):03d}.laz"
         if not path.is_file():
             return None

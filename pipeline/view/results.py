@@ -131,7 +131,8 @@ class Results(Protocol):
     """Base class of the result folders that the page of `scarpsim view` can show, one class for each kind of folder.
 
     A step is one of the states between which the user moves, such as an epoch. A surface is a raster of heights that the page
-    can draw, such as that of the first or of the second epoch.
+    can draw, such as that of the first or of the second epoch. An item is something on the wall that the user can select from a
+    list, such as a block.
 
     Attributes
     ----------

@@ -27,7 +27,10 @@ _ROCK, _HEIGHT = Layer("rock", "rock (shaded)", ""), Layer("height", "relief", "
 
 
 class RunResults:
-    """The folder of `simulate`, with the detections in the folder `detections` if given."""
+    """Result of `scarpsim simulate`, as `scarpsim view` shows it in the browser, with detections if a folder of them is given.
+
+    The user moves between epochs (a `step` of `Results`) and selects blocks and detections (an `item` of `Results`).
+    """
 
     step_name = "epoch"
 
@@ -86,7 +89,10 @@ class RunResults:
         return Patch(*centres(grid, rows, columns, factor), height, value, middle, factor)
 
     def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
-        """Return the points of an epoch in the window."""
+        """Return at most about `budget` measured points of an epoch; None if the run has no points.laz of it.
+
+        Arguments as in `Results.patch`.
+        """
         path = epoch_folder(self.folder, int(step)) / "points.laz"
         if not path.exists():
             return None

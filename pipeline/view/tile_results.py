@@ -19,7 +19,10 @@ _SIGMA_M = 0.01
 
 
 class TileResults:
-    """A split of a data set for the page: its steps are the tiles, and its items the annotated blocks."""
+    """A split of a data set (train, val or test), as `scarpsim view` shows it in the browser.
+
+    The user moves from tile to tile (a `step` of `Results`) and selects annotated blocks (an `item` of `Results`).
+    """
 
     step_name = "tile"
     surfaces = {"relief": "difference, as relief (rock that is missing lies deep)"}  # noqa: RUF012

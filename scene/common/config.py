@@ -23,14 +23,13 @@ from scene.common.yaml_text import parse_yaml
 class Config(BaseModel):
     """Base class of every config section: immutable, and unknown keys are errors.
 
-    Field names carry their unit (`_m`, `_rad`, `_px`, `_ppm`). Infinite and NaN values are refused.
+    Field names carry their unit (`_m`, `_rad`, `_px`, `_ppm`). Infinite and NaN values are refused. A subclass lists in
+    `short_forms` the keys that a file may use although they are no fields, because other keys replace them before parsing.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
     short_forms: ClassVar[tuple[str, ...]] = ()
-    """Keys that a file may use in this section although the model has no such field, because they are replaced by other keys
-    before parsing. Error messages list them as allowed.
-    """
+    """Further keys that a file may use in this section. Error messages list them as allowed."""
 
 
 ConfigT = TypeVar("ConfigT", bound=BaseModel)
@@ -91,8 +90,9 @@ def load_yaml(path: Path) -> Any:
 
 
 _MOST_MISTAKES = 4
-"""Number of mistakes that a message spells out; the rest are only counted, because in a file of another kind every key is wrong.
-"""
+"""Number of mistakes that a message spells out; the rest are only counted, because in a file of another kind every key is
+    wrong.
+    """
 
 
 def _listed(mistakes: list[str]) -> str:

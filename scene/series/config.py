@@ -11,7 +11,8 @@ from pydantic import Field, model_validator
 from scene.common.config import Config
 
 LAST_SHARE = 0.01
-"""Share of the lead time before failure at which a block that follows the inverse-velocity law has moved by `displacement_m`."""
+"""Share of the lead time before failure at which a block that follows the inverse-velocity law has moved by
+    `displacement_m`."""
 
 
 class MagnitudeFrequency(Config):
@@ -53,9 +54,9 @@ class RockfallRate(Config):
 class Motion(Config):
     """How a block moves out of the wall, along its normal, before it falls.
 
-    With the time to failure s and the lead time L, `linear` creep moves it by D (1 - s / L). The inverse-velocity law of Fukuzono
-    (1985), 1 / v proportional to s, moves it by D ln(L / s) / ln(100), at most by D: it has moved by D when 1 % of the lead time
-    is left.
+    Let s be the time that is left until the fall, L the lead time (`lead_h`), D the largest displacement (`displacement_m`)
+    and v the velocity. `linear` creep moves the block by D (1 - s / L). The inverse-velocity law of Fukuzono (1985), 1 / v
+    proportional to s, moves it by D ln(L / s) / ln(100), at most by D: it has moved by D when 1 % of the lead time is left.
     """
 
     law: Literal["inverse_velocity", "linear"] = Field(
@@ -65,7 +66,7 @@ class Motion(Config):
     displacement_m: float = Field(0.03, gt=0, le=1.0, description="D: how far the block moves out before it falls [m]")
 
     def displacement(self, left_h: float) -> float:
-        """Return how far the block has moved, m, when `left_h` hours are left until it falls."""
+        """Return how far the block has moved, m, when `left_h` hours are left until it falls; 0 before the lead time."""
         if left_h >= self.lead_h:
             return 0.0
         if self.law == "linear":
@@ -74,7 +75,11 @@ class Motion(Config):
         return float(self.displacement_m * np.log(share) / np.log(LAST_SHARE))
 
     def time_left(self, displacement_m: float) -> float:
-        """Return how many hours are left when the block has moved that far (inverse of `displacement`); 0 for more than D."""
+        """Return the hours that are left until the fall when the block has moved `displacement_m` (inverse of `displacement`).
+
+        It is 0 if the block has moved farther than the field `displacement_m` of the config, the largest motion before the
+        fall.
+        """
         moved = displacement_m / self.displacement_m
         if moved > 1:
             return 0.0

@@ -134,7 +134,7 @@ class Table:
 class BlockRule:
     """How one generation of beds and joints divides the rock into blocks, and how far the blocks protrude.
 
-    Beds are spaced along s, joints along t; both coordinates are inclined to (u, v) by `dip` and `lean`.
+    Beds are spaced along s = v - dip u, joints along t = u - lean v, with u along the wall and v up its slope, m.
 
     Attributes
     ----------
@@ -166,21 +166,25 @@ class BlockRule:
 
 @dataclass(frozen=True)
 class JointedBlocks:
-    """Blocks between beds and joints, as tables over (bed, t).
+    """Blocks between beds and joints of a wall plane, as tables with a row for each bed and a column for each cm of t.
+
+    The coordinates follow the rock: s = v - dip u crosses the beds, and t = u - lean v crosses the joints, m, with u along the
+    wall, v up its slope, and the slopes `dip` and `lean` of the rule.
 
     Attributes
     ----------
     rule : BlockRule
         How the rock is divided.
     row : Table
-        Table row as a function of s: whole within a bed, rising to the next over the ramp, so that bilinear interpolation of
-        the tables makes the steps between beds.
+        Table row as a function of s: a whole number within a bed, rising to the next over `ramp_m` of the rule, so that
+        bilinear interpolation of the tables makes the steps between beds.
     across : Table
         Distance of s from the middle of its bed, m.
     start : float
         t of the first column, m.
     height, slope, tone : float32 arrays (beds, columns)
-        Height of the block's face (m), its slope across the bed, and its tone.
+        Height of the block's face over the wall plane (m), its slope across the bed (1), and its tone: a standard normal number
+        for each block, which makes its albedo higher or lower.
     """
 
     rule: BlockRule

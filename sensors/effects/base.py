@@ -36,13 +36,17 @@ class Stage(IntEnum):
 
 
 class ShowsIn(StrEnum):
-    """How an effect becomes visible in a measurement."""
+    """How an effect becomes visible in a measurement.
 
-    MEAN = "mean"  # ranges or disparities are off
-    SPREAD = "spread"  # they scatter more
-    VALUES = "values"  # they crowd at some values
-    RETURNS = "returns"  # some are missing
-    EDGES = "edges"  # the surface's edges are displaced
+    MEAN: ranges or disparities are off. SPREAD: they scatter more. VALUES: they crowd at some values. RETURNS: some are
+    missing. EDGES: edges of the surface are displaced. `scarpsim gap` searches each kind by another method.
+    """
+
+    MEAN = "mean"
+    SPREAD = "spread"
+    VALUES = "values"
+    RETURNS = "returns"
+    EDGES = "edges"
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,14 @@ from sensors.signal_chain.beam import SPEED_OF_LIGHT_M_S, Beam, Mode, Ranging
 class BeamDivergence(Effect):
     """The beam has a Gaussian cross section with full divergence D (1/e^2), represented by sub-rays.
 
-    A pulse scanner merges echoes closer than c tau / 2 into one return at their centroid, weighted by power (mixed pixels). It
-    records the first return, the strongest, the mean of all, or (multiple) the strongest in the scan's grid and all others
-    beside it. A phase scanner adds all echoes as phasors, whatever the mode. On a tilted plane the footprint is D R / cos i
-    long, and the mean range is that of the axis to second order in D. The block label is that of the strongest echo in the
-    return. At edges a return is biased towards the surface that is hit more squarely, whose echo is stronger: 0.18 +- 0.03 mm
-    on average over a rough wall of 1 M pulses at 105 m. With equal echoes it is -0.01 +- 0.02 mm, so the sub-rays themselves
-    have no bias.
+    A pulse scanner merges echoes closer than c tau / 2 into one return at their centroid, weighted by power (mixed pixels).
+    It records the first return, the strongest, the mean of all returns, or all of them. In the last case (mode `multiple`)
+    the strongest fills the cell of the scan's grid, and the others are listed as further points. A phase scanner adds all
+    echoes as phasors, whatever the mode. On a tilted plane the footprint is D R / cos i long, and the mean range is that of
+    the axis to second order in D. A return belongs to the fallen block, if any, that gave its strongest echo. At edges a
+    return is biased towards the surface that is hit more squarely, whose echo is stronger. On a rough wall of 1 M pulses at
+    105 m this bias was 0.18 +- 0.03 mm on average. When all echoes were given the same power it was -0.01 +- 0.02 mm, so
+    the sub-rays themselves cause no bias.
     """
 
     name: Literal["beam_divergence"] = "beam_divergence"

@@ -13,11 +13,15 @@ from sensors.effects.camera_effect import CameraEffect
 class CameraPhi(CameraEffect):
     """A camera is rotated about its own y axis against its nominal orientation.
 
-    R_real = R_nominal R_y(angle), camera to world; right-handed (x right, y down, z forward).
+    R_real = R_nominal R_y(angle), camera to world; right-handed (x right, y down, z forward). If `camera` is `both`, both
+    turn by the same angle, so that the angle between their viewing axes stays; if it is left or right, that angle changes.
     """
 
     name: Literal["camera_phi"] = "camera_phi"
-    means = "A camera is turned about its y axis against its surveyed pose: the convergence of the pair is wrong."
+    means = (
+        "A camera is turned about its y axis against its surveyed pose. If one camera is, the angle between the viewing axes"
+        " (convergence) is wrong; if both turn alike, it is right."
+    )
     act = "Survey control points on stable rock and orient both cameras by them in every epoch."
     angle_rad: float = parameter("real minus nominal rotation", unit="rad", source="photogrammetry", typical=5e-5, ge=-1, le=1)
 

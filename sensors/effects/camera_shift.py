@@ -13,7 +13,7 @@ from sensors.effects.camera_effect import CameraEffect
 
 
 class CameraShift(CameraEffect):
-    """A camera's perspective centre is not where it was surveyed: X_real = X_nominal + (x, y, z), world frame."""
+    """A camera's perspective centre is not where it was surveyed: X_real = X_nominal + (x, y, z)."""
 
     name: Literal["camera_shift"] = "camera_shift"
     means = "A camera does not stand where it was surveyed: the base is wrong, and all depths with it."

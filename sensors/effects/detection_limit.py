@@ -17,7 +17,7 @@ from sensors.signal_chain.pulses import PulseGeometry, Pulses
 class DetectionLimit(Effect):
     """An echo below a minimum power gives no return.
 
-    The power is rho cos i / R^2, relative to that of albedo 1 at 100 m and normal incidence (lidar range equation).
+    The power is rho cos i (100 m / R)^2, relative to that of albedo 1 at 100 m and normal incidence (lidar range equation).
     """
 
     name: Literal["detection_limit"] = "detection_limit"

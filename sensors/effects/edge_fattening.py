@@ -19,12 +19,11 @@ _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], dtype=np.uint8)
 class EdgeFattening(RasterEffect):
     """At depth steps the foreground grows over the background by r: outlines become larger, niches smaller.
 
-    d(p) = max of d(q) over |q - p| <= r: cell p gets the largest disparity of the cells q within r (`radius_px`) that lie on
-    the near side of a depth step. A depth step is where neighbouring cells
-    differ by more than one pixel of the matched image (the discontinuities of semi-global matching, Hirschmueller 2008); for a
-    matcher that follows steeper slopes, increase `step_px`. Smaller slopes do not change. Half-occluded cells within r get the
-    foreground's disparity too, since the outlines in both images grow alike and pass the left-right check. r is rounded down
-    to whole cells.
+    d'(p) = max of d(q) over |q - p| <= r: cell p gets the largest disparity of the cells q within r that lie on the near
+    side of a depth step. A depth step is where neighbouring cells differ by more than one pixel of the matched image (the
+    discontinuities of semi-global matching, Hirschmueller 2008); for a matcher that follows steeper slopes, increase
+    `step_px`. Smaller slopes do not change. Half-occluded cells within r get the foreground's disparity too, since the
+    outlines in both images grow alike and pass the left-right check. r is rounded down to whole cells.
     """
 
     name: Literal["edge_fattening"] = "edge_fattening"

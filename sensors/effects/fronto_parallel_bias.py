@@ -15,10 +15,9 @@ from sensors.signal_chain.matches import Matches
 class FrontoParallelBias(Effect):
     """A matcher with windows of one disparity is biased in proportion to the gradient of the disparity.
 
-    dd = min(max(a |grad d| + b d_u, -L), L), with d_u the change of the disparity per px along the row and |grad d| the length
-    of its gradient along row and column. A window on a slanted surface contains a range of disparities and takes one of them
-    (Bleyer et al. 2011, 1). An asymmetric window takes that of a place beside its centre, b px along the row (Kanade & Okutomi
-    1994). Registration absorbs most of b, because it displaces the whole surface.
+    dd = min(max(a |grad d| + b d_u, -L), L), which lies between -L and L. A window on a slanted surface contains a range of
+    disparities and takes one of them (Bleyer et al. 2011, 1). An asymmetric window takes that of a place beside its centre,
+    b px along the row (Kanade & Okutomi 1994). Registration absorbs most of b, because it displaces the whole surface.
     """
 
     name: Literal["fronto_parallel_bias"] = "fronto_parallel_bias"

@@ -19,7 +19,7 @@ from sensors.signal_chain.node_grid import smooth_field, uniform_field_correlati
 class HeavyTailedNoise(NodeNoise):
     """Matching noise whose size varies log-normally over the image.
 
-    dd = sigma a exp(t b - t^2), with a and b independent smooth fields of mean 0 and variance 1. The standard deviation is
+    dd = sigma a exp(t b - t^2), where a and b are independent. The standard deviation is
     sigma, the kurtosis 3 exp(4 t^2). Both fields have Gaussian values on a grid of nodes `step` apart, with bilinear
     interpolation. The model was fitted to OpenCV's semi-global matching of rendered and real pictures
     (docs/explanation/matching.md). It is not in the shared catalogue.
@@ -55,8 +55,9 @@ class HeavyTailedNoise(NodeNoise):
     def semivariogram(self, lag: FloatArray) -> FloatArray:
         """Return half the mean squared difference (k,), px2, of two pixels `lag` (k, 2), px, apart.
 
-        It is sigma^2 (1 - <r exp(t^2 (r - 1))>), where t is the tail parameter, r the correlation of the fields at two positions,
-        and < > the average over positions. This follows from E exp(t (b + b')) = exp(t^2 (1 + r)) for normal b, b' of variance 1.
+        It is sigma^2 (1 - <r exp(t^2 (r - 1))>), where t is the tail parameter, r the correlation of the fields at two
+        positions, and < > the average over positions. This follows from E exp(t (b + b')) = exp(t^2 (1 + r)) for normal b,
+        b' of variance 1.
         """
         correlation = uniform_field_correlation(lag / self.step_px)
         kept = correlation * np.exp(self.tail**2 * (correlation - 1))

@@ -20,9 +20,9 @@ from sensors.signal_chain.matches import Matches
 class PixelLocking(Effect):
     """The matcher's sub-pixel disparities are biased towards whole pixels.
 
-    dd = A sin(2 pi d / n + phase), with d the disparity that the matcher finds and n the reduction of the matched image (2, 4,
-    8 for high, medium, low), so that d / n counts its pixels. Semi-global matching has A of about 0.2 to 0.25 px of the
-    matched image, that is n times as much here (Shimizu & Okutomi 2005). The effect acts last, after all noise.
+    dd = A sin(2 pi d / n + phase), with n the reduction of the matched image by default (2, 4, 8 for high, medium, low), so
+    that d / n counts its pixels. Semi-global matching has A of about 0.2 to 0.25 px of the matched image, that is n times
+    as much here (Shimizu & Okutomi 2005). The effect acts last, after all noise.
     """
 
     name: Literal["pixel_locking"] = "pixel_locking"

@@ -18,7 +18,7 @@ from sensors.signal_chain.pulses import PulseGeometry, Pulses
 class Precipitation(Effect):
     """Rain, snow or dust absorbs echoes, and some drops return one themselves.
 
-    A return is lost with probability 1 - exp(-2 beta R). A share of the lost ones (`early_share`) returns early, from a
+    A return is lost with probability 1 - exp(-2 beta R). The share `early_share` of the lost ones returns early, from a
     drop. The drop's range r has the density exp(-2 beta r), normalised between the instrument's minimum range and R. An early
     return keeps the pulse's range errors and its power, because a drop's brightness is not modelled. It belongs to no block.
     Pulses that hit nothing do not return from drops.

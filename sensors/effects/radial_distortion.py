@@ -14,7 +14,7 @@ class RadialDistortion(CameraEffect):
     """The real radial distortion differs from the calibrated one, which domes or dishes the surface.
 
     k_real = k_nominal + k. On a rectified pair the doming is in the ratio 3 : 1 along u and v: dZ = -Z k1 [3 (u - b/2)^2 + v^2
-    + b^2/4] (James & Robson 2014), with u, v tangents in the rectified left camera and b = base / Z.
+    + b^2/4] (James & Robson 2014).
     """
 
     name: Literal["radial_distortion"] = "radial_distortion"

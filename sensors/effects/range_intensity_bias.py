@@ -17,7 +17,7 @@ from sensors.signal_chain.pulses import PulseGeometry, Pulses
 class RangeIntensityBias(RangeEffect):
     """The range error depends on the received power (time walk).
 
-    dR = k ln(I / I_0), with I the received power and I_0 a given one, or the median of all pulses that return. A weaker echo
+    dR = k ln(I / I_0), with I_0 a given power or the median of all pulses that return. A weaker echo
     crosses a fixed threshold later, so k is negative there. The median belongs to one scan: give I_0 if several scans, or
     parts of a scan, have to agree. Pulses that are lost only at the return stage count in the median.
     """

@@ -13,7 +13,8 @@ from sensors.signal_chain.pulses import PulseGeometry, slant
 class RangeNoiseIncidence(RangeSpread):
     """Range noise grows with the incidence angle.
 
-    dR ~ N(0, s (1 / cos i - 1)), independent for each pulse (Soudarissanane et al. 2011).
+    dR ~ N(0, sigma (1 / cos i - 1)), independent for each pulse (Soudarissanane et al. 2011). The factor of sigma is 0 at
+    normal incidence and 1 at 60 degrees.
     """
 
     name: Literal["range_noise_incidence"] = "range_noise_incidence"

@@ -15,7 +15,7 @@ from sensors.signal_chain.pulses import PulseGeometry, Pulses
 
 
 class RangeQuantization(Effect):
-    """Ranges are rounded to the nearest multiple of a step, after all other range effects.
+    """Ranges are rounded to the nearest multiple of `step`, after all other range effects.
 
     Where the range noise exceeds a third of the step, this adds the variance step^2 / 12 of a uniform error.
     """

@@ -11,7 +11,7 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 
 class RangeScale(RangeEffect):
-    """Ranges are wrong in proportion to their length: dR = scale R.
+    """Ranges are wrong in proportion to their length: dR = scale 1e-6 R.
 
     Causes are the instrument's scale, and air temperature and pressure (about +1 ppm/K, -0.28 ppm/hPa; Lichti 2007, A1).
     """

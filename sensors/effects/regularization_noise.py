@@ -19,16 +19,16 @@ from sensors.signal_chain.node_grid import node_semivariogram, smooth_field
 class RegularizationNoise(NodeNoise):
     """Neighbouring disparities share errors: Gaussian values on the nodes of a grid over the image, interpolated bilinearly.
 
-    dd(u, v) = sum_ij w_ij(u, v) g_ij, with g_ij ~ N(0, sigma) at node (i, j), bilinear weights w_ij, and column u and row v of
-    the pixel. Nodes lie at multiples of the step. The variance is sigma^2 / 4 midway between nodes, and 4 sigma^2 / 9 on
-    average over the image.
+    dd(u, v) = sum_ij w_ij(u, v) g_ij, with g_ij ~ N(0, sigma) at node (i, j). Nodes lie at multiples of `step`. The
+    bilinear weights w_ij decrease from 1 at the node to 0 one step away. The variance is sigma^2 / 4 midway between nodes,
+    and 4 sigma^2 / 9 on average over the image.
     """
 
     name: Literal["regularization_noise"] = "regularization_noise"
     means = "Disparities have errors that neighbours share, as a smoothing matcher makes them."
     act = (
-        "Simulate and plan with the value found: averaging neighbours does not lower it. A matcher with less smoothing, "
-        "or another look, does."
+        "Simulate and plan with the value found: averaging neighbours does not lower it. A matcher with less smoothing "
+        "lowers it, and so does the mean of depth maps from several camera positions."
     )
     told_by = "disparities of every pixel, of which neighbours share this noise and no white one"
     order = 30

@@ -19,10 +19,10 @@ from sensors.signal_chain.matches import ImageRows
 class RowJitter(Effect):
     """Image rows are displaced sideways by a wave, as by a rolling shutter or vibration during the exposure.
 
-    dx = A sin(2 pi row / n + phase) is the recorded minus the ideal column of a pixel; row = v, px from the top of the frame.
+    dx = A sin(2 pi v / n + phase) is the recorded minus the ideal column of a pixel in row v; the wave repeats after n rows.
     In the left image this changes the disparity by +dx, and each pixel sees what lies dx px to the left. In the right image it
-    changes the disparity by -dx at the right image's row. If both cameras shake alike (`both`), the depth is preserved except
-    for the difference between the rows of a point in the two images.
+    changes the disparity by -dx at the right image's row. If both cameras shake alike (`both`), the two changes cancel where a
+    point has the same row in both images. Where its rows differ, the difference of the two displacements remains.
     """
 
     name: Literal["row_jitter"] = "row_jitter"

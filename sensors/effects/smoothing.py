@@ -16,9 +16,9 @@ from sensors.effects.raster_effect import RasterEffect
 class Smoothing(RasterEffect):
     """Disparities are low-pass filtered, as by the matcher's windows and smoothness terms.
 
-    d = (G * m d) / (G * m): * is a convolution, G a Gaussian of sigma px, and m is 1 where there is a match,
-    else 0. Unmatched cells neither count nor are filled (normalised convolution, Knutsson & Westin 1993). Near them and at the
-    image's border the mean is one-sided: where the disparity has a slope s, it is wrong by up to 0.8 s sigma.
+    d' = (G * m d) / (G * m), where * is the convolution over the image. Unmatched cells neither count nor are filled
+    (normalised convolution, Knutsson & Westin 1993). Near them and at the image's border the mean is one-sided: where the
+    disparity changes by s px per px, it is wrong by up to 0.8 s sigma.
     """
 
     name: Literal["smoothing"] = "smoothing"

@@ -27,10 +27,10 @@ LARGEST_SIGMA_PX = 1.0
 class TextureNoise(Effect):
     """Matching noise grows where the rock has little texture, by the Cramer-Rao bound of matching a window.
 
-    sigma_d^2 = k sigma_I^2 / sum gx^2, at most 1 px^2. gx is the horizontal gradient of the image in a cell of the depth map,
-    in grey values per px of the full-resolution frame; its square is summed over the 5 x 5 cells about each cell. sigma_I is 1
-    grey value of 255. For the simulated matcher the image is 255 x albedo (no shading, no texture finer than the wall's
-    triangles). k = 2 is the bound for two equally noisy images. Real rock has finer texture, so its k is smaller.
+    sigma_d^2 = k sigma_I^2 / sum gx^2, at most 1 px^2. The sum of the squared gradients runs over the 5 x 5 cells of the
+    depth map about each cell. sigma_I is 1 grey value of 255. For the simulated matcher the image is 255 x albedo (no
+    shading, no texture finer than the wall's triangles). k = 2 is the bound for two equally noisy images. Real rock has
+    finer texture, so its k is smaller.
     """
 
     name: Literal["texture_noise"] = "texture_noise"

@@ -17,10 +17,9 @@ from sensors.signal_chain.matches import Matches
 class TileShift(Effect):
     """A matcher that works in tiles shifts neighbouring tiles against each other.
 
-    dd = A (-1)^(i + j), with the tile's column i = floor(u / n) and row j = floor(v / n): u, v are the pixel in the left image
-    and n is the side of a tile, px, counted from the frame's corner. Tiles are matched one by one to save memory (Hirschmueller
-    2008, 2.6); each has its own offset, and the seams show. This effect is the pattern with the sharpest seams: the tiles of
-    a checkerboard.
+    dd = A (-1)^(i + j), with the tile's column i = floor(u / n) and row j = floor(v / n), counted from the frame's corner.
+    Tiles are matched one by one to save memory (Hirschmueller 2008, 2.6); each has its own offset, and the seams show. This
+    effect is the pattern with the sharpest seams: the tiles of a checkerboard.
     """
 
     name: Literal["tile_shift"] = "tile_shift"

@@ -13,7 +13,7 @@ from sensors.signal_chain.pulses import PulseGeometry
 class TiltDrift(AimEffect):
     """The scanner tilts during the scan, so that directions are rotated by angles that grow from 0 to the given rates.
 
-    w = s (rate_x, rate_y, 0) is the rotation vector, with s the elapsed share of the scan's duration. The rotations are
+    w = s (rate_x, rate_y, 0) is the rotation vector. The rotations are
     right-handed about the scanner's axes. A direction u is recorded as u + w x u, that is
     daz = -cot z (w_x cos az + w_y sin az) and dz = w_y cos az - w_x sin az. The scanner itself tilts by -w. The equations are
     of first order in the angles: for a tilt of 60 arcsec their error is below 0.01 mm at 100 m.

@@ -17,8 +17,7 @@ from sensors.signal_chain.pulses import PulseGeometry
 class Wobble(AimEffect):
     """The standing axis wobbles as the scanner rotates, which tilts whole scan lines by a wave.
 
-    dz = a sin(2 pi line / n + phase), with `line` the number of the scan line, from 0 at the first, and n
-    `lines_per_cycle`. There is one line for each azimuth step.
+    dz = a sin(2 pi line / n + phase). There is one line for each azimuth step.
     """
 
     name: Literal["wobble"] = "wobble"

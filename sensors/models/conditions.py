@@ -84,7 +84,7 @@ class PoseShift:
 
     @property
     def is_null(self) -> bool:
-        """Whether both poses agree."""
+        """Whether the real pose is the surveyed one: no displacement and no rotation."""
         return not (self.position_m.any() or self.rotation_rad.any())
 
 

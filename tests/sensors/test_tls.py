@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from scene.geometry.frame import WallFrame
 from scene.geometry.mesh import DEFAULT_ALBEDO, TriangleMesh
 from scene.ray_casting.raycast import RayCaster
 from sensors.effects import TLS_EFFECTS
+from sensors.laser import tls
 from sensors.laser.tls import LaserScanner, Pattern, ScannerConfig
 from sensors.models.placement import check_in_front
 from sensors.models.sensor_model import TlsModel
@@ -230,3 +232,16 @@ def test_a_plane_is_scanned_from_its_back_as_from_its_front() -> None:
 def test_wrong_scanner_settings_are_named(values: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         parse(ScannerConfig, values, "config")
+
+
+def test_a_pattern_may_fill_the_free_memory_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = ScannerConfig(azimuth_step_rad=0.01, zenith_step_rad=0.01)
+    windows = (0.0, 0.09), (1.0, 1.19)  # 10 lines of 20 pulses
+    for missing, fits in ((0, True), (1, False)):
+        free = SimpleNamespace(available=200 * tls._BYTES_PER_PULSE - missing)
+        monkeypatch.setattr(tls.psutil, "virtual_memory", lambda free=free: free)
+        if fits:
+            assert Pattern.over(*windows, settings).pulses == 20
+        else:
+            with pytest.raises(InputError, match="10 lines of 20 pulses"):
+                Pattern.over(*windows, settings)

@@ -129,14 +129,14 @@ class MeasurementBase(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class TlsMeasurement(MeasurementBase):
-    """A laser scan, or several epochs of it.
+    """n points of a laser scan, or of several: in other poses or faces (channel `scan`), or at other times (channel `epoch`).
 
     Attributes
     ----------
     station, face : Pose of the first scan (scanner to wall frame), and the face of the instrument in which it was made.
     scans : Pose and face of each of several scans; the points' channel `scan` has their numbers. Empty for one scan.
     pattern : Nominal directions of the pulses; None if unknown.
-    pulses : (m,) mask of the pattern's pulses among which the points are; None: all.
+    pulses : (m,) mask of the m pulses of the pattern: true for those from which the points may come; None: all.
     order : (n,) scan line and (n,) elapsed share of the scan's duration of each point, if known.
     planes : Planes through the reference's vertices, to which incidence angles refer; None: its triangles.
     reference_error_m : Standard deviation of each vertex of the reference along the rays, m.

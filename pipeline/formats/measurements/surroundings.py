@@ -18,8 +18,9 @@ class Surroundings:
     Attributes
     ----------
     point : (n, 3) place that each pixel sees, wall frame, m; NaN if unknown.
-    edge_px : (n,) largest deviation of the reference from its tangent plane within some pixels, px of disparity.
-    hidden : (n,) whether the right camera does not see the place.
+    edge_px : (n,) how much the reference departs from a plane around each pixel. It is compared with its tangent plane at the
+        four pixels a few px to the left, right, above and below; the largest difference of the two disparities counts, px.
+    hidden : (n,) true where the right camera does not see the place.
     """
 
     point: FloatArray

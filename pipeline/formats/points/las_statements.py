@@ -40,7 +40,7 @@ def stated_units(header: laspy.LasHeader, where: str) -> tuple[AxisUnits | None,
     if by_wkt is not None and by_keys is not None and not np.allclose(by_wkt.metres, by_keys.metres, rtol=1e-8, atol=0):
         raise InputError(
             f"states two units: {by_wkt.name} in {by_wkt.source}, {by_keys.name} in {by_keys.source}", where=where,
-            remedy="export it with one coordinate system",
+            remedy="export it again with a coordinate system whose unit is that of the coordinates",
         )  # fmt: skip
     return by_wkt or by_keys, notes
 
@@ -99,11 +99,11 @@ def _agreed(by_system: float | None, unit_code: int | None, what: str, where: st
     """Return the unit by the coordinate system and by the unit's own key; raise InputError if they differ."""
     by_unit = None if not unit_code or unit_code >= _USER_DEFINED else metres_of_epsg_unit(unit_code)
     if by_system is not None and by_unit is not None and not np.isclose(by_system, by_unit, rtol=1e-8, atol=0):
-        units = f"{by_system:.10g} m by the coordinate system, {by_unit:.10g} m by the unit"
+        units = f"{by_system:.10g} m by the coordinate system, {by_unit:.10g} m by the key of the unit itself"
         raise InputError(
             f"states two units of its {what} in its GeoTIFF keys: {units}",
             where=where,
-            remedy="export it with one coordinate system",
+            remedy="export it again with a coordinate system whose unit is that of the coordinates",
         )
     return by_system if by_unit is None else by_unit
 

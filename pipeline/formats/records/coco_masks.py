@@ -68,7 +68,7 @@ def _checked(segmentation: Mapping[str, Any], height: int, width: int, where: st
     if size != [height, width]:
         allowed = f"[{height}, {width}], the image's height and width"
         raise InputError(
-            f"the size of its run lengths is {_kind(size)}",
+            f"the image size of its segmentation (key `size`) is {_kind(size)}",
             where=where,
             allowed=allowed,
             remedy="use masks and images of the same data set",

@@ -52,7 +52,7 @@ class CandidateFamilies:
 
     @cached_property
     def by_name(self) -> dict[str, tuple[list[int], list[int]]]:
-        """For the name of each family, two lists of indices: its candidates in `plain`, and its sines counted over all grids."""
+        """For the name of each family, two lists of indices: its candidates in `plain`, and its sines as `sine` counts them."""
         families: dict[str, tuple[list[int], list[int]]] = {}
         for row, candidate in enumerate(self.plain):
             families.setdefault(candidate.family, ([], []))[0].append(row)
@@ -64,7 +64,11 @@ class CandidateFamilies:
         return families
 
     def sine(self, number: int) -> Candidate:
-        """Return the sinusoidal candidate with this index, counted over the frequencies of all grids."""
+        """Return one sine as a candidate.
+
+        `number` counts through the frequencies of the first element of `grids`, then through those of the next, from 0. Raises
+        IndexError if there are fewer.
+        """
         for grid in self.grids:
             if number < len(grid.frequencies):
                 return grid.candidate(number)
@@ -76,8 +80,8 @@ class CandidateFamilies:
 class Design:
     """The regression problem of one search: residuals at n points, with the columns of the pose and of all candidates.
 
-    Columns are divided by the predicted standard deviation and projected into two parts: deviations within cells of the wall, and
-    cell means (see `ProjectedColumns`). Designs are immutable.
+    Columns are divided by the predicted standard deviation and projected into two parts: deviations within cells of the
+    wall, and cell means (see `ProjectedColumns`). Designs are immutable.
 
     Attributes
     ----------
@@ -327,8 +331,8 @@ class Design:
     def identifiability(self) -> tuple[list[str], FloatArray, FloatArray]:
         """Compare the signatures of the effects with each other and with the pose.
 
-        Two effects with a cosine near 1 in magnitude cannot be told apart; an effect with a share near 0 cannot be told from the
-        pose.
+        Two effects with a cosine near 1 in magnitude cannot be told apart; an effect with a share near 0 cannot be told
+        from the pose.
 
         Returns
         -------

@@ -6,10 +6,10 @@ follow the Gaussian process g plus the noise of a mean. The deviations within ce
 white. Where neighbours share noise, which is larger than g, they are deviations from the mean, with the covariance of that
 noise. Both parts contain information on b.
 
-The correlation of the reference's error is not known. Rough (Matern 3/2), smooth (Gaussian) and wavy ones (isotropic waves of
-about one length, each with the covariance J0 of Bessel) of several lengths are kept as far as the data allow them. For each, one
-eigendecomposition serves every amplitude (Lippert et al. 2011, eq. 4), so that the likelihood of each candidate is maximised
-over the covariance too.
+The correlation of the reference's error is not known. Rough (Matern 3/2), smooth (Gaussian) and wavy ones (isotropic waves
+    of about one length, each with the covariance J0 of Bessel) of several lengths are kept as far as the data allow them.
+    For each, one eigendecomposition serves every amplitude (Lippert et al. 2011, eq. 4), so that the likelihood of each
+    candidate is maximised over the covariance too.
 """
 
 from __future__ import annotations
@@ -58,14 +58,17 @@ _NOTHING = 1e-14
 
 @dataclass(frozen=True, eq=False)
 class CellCovariance:
-    """One trial covariance of the means of m cells of the wall: correlated error of the reference plus noise.
+    """One of the covariances that are tried for the mean residuals of m cells of the wall.
 
-    It is held by its eigenvalues, in units in which the noise of a cell mean is independent with variance 1.
+    It is the sum of two parts: the error of the reference surface, which is correlated between cells, and the sensor's
+    noise. Cell means are divided by the standard deviations of their noise, so that the noise is the unit matrix. The
+    covariance is given by its eigenvectors and eigenvalues.
 
     Attributes
     ----------
-    basis : Index of the correlation function of the reference error, and so of its eigenvectors.
-    variance_ratio : Variance of the reference error relative to the median noise variance of a cell mean.
+    basis : Index of the correlation function of the reference error among those tried, and so of the eigenvectors.
+    variance_ratio : Variance of the reference error divided by the median noise variance of a cell mean, both in the square of
+        the observable's unit.
     weight : (m,) inverse eigenvalues.
     """
 
@@ -433,9 +436,9 @@ def fit_reml(
 ) -> MeanFit:
     """Fit design columns to residuals by generalised least squares, under the most likely covariance of the cell means.
 
-    Covariances are compared by their restricted likelihood (REML, Patterson & Thompson 1971). The covariance of the coefficients
-    is an average over all of them, weighted by that likelihood. It includes the differences of the estimates, because the true
-    covariance is not known.
+    Covariances are compared by their restricted likelihood (REML, Patterson & Thompson 1971). The covariance of the
+    coefficients is an average over all of them, weighted by that likelihood. It includes the differences of the estimates,
+    because the true covariance is not known.
 
     Parameters
     ----------

@@ -2,9 +2,9 @@
 
 With them any sets of candidates are compared quickly.
 
-There are two kinds of columns. Products of fixed columns with each other are all known. Of each searched sine only the products
-with itself and with the held columns are known: those of the effects that others are fitted beside (`with_sine_products`). A sine
-that is itself to be held becomes a fixed column first (`extend`).
+There are two kinds of columns. Products of fixed columns with each other are all known. Of each searched sine only the
+    products with itself and with the held columns are known: those of the effects that others are fitted beside
+    (`with_sine_products`). A sine that is itself to be held becomes a fixed column first (`extend`).
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ class NoiseDraws:
     Attributes
     ----------
     rows : Slice of n' of the points on which white noise is drawn.
-    white : (n', d) white noise of d draws, in single precision, which is enough here.
+    white : (n', d) white noise of d draws (realisations), in single precision, which is enough here.
     on_nodes : (q, d) contribution of the noise at the nodes (see `WithinCellNoise.draw`).
     """
 
@@ -145,9 +145,10 @@ class NoiseDraws:
 
     @classmethod
     def of(cls, model: MeanModel, count: int, most_rows: int, random: KeyedRandom) -> NoiseDraws:
-        """Draw the noise.
+        """Draw d independent realisations of the noise at all points.
 
-        To save time, white noise is drawn on a subsample of the points and scaled up to the weight of all points.
+        To save time, white noise is drawn at n' of the n points only and multiplied by sqrt(n / n'). The inner product of a
+        design column with it then has the same variance as over all points.
 
         Parameters
         ----------
@@ -202,8 +203,9 @@ def sine_products(grids: list[SineGrid], weighed: FloatArray, root: FloatArray) 
 class NormalEquations:
     """Normal equations X' V^-1 X b = X' V^-1 y of pose and all candidates, under each of C covariances V.
 
-    From them, any set of candidates is scored without returning to the points. Searched sines have products only with themselves
-    and with the h held columns. These belong to the pose and to effects that stay in the model while others are scored.
+    From them, any set of candidates is scored without returning to the points. Searched sines have products only with
+    themselves and with the h held columns. These belong to the pose and to effects that stay in the model while others are
+    scored.
 
     Attributes
     ----------
@@ -352,15 +354,19 @@ def _explained(rest: FloatArray, own: FloatArray, left: FloatArray) -> FloatArra
 def assemble(
     model: MeanModel, at: list[CellCovariance], fixed: ProjectedColumns, value: ProjectedColumns, waves: SineProducts
 ) -> NormalEquations:
-    """Build the normal equations of pose and candidates, in which no column is held yet.
+    """Build the normal equations of pose and candidates under each of C covariances, before any effect is in the model.
 
     Parameters
     ----------
     model : The mean model.
-    at : The C covariances of the cell means.
-    fixed : The columns of the pose and of all candidates but the searched sines.
-    value : Columns of residuals.
-    waves : Inner products of the searched sines.
+    at : The C covariances of the cell means that are tried.
+    fixed : The k columns of the pose and of all candidates but the sines whose period is searched.
+    value : v columns of residuals: one of measured residuals, or several of simulated ones.
+    waves : Inner products of the w sines whose period is searched.
+
+    Returns
+    -------
+    Equations whose list `held_columns`, the columns that stay in the model while others are scored, is empty.
     """
     gram, right = fixed.within.T @ fixed.within_weighted, fixed.within.T @ value.within_weighted
     square = np.einsum("nv,nv->v", value.within, value.within_weighted)

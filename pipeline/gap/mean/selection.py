@@ -1,9 +1,9 @@
 """Select the systematic effects: forward selection of sets of up to three, tested against a simulated null distribution.
 
-The score of a candidate is its penalised log-likelihood ratio: the log-likelihood ratio minus twice its mean under the null. It
-estimates the ratio on new data; for k linear columns the penalty is k, as in AIC, and it is larger if a period is searched. Sets
-are grown from the five best of each size. Two effects are therefore also found if neither is the best one alone, for example
-because a third effect resembles their sum.
+The score of a candidate is its penalised log-likelihood ratio: the log-likelihood ratio minus twice its mean under the
+    null. It estimates the ratio on new data; for k linear columns the penalty is k, as in AIC, and it is larger if a period
+    is searched. Sets are grown from the five best of each size. Two effects are therefore also found if neither is the best
+    one alone, for example because a third effect resembles their sum.
 """
 
 from __future__ import annotations
@@ -158,13 +158,17 @@ class CandidateScorer(Protocol):
     """The scores that `ForwardSelection` needs. `MeanSearch` computes them; tests may use a simple stand-in."""
 
     def score_families(self, members: EffectSet) -> tuple[FamilyScore, ...]:
-        """Return the score of every family's best variant in addition to the effects `members`, best score first."""
+        """Score each family of candidates by its best variant, when that is added to the effects `members` of a model.
+
+        A family is the set of all variants of one explanation, such as an effect with different cameras or periods. Scores are
+        penalised log-likelihood ratios (see `FamilyScore`); the best family is first.
+        """
 
     def p_value(self, score: float) -> float:
-        """Return the p-value of a score, under the null distribution of the largest score over all families."""
+        """Return the p-value of a penalised log-likelihood ratio under the null distribution of the largest of all families."""
 
     def joint_score(self, members: EffectSet) -> float:
-        """Return the score of the effects `members` together, with the periods of their sines refined."""
+        """Return the penalised log-likelihood ratio of the effects `members` together, sine periods refined."""
 
     def correlated_covariates(self, form: FamilyScore) -> set[str]:
         """Return the covariates that are so highly correlated with that of a non-parametric term that they could replace it."""

@@ -92,8 +92,8 @@ class SearchOutcome:
 class _SingleFit:
     """One effect alone in the model, without linearising.
 
-    estimate: the effect; residuals, measurement: with it in the model, at the estimated pose; value: (n,) registered residuals of
-    all points, 0 where a point is not used; used: (n,) points that are used; log_likelihood: of these points.
+    estimate: the effect; residuals, measurement: with it in the model, at the estimated pose; value: (n,) registered
+    residuals of all points, 0 where a point is not used; used: (n,) points that are used; log_likelihood: of these points.
     """
 
     estimate: Estimate
@@ -131,7 +131,7 @@ class _SingleFit:
         return cls(estimate, at_points_of(found, given.part), measurement, value, kept, log_likelihood)
 
     def improved(self, given: SearchInput, first: MeanSearch) -> _SingleFit | None:
-        """Return the fit after one Gauss-Newton step from the present values."""
+        """Return the fit after one Gauss-Newton step from the present values; None for the reasons of `of`."""
         candidate = _recomputed(self.estimate.candidate, candidate_families(self.measurement, self.residuals))
         width = candidate.columns.shape[1]
         step = _gauss_newton_step(self.residuals, candidate.columns, prior_precision(candidate, width), np.zeros(width))
@@ -202,8 +202,8 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
 def search_at_joint_fit(given: SearchInput) -> SearchOutcome | None:
     """Search for effects with the model linearised at the joint fit of all effects of the catalogue.
 
-    There, rays are traced to where they really went, so the Jacobian is right even if an effect is large. The fitted part of all
-    effects is added back to the residuals before the search.
+    There, rays are traced to where they really went, so the Jacobian is right even if an effect is large. The fitted part
+    of all effects is added back to the residuals before the search.
 
     Parameters
     ----------

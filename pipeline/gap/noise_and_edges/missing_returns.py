@@ -25,8 +25,9 @@ _PULSES_PER_PATCH = 60.0
 _STRIPS = 8
 """Strips across a sector whose losses must agree."""
 _DIRECTIONS = {"azimuth": "zenith", "zenith": "azimuth"}
-"""Angles on which losses may depend without an effect of the catalogue, and the angle across each. Range, incidence and power are
-explained by the catalogue."""
+"""Angles on which losses may depend without an effect of the catalogue, and the angle across each. Range, incidence and
+    power are explained by the catalogue.
+    """
 _BINS = 16
 _MOST_PULSES = 20_000
 """Pulses that decide where the search for the best values starts."""
@@ -116,7 +117,8 @@ class LossData:
 class _LossFit:
     """Result of a fit.
 
-    values: parameters at the maximum; gain: log-likelihood ratio; probability: (m,); cost: negative log-likelihood of parameters.
+    values: parameters at the maximum; gain: log-likelihood ratio; probability: (m,); cost: negative log-likelihood of
+    parameters.
     """
 
     values: FloatArray
@@ -130,9 +132,9 @@ def explain_missing_returns(
 ) -> LossExplanation | None:
     """Find the effect that explains which laser pulses did not return; None if no explanation improves the likelihood enough.
 
-    Losses come in clusters (shrubs, wet rock), so a likelihood of independent pulses is overconfident. Log-likelihood ratios are
-    therefore divided by the overdispersion: the variance of the losses in patches of the wall relative to that of independent
-    losses.
+    Losses come in clusters (shrubs, wet rock), so a likelihood of independent pulses is overconfident. Log-likelihood
+    ratios are therefore divided by the overdispersion: the variance of the losses in patches of the wall relative to that
+    of independent losses.
 
     Parameters
     ----------
@@ -212,8 +214,8 @@ def _quantile_group(values: FloatArray, count: int) -> NDArray[np.int64]:
 def _ends_abruptly(intensity: FloatArray) -> bool:
     """Whether the recorded powers end abruptly, as at a detection limit, and do not thin out.
 
-    Below a limit the density drops to zero, so the lowest percent of the log powers covers twice the interval of the lowest half
-    percent (ratio 0.5). The tail of a normal distribution gives 0.8.
+    Below a limit the density drops to zero, so the lowest percent of the log powers covers twice the interval of the lowest
+    half percent (ratio 0.5). The tail of a normal distribution gives 0.8.
     """
     ordered = np.sort(np.log(np.maximum(intensity, 1e-12)))
     low, middle, high = (float(ordered[int(share * (len(ordered) - 1))]) for share in (0.0005, 0.005, 0.01))
@@ -259,9 +261,9 @@ def _fit_precipitation(losses: LossData, range_m: FloatArray, early: int, points
 
 
 def _first_parameter_std(cost: Callable[[FloatArray], float], top: FloatArray) -> float:
-    """Return the standard deviation of the first of two parameters, from the curvature of the cost.
+    """Return the standard deviation of the first of two parameters, from the curvature of `cost` at its minimum `top`.
 
-    It is 1 where the curvature is not positive definite.
+    `cost` is a negative log-likelihood. The result is 1 where the curvature is not positive definite.
     """
     step = 0.05
     moves = step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1]])

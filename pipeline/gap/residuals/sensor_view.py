@@ -31,8 +31,9 @@ _AROUND = 24
 _LARGEST_CELL = 4.0
 """Largest area of a Delaunay triangle, in median ones."""
 _FROM_AFAR, _STEEPEST = 1000.0, 0.2
-"""A surface without cameras is viewed along its plane's normal from this many times as far; and the smallest cosine of its slope.
-"""
+"""A surface without cameras is viewed along its plane's normal from this many times as far; and the smallest cosine of its
+    slope.
+    """
 
 
 @dataclass(frozen=True)
@@ -41,13 +42,15 @@ class SensorView:
 
     Attributes
     ----------
-    coordinates : (n, 2) direction of each point: azimuth and zenith, rad, or column and row, px. Several scans lie side by side.
+    coordinates : (n, 2) direction of each point: azimuth and zenith, rad, or column and row, px. Each of several scans is
+        shifted by a constant, so that points of different scans are not neighbours.
     epoch : (n,) number of the point's epoch.
     origin : (3,) origin of the rays, or (n, 3) for several scans, wall frame, m.
     ray : (n, 3) unit directions of the rays, wall frame.
     reference_m : (n,) range to the reference along the rays, m.
     disparity : (n,) disparity of the reference minus that at infinity, px; None if ranges were measured.
-    slant : (n,) change of range per metre of residual, for a surface without cameras, which is viewed from far away; else None.
+    slant : (n,) change of range per metre of residual. Only for points whose cameras are unknown, where rays are assumed to come
+        from a distant place in front of the wall; else None.
     """
 
     coordinates: FloatArray

@@ -59,9 +59,12 @@ class TlsResiduals(Residuals):
 
     @property
     def with_sigma_of_means(self) -> Self:
-        """Return the residuals with the sigma that counts for means over many neighbours: sqrt(n) times the sigma of a mean of n.
+        """Return the residuals with larger standard deviations (n,), m, for statistics of means over many neighbouring points.
 
-        It differs from the sigma of single points because neighbouring rays share errors of the vertices between them.
+        Divided by sqrt(k), the new sigma is the standard deviation of a mean of k neighbours. The sigma of a single point
+        would give too small a value: neighbouring rays meet triangles of the reference that have vertices in common, so
+        that the errors of these vertices do not average out. Without errors of single vertices the residuals are returned
+        unchanged.
         """
         corner, weight = self.geometry.corner, self.geometry.weight
         if not self.reference_error_m or self.error_is_relief or corner is None or weight is None:

@@ -32,8 +32,8 @@ def view_signatures(view: SurveyView) -> list[Candidate]:
 def group_by_effect(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
     """Group candidates by effect, and keep a few variants of each.
 
-    The first variant represents the effect in tables. The others, such as other cameras, are alternatives that another effect may
-    be confused with. A wave with searched period is represented by its middle period.
+    The first variant represents the effect in tables. The others, such as other cameras, are alternatives that another
+    effect may be confused with. A wave with searched period is represented by its middle period.
 
     Returns
     -------
@@ -85,7 +85,7 @@ class SurveyDesign:
     projected : (n, k) signatures after the pose of each station is projected out.
     signatures : (n, k) signatures before that.
     pose_basis : (n, p) orthonormal basis of the pose columns.
-    spans : For each effect, slices of the k columns that belong to each of its variants.
+    spans : For each effect, the slice of the k columns that belongs to each of its variants (other cameras or periods).
     scales : For each effect, the parameter value per unit of each coefficient.
     cells : Cells of the wall, between which the reference's error is correlated.
     sigma : (n,) standard deviations, reduced so that a subsample has the weight of all points.
@@ -112,7 +112,8 @@ class SurveyDesign:
         Parameters
         ----------
         views : What each station or pair sees.
-        families : The variants of each effect (`group_by_effect`).
+        families : For the name of each effect, its variants, as `group_by_effect` gives them. A variant is the effect with one
+            choice of the values that are not fitted, such as the camera or a period.
         points : Observations of known points; None if the survey has none.
         """
         wanted = [variant for variants in families.values() for variant in variants]

@@ -45,13 +45,16 @@ Pose = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True)
 class SurveyView:
-    """What one scanner station or one stereo pair sees of the wall.
+    """What one scanner station or one stereo pair, real or planned, sees of the wall.
+
+    Precision is predicted from the geometry alone, so that a planned station needs no measured values. A subsample of the
+    points is enough for this; `sigma` gives it the weight of all points.
 
     Attributes
     ----------
     residuals : Geometry of n points, a subsample on smooth parts of the wall; the residual values have no meaning.
-    point_count : Number of points of the full view.
-    station : Number of its pose; views with the same number share a pose.
+    point_count : Number of points on smooth parts in the full view.
+    station : Number of the station or pair, from 0; views with the same number share a pose.
     measurement : A measurement with the pose or the cameras of the view.
     """
 
@@ -66,9 +69,9 @@ class SurveyView:
 
         Parameters
         ----------
-        found : Geometry of the subsample.
-        whole : Number of points of the full view.
-        number : Number of the pose.
+        found : Geometry of a subsample of the view's points; residuals whose values have no meaning.
+        whole : Number of points of the full view, before the subsample was drawn.
+        number : Number of the station or pair; views with the same number share a pose.
         measurement : A measurement with that pose.
 
         Raises
@@ -93,12 +96,13 @@ class SurveyView:
 
 @dataclass(frozen=True)
 class TlsView(SurveyView):
-    """What one scanner station sees of the wall.
+    """What one scanner station, real or planned, sees of the wall.
 
     Attributes
     ----------
-    residuals : Geometry of the rays of a subsample of the points; the residual values have no meaning.
-    measurement : A measurement with the pose of the station.
+    residuals : Geometry of the rays of n points, a subsample; the residual values have no meaning, because only the geometry
+        is used.
+    measurement : A measurement with the pose of the station. A planned station has simulated points without noise.
     """
 
     residuals: TlsResiduals
@@ -107,11 +111,12 @@ class TlsView(SurveyView):
 
 @dataclass(frozen=True)
 class StereoView(SurveyView):
-    """What one stereo pair sees of the wall.
+    """What one stereo pair, real or planned, sees of the wall.
 
     Attributes
     ----------
-    residuals : Geometry of the pixels of a subsample of the points; the residual values have no meaning.
+    residuals : Geometry of the pixels of n points, a subsample; the residual values have no meaning, because only the geometry
+        is used.
     measurement : A measurement with the cameras of the pair.
     """
 
