@@ -338,15 +338,16 @@ def verdicts() -> dict[str, Verdict]:
         ),
         "unknown": Verdict(
             "The model is rejected, but the catalogue does not explain why. There are three cases:\n\n"
-            "1. An empirical curve of one covariate, such as the azimuth or the time, explains clearly more than any effect of "
-            "the catalogue: its score, a penalised log-likelihood, is higher by at least 5.\n"
+            "1. An empirical curve of one covariate, such as the azimuth or the time, explains clearly more (a penalised "
+            "log-likelihood ratio higher by 5) than any effect of the catalogue.\n"
             "2. Nothing that was tried passes the test on validation blocks, although the gap exceeds the floor by more than "
             "its uncertainty, or the misfit has a p-value of at most 0.01. The report then says where the misfit is and how "
             "large.\n"
-            "3. Effects were named, but they leave most of the gap open. Or they leave a misfit with a p-value of at most 0.01 "
-            "although the gap before them was within its uncertainty of the floor, so that closing it proves little.",
+            "3. Effects were named, but they leave most of the gap open. Or they leave a misfit with a p-value of at most 0.01, "
+            "and the gap is so small that one cannot tell how much of it they close.",
             "See in the report on which covariate the disagreement depends, and in what form. model_after.yaml holds an "
-            "empirical term that reproduces it in simulations, but only within the measured range of the covariate.",
+            "empirical term that reproduces it in simulations, but only within the measured range of the covariate "
+            "(`along`, in the unit of the covariate: rad for angles).",
             "The ranges of a scanner jump by 4 mm in the middle of the scan, as after a knock.",
             _case(seed=18, ranges=lambda scan: scan.R + 0.002 * np.where(scan.az > 1.6, 1.0, -1.0)),
             "The second line of the terminal is the empirical term: a curve through 65 points between the azimuths 0.9508 and "
