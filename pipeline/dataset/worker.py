@@ -100,7 +100,12 @@ def use_threads(count: int) -> None:
 
 
 def make_and_store_run(orders: Sequence[EpochOrder]) -> list[dict[str, Any]]:
-    """Make epochs one after the other, without changing the stage in between; return what each took (see `make_and_store`)."""
+    """Make epochs of one wall one after the other, so that the loaded wall is used again.
+
+    Returns
+    -------
+    The times, memory and tiles of each epoch, as `make_and_store` returns them.
+    """
     with _one_at_a_time:
         return [make_and_store(order) for order in orders]
 

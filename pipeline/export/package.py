@@ -43,7 +43,10 @@ def package(folder: Path) -> dict[str, Any]:
 
 
 def save_package(folder: Path, path: Path) -> int:
-    """Write the package; return the number of files that it lists."""
+    """Write the description of a results folder as a Data Package (JSON): each file with its size and SHA-256 checksum.
+
+    Returns the number of files that the description lists.
+    """
     made = package(folder)
     write_json(path, made)
     return len(made["resources"])

@@ -333,9 +333,9 @@ def true_pose(surface: EpochSurfaces, random: KeyedRandom) -> RigidTransform:
 def recommend(rows: Iterable[StudyRow], parameter: Parameter) -> Recommendation | None:
     """Recommend a setting by the largest error over epochs and repetitions; None if all registrations failed.
 
-    For the subsample ratio, this is the largest one up to which all are as good as using all points, which needs the fewest
-    points. For the outlier threshold (with gradual decrease) it is the middle, in the logarithm, of the good range around the
-    best.
+    The subsample ratio is the share of points that are left out: the recommendation is the largest one up to which all errors are
+    as small as with all points. The recommended outlier threshold is the geometric middle of the range of thresholds around
+    the best one whose errors are as small. Only registrations whose threshold decreases gradually count.
     """
     chosen = [row for row in rows if row.parameter == parameter and row.gradual]
     values = sorted({row.value for row in chosen})

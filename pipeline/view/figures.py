@@ -109,7 +109,17 @@ def map_figure(
     window: ViewWindow | None,
     selected: int | None = None,
 ) -> go.Figure:
-    """Draw the window as a map; zooming it changes the window of both pictures. Arguments as in `wall_figure`."""
+    """Draw the shown part of the difference map, with outlines of its items; zooming it also moves the view of the wall in 3D.
+
+    Parameters
+    ----------
+    patch : Values of the map in the shown part.
+    items : All blocks, detections or events; those that overlap the patch are drawn.
+    layer : Colours and unit of the values.
+    shown : Kinds of items that are drawn.
+    window : Left, right, lower and upper limit of the axes, wall frame, m; None for the whole patch.
+    selected : Number of the highlighted item.
+    """
     figure = go.Figure(_heatmap(patch, layer))
     for kind in ITEM_TRACES:
         chosen = [(number, item) for number, item in enumerate(items) if item.kind == kind and _overlaps(item, patch)]

@@ -88,9 +88,10 @@ class TriangleMesh:
 
     @cached_property
     def edges(self) -> NDArray[np.int64]:
-        """Number (3 m,) of each triangle side, equal for both directions.
+        """Return an integer for each of the 3 m sides of the m triangles.
 
-        Sides 0-1 of all triangles come first, then 1-2, then 2-0.
+        Sides between the same two vertices have the same integer in either direction. Sides 0-1 of all triangles come first, then
+        1-2, then 2-0.
         """
         start, stop = self.faces.T.ravel(), self.faces[:, [1, 2, 0]].T.ravel()
         return np.minimum(start, stop).astype(np.int64) * len(self.vertices) + np.maximum(start, stop)

@@ -73,7 +73,7 @@ class Echo:
 
 @dataclass(frozen=True)
 class SubRays:
-    """The echoes (n times `many`,) of all sub-rays of n pulses, evaluated in memory, pulse by pulse."""
+    """The echoes of all sub-rays of n pulses, kept in memory: `many` sub-rays a pulse, those of one pulse side by side."""
 
     echoes: Echo
     many: int

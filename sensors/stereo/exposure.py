@@ -131,13 +131,15 @@ def full_scale(*pictures: Radiance) -> float:
 def expose(radiance: Radiance, white: float, step: int, config: ExposureConfig, random: KeyedRandom) -> Photograph:
     """Expose a picture.
 
-    The number of electrons is N = N_full L / white 2^EV with N_full = step^2 full wells (binning). Their noise is Gaussian
-    with variance N + step^2 read^2; shot noise is nearly Gaussian above a hundred electrons. Beyond N_full a pixel is clipped.
+    The number of electrons is N = N_full 2^EV L / white, with the radiance L, the exposure compensation EV
+    (`config.compensation_ev`), and N_full = step^2 full wells, since step^2 pixels of the sensor are added. Their noise is
+    Gaussian with variance N + step^2 r^2, where r is the read noise of a pixel in electrons; shot noise is nearly Gaussian above
+    a hundred electrons. Beyond N_full a pixel is clipped.
 
     Parameters
     ----------
     radiance : (rows, columns) array
-        The rendered picture.
+        The rendered picture, in any unit that `white` shares.
     white : float
         Radiance that saturates at 0 EV.
     step : int

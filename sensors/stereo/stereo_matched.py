@@ -141,7 +141,8 @@ class MatchedStereoPair:
         Returns
         -------
         (h, w) array
-            Disparities of the left rectified grid, cells, without the grid's offset; NaN without a match.
+            Disparities in cells of the left rectified grid; NaN without a match. The caller adds `grid.disparity_offset`, by
+            which the right grid is shifted.
         """
         margin, geometry, config = self.matching.depth_margin_m, grid.geometry, self.matching
         reach = max(depths_m[0] - margin, depths_m[0] / 2), depths_m[1] + margin

@@ -263,7 +263,19 @@ def rectified_pixel(
 def rectified_tangents(
     x: mi.Float64, y: mi.Float64, rotation: FloatArray, f: float, u_0: float, v_0: float
 ) -> tuple[mi.Float64, mi.Float64]:
-    """Convert ideal image coordinates (X/Z, Y/Z) to a rectified pixel. Arguments as in `rectified_pixel`."""
+    """Convert ideal image coordinates to pixels of a rectified image.
+
+    Parameters
+    ----------
+    x, y : (n,) tangents X/Z and Y/Z in the camera's frame, without distortion.
+    rotation : (3, 3) rotation from the camera's frame to the rectified frame.
+    f : Principal distance of the rectified image, px.
+    u_0, v_0 : Principal point of the rectified image, px.
+
+    Returns
+    -------
+    (n,) columns and (n,) rows, px.
+    """
     ray = rotated(rotation, mi.Array3f64(x, y, 1.0))
     scale, centre_u, centre_v = opaque(f, u_0, v_0)
     return scale * ray.x / ray.z + centre_u, scale * ray.y / ray.z + centre_v

@@ -74,9 +74,10 @@ def _common(left: Tensor, right: Tensor) -> Tensor:
 
 
 def encode(boxes: Tensor, reference: Tensor) -> Tensor:
-    """Code boxes (..., 4) relative to reference boxes.
+    """Code boxes (..., 4) relative to reference boxes (..., 4), both as top, left, bottom, right, px.
 
-    The code is the shift of the centre in units of the reference's size, and the logarithm of the size ratio.
+    The code (..., 4) has the shift of the centre in y and x in units of the reference's height and width, then the logarithms of
+    the ratios of heights and widths. All are divided by their usual standard deviations.
     """
     centre, size = _centre_size(boxes)
     at, scale = _centre_size(reference)

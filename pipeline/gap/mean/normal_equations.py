@@ -166,12 +166,14 @@ class NoiseDraws:
         return cls(rows, (white / np.sqrt(model.within_noise.white)).astype(np.float32), on_nodes)
 
     def products(self, within: FloatArray, on_nodes: FloatArray) -> FloatArray:
-        """Return the (k, d) inner products of k design columns with the draws, weighted by the inverse covariance of the noise.
+        """Return what noise alone adds to the right-hand side of the normal equations: (k, d) for k design columns and d draws.
+
+        These are inner products of the columns with the drawn noise, weighted by the inverse covariance of the noise.
 
         Parameters
         ----------
-        within : (n', k) deviations of the columns within cells, on the points of `rows`.
-        on_nodes : (q, k) products of the columns with the nodes' weights (see `WithinCellNoise.to_nodes`).
+        within : (n', k) columns minus their mean in each wall cell, at the n' points on which white noise is drawn (`rows`).
+        on_nodes : (q, k) columns projected on the q nodes of the grid-correlated noise (`WithinCellNoise.to_nodes`).
         """
         return np.asarray(within.astype(np.float32).T @ self.white + on_nodes.T @ self.on_nodes)
 

@@ -135,7 +135,7 @@ class NominalPair:
         return rectified_pixel(self.pair.left, rect.left, u, v, rect.f, rect.u_left, rect.v)[0]
 
     def tangent(self, u: FloatArray, v: FloatArray) -> FloatArray:
-        """Return the tangent of the angle between the rectified row of pixels and the rectified axis.
+        """Return (row - principal row) / f of each pixel in the rectified left image: the vertical slope of its line of sight.
 
         Parameters
         ----------

@@ -112,7 +112,10 @@ class DirectedScanner(LaserScanner):
         return np.array(dr.select(pulses.returned, pulses.range_m, np.nan))
 
     def measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
-        """Apply the effects that act on recorded values, with the recorded powers, given incidence angles and corrected ranges.
+        """Apply the effects that act on recorded values, such as intensity and range noise.
+
+        The measurement supplies what the effects depend on: its recorded intensity as the echo's power, its angle of incidence,
+        and the range to the surface after a correction of the reference's shape between its vertices.
 
         Parameters
         ----------
