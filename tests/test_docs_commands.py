@@ -200,6 +200,7 @@ PARSED = (
     "scarpsim view runs/my_series",
     "scarpsim view runs/series",
     "scarpsim view april",
+    "scarpsim view june",
     "scarpsim monitor march.laz april.laz --out april",
     "scarpsim monitor scans/2026-*.laz --workers 2 --out year",
     "scarpsim monitor scans/2026-*.laz --workers 2 --out year --resume",

@@ -64,6 +64,7 @@ class _Found:
     effects: tuple[NamedEffect, ...]
     evidence: Evidence
     changes: tuple[Any, ...] = ()
+    unseen: tuple[Any, ...] = ()
     thresholds: Thresholds = THRESHOLDS
     residuals: _Residuals = field(default_factory=lambda: _Residuals(range(1000)))
 

@@ -389,7 +389,7 @@ def asked(*more: str, reference: str = "wall.ply", scanner: str = "riegl_vz400i"
 
 
 BAD: dict[str, tuple[Callable[[Case, Path], list[str]], str]] = {
-    "no reference": (lambda case, folder: [str(as_laz(case, folder)), "--scanner", "x"], "a mesh, a cloud, another epoch"),
+    "no reference": (lambda case, folder: [str(as_laz(case, folder)), "--scanner", "x"], "a mesh, a cloud or another epoch"),
     "no such reference": (asked(reference="no.ply"), "no.ply: there is no such file"),
     "no such scanner": (asked(scanner="riegl_vz400j"), "riegl_vz400i"),
     "millimetres": (move(lambda points: 1000 * points), "add --unit mm"),
@@ -463,7 +463,7 @@ def test_a_real_scan_of_rounded_coordinates(tmp_path: Path) -> None:
     The coordinates have steps of 6 cm east and 1.6 cm north. The command asks for the position, and then treats the rounding as
     an error.
     """
-    with pytest.raises(InputError, match="in front of them"):
+    with pytest.raises(InputError, match="in front of the points"):
         build(Request([ROCKS], "half", "riegl_vz400i"), tmp_path / "out")
     found = build(Request([ROCKS], "half", "riegl_vz400i", position=(547450.0, 149565.0, 725.0)), tmp_path / "out")
     assert "from rounded coordinates" in found.about["model"][1]

@@ -151,7 +151,7 @@ def test_equal_maps_give_equal_surfaces(pycolmap: Any) -> None:
 
 def test_maps_that_disagree_are_an_error(pycolmap: Any) -> None:
     left, right = maps()
-    with pytest.raises(InputError, match="fused 0 points"):
+    with pytest.raises(InputError, match="kept 0 points when it fused"):
         colmap_surface(left, DepthMap(right.camera, right.depth * 1.05), *labels(left), SurfaceConfig(), FusionConfig())
 
 

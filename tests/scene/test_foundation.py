@@ -177,7 +177,7 @@ def test_triangles_below_a_millimetre_leak_no_ray() -> None:
 
 def test_coordinates_far_from_the_origin_are_refused() -> None:
     mesh = plane(np.array([0, 0, 1.0]), np.array([652_000.0, 4_921_000.0, 830.0]))
-    with pytest.raises(InputError, match="wall frame"):
+    with pytest.raises(InputError, match="too far from the origin"):
         RayCaster(mesh)
 
 

@@ -302,7 +302,8 @@ def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list
         alone = _single_fit(given, first, candidate)
         if alone is None:
             continue
-        linearised = first.design.log_likelihood(np.where(alone.used, given.part.value, 0.0), candidate)
+        compared = alone.used | (len(together) > 1)  # several effects may rest on points that the refit of one leaves out
+        linearised = first.design.log_likelihood(np.where(compared, given.part.value, 0.0), candidate)
         if not found and abs(alone.log_likelihood - linearised) < tolerance:
             return []
         found.append(alone)
