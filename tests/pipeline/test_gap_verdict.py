@@ -65,6 +65,7 @@ class _Found:
     evidence: Evidence
     changes: tuple[Any, ...] = ()
     unseen: tuple[Any, ...] = ()
+    reference_sigma: float | None = None
     thresholds: Thresholds = THRESHOLDS
     residuals: _Residuals = field(default_factory=lambda: _Residuals(range(1000)))
 
