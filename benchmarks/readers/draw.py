@@ -27,7 +27,7 @@ _HEAD = """# What readers understand
 This page shows how well readers who had not seen the code understood it. Each round drew 60 public definitions, 15 pages and 40
 messages at random. A reader saw a definition's signature and docstring alone, a page, or a message, said what it means, and
 gave a grade: 3 if it could be told at once, 2 after a second reading, 1 in part, 0 not at all. What got less than 2 was
-rewritten afterwards.
+rewritten afterwards, except messages that only pass on another message.
 
 """
 
