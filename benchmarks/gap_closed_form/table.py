@@ -47,7 +47,7 @@ _LABELS = {
     "the same, as the angle to the nearest other effect lets it (1 - sin^2, median)": "its expectation from the angle to the "
     "nearest other effect, 1 - sin^2 (median)",
     "the same, where that angle leaves it 5 % at most": "the share that it closes where the expectation is 5 % at most",
-        "rightly named, but the gap is within its uncertainty": "right names where the gap is too small to be told from none",
+    "rightly named, but the gap is within its uncertainty": "right names where the gap is too small to be told from none",
     "the same, where every true effect was named": "the same intervals, where every true effect was named",
 }
 """Rows of the results whose names need more words on the page."""
@@ -98,17 +98,17 @@ def markdown(found: Json) -> str:
         f"# Measurements simulated in closed form: {sensor}",
         _introduction(found),
         _made_by(found),
-                "## Results\n\n" + _HOW_TO_READ + "\n\n" + _figures(found["figures"], found["by_sensor"]),
+        "## Results\n\n" + _HOW_TO_READ + "\n\n" + _figures(found["figures"], found["by_sensor"]),
         _READING,
         "## What the measurements hold\n\n" + _NUISANCES,
         "## Compared with two simple methods\n\nBoth take residuals as independent and give one name: the effect with the "
         "largest |z| (estimate over its standard error) above 3, or the best effect by the Bayesian information criterion (BIC) "
-                "if it is ahead by more than 10.\nBoth find fewer of the clear effects, and raise many false alarms.\n\n"
+        "if it is ahead by more than 10.\nBoth find fewer of the clear effects, and raise many false alarms.\n\n"
         + _baselines(found),
         "## Answers by effect\n\nEach true effect counts once, also those of measurements with several effects, "
         "which the figures above leave out. Weak effects,\nwith S/N x sin(angle) below 8, are in brackets. "
         "A name that begins with `off_` is an error outside the catalogue.\n\n"
-                + f"{_ANSWERS_READ}\n\n{_OUTSIDE}\n\n"
+        + f"{_ANSWERS_READ}\n\n{_OUTSIDE}\n\n"
         + _by_effect(found["by_effect"]),
         "## Detection by strength\n\nThe measurements have one effect each, and a row has those whose ratio lies in its bin. "
         '"Found at all" counts any\nfinding, right or wrong, by bins of S/N. "Right class" counts right answers, by bins of '
