@@ -242,13 +242,18 @@ who wonder whether a default decides their case. `--set` changes a threshold for
     scarpsim gap my_measurement --set mean.class_margin=4 --set points.fewest=500 --out diagnosis
 
 Each threshold of `pipeline/gap/thresholds.py` was set to 0.7 and 1.4 times its value, on development cases of some thousand
-points of the [closed-form generator](gap_closed_form.md). For each of both values the table has four counts: the cases that use
-the threshold, those whose answer (verdict or names) changes, those that become wrong, and those that become right. A threshold
-that no case uses, or that is newer than the run, is not listed. "-" means that the value is not allowed, or that the time was
-up.
+points of the [closed-form generator](gap_closed_form.md). For each of both values ("x 0.7", "x 1.4") the table has four columns:
 
-So few cases show which thresholds are close to changing an answer, but not how often they do. [What the thresholds
-decide](#what-the-thresholds-decide) is at the end of the page."""
+| column | cases that it counts |
+|---|---|
+| cases | those that use the threshold |
+| changed | those whose answer (verdict or names) is another one than with the usual value |
+| became wrong | those whose answer was right, with what is wrong now: a wrong name, a missed effect, a false alarm |
+| became right | those whose answer was wrong, with what was wrong |
+
+A threshold that no case uses, or that is newer than the run, is not listed. "-" means that the value is not allowed, or that the
+time was up. Most thresholds change no answer within this range. So few cases show which thresholds are close to changing an
+answer, but not how often they do. [What the thresholds decide](#what-the-thresholds-decide) is at the end of the page."""
 
 
 if __name__ == "__main__":
