@@ -39,8 +39,8 @@ _OUTCOMES = {
 _RULES = """These rules apply:
 
 - **Named** counts effects of the [catalogue](../reference/effects/README.md). An empirical term, which describes a pattern
-  without a cause, is in the column "named" of the tables, but does not count. Some carry "empirical" in their name. Others have the name
-  of a noise effect.
+  without a cause, is in the column "named" of the tables, but does not count. Some carry "empirical" in their name. Others
+  have the name of a noise effect.
 - **New** is an effect that the diagnosis of the measurement without the injection does not name. Effects that it does name may
   stand beside the injected one.
 - **The size is right** within 3 standard errors or 15 % of the injected value, and the period of a wave within 5 %. Other
