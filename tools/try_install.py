@@ -151,7 +151,8 @@ This page is for users who install scarpsim without its repository. It lists eac
 
 Each trial started with an empty environment and an empty folder, and with no variable of the shell but the path, the home and the
 package index. The program then simulated a small wall with the laser scanner, or imported what the extra adds. Times include the
-installation, mostly from a local cache of packages.
+installation, mostly from a local cache of packages. An *extra* is a named group of optional packages, such as `detect` for the
+detector. All ways in the table work. "Glibc" in the name of the machine is the version of its C library.
 
 Tried at commit {record["commit"]} on {record["machine"]}.
 
