@@ -244,9 +244,10 @@ It leaves the measurement folders and the reports in runs/gap_examples/motorcycl
 
 ## Results
 
-A residual is a measured minus a predicted disparity, here as a distance along the line of sight. `before` and `after` are root
-mean squares of the residuals, without and with the named effects. `floor` is what the noise alone would leave, and `closed` the
-share of the way from `before` to `floor`. An effect named "as a description" describes the residuals, but is no known physical
+A residual is a measured minus a predicted disparity. `before` and `after` say how far the measured residuals are from those that
+the model predicts, without and with the named effects, as a distance along the line of sight
+([how](../explanation/gap_verdict.md#the-gap)). `floor` is what the noise alone would leave, and `closed` the share of the way
+from `before` to `floor`. An effect named "as a description" describes the residuals, but is no known physical
 cause. The [catalogue](../reference/effects/README.md) explains the effects and their parameters. The verdict of the first row is
 `unknown` because residuals are left that the named effects do not explain; `several` means that several effects are named.""",
     "sgbm": """\
@@ -267,9 +268,10 @@ It leaves the measurement folders and the reports in runs/gap_examples/sgbm.
 
 ## Results
 
-A residual is a measured minus a predicted disparity, here as a distance along the line of sight. `before` and `after` are root
-mean squares of the residuals, without and with the named effects. `floor` is what noise alone would leave, and `closed` is the
-share of the way from `before` to `floor`. An effect named "as a description" describes the residuals, but is no known physical
+A residual is a measured minus a predicted disparity. `before` and `after` say how far the measured residuals are from those that
+the model predicts, without and with the named effects, as a distance along the line of sight
+([how](../explanation/gap_verdict.md#the-gap)). `floor` is what noise alone would leave, and `closed` is the share of the way from
+`before` to `floor`. An effect named "as a description" describes the residuals, but is no known physical
 cause. The [catalogue](../reference/effects/README.md) explains the effects and their parameters. The verdict `unknown` means that
 residuals are left that the named effects do not explain, and `several` that several effects are named.""",
 }

@@ -74,13 +74,11 @@ _COLUMNS = (
 )
 
 _BASES_READ = (
-    "An answer is a [verdict](../reference/glossary.md#model-and-measurement), with the effects that it names after a colon. "
-    '"Before" is '
-    'the root mean square of what the model does not predict, without named effects, and "floor" what noise alone leaves. "One '
-    "half "
-    'against the other" means that every second point makes the reference surface with which the others are compared. The scans '
-    "disagree "
-    "with the noise of the data sheet, so the injections start from the noise that the first answer proposes."
+    "An answer is a [verdict](../reference/glossary.md#model-and-measurement), with the effects that it names after a "
+    'colon. "Before" says how far the residuals are from those that the model predicts without named effects, and "floor" '
+    'what noise alone leaves ([score](../explanation/gap_verdict.md#the-gap)). "One half against the other" means that '
+    "every second point makes the reference surface with which the others are compared. The scans disagree with the noise "
+    "of the data sheet, so the injections start from the noise that the first answer proposes."
 )
 
 _CAUSES = {
