@@ -337,7 +337,8 @@ def verdicts() -> dict[str, Verdict]:
             "All ranges of a scanner are too long by 2 mm. On this wall most of that looks like a shift of the scanner, and the "
             "rest like a wrong scale.",
                         _case(seed=13, ranges=lambda scan: scan.R + 0.002),
-            "A misfit remains, but the effect closes more than half of the gap, so the verdict is not [unknown](unknown.md). The size is "
+            "A misfit remains, but the effect closes more than half of the gap, so the verdict is not [unknown](unknown.md). "
+            "The size is "
             "1.6 "
             "mm instead of 2 mm because it is uncertain, by the ± 0.3 mm that the report states.",
         ),
