@@ -216,7 +216,7 @@ def main() -> None:
 
 def decided() -> str:
     """Return a table of all thresholds with their units and what each decides."""
-    lines = ["## What the thresholds decide", "", "| threshold | value | unit | what it decides |", "|---|---|---|---|"]
+    lines = [_WORDS, "", "| threshold | value | unit | what it decides |", "|---|---|---|---|"]
     for key in keys():
         group, name = key.split(".")
         values = getattr(Thresholds(), group)
@@ -233,6 +233,21 @@ def _made_by(arguments: argparse.Namespace) -> str:
     return f"| cases | seed | commit | command |\n|---|---|---|---|\n{row}"
 
 
+_WORDS = """## What the thresholds decide
+
+[How gap works](../explanation/how_gap_works.md) explains the steps, and the [glossary](../reference/glossary.md) more words:
+
+| word | meaning |
+|---|---|
+| log-likelihood | unit of a difference: 3 means a factor of 20 in likelihood |
+| gain, log-likelihood ratio | by how much the logarithm of the likelihood is larger with the effect than without it |
+| score | gain minus a penalty for the number of parameters |
+| wall blocks | parts into which the wall is divided, not fallen rock |
+| root sums of squares of the wall blocks' gains | sum of the blocks' gains over the root of their sum of squares; 2 for four equal gains |
+| non-parametric, empirical term | a curve that describes residuals without naming a cause |
+| resultant length | how much values prefer one phase, such as whole pixels: 0 for none, 1 if all have it; they then crowd there |
+| strips | parts of the scan by direction, each across the sector in question |
+| selection pass, trial | one run of the search for effects; one value of a parameter that is tried |"""
 _PAGE = "docs/validation/gap_thresholds.md"
 _HEAD = """# What each threshold does
 
