@@ -243,7 +243,7 @@ _WORDS = """## What the thresholds decide
 | gain, log-likelihood ratio | by how much the logarithm of the likelihood is larger with the effect than without it |
 | score | gain minus a penalty for the number of parameters |
 | wall blocks | parts into which the wall is divided, not fallen rock |
-| root sums of squares of the wall blocks' gains | sum of the blocks' gains over the root of their sum of squares; 2 for four equal gains |
+| root sums of squares of the wall blocks' gains | their sum over the root of their sum of squares; four equal gains give 2 |
 | non-parametric, empirical term | a curve that describes residuals without naming a cause |
 | resultant length | how much values prefer one phase, such as whole pixels: 0 for none, 1 if all have it; they then crowd there |
 | strips | parts of the scan by direction, each across the sector in question |
