@@ -66,9 +66,10 @@ _OUTSIDE = """| error outside the catalogue | what it is |
 | off_spread_half, off_spread_radius | additional noise in half of the image, far from the middle of the image |
 | off_loss_sector | lost returns in a sector of azimuths |"""
 
-_HOW_TO_READ = """Each cell has a share with its counts and its 95 % interval (Wilson) in brackets, or a median with the number of
-values in brackets. Then it says whether the goal was met: "yes", "no", or "undecided", which means that the interval contains
-values that reach the goal and values that do not. So few measurements leave most goals undecided."""
+_HOW_TO_READ = """Each cell has a share with its counts and its 95 % interval (Wilson) in brackets, or a median with the
+number of values in brackets; "(of 1)" is one value for all measurements together. Then it says whether the goal was met:
+"yes", "no", or "undecided", which means that the interval contains values that reach the goal and values that do not. So few
+measurements leave most goals undecided."""
 
 _READING = """The "share of the gap" is 100 % if nothing but noise is left. The best wrong effect closes much of the gap wherever
 two signatures are alike: fitted freely, an effect at the angle a to the true one takes 1 - sin^2 a of its square, whatever the
