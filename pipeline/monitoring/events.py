@@ -28,6 +28,8 @@ _GROWS = 0.5
 LEAST_PIXELS = 16
 SIGNIFICANT = 7.0
 """Standard deviations by which the mean over a whole region must differ from zero."""
+INSIGNIFICANT = "insignificant"
+"""The mark of a region that noise or an edge may explain wholly."""
 _STEEP = 4.0
 """Tangent of the angle to the wall's plane beyond which heights are those of an edge (76 degrees)."""
 _SCATTERED = 3.0
@@ -75,7 +77,8 @@ class ChangedRegion:
     score : float
         Score of the detection, 0 to 1; NaN without a detector.
     marks : tuple of str
-        "edge", "vegetation", "thin": another explanation of the change; "insignificant": a detection that may be noise.
+        "edge", "vegetation", "thin": another explanation of the change; "insignificant": noise or an edge may
+        explain all of it.
     identity : int
         Number of the event; 0 if it is not yet known.
     view : int
@@ -176,7 +179,9 @@ def region_of_mask(mask: NDArray[np.bool_], row: int, column: int, score: float,
         return None
     kind: Kind = "missing" if window[known].mean() >= 0 else "added"
     region = replace(_measured(known, row, column, kind, change), score=score)
-    return region if region.significance >= SIGNIFICANT else replace(region, marks=(*region.marks, "insignificant"))
+    if region.significance >= SIGNIFICANT or INSIGNIFICANT in region.marks:
+        return region
+    return replace(region, marks=(*region.marks, INSIGNIFICANT))
 
 
 def _begins(standard: NDArray[np.floating], significance: Significance) -> NDArray[np.bool_]:
@@ -205,7 +210,8 @@ def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change
 
     Volume and significance are those of the whole mask. Heights come from 3 x 3 pixels, so that a sharp edge is spread over
     neighbouring ones: outline and area are those of the pixels with at least `_EDGE_SHARE` of the largest depth around them, and
-    the median depth is that of the pixels with at least half of it.
+    the median depth is that of the pixels with at least half of it. A region is insignificant if its median change is, so that a
+    few pixels at an edge make most of it, or if its volume is below its standard deviation.
     """
     row, column, mask = _padded(mask, row, column, change.difference.shape)
     window = (slice(row, row + mask.shape[0]), slice(column, column + mask.shape[1]))
@@ -220,6 +226,11 @@ def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change
     deepest = ndimage.grey_dilation(np.where(whole, depth, 0.0), size=(_EDGE_PX, _EDGE_PX))
     inner = _without_islands(whole & (depth >= _EDGE_SHARE * deepest))
     rows, columns = np.nonzero(inner)
+    volume = float(depth[whole].sum()) * gsd**2
+    volume_std = float(np.sqrt((noise * pixels) ** 2 + rough[0] ** 2 + rough[1] ** 2)) * gsd**2
+    typical = float(np.median((depth / change.significance.one_sigma[window])[mask]))
+    few = typical < SIGNIFICANT * change.significance.sigma_of_mean(int(mask.sum()))
+    uncertain = (INSIGNIFICANT,) if few or volume < volume_std else ()
     return ChangedRegion(
         kind=kind,
         row=row,
@@ -233,10 +244,10 @@ def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change
         area_m2=int(inner.sum()) * gsd**2,
         depth_median_m=float(np.median(depth[inner & (depth >= deepest / 2)])),
         depth_largest_m=float(depth[inner].max()),
-        volume_m3=float(depth[whole].sum()) * gsd**2,
-        volume_std_m3=float(np.sqrt((noise * pixels) ** 2 + rough[0] ** 2 + rough[1] ** 2)) * gsd**2,
+        volume_m3=volume,
+        volume_std_m3=volume_std,
         significance=float(depth[mask].mean()) / max(noise, 1e-9),
-        marks=_marks(mask, window, sign, change),
+        marks=(*_marks(mask, window, sign, change), *uncertain),
     )
 
 
