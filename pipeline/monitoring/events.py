@@ -2,7 +2,8 @@
 
 A region begins where the mean difference over a small square is far beyond its error, and grows over neighbouring pixels of the
 same sign that exceed half their level of detection. Its volume is the sum of the differences, its standard deviation that of the
-mean over so many pixels, with the registration's, times the area.
+mean over so many pixels, with the registration's, times the area. Where edges were sampled differently, a few pixels make most
+of a mean. So the median has to be significant too, and the volume larger than its standard deviation.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ _GROWS = 0.5
 """Share of the level of detection that pixels at a region's rim exceed."""
 LEAST_PIXELS = 16
 SIGNIFICANT = 7.0
-"""Standard deviations by which the mean over a whole region must differ from zero."""
+"""Standard deviations by which the mean and the median over a whole region must differ from zero."""
 INSIGNIFICANT = "insignificant"
-"""The mark of a region that noise or an edge may explain wholly."""
+"""The mark of a detection that noise or an edge may explain wholly."""
 _STEEP = 4.0
 """Tangent of the angle to the wall's plane beyond which heights are those of an edge (76 degrees)."""
 _SCATTERED = 3.0
@@ -77,8 +78,8 @@ class ChangedRegion:
     score : float
         Score of the detection, 0 to 1; NaN without a detector.
     marks : tuple of str
-        "edge", "vegetation", "thin": another explanation of the change; "insignificant": noise or an edge may
-        explain all of it.
+        "edge", "vegetation", "thin": another explanation of the change; "insignificant": a detection that noise or an
+        edge may explain wholly.
     identity : int
         Number of the event; 0 if it is not yet known.
     view : int
@@ -178,10 +179,7 @@ def region_of_mask(mask: NDArray[np.bool_], row: int, column: int, score: float,
     if not known.any():
         return None
     kind: Kind = "missing" if window[known].mean() >= 0 else "added"
-    region = replace(_measured(known, row, column, kind, change), score=score)
-    if region.significance >= SIGNIFICANT or INSIGNIFICANT in region.marks:
-        return region
-    return replace(region, marks=(*region.marks, INSIGNIFICANT))
+    return replace(_measured(known, row, column, kind, change), score=score)
 
 
 def _begins(standard: NDArray[np.floating], significance: Significance) -> NDArray[np.bool_]:
@@ -201,7 +199,7 @@ def _kept(mask: NDArray[np.bool_], row: int, column: int, kind: str, change: Cha
     if int(mask.sum()) < LEAST_PIXELS:
         return
     region = _measured(mask, row, column, "missing" if kind == "missing" else "added", change)
-    if region.significance >= SIGNIFICANT:
+    if INSIGNIFICANT not in region.marks:
         yield region
 
 
@@ -210,8 +208,7 @@ def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change
 
     Volume and significance are those of the whole mask. Heights come from 3 x 3 pixels, so that a sharp edge is spread over
     neighbouring ones: outline and area are those of the pixels with at least `_EDGE_SHARE` of the largest depth around them, and
-    the median depth is that of the pixels with at least half of it. A region is insignificant if its median change is, so that a
-    few pixels at an edge make most of it, or if its volume is below its standard deviation.
+    the median depth is that of the pixels with at least half of it.
     """
     row, column, mask = _padded(mask, row, column, change.difference.shape)
     window = (slice(row, row + mask.shape[0]), slice(column, column + mask.shape[1]))
@@ -228,9 +225,10 @@ def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change
     rows, columns = np.nonzero(inner)
     volume = float(depth[whole].sum()) * gsd**2
     volume_std = float(np.sqrt((noise * pixels) ** 2 + rough[0] ** 2 + rough[1] ** 2)) * gsd**2
+    significance = float(depth[mask].mean()) / max(noise, 1e-9)
     typical = float(np.median((depth / change.significance.one_sigma[window])[mask]))
-    few = typical < SIGNIFICANT * change.significance.sigma_of_mean(int(mask.sum()))
-    uncertain = (INSIGNIFICANT,) if few or volume < volume_std else ()
+    least = min(significance, typical / float(change.significance.sigma_of_mean(int(mask.sum()))))
+    insignificant = (INSIGNIFICANT,) if least < SIGNIFICANT or volume < volume_std else ()
     return ChangedRegion(
         kind=kind,
         row=row,
@@ -246,8 +244,8 @@ def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change
         depth_largest_m=float(depth[inner].max()),
         volume_m3=volume,
         volume_std_m3=volume_std,
-        significance=float(depth[mask].mean()) / max(noise, 1e-9),
-        marks=(*_marks(mask, window, sign, change), *uncertain),
+        significance=significance,
+        marks=(*_marks(mask, window, sign, change), *insignificant),
     )
 
 

@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 
 from pipeline.formats.files.atomic import write_bytes, write_text
 from pipeline.formats.rasters.geotiff import read_geotiff
-from pipeline.monitoring.events import INSIGNIFICANT
 from pipeline.monitoring.magnitude import PowerLaw, fit_power_law
 from pipeline.monitoring.model import compared_in_words
 from pipeline.monitoring.products import Followed, Result, event_raster
@@ -81,7 +80,7 @@ def law_in_words(law: PowerLaw) -> str:
 
 
 def _kind_in_words(epoch: Followed, kind: str) -> str:
-    regions = [region for region in epoch.regions if region.kind == kind and INSIGNIFICANT not in region.marks]
+    regions = [region for region in epoch.regions if region.kind == kind]
     if not regions:
         return ""
     volume = sum(region.volume_m3 for region in regions)
