@@ -128,7 +128,8 @@ class Comparison:
         """Return a figure of the report by its name.
 
         kind: maps (difference maps), level_of_detection, noise, by_covariate (noise over incidence angle, range and the like),
-        detection (share of blocks seen, over size) or size_and_depth (of the blocks).
+        detection (share of blocks detected over size and depth, and errors of their volumes) or size_and_depth (that share as a
+        table).
         """
         drawn = pictures(self.figures)
         return Picture(pick({name.removesuffix(".png"): png for name, png in drawn.items()}, kind, "plot"))

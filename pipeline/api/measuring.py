@@ -221,9 +221,10 @@ class Diagnosis:
     def verdict(self) -> str:
         """The result in a word.
 
-        One of named (the effects are found), several (some of several), ambiguous (effects that the data cannot tell apart),
-        unknown
-        (a disagreement that no known effect explains), no_gap (sensor model and measurement agree) and insufficient_data.
+        One of named (one effect explains the disagreement), several (more than one does), ambiguous (one of some effects that
+        the data
+        cannot tell apart), unknown (no known effect explains it), no_gap (sensor model and measurement agree) and
+        insufficient_data.
         """
         return self.found.verdict
 
