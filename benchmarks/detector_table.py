@@ -193,7 +193,8 @@ def total(cells: Cells) -> str:
     """Return the means over all cells as a sentence."""
     figures = [f"{100 * mean_f1(each(bar)):.1f}" for each in (cells.network, cells.baseline) for bar in (BARS[0], BARS[2])]
     return (
-        f"{cells.tested.placement}, {cells.sensors} together, mean F1 of masks over {len(cells.images)} cells at 0.25 and 0.75: "
+        f"{cells.tested.placement}, {cells.sensors} together, mean F1 of masks at 0.25 and 0.75 over {len(cells.images)} "
+        "combinations of wall, noise and size: "
         f"detector {figures[0]} and {figures[1]} %, baseline {figures[2]} and {figures[3]} %."
     )
 

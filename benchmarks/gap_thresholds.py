@@ -216,7 +216,7 @@ def main() -> None:
 
 def decided() -> str:
     """Return a table of all thresholds with their units and what each decides."""
-    lines = ["## What the thresholds decide", "", "| threshold | value | unit | what it decides |", "|---|---|---|---|"]
+    lines = [_WORDS, "", "| threshold | value | unit | what it decides |", "|---|---|---|---|"]
     for key in keys():
         group, name = key.split(".")
         values = getattr(Thresholds(), group)
@@ -233,6 +233,21 @@ def _made_by(arguments: argparse.Namespace) -> str:
     return f"| cases | seed | commit | command |\n|---|---|---|---|\n{row}"
 
 
+_WORDS = """## What the thresholds decide
+
+[How gap works](../explanation/how_gap_works.md) explains the steps, and the [glossary](../reference/glossary.md) more words:
+
+| word | meaning |
+|---|---|
+| log-likelihood | unit of a difference: 3 means a factor of 20 in likelihood |
+| gain, log-likelihood ratio | by how much the logarithm of the likelihood is larger with the effect than without it |
+| score | gain minus a penalty for the number of parameters |
+| wall blocks | parts into which the wall is divided, not fallen rock |
+| root sums of squares of the wall blocks' gains | their sum over the root of their sum of squares; four equal gains give 2 |
+| non-parametric, empirical term | a curve that describes residuals without naming a cause |
+| resultant length | how much values prefer one phase, such as whole pixels: 0 for none, 1 if all have it; they then crowd there |
+| strips | parts of the scan by direction, each across the sector in question |
+| selection pass, trial | one run of the search for effects; one value of a parameter that is tried |"""
 _PAGE = "docs/validation/gap_thresholds.md"
 _HEAD = """# What each threshold does
 
@@ -242,13 +257,18 @@ who wonder whether a default decides their case. `--set` changes a threshold for
     scarpsim gap my_measurement --set mean.class_margin=4 --set points.fewest=500 --out diagnosis
 
 Each threshold of `pipeline/gap/thresholds.py` was set to 0.7 and 1.4 times its value, on development cases of some thousand
-points of the [closed-form generator](gap_closed_form.md). For each of both values the table has four counts: the cases that use
-the threshold, those whose answer (verdict or names) changes, those that become wrong, and those that become right. A threshold
-that no case uses, or that is newer than the run, is not listed. "-" means that the value is not allowed, or that the time was
-up.
+points of the [closed-form generator](gap_closed_form.md). For each of both values ("x 0.7", "x 1.4") the table has four columns:
 
-So few cases show which thresholds are close to changing an answer, but not how often they do. [What the thresholds
-decide](#what-the-thresholds-decide) is at the end of the page."""
+| column | cases that it counts |
+|---|---|
+| cases | those that use the threshold |
+| changed | those whose answer (verdict or names) is another one than with the usual value |
+| became wrong | those whose answer was right, with what is wrong now: a wrong name, a missed effect, a false alarm |
+| became right | those whose answer was wrong, with what was wrong |
+
+A threshold that no case uses, or that is newer than the run, is not listed. "-" means that the value is not allowed, or that the
+time was up. Most thresholds change no answer within this range. So few cases show which thresholds are close to changing an
+answer, but not how often they do. [What the thresholds decide](#what-the-thresholds-decide) is at the end of the page."""
 
 
 if __name__ == "__main__":

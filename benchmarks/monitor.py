@@ -4,7 +4,7 @@
 
 Simulated epochs of both sensors are given without their truth, in projected coordinates and moved by a few centimetres. Blocks
 count if at least half of their volume can be seen. The cliff is that of shared/data, scanned by a simulated scanner. The last
-part times two clouds of 20 million points.
+parts time two clouds of 20 million points, and 48 epochs of 2 million against reading their files.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from scene.geometry.mesh import FloatArray  # noqa: E402
 DOCUMENT = ROOT / "docs" / "validation" / "monitor.md"
 MARKS = {
     name: (f"<!-- {name} -->", f"<!-- end of {name} -->")
-    for name in ("simulated", "nothing", "cliff", "m3c2", "regions", "speed")
+    for name in ("simulated", "nothing", "cliff", "m3c2", "regions", "speed", "many")
 }
 CLIFF = ROOT.parent / "shared" / "data" / "trier_cliff"
 PAIR, PAIR_FROM = CLIFF.parent / "tls_rock_blocks_pair", np.array([547_466.3, 149_575.8, 706.1])
@@ -65,6 +65,8 @@ SPECK = {"rockfall__count": 1, "rockfall__size_m": {"kind": "gaussian", "mean": 
 """A single rockfall of 2 mm, far below what any pixel shows: next to nothing."""
 STEP_RAD = 2.618e-4
 POINTS = 20_000_000
+EPOCHS, EPOCH_POINTS = 48, 2_000_000
+"""Of the series whose time is compared with that of reading it."""
 NORMAL_95 = 1.96
 
 
@@ -327,24 +329,50 @@ def speed() -> Iterator[str]:
         for number in (1, 2):
             write_laz(
                 Path(folder) / f"{number}.laz",
-                PointCloud(_large_wall(number)),
+                PointCloud(_large_wall(number, POINTS)),
             )
-        words = ["monitor", f"{folder}/1.laz", f"{folder}/2.laz", "--position", "50,-80,10", "--out", f"{folder}/out", "--quiet"]
-        command = [sys.executable, "-c", "import sys; from pipeline.cli.main import main; sys.exit(main(sys.argv[1:]))", *words]
-        began = time.monotonic()
-        subprocess.run(command, check=True, cwd=ROOT, capture_output=True)
-        took = time.monotonic() - began
-        used = resource.getrusage(resource.RUSAGE_CHILDREN)
-        processor = used.ru_utime + used.ru_stime
+        took, processor = _timed(MONITOR, f"{folder}/1.laz", f"{folder}/2.laz", *FROM, "--out", f"{folder}/out")
         others = max(os.getloadavg()[0] - processor / took, 0.0)
-        yield f"| {POINTS:,} | {took:.0f} s | {processor:.0f} s | {used.ru_maxrss / 1e6:.1f} GB | {others:.1f} |"
+        memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6
+        yield f"| {POINTS:,} | {took:.0f} s | {processor:.0f} s | {memory:.1f} GB | {others:.1f} |"
 
 
-def _large_wall(seed: int) -> FloatArray:
+def many() -> Iterator[str]:
+    """Rows of the table of many epochs: the time of the command, and of a process that only reads the same files."""
+    yield "| epochs, points in each | what | time | processor time | over reading |"
+    yield "|---|---|---|---|---|"
+    with tempfile.TemporaryDirectory() as folder:
+        files = [f"{folder}/2026-03-01T{number // 2:02d}{30 * (number % 2):02d}.laz" for number in range(EPOCHS)]
+        for number, file in enumerate(files):
+            write_laz(Path(file), PointCloud(_large_wall(number, EPOCH_POINTS)))
+        reading = _timed(READ, *files)
+        rows = {"reading the files": reading}
+        for workers in ("1", "2"):
+            words = [*files, *FROM, "--workers", workers, "--out", f"{folder}/out{workers}"]
+            rows[f"`monitor --workers {workers}`"] = _timed(MONITOR, *words)
+        for what, (took, processor) in rows.items():
+            yield f"| {EPOCHS}, {EPOCH_POINTS:,} | {what} | {took:.0f} s | {processor:.0f} s | {processor / reading[1]:.1f} |"
+
+
+MONITOR = "import sys; from pipeline.cli.main import main; sys.exit(main(['monitor', '--quiet', *sys.argv[1:]]))"
+READ = "import sys, pathlib; from pipeline.formats.points.laz import read_laz; [*map(read_laz, map(pathlib.Path, sys.argv[1:]))]"
+FROM = ("--position", "50,-80,10")
+
+
+def _timed(program: str, *words: str) -> tuple[float, float]:
+    """Run a program with Python; return its wall time and the processor time of all its threads and processes, s."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    began = time.monotonic()
+    subprocess.run([sys.executable, "-c", program, *words], check=True, cwd=ROOT, capture_output=True)
+    took, used = time.monotonic() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    return took, used.ru_utime + used.ru_stime - before.ru_utime - before.ru_stime
+
+
+def _large_wall(seed: int, count: int) -> FloatArray:
     """(n, 3) points of a wall of 100 m x 40 m with 3 mm of noise, m."""
     random = np.random.default_rng(seed)
-    x, z = random.uniform([0, 0], [100, 40], (POINTS, 2)).T
-    y = -0.5 * np.sin(0.9 * x) * np.cos(1.1 * z) + 0.003 * random.normal(size=POINTS)
+    x, z = random.uniform([0, 0], [100, 40], (count, 2)).T
+    y = -0.5 * np.sin(0.9 * x) * np.cos(1.1 * z) + 0.003 * random.normal(size=count)
     return np.column_stack([x, y, z])
 
 
@@ -361,6 +389,7 @@ def main() -> None:
         "m3c2": against_m3c2,
         "regions": regions,
         "speed": speed,
+        "many": many,
     }
     for part in arguments.parts:
         table = printed(rows[part]())

@@ -46,6 +46,11 @@ class Row:
 
 
 RATIO, MEMORY = {"ratio": rf"ratio{_NUMBER}"}, {"GB": rf"peak memory[a-z ]*{_NUMBER} GB"}
+ICP = {
+    "of Open3D's time": r"ours, default\s+[\d.]+\s+[\d.]+\s+([\d.]+)",
+    "of it (points shuffled)": r"ours, points shuffled\s+[\d.]+\s+[\d.]+\s+([\d.]+)",
+    "GB": rf"peak memory{_NUMBER} GB",
+}
 ROWS = {
     "tls": Row(
         "laser scan: 5 million pulses on 1.3 million triangles, with noise",
@@ -60,11 +65,44 @@ ROWS = {
         {"of the bare ray rate": rf"share of the bare rate, beam{_NUMBER}"} | MEMORY,
         "at least 0.5",
     ),
+    "startup": Row(
+        "start of `simulate` until it builds the wall",
+        "startup.py",
+        {"s": rf"until it builds the wall[:]{_NUMBER} s", "s of processor time": r"until it builds the wall[^(]+\(([\d.]+) s"},
+        "at most 0.8 s",
+    ),
     "tls_process": Row(
-        "the scene on which HELIOS++ was measured, as one process, with 19 sub-rays",
-        "tls_process.py",
-        {"x HELIOS++'s rate": r"by its CPU time, at best\s+[\d.]+ M\s+([\d.]+) x", "s": rf"process from PLY to LAS{_NUMBER} s"},
-        "at least 5, at most 11 s",
+        "mesh file to LAS file as one process: 2.8 million pulses on 1.3 million triangles, one ray each",
+        "tls_process.py --sub-rays 1",
+        {"s": rf"process from PLY to LAS{_NUMBER} s", "s of processor time": rf"CPU time of all threads{_NUMBER} s"}
+        | {"M pulses/s": rf"observation, pulses/s{_NUMBER} M", "GiB": rf"peak memory{_NUMBER} GiB"},
+        "at most 3.5 s, at least 4 M pulses/s, at most 1.5 GiB",
+    ),
+    "tls_process_beam": Row(
+        "the same with 19 sub-rays, the scene on which HELIOS++ was measured",
+        "tls_process.py --sub-rays 19",
+        {"s": rf"process from PLY to LAS{_NUMBER} s", "s of processor time": rf"CPU time of all threads{_NUMBER} s"}
+        | {"M pulses/s": rf"observation, pulses/s{_NUMBER} M", "GiB": rf"peak memory{_NUMBER} GiB"},
+        "at most 8 s, at least 0.5 M pulses/s, at most 1.5 GiB",
+    ),
+    "demo": Row(
+        "the demo, stereo pair and laser scanner",
+        "processes.py --only demo",
+        {"s (stereo pair)": rf"demo stereo{_NUMBER} s", "s (laser scanner)": rf"demo tls{_NUMBER} s"},
+        "at most 60 s",
+    ),
+    "surface": Row(
+        "surface from 45,000 points",
+        "processes.py --only surface",
+        {"s": rf"surface{_NUMBER} s", "s of processor time": r"surface[^,]+, processor\s+([\d.]+) s"},
+        "at most 1 s",
+    ),
+    "detect": Row(
+        "`detect default` on maps of 2,385 x 482 px and of 1,790 x 1,790 px",
+        "processes.py --only detect",
+        {"s (smaller map)": rf"detect smaller{_NUMBER} s", "s (larger map)": rf"detect larger{_NUMBER} s"}
+        | {"GB": r"detect larger[^G]+,\s+([\d.]+) GB"},
+        "at most 15 s and 30 s",
     ),
     "laz": Row(
         "LAZ file of 3 million points with three extra dimensions",
@@ -84,7 +122,7 @@ ROWS = {
         "the same out of 16 million triangles", "carve.py --large", {"GB": r"carve\s+[\d.]+\s+([\d.]+)"}, "at most 6 GB"
     ),
     "difference": Row("difference map of 3500 x 1500 px", "difference.py", MEMORY, "at most 2 bare casts"),
-    "icp": Row("registration (ICP) of 1 million points", "icp.py", {"GB": rf"peak memory{_NUMBER} GB"}, "at most Open3D's time"),
+    "icp": Row("registration (ICP) of 1 million points", "icp.py", ICP, "at most half of Open3D's time"),
     "epoch_stereo": Row(
         "stereo epoch of Glendale with 1,500 blocks and all products",
         "epoch.py",

@@ -140,14 +140,20 @@ def epochs_words(folder: Path, points: int, epochs: int) -> list[str]:
 
 
 def map_words(folder: Path, times: int) -> list[str]:
-    """Write a difference map with a dozen niches in each 256 px square."""
-    random, side = np.random.default_rng(1), MAP_PX * math.isqrt(times)
-    values = random.normal(0, 0.005, (side, side)).astype(np.float32)
-    for _ in range(12 * (side // 256) ** 2):
-        (height, width), (row, column) = random.integers(5, 25, 2), random.integers(0, side - 25, 2)
-        values[row : row + height, column : column + width] += 0.05
-    write_geotiff(folder / "map.tif", values, Grid(0.0, side * 0.02, 0.02, side, side))
+    """Write a square difference map."""
+    side = MAP_PX * math.isqrt(times)
+    write_map(folder / "map.tif", (side, side))
     return [str(folder / "map.tif")]
+
+
+def write_map(path: Path, shape: tuple[int, int]) -> None:
+    """Write a difference map, m, of (rows, columns), with a dozen niches in each 256 px square."""
+    random, (rows_px, columns_px) = np.random.default_rng(1), shape
+    values = random.normal(0, 0.005, shape).astype(np.float32)
+    for _ in range(12 * (rows_px * columns_px // 256**2)):
+        (height, width), row, column = random.integers(5, 25, 2), random.integers(rows_px - 25), random.integers(columns_px - 25)
+        values[row : row + height, column : column + width] += 0.05
+    write_geotiff(path, values, Grid(0.0, rows_px * 0.02, 0.02, columns_px, rows_px))
 
 
 WORKS = (

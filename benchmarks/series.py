@@ -77,6 +77,8 @@ LARGE: dict[str, Any] = {
 }
 """A wall of 1.3 million triangles and a million pulses."""
 OVERLAP = 0.3
+APART_M = 0.1
+"""Distance between bounding boxes up to which an earlier change may be one event with a rockfall, three pixels of the map."""
 NORMAL_95 = 1.96
 
 
@@ -86,7 +88,8 @@ class Outcome:
 
     volume: m3; seen: share of the volume in the map; kept: whether it is listed in the first epoch without it; late: epochs from
     that epoch to the first that lists it, NaN: none; measured, sigma: volume with its standard deviation there, m3; lead: hours
-    before the fall at which it is listed as a block that moved out, NaN: not, or it did not move.
+    before the fall at which it is listed as a block that moved out, NaN: not, or it did not move; untouched: whether nothing had
+    fallen, moved or come to rest within `APART_M` of it.
     """
 
     volume: float
@@ -96,6 +99,7 @@ class Outcome:
     sigma: float
     moved: bool
     lead: float
+    untouched: bool
 
 
 def found(folder: Path, config: SimulationConfig) -> tuple[list[Outcome], list[tuple[bool, str]], dict[str, Any]]:
@@ -121,7 +125,7 @@ def found(folder: Path, config: SimulationConfig) -> tuple[list[Outcome], list[t
                 held = hits.setdefault((number, region.kind), {})
                 volume, variance = held.get(epoch.number, (0.0, 0.0))
                 held[epoch.number] = volume + region.volume_m3, variance + region.volume_std_m3**2
-    outcomes = [_outcome(event, record["epochs"], truth["hours"], hits) for event in truth["events"]]
+    outcomes = [_outcome(event, record["epochs"], truth, hits) for event in truth["events"]]
     return [each for each in outcomes if each is not None], list(false.values()), truth
 
 
@@ -139,10 +143,10 @@ def _event_at(box: np.ndarray, kind: str, hour: float, events: Sequence[dict[str
     for event in events:
         fallen = event["falls_h"] <= hour
         if fallen == (kind == "missing") and (fallen or event["precursor"]):
-            shared = _overlap(box, np.array(event["block"]["bbox_m"]).reshape(2, 3)[:, :2])
+            shared = _overlap(box, _rectangle(event["block"]["bbox_m"]))
             best, share = (event["event"], shared) if shared > share else (best, share)
     if best is None and kind == "added":
-        lying = [np.array(event["deposit_bbox_m"]).reshape(2, 3)[:, :2] for event in events if event["deposit_bbox_m"]]
+        lying = [_rectangle(event["deposit_bbox_m"]) for event in events if event["deposit_bbox_m"]]
         best = 0 if any(_overlap(box, each) > OVERLAP for each in lying) else None
     return best
 
@@ -156,11 +160,11 @@ def _overlap(one: np.ndarray, other: np.ndarray) -> float:
 def _outcome(
     event: dict[str, Any],
     epochs: Sequence[dict[str, Any]],
-    hours: Sequence[float],
+    truth: dict[str, Any],
     hits: dict[tuple[int, str], dict[int, tuple[float, float]]],
 ) -> Outcome | None:
     """What was found of a rockfall; None for one that falls after the series."""
-    first, number = event["first_missing_epoch"], event["event"]
+    first, number, hours = event["first_missing_epoch"], event["event"], truth["hours"]
     if first is None:
         return None
     block = next(each for each in epochs[first]["blocks"] if each["label"] == number)
@@ -171,7 +175,28 @@ def _outcome(
     early = [epoch for epoch in hits.get((number, "added"), {}) if epoch < first]
     lead = event["falls_h"] - hours[min(early)] if early else np.nan
     late = np.nan if at is None else float(at - first)
-    return Outcome(event["volume_m3"], seen, late, volume, float(np.sqrt(variance)), event["precursor"] is not None, lead)
+    moved, untouched = event["precursor"] is not None, _is_untouched(event, truth)
+    return Outcome(event["volume_m3"], seen, late, volume, float(np.sqrt(variance)), moved, lead, untouched)
+
+
+def _is_untouched(event: dict[str, Any], truth: dict[str, Any]) -> bool:
+    """Whether nothing had changed beside a rockfall in the first epoch without it."""
+    hour = truth["hours"][event["first_missing_epoch"]]
+    around = _rectangle(event["block"]["bbox_m"]) + APART_M * np.array([[-1.0], [1.0]])
+    for other in truth["events"]:
+        if other["event"] == event["event"]:
+            continue
+        fallen = other["falls_h"] <= hour
+        changed = [other["block"]["bbox_m"]] if fallen or other["precursor"] else []
+        changed += [other["deposit_bbox_m"]] if fallen and other["deposit_bbox_m"] else []
+        if any(_overlap(around, _rectangle(each)) > 0 for each in changed):
+            return False
+    return True
+
+
+def _rectangle(box: Sequence[float]) -> np.ndarray:
+    """(2, 2) lower and upper corner of a bounding box in the plane of the wall, m."""
+    return np.array(box).reshape(2, 3)[:, :2]
 
 
 def found_rows(outcomes: Sequence[Outcome], false: Sequence[tuple[bool, str]], days: float) -> Iterator[str]:
@@ -196,18 +221,23 @@ def found_rows(outcomes: Sequence[Outcome], false: Sequence[tuple[bool, str]], d
 
 def promised_rows(outcomes: Sequence[Outcome], plan: SeriesPlan) -> Iterator[str]:
     """Rows of the table of promised and found shares."""
-    yield "| volume | rockfalls | promised to be listed | listed in the first epoch | difference in standard deviations |"
-    yield "|---|---|---|---|---|"
+    yield "| volume | place | rockfalls | promised to be listed | listed in the first epoch | difference in standard deviations |"
+    yield "|---|---|---|---|---|---|"
     law = plan.promises[0].missing
     for low, high in CLASSES_L:
-        inside = [each for each in outcomes if low <= 1e3 * each.volume < high and each.seen >= 0.5]
-        if not inside:
-            continue
-        share = law.probability(np.array([each.volume for each in inside]))
-        hit = sum(each.late == 0 for each in inside)
-        spread = float(np.sqrt(max(np.sum(share * (1 - share)), 0.25)))
-        name = f"{low:g} to {high:g} l" if np.isfinite(high) else f"above {low:g} l"
-        yield f"| {name} | {len(inside)} | {share.sum():.1f} | {hit} | {(hit - share.sum()) / spread:+.1f} |"
+        for untouched in (True, False):
+            inside = [
+                each for each in outcomes if low <= 1e3 * each.volume < high and each.seen >= 0.5 and each.untouched == untouched
+            ]
+            if not inside:
+                continue
+            share = law.probability(np.array([each.volume for each in inside]))
+            hit = sum(each.late == 0 for each in inside)
+            spread = float(np.sqrt(max(np.sum(share * (1 - share)), 0.25)))
+            name = f"{low:g} to {high:g} l" if np.isfinite(high) else f"above {low:g} l"
+            place = "untouched rock" if untouched else "beside an earlier change"
+            difference = f"{(hit - share.sum()) / spread:+.1f}"
+            yield f"| {name} | {place} | {len(inside)} | {share.sum():.1f} | {hit} | {difference} |"
     value, lower, upper = law.volume_m3()
     yield ""
     yield f"Promised smallest rockfall (95 %): {1e3 * value:.2g} l, interval {1e3 * lower:.2g} to {1e3 * upper:.2g} l."

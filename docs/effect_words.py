@@ -221,6 +221,11 @@ _REFERENCES = {
     " Transactions on Pattern Analysis and Machine Intelligence 30(2)",
     "Shimizu & Okutomi 2005": "Shimizu and Okutomi (2005), Sub-pixel estimation error cancellation on area-based matching,"
     " International Journal of Computer Vision 63(3)",
+    "Bleyer et al. 2011": "Bleyer, Rhemann and Rother (2011), PatchMatch stereo: stereo matching with slanted support "
+    "windows, British"
+    " Machine Vision Conference",
+    "Kanade & Okutomi 1994": "Kanade and Okutomi (1994), A stereo matching algorithm with an adaptive window: theory and"
+    " experiment, IEEE Transactions on Pattern Analysis and Machine Intelligence 16(9)",
     "Knutsson & Westin 1993": "Knutsson and Westin (1993), Normalized and differential convolution, CVPR 1993",
     "James & Robson 2014": "James and Robson (2014), Mitigating systematic error in topographic models derived from UAV and"
     " ground-based image networks, Earth Surface Processes and Landforms 39(10)",

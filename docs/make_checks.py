@@ -42,10 +42,11 @@ NO_FAULT = "none of these"
 Make = Callable[[Path], None]
 _HEAD = """# Checks of input files
 
-This page lists faults of input files and says which command, option or function finds them. It is for users who wonder whether a
-fault of their data could go unnoticed. Each cell was tried. *Refused* means that the program writes nothing and gives one
-message, which says what is wrong, where, what is allowed and what to do. A command then ends with exit status 2, and a function
-raises `InputError`.
+This page lists faults of input files and says which command, option or function finds them. It is for users who wonder
+whether a fault of their data could go unnoticed. In each table the rows are faults and the columns commands, options or
+functions that read the file. Each cell was tried. *Refused* means that the program writes nothing and gives one message,
+which says what is wrong, where, what is allowed and what to do. A command then ends with exit status 2, and a function raises
+`InputError`.
 """
 
 

@@ -53,11 +53,13 @@ SCENES = {
     " map has medium quality: one cell for 4 x 4 px of the left image.",
     "tls": "A laser scanner sees a generated wall from 105 m, with angular steps of 0.5 mrad.",
 }
+CELLS = {"stereo": "cells of the depth map", "tls": "pulses"}
 _INDEX = """# The effects
 
 An effect is one way in which a real laser scanner or stereo pair differs from an ideal one: a systematic error, or noise. This
 catalogue is for users who simulate sensor errors, or who read the name of one in a diagnosis by `scarpsim gap`. Each effect has a
-page with its equation, its parameters and a map of what it does to a measurement.
+page with its equation, its parameters and a map of what it does to a measurement. If you have a pattern and look for its cause,
+begin with [From symptom to cause](../gap/symptoms.md).
 
 `docs/make_gallery.py` writes these pages; do not edit them."""
 _ORDER = """## When an effect acts
@@ -155,13 +157,17 @@ def page(effect: type[Effect], comparison: Comparison) -> str:
         symbols(effect),
         f"When the program simulates a measurement, {STAGES[effect.stage]} (stage [`{stage}`](README.md#when-an-effect-acts)).",
         f"## Parameters\n\n{parameter_table(effect)}",
-        "With the default values the effect is off. A unit of `[1]` marks a pure number, and the source"
-        " `empirical` a value that no publication gives.",
+        "With the default values the effect is off. A unit of `[1]` marks a pure number. The source is where the "
+        "parameter comes"
+        " from; `empirical` marks a value that no publication gives.",
         f"## In a config\n\n```yaml\n{yaml(shown)}\n```",
         f"## Its difference map\n\n![{name}]({name}.png)",
-        f"The map shows the recorded {_quantity(effect)} with the effect of the example minus that without it. Red is farther"
-        f" away, as missing rock would be. {SCENES[effect.sensor]} There is no other noise.",
-        _figures(comparison),
+        f"The map shows the recorded {_quantity(effect)} with the effect of the example minus that without it, as the "
+        f"mean over"
+        f" the {CELLS[effect.sensor]} in each pixel of {GSD_M:g} m. Red is farther away, as missing rock would be; light grey has"
+        f" no data. Where the effect removes or adds values, pixels are dark grey or green. {SCENES[effect.sensor]} There is no"
+        " other noise.",
+        _figures(effect.sensor, comparison),
         references(effect),
         "[From symptom to cause](../gap/symptoms.md) compares the maps of all effects. The [glossary](../glossary.md) explains"
         " the words. `docs/make_gallery.py` writes this page from the code; do not edit it.",
@@ -208,14 +214,16 @@ def _quantity(effect: type[Effect]) -> str:
     return "depth" if effect.sensor == "stereo" else "range"
 
 
-def _figures(comparison: Comparison) -> str:
+def _figures(sensor: str, comparison: Comparison) -> str:
     values = comparison.difference[np.isfinite(comparison.difference)] * 1e3
     cells, median = comparison.without.valid.sum(), np.median(values)
     spread = 1.4826 * np.median(np.abs(values - median))
     return (
-        f"Over all cells the difference has a mean of {values.mean():.2f} mm, a standard deviation of {values.std():.2f} mm and"
-        f" an NMAD of {spread:.2f} mm. The effect leaves {100 * comparison.lost.sum() / cells:.2f} % of the cells without a"
-        f" value, and gives a value to {100 * comparison.gained.sum() / cells:.2f} % that have none without it."
+        f"Over all {CELLS[sensor]} the difference has a mean of {values.mean():.2f} mm, a standard deviation of "
+        f"{values.std():.2f} mm and"
+        f" an NMAD (robust standard deviation, which outliers do not affect) of {spread:.2f} mm. The effect leaves"
+        f" {100 * comparison.lost.sum() / cells:.2f} % of them without a value, and gives a value to"
+        f" {100 * comparison.gained.sum() / cells:.2f} % that have none without it."
     )
 
 

@@ -192,7 +192,7 @@ def page(name: str, title: str, before: str, found: list[tuple[str, GapDiagnosis
     """docs/validation/gap_<...>.md up to the line that marks hand-written text, which is kept."""
     path = FOLDER / f"{_FILES[name]}.md"
     kept = path.read_text().partition(_MARK)[2] if path.exists() else "\n"
-    parts = [f"# {title}", before, "## Results", table(found)]
+    parts = [f"# {title}", before, table(found)]
     for matcher, _ in found:
         picture = slug_picture(f"{name}_{matcher.replace(', ', '_')}")
         parts.append(f"![Maps of the residuals before and after, {matcher}]({picture})")
@@ -236,32 +236,46 @@ least-squares refinement. The reference is the surface of the disparities that t
 where they jump by more than 1 px. The model states a nearly perfect matcher: 0.05 px of white noise and no effects.
 
 The answers find the pixel locking of the plain matcher, which the refinement removes, and the fattened edges of both. They cannot
-tell the correlated errors of a matcher from errors of the cameras.
-
-Made by
+tell the correlated errors of a matcher from errors of the cameras. This command makes the page's results:
 
     python docs/make_gap_examples.py motorcycle
 
-which leaves the measurement folders and the reports in runs/gap_examples/motorcycle.""",
+It leaves the measurement folders and the reports in runs/gap_examples/motorcycle.
+
+## Results
+
+A residual is a measured minus a predicted disparity. `before` and `after` say how far the measured residuals are from those that
+the model predicts, without and with the named effects, as a distance along the line of sight
+([how](../explanation/gap_verdict.md#the-gap)). `floor` is what the noise alone would leave, and `closed` the share of the way
+from `before` to `floor`. An effect named "as a description" describes the residuals, but is no known physical
+cause. The [catalogue](../reference/effects/README.md) explains the effects and their parameters. The verdict of the first row is
+`unknown` because residuals are left that the named effects do not explain; `several` means that several effects are named.""",
     "sgbm": """\
 This page shows what `scarpsim gap` says of a real matcher on rendered photographs, where the truth is known: the cameras are
 perfect and the surface is exact, so whatever is found is due to the matcher. It is for users of photogrammetric surfaces.
 
 A wall of 24 m x 15 m in the style of Glendale is rendered from 50 m (base 13 m, medium quality) and matched by OpenCV's
-semi-global matching, with and without least-squares refinement. The model states a nearly perfect matcher: 0.05 px of white noise
-and no effects. Values are in pixels of the frame; a pixel of the matched pictures is 4 px of the frame.
+semi-global matching (`sgbm`), with and without least-squares refinement. The model states a nearly perfect matcher: 0.05 px
+of white noise and no effects. Values are in pixels of the full image; a pixel of the matched pictures is 4 px of it.
 [Matching](../explanation/matching.md) has the errors of the matchers.
 
 The answers find the pixel locking of the plain matcher and the smoothing (a low-pass filter) of the refined one, and blame no
-camera.
-
-Made by
+camera. This command makes the page's results:
 
     python docs/make_gap_examples.py sgbm
 
-which leaves the measurement folders and the reports in runs/gap_examples/sgbm.""",
+It leaves the measurement folders and the reports in runs/gap_examples/sgbm.
+
+## Results
+
+A residual is a measured minus a predicted disparity. `before` and `after` say how far the measured residuals are from those that
+the model predicts, without and with the named effects, as a distance along the line of sight
+([how](../explanation/gap_verdict.md#the-gap)). `floor` is what noise alone would leave, and `closed` is the share of the way from
+`before` to `floor`. An effect named "as a description" describes the residuals, but is no known physical
+cause. The [catalogue](../reference/effects/README.md) explains the effects and their parameters. The verdict `unknown` means that
+residuals are left that the named effects do not explain, and `several` that several effects are named.""",
 }
-"""What each page starts with: what was evaluated, and what it means."""
+"""What each page has before its table: what was evaluated, what it means, and how the table is read."""
 
 
 if __name__ == "__main__":

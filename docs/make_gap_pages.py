@@ -218,7 +218,9 @@ def symptoms_page(found: list[Symptom], tables: dict[str, Identifiability]) -> s
         "# From symptom to cause",
         "",
         "This page shows how each effect of [the catalogue](../effects/README.md) looks in a map of the residuals. It is for"
-        " users who see a pattern in such a map and look for its cause. `docs/make_gap_pages.py` writes it; do not edit it.",
+        " users who see a pattern in such a map, for example in the report of `scarpsim gap`, and look for its cause. Find the"
+        " picture that looks most like yours; its row names the effect. `docs/make_gap_pages.py` writes this page; do not edit "
+        "it.",
         "",
         "A *residual* is the measured minus the predicted range or depth, in mm. Each map shows the residuals that one effect of"
         " typical size makes on a generated wall, seen from 105 m without noise, **after a shift and a rotation of the sensor are"
@@ -334,7 +336,11 @@ def verdicts() -> dict[str, Verdict]:
             "is true. Elsewhere it may be wrong.",
             "All ranges of a scanner are too long by 2 mm. On this wall most of that looks like a shift of the scanner, and the "
             "rest like a wrong scale.",
-            _case(seed=13, ranges=lambda scan: scan.R + 0.002),
+                        _case(seed=13, ranges=lambda scan: scan.R + 0.002),
+            "A misfit remains, but the effect closes more than half of the gap, so the verdict is not [unknown](unknown.md). "
+            "The size is "
+            "1.6 "
+            "mm instead of 2 mm because it is uncertain, by the ± 0.3 mm that the report states.",
         ),
         "unknown": Verdict(
             "The model is rejected, but the catalogue does not explain why. There are three cases:\n\n"
@@ -385,7 +391,7 @@ def verdicts() -> dict[str, Verdict]:
 _TERMS = """An *effect* is a sensor error of [the catalogue](../effects/README.md). The *gap* is how far the measurement lies from
 the model's prediction, *before* and *after* the named effects are in the model. The *floor* is what the model's own noise leaves.
 The [glossary](../glossary.md#model-and-measurement) explains further words, and
-[how gap works](../../explanation/how_gap_works.md) the tests."""
+[how gap reaches its verdict](../../explanation/gap_verdict.md) the tests."""
 _PICTURES = """The maps show how much deeper the surface was measured than predicted, and the measured over the predicted standard
 deviation. On the left is the model before the named effects, on the right after them. The bar shows the gap on the validation
 blocks."""

@@ -148,7 +148,10 @@ def page(answers: dict[Mistake, str]) -> str:
     """docs/reference/mistakes.md."""
     head = """# Common mistakes
 
-This page is for users who got an error message and want to know what caused it. It shows common mistakes and their messages.
+This page is for users who got an error message and want to know what caused it. It shows common mistakes and their messages:
+look for yours by its words, or by the part of the program that it names. In each box the first line is the command, and the
+second the message. A message says where the mistake is, what is wrong ("got" is your value), what is allowed, and what to do.
+
 A mistake ends the command with exit status 2 and leaves no half-written results. `...` stands for `--config site.yaml --out out`,
 a small site.
 

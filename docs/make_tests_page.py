@@ -12,7 +12,8 @@ _HEAD = """# What the tests cover, and when they run
 
 This page lists the long tests, for developers who make a release or change a method. `make test` runs lint, spelling, types and
 the tests that take seconds each. `make validate` runs the tests below. Run it before each release and after each larger change.
-What a long test covers as a whole also has short tests of its parts in `make test`.
+What a long test covers as a whole also has short tests of its parts in `make test`. Each table has the files with long tests,
+how many they hold, and what a file tests. The sentence below a heading says which shorter tests cover the same.
 
 On two cores, with an empty kernel cache, the 4,658 tests of `make test` took 11.5 minutes of time and 19 of processor time.
 

@@ -131,6 +131,7 @@ SCRIPTS: dict[str, Tiny] = {
     ),
     "niche_texture": Tiny(("--set", "tiny")),
     "noise_table": Tiny(("--maps", "2", "--levels", "high", "--out", "noise"), overrides=SMALL_SITE),
+    "processes": Tiny(values={"POINTS": 2000, "MAPS_PX": {"detect": (64, 64)}, "DEMO": {}}),
     "reconstruction": Tiny(keys=COARSE_WALL | {"RigConfig": {"width": 1472, "height": 984, "distance_m": 25.0}}),
     "scale": Tiny(("--only", "surface:points"), values={"POINTS": 5000}),
     "series": Tiny(

@@ -145,13 +145,16 @@ def page(record: dict[str, Any]) -> str:
     rows = [
         f"| {each['what']} | {each['how'] or 'none'} | {each['said']} | {each['seconds']:.0f} s |" for each in record["trials"]
     ]
+    failed = sum(each["said"] != "works" for each in record["trials"])
+    works = f"{failed} of the ways in the table failed." if failed else "All ways in the table work."
     head = f"""# Ways to install
 
 This page is for users who install scarpsim without its repository. It lists each way that was tried and what came of it.
 
 Each trial started with an empty environment and an empty folder, and with no variable of the shell but the path, the home and the
 package index. The program then simulated a small wall with the laser scanner, or imported what the extra adds. Times include the
-installation, mostly from a local cache of packages.
+installation, mostly from a local cache of packages. An *extra* is a named group of optional packages, such as `detect` for the
+detector. {works} "Glibc" in the name of the machine is the version of its C library.
 
 Tried at commit {record["commit"]} on {record["machine"]}.
 

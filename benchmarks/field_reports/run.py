@@ -30,7 +30,9 @@ _HEAD = """# Files that broke other programs
 This page shows what scarpsim does with files of the kinds that users of other programs reported as misread, refused or fatal.
 It is for those who wonder whether their own files will be read as they are meant. The reports are public threads of the
 trackers of those programs. For each we wrote a small file of our own with the reported property, gave it to scarpsim, and
-compared the result with the truth that the file was made from.
+compared the result with the truth that the file was made from. Each row has the property of the file with its report, what a
+program should do with it, and what scarpsim does. A refusal is right where the file does not say enough; then the message is
+shown. All rows are right.
 """
 _END = "This page is written by `python benchmarks/field_reports/run.py`, and the test suite tries every row again.\n"
 

@@ -20,15 +20,16 @@ _ANSWERS = (
 
 _NUISANCES = """| always present | size |
 | --- | --- |
-| pose | wrong by millimetres and some 10 microradians |
+| pose | wrong by millimetres and some 10 microradians, as if from a survey |
 | error of the reference | 0.2 to 0.8 mm for the laser, 1 to 4 mm for stereo, correlated over 1.5 to 6 m |
 | albedo | varies smoothly and from point to point |
 | missing returns | 1 to 2 %; in a third of the cases also shrubs (round patches without returns) |
 | changes of the scene | fallen blocks and debris in all cases but those without an effect |
-| optional fields | each absent in a quarter of the cases |
-| effects that the model has right already | in one of eight laser cases |
+| optional fields of a measurement (such as intensity or time) | each absent in a quarter of the cases |
+| effects that the sensor model states already, rightly | in one of eight laser cases |
 
-Strengths are spread evenly in their logarithm from 2 to 120, up to three times the catalogue's largest typical size."""
+The strengths S/N of the effects are spread evenly in their logarithm from 2 to 120, up to three times the largest typical size
+that the catalogue states."""
 
 _LABELS = {
     "false alarms on no-effect cases": "false alarms: the verdict is not `no_gap`, though there is no effect",
@@ -46,7 +47,8 @@ _LABELS = {
     "the same, as the angle to the nearest other effect lets it (1 - sin^2, median)": "its expectation from the angle to the "
     "nearest other effect, 1 - sin^2 (median)",
     "the same, where that angle leaves it 5 % at most": "the share that it closes where the expectation is 5 % at most",
-    "rightly named, but the gap is within its uncertainty": "right names although the gap is within its uncertainty of the floor",
+    "rightly named, but the gap is within its uncertainty": "right names where the gap is too small to be told from none",
+    "the same, where every true effect was named": "the same intervals, where every true effect was named",
 }
 """Rows of the results whose names need more words on the page."""
 
@@ -64,9 +66,30 @@ _OUTSIDE = """| error outside the catalogue | what it is |
 | off_spread_half, off_spread_radius | additional noise in half of the image, far from the middle of the image |
 | off_loss_sector | lost returns in a sector of azimuths |"""
 
-_READING = """"Undecided" means that the 95 % interval (Wilson) contains values that reach the goal and values that do not. The
-best wrong effect closes much of the gap wherever two signatures are alike: fitted freely, an effect at the angle a to the true
-one takes 1 - sin^2 a of its square, whatever the method. "(of 24)" is the number of measurements over which a median is taken."""
+_HOW_TO_READ = """Each cell has a share with its counts and its 95 % interval (Wilson) in brackets, or a median with the
+number of values in brackets; "(of 1)" is one value for all measurements together. Then it says whether the goal was met:
+"yes", "no", or "undecided", which means that the interval contains values that reach the goal and values that do not. So few
+measurements leave most goals undecided."""
+
+_READING = """The "share of the gap" is 100 % if nothing but noise is left. The best wrong effect closes much of the gap wherever
+two signatures are alike: fitted freely, an effect at the angle a to the true one takes 1 - sin^2 a of its square, whatever the
+method. Where no other effect is alike, it closes next to nothing."""
+
+_ANSWERS_READ = """| column or name | meaning |
+| --- | --- |
+| (none), (change) | measurements without an effect; those in which only rock fell |
+| (off ...) | an error outside the catalogue |
+| right, alone; right, in a class | the true effect is named; it is one of those that cannot be told from a named one |
+| other effect only | the measurement has two effects, and only the other one is named |
+| wrong name | an effect is named that is not there |
+| unknown | no name, but the verdict `unknown` or an empirical description |
+| no_gap, insufficient_data | this [verdict](../reference/glossary.md#model-and-measurement), without a name |
+| error | the program gave no answer |"""
+
+_FAILURES_READ = """"Case" is the number of the measurement, and "effects" what it contains: `one` or `two` effects of the
+catalogue, or an error outside it (`off`). "x sin" is S/N x sin(angle), and "nearest" the most similar effect of another class.
+In an answer, `~` joins effects that cannot be told apart, and `empirical` stands for a description without a cause. "Missed" is a
+clear effect that the answer does not have. "Called unknown" has an empirical description besides the right name."""
 
 
 def markdown(found: Json) -> str:
@@ -76,23 +99,24 @@ def markdown(found: Json) -> str:
         f"# Measurements simulated in closed form: {sensor}",
         _introduction(found),
         _made_by(found),
-        "## Results\n\n" + _figures(found["figures"], found["by_sensor"]),
+        "## Results\n\n" + _HOW_TO_READ + "\n\n" + _figures(found["figures"], found["by_sensor"]),
         _READING,
         "## What the measurements hold\n\n" + _NUISANCES,
         "## Compared with two simple methods\n\nBoth take residuals as independent and give one name: the effect with the "
         "largest |z| (estimate over its standard error) above 3, or the best effect by the Bayesian information criterion (BIC) "
-        "if it is ahead by more than 10.\n\n" + _baselines(found),
+        "if it is ahead by more than 10.\nBoth find fewer of the clear effects, and raise many false alarms.\n\n"
+        + _baselines(found),
         "## Answers by effect\n\nEach true effect counts once, also those of measurements with several effects, "
         "which the figures above leave out. Weak effects,\nwith S/N x sin(angle) below 8, are in brackets. "
         "A name that begins with `off_` is an error outside the catalogue.\n\n"
-        + _OUTSIDE
-        + "\n\n"
+        + f"{_ANSWERS_READ}\n\n{_OUTSIDE}\n\n"
         + _by_effect(found["by_effect"]),
-        '## Detection by strength\n\nThe measurements have one effect each. "Found at all" is sorted by S/N, and "right class" '
-        "by S/N x sin(angle).\n\n" + _curves(found["detection"]),
-        "## Coverage of the 90 % intervals\n\nHow many of the intervals of each parameter contain its true value.\n\n"
-        + _coverage(found["coverage"]),
-        "## Failures\n\n" + _failures(found["failures"]),
+        "## Detection by strength\n\nThe measurements have one effect each, and a row has those whose ratio lies in its bin. "
+        '"Found at all" counts any\nfinding, right or wrong, by bins of S/N. "Right class" counts right answers, by bins of '
+        "S/N x sin(angle).\n\n" + _curves(found["detection"]),
+        "## Coverage of the 90 % intervals\n\nFor each parameter of an effect that was named: how many of its 90 % intervals "
+        'contain the true value ("inside"), of how many.\n\n' + _coverage(found["coverage"]),
+        f"## Failures\n\n{_FAILURES_READ}\n\n" + _failures(found["failures"]),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -120,11 +144,15 @@ the diagnosis.
 | effect | a sensor error of [the catalogue](../reference/effects/README.md) |
 | signature | the pattern of residuals that an effect makes |
 | class | effects that this measurement cannot tell apart: the angle between their signatures has a sine below 0.1 |
-| gap, floor | how much worse the measurement fits the model than it should; what noise alone leaves |
-| S/N | strength of an effect: its signature after the pose fit, against the noise and the correlated error of the reference |
-| S/N x sin(angle) | what is left of it when the nearest effect of another class is fitted too |
+| floor | how far the measurement departs from the model where only noise is left, in m |
+| gap | how much farther than the floor it departs |
+| S/N | strength of an effect: signal-to-noise ratio of its signature after the pose fit; noise includes the reference's error |
+| S/N x sin(angle) | what is left of S/N when the most similar effect of another class is fitted too |
 | clear | an effect whose S/N x sin(angle) is 8 or more, in a measurement with no other effect |
 | validation blocks | parts of the wall that were not used to find effects |
+| reference | the surface with which the measurement is compared |
+| false alarm | an effect is named, or the verdict is `unknown`, though the sensor has no error |
+| interval | the range of a parameter that the answer states; a 90 % interval should contain the truth in 90 % of the cases |
 | `no_gap`, `unknown` | verdicts: measurement and model agree; they disagree, and no effect of the catalogue explains it |"""
 
 

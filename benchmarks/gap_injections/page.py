@@ -38,8 +38,9 @@ _OUTCOMES = {
 
 _RULES = """These rules apply:
 
-- **Named** counts effects of the catalogue. An empirical term, which describes a pattern without a cause, is in the column
-  "named" of the tables, but does not count. Some carry "empirical" in their name. Others have the name of a noise effect.
+- **Named** counts effects of the [catalogue](../reference/effects/README.md). An empirical term, which describes a pattern
+  without a cause, is in the column "named" of the tables, but does not count. Some carry "empirical" in their name. Others
+  have the name of a noise effect.
 - **New** is an effect that the diagnosis of the measurement without the injection does not name. Effects that it does name may
   stand beside the injected one.
 - **The size is right** within 3 standard errors or 15 % of the injected value, and the period of a wave within 5 %. Other
@@ -64,9 +65,20 @@ _STRENGTH = (
 )
 
 _COLUMNS = (
-    "The end of each name of a value is its unit (m, rad, px, ppm); k1 has none. `outcome` is explained above, `verdict` on [the "
-    "pages of the verdicts](../reference/gap/unknown.md). `size found` is the injected effect's size in the answer with its "
-    "standard error."
+    'The first column has the number of the case. "Put in" is the injected effect, and "values" are its parameters. The end '
+    "of each name "
+    'of a value is its unit (m, rad, px, ppm); k1 has none. "Outcome" is explained above, "verdict" on [the pages of the '
+    'verdicts](../reference/gap/unknown.md). "Named" is what the answer names. "Size found" is the injected effect\'s size in '
+    "the "
+    "answer with its standard error."
+)
+
+_BASES_READ = (
+    "An answer is a [verdict](../reference/glossary.md#model-and-measurement), with the effects that it names after a "
+    'colon. "Before" says how far the residuals are from those that the model predicts without named effects, and "floor" '
+    'what noise alone leaves ([score](../explanation/gap_verdict.md#the-gap)). "One half against the other" means that '
+    "every second point makes the reference surface with which the others are compared. The scans disagree with the noise "
+    "of the data sheet, so the injections start from the noise that the first answer proposes."
 )
 
 _CAUSES = {
@@ -108,7 +120,7 @@ def page(rows: list[Json], bases: dict[str, Json]) -> str:
         _RULES,
         _table(("error outside the catalogue", "what it is"), _OUTSIDE.items()),
         _STRENGTH,
-        "## The measurements without an injected effect\n\n" + _bases(bases),
+        f"## The measurements without an injected effect\n\n{_BASES_READ}\n\n" + _bases(bases),
         "## Why cases fail\n\n" + _table(("where", "why"), _CAUSES.items()),
         f"## Failures\n\nThese are {len(failed)} of {len(rows)} cases. {_COLUMNS}\n\n" + _rows(failed),
         "## All injections\n\n" + _rows(rows),
@@ -182,11 +194,15 @@ def _in_short(rows: list[Json]) -> str:
         said.append(
             f"On {words}, {right} of {len(inside)} effects of the catalogue are named with their size or listed among those that "
             f"cannot be told apart; {unknown} of {len(outside)} errors outside the catalogue get the right answer, `unknown`. "
-            f"A wrong effect is named in {wrong} of all {len(group)} cases."
+            f"A wrong effect is named in {wrong} of all {len(group)} cases, where the goal for simulated "
+            f"measurements is 2 %."
         )
     said.append(
         f"In {len(spoiled)} of the {len(known)} good answers on effects of the catalogue the verdict is still `unknown`, because "
-        "the measurement disagreed with its model before the injection already."
+        "the measurement disagreed with its model before the injection already.\n\nIn the table each row is a group of "
+        'injections: by their signal-to-noise ratio S/N, or by the measurement (both are explained below). "Number" is the '
+        "size "
+        "of the group, and the other columns count [the outcomes](#how-answers-are-scored). Right and class are good outcomes."
     )
     return " ".join(said)
 

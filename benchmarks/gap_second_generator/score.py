@@ -37,7 +37,7 @@ _WORDS = """| kind of measurement | what it contains |
 |---|---|
 | none | no effect |
 | change | no effect, but rock that fell or moved |
-| off | one error outside the catalogue, such as second_wall (echoes by way of a second wall), matcher_tiles, rough_rows |
+| off | one error outside the catalogue |
 | one, two | one or two effects of the catalogue |
 
 | outcome | what the answer says |
@@ -49,9 +49,17 @@ _WORDS = """| kind of measurement | what it contains |
 | wrong name | a wrong effect |
 | unknown, no_gap, insufficient_data | this [verdict](../reference/glossary.md#model-and-measurement), and no effect |
 
-The right answer is `no_gap` for the kinds none and change, and `unknown` for off. "Ratio" is the signal-to-noise ratio of an
-effect, in brackets what is left of it when the most similar other effect is fitted too. "p of what remains" is the p-value of
-the misfit that is left. Intervals are binomial, 95 %.
+The right answer is `no_gap` for the kinds none and change, and `unknown` for off. Alone and class are right for the kinds one
+and two. Errors outside the catalogue are, for example, second_wall (echoes by way of a second wall), matcher_tiles (tiles of
+the disparity raster with errors of their own) and rough_rows (more noise in some rows). In the first table of each sensor, a
+row is a kind of measurement, and the columns count the outcomes; "error" means that the program gave no answer. The second
+table has shares with their counts and binomial 95 % intervals. A *clear* effect has a ratio of 12 or more beside the most
+similar other one, and the *reference* is the surface with which a measurement is compared.
+
+The table of failures has the number and kind of each case that is not answered rightly. "Truth" is what the case contains.
+"Ratio" is the signal-to-noise ratio of an effect, in brackets what is left of it when the most similar other effect, which is
+named, is fitted too. "Answer" is the verdict and the named effects with their parameters, whose last part is the unit. "p of
+what remains" is the p-value of the misfit that is left: at 0.01 and below `gap` rejects the model.
 """
 LEVEL_90 = float(norm.ppf(0.95))
 EDGED = ("strips", "tiles")

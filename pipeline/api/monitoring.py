@@ -19,6 +19,7 @@ from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.products import COLUMNS, Result
 from pipeline.monitoring.report import headline
 from pipeline.monitoring.run import monitor_paths
+from pipeline.monitoring.site import WallView
 from pipeline.report.notebook_progress import python_progress
 from pipeline.report.words import counted
 from scene.common.errors import InputError
@@ -114,10 +115,19 @@ class Monitoring:
     def differences(self) -> xarray.DataArray:
         """Difference maps, (epoch, y, x), m: reference minus epoch along the wall's normal.
 
-        Missing rock is positive; pixels without data are NaN. Of several views these are the maps of the first.
+        Missing rock is positive; pixels without data are NaN. Of several views these are the maps of the first; see
+        `differences_in` for the others.
+        """
+        return self.differences_in(1)
+
+    def differences_in(self, view: int) -> xarray.DataArray:
+        """Return the difference maps of one view of the wall, (epoch, y, x), m, as `differences` has those of the first.
+
+        view: number of the view, from 1 on; a wall that turns no corner has one. Raises InputError if there is no such view.
         """
         xarray = library("xarray")
-        maps = [self._map("difference", epoch.number) for epoch in self.result.epochs]
+        suffix = self._view(view).suffix
+        maps = [self._map("difference", f"{epoch.number:03d}{suffix}") for epoch in self.result.epochs]
         return xarray.concat(maps, dim=xarray.IndexVariable("epoch", [epoch.number for epoch in self.result.epochs]))
 
     @property
@@ -133,10 +143,14 @@ class Monitoring:
         """Registration of each epoch on the reference, wall frame, as in monitor.json; keyed by the epoch's number."""
         return {epoch.number: epoch.record.registration for epoch in self.result.epochs}
 
-    def plot(self, epoch: int | None = None) -> Picture:
-        """Return the difference map of an epoch with the outlines of its events. Default: the last epoch."""
+    def plot(self, epoch: int | None = None, view: int = 1) -> Picture:
+        """Return the difference map of an epoch in one view of the wall, with the outlines of its events.
+
+        epoch, view: their numbers, from 1 on; by default the last epoch in the first view. Raises InputError if there is no
+        such epoch or view.
+        """
         number = self.result.epochs[-1].number if epoch is None else epoch
-        path = self.folder / f"map_{number:03d}.png"
+        path = self.folder / f"map_{number:03d}{self._view(view).suffix}.png"
         if not path.is_file():
             raise InputError(
                 f"there is no epoch {number}",
@@ -157,7 +171,15 @@ class Monitoring:
         rows = {f"epoch {epoch.number}": counted(len(epoch.regions), "event") for epoch in self.result.epochs}
         return html_table(self.summary(), rows, self.plot())
 
-    def _map(self, kind: str, number: int) -> xarray.DataArray:
-        """Return a GeoTIFF of an epoch as a DataArray."""
-        values, grid = read_geotiff(self.folder / f"{kind}_{number:03d}.tif")
+    def _view(self, number: int) -> WallView:
+        """Return the view with this number."""
+        views = self.result.site.views
+        if not 1 <= number <= len(views):
+            allowed = f"1 to {len(views)}" if len(views) > 1 else "1: the wall has one view"
+            raise InputError(f"there is no view {number}", where="view", allowed=allowed, remedy="choose one of these views")
+        return views[number - 1]
+
+    def _map(self, kind: str, place: str) -> xarray.DataArray:
+        """Return a GeoTIFF of an epoch in a view as a DataArray; place: their numbers as in the file's name."""
+        values, grid = read_geotiff(self.folder / f"{kind}_{place}.tif")
         return data_array(values, grid, kind, DIFFERENCE)

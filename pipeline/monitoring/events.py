@@ -2,7 +2,8 @@
 
 A region begins where the mean difference over a small square is far beyond its error, and grows over neighbouring pixels of the
 same sign that exceed half their level of detection. Its volume is the sum of the differences, its standard deviation that of the
-mean over so many pixels, with the registration's, times the area.
+mean over so many pixels, with the registration's, times the area. Where edges were sampled differently, a few pixels make most
+of a mean. So the median has to be significant too, and the volume larger than its standard deviation.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ _GROWS = 0.5
 """Share of the level of detection that pixels at a region's rim exceed."""
 LEAST_PIXELS = 16
 SIGNIFICANT = 7.0
-"""Standard deviations by which the mean over a whole region must differ from zero."""
+"""Standard deviations by which the mean and the median over a whole region must differ from zero."""
+INSIGNIFICANT = "insignificant"
+"""The mark of a detection that noise or an edge may explain wholly."""
 _STEEP = 4.0
 """Tangent of the angle to the wall's plane beyond which heights are those of an edge (76 degrees)."""
 _SCATTERED = 3.0
@@ -75,7 +78,8 @@ class ChangedRegion:
     score : float
         Score of the detection, 0 to 1; NaN without a detector.
     marks : tuple of str
-        "edge", "vegetation", "thin": another explanation of the change; "insignificant": a detection that may be noise.
+        "edge", "vegetation", "thin": another explanation of the change; "insignificant": a detection that noise or an
+        edge may explain wholly.
     identity : int
         Number of the event; 0 if it is not yet known.
     view : int
@@ -175,8 +179,7 @@ def region_of_mask(mask: NDArray[np.bool_], row: int, column: int, score: float,
     if not known.any():
         return None
     kind: Kind = "missing" if window[known].mean() >= 0 else "added"
-    region = replace(_measured(known, row, column, kind, change), score=score)
-    return region if region.significance >= SIGNIFICANT else replace(region, marks=(*region.marks, "insignificant"))
+    return replace(_measured(known, row, column, kind, change), score=score)
 
 
 def _begins(standard: NDArray[np.floating], significance: Significance) -> NDArray[np.bool_]:
@@ -196,7 +199,7 @@ def _kept(mask: NDArray[np.bool_], row: int, column: int, kind: str, change: Cha
     if int(mask.sum()) < LEAST_PIXELS:
         return
     region = _measured(mask, row, column, "missing" if kind == "missing" else "added", change)
-    if region.significance >= SIGNIFICANT:
+    if INSIGNIFICANT not in region.marks:
         yield region
 
 
@@ -220,6 +223,12 @@ def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change
     deepest = ndimage.grey_dilation(np.where(whole, depth, 0.0), size=(_EDGE_PX, _EDGE_PX))
     inner = _without_islands(whole & (depth >= _EDGE_SHARE * deepest))
     rows, columns = np.nonzero(inner)
+    volume = float(depth[whole].sum()) * gsd**2
+    volume_std = float(np.sqrt((noise * pixels) ** 2 + rough[0] ** 2 + rough[1] ** 2)) * gsd**2
+    significance = float(depth[mask].mean()) / max(noise, 1e-9)
+    typical = float(np.median((depth / change.significance.one_sigma[window])[mask]))
+    least = min(significance, typical / float(change.significance.sigma_of_mean(int(mask.sum()))))
+    insignificant = (INSIGNIFICANT,) if least < SIGNIFICANT or volume < volume_std else ()
     return ChangedRegion(
         kind=kind,
         row=row,
@@ -233,10 +242,10 @@ def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change
         area_m2=int(inner.sum()) * gsd**2,
         depth_median_m=float(np.median(depth[inner & (depth >= deepest / 2)])),
         depth_largest_m=float(depth[inner].max()),
-        volume_m3=float(depth[whole].sum()) * gsd**2,
-        volume_std_m3=float(np.sqrt((noise * pixels) ** 2 + rough[0] ** 2 + rough[1] ** 2)) * gsd**2,
-        significance=float(depth[mask].mean()) / max(noise, 1e-9),
-        marks=_marks(mask, window, sign, change),
+        volume_m3=volume,
+        volume_std_m3=volume_std,
+        significance=significance,
+        marks=(*_marks(mask, window, sign, change), *insignificant),
     )
 
 

@@ -22,7 +22,7 @@ class HeavyTailedNoise(NodeNoise):
     dd = sigma a exp(t b - t^2), where a and b are independent smooth random fields of variance 1 and t is the tail parameter.
     The standard deviation is sigma, the kurtosis 3 exp(4 t^2). Both fields have Gaussian values on a grid of nodes `step`
     apart, with bilinear interpolation. The model was fitted to OpenCV's semi-global matching of rendered and real pictures
-    (docs/explanation/matching.md). It is for simulation only: `scarpsim gap` does not name it.
+    (docs/explanation/matching.md). It is for simulation only; `scarpsim gap` does not look for it.
     """
 
     name: Literal["heavy_tailed_noise"] = "heavy_tailed_noise"

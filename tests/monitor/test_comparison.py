@@ -99,6 +99,15 @@ def test_added_rock_has_the_other_sign() -> None:
     assert region.volume_m3 == pytest.approx(0.1, abs=3 * region.volume_std_m3)
 
 
+def test_a_change_of_a_few_pixels_is_no_event() -> None:
+    """Stray points 0.3 m before the wall within one pixel; a niche of 0.2 m is an event."""
+    points = wall(2, missing=((4.0, 4.0, 0.2, 0.1),))
+    stray = (np.abs(points[:, :2] - np.array([11.0, 6.0])) < 0.04).all(axis=1)
+    points[stray, 2] += 0.3
+    found = compare_epoch(ReferenceHeights.of(cloud(1), [GRID]), WallPoints.of(points), (), 1).regions
+    assert [round(each.x_m) for each in found] == [4]
+
+
 def test_nothing_is_found_where_nothing_fell() -> None:
     """Five pairs of 160 m2; the aim is one false event in 1,000 m2."""
     reference = ReferenceHeights.of(cloud(1), [GRID])

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from monitor_cases import las, points
 
+from pipeline.api.monitoring import Monitoring
 from pipeline.formats.points.laz import read_laz
 from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.monitoring.options import MonitorOptions
+from pipeline.monitoring.products import Result
 from pipeline.monitoring.run import monitor_paths
 from pipeline.monitoring.views import divided
 from pipeline.monitoring.write_site import write_site
@@ -40,7 +42,7 @@ def corner(seed: int, *, fallen: bool = False, count: int = 120_000) -> FloatArr
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
     base = tmp_path_factory.mktemp("corner")
     files = [
         las(base / "2026-03-01.las", corner(1)),
@@ -48,6 +50,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ]
     result = monitor_paths(files, base / "out", MonitorOptions(position=STATION))
     write_site(result, base / "site.yaml")
+    return result
+
+
+@pytest.fixture(scope="module")
+def folder(result: Result) -> Path:
     return result.folder
 
 
@@ -79,6 +86,17 @@ def test_each_view_has_its_files(folder: Path) -> None:
         assert np.isfinite(difference).sum() * grid.gsd**2 == pytest.approx(12 * 8, rel=0.1)
         assert (folder / f"map_001{suffix}.png").is_file()
     assert (folder.parent / "site_wall.ply").is_file()
+
+
+def test_python_has_the_maps_of_each_view(result: Result) -> None:
+    found = Monitoring(result)
+    first, second = found.differences, found.differences_in(2)
+    assert first.dims == second.dims == ("epoch", "y", "x")
+    assert float(second.max()) == pytest.approx(DEEP_M, abs=0.02)
+    assert not np.array_equal(first, second)
+    assert found.plot().png != found.plot(view=2).png
+    with pytest.raises(InputError, match="there is no view 3"):
+        found.differences_in(3)
 
 
 def test_the_viewer_shows_each_view(folder: Path) -> None:
