@@ -38,7 +38,7 @@ class ChosenCells(StereoPair):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, columns) of the observation: (n, 1), a column of the n chosen cells."""
+        """(rows, columns) of an observation's arrays: (n, 1), a column of the n chosen cells."""
         return len(self.chosen), 1
 
     def cells(self) -> tuple[mi.UInt32, mi.Float64, mi.Float64]:
@@ -58,7 +58,7 @@ class ChosenPulses(LaserScanner):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, columns) of the observation: (n, 1), a column of the n chosen pulses."""
+        """(rows, columns) of an observation's arrays: (n, 1), a column of the n chosen pulses."""
         return len(self.chosen), 1
 
     def emit(self) -> Pulses:

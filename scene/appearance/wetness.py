@@ -48,7 +48,10 @@ class WetnessConfig(Config):
         return replace(mesh, vertex_albedo=(dry * factor).astype(np.float32))
 
     def wetness(self, points: FloatArray) -> FloatArray:
-        """Return how wet the rock is, (n,), at points (n, 3), m, wall frame: 0 dry, 1 wet, with a smooth transition."""
+        """Return how wet the rock is, (n,), at points (n, 3), m, wall frame: 0 dry, 1 wet, with a smooth transition.
+
+        Wet patches lie at the same places in every epoch; elsewhere the rock is dry.
+        """
         key = KeyedRandom(self.seed).child("wetness").key & 0xFFFFFFFF
         ramp = np.clip((_noise(points / self.patch_m, key) - _threshold(self.share)) / _RAMP + 0.5, 0, 1)
         return ramp * ramp * (3 - 2 * ramp)

@@ -116,13 +116,13 @@ class Blocks:
 
     @cached_property
     def bbox(self) -> FloatArray:
-        """(k, 2, 3) smallest and largest coordinates of each block, wall frame, m."""
+        """(k, 2, 3) smallest and largest coordinates of each of the k blocks, wall frame, m."""
         low = np.minimum.reduceat(self.vertices, self.vertex_start[:-1], axis=0)
         return np.stack([low, np.maximum.reduceat(self.vertices, self.vertex_start[:-1], axis=0)], axis=1)
 
     @cached_property
     def face_label(self) -> IntArray:
-        """(m,) label, 1 to k, of each face's block."""
+        """(m,) label, 1 to k, of the block to which each of the m faces belongs."""
         return np.repeat(np.arange(1, len(self) + 1, dtype=np.int32), np.diff(self.face_start))
 
     def mesh(self, index: int) -> TriangleMesh:

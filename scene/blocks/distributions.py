@@ -31,7 +31,10 @@ class Constant(Config):
 
 
 class Gaussian(Config):
-    """Normal distribution, truncated from below if a minimum is given."""
+    """Normal distribution, truncated from below if a minimum is given.
+
+    A config uses it for quantities that are drawn at random, such as the sizes of blocks (`sample`), in the quantity's unit.
+    """
 
     kind: Literal["gaussian"] = "gaussian"
     mean: float = Field(description="mean, before truncation")
@@ -56,7 +59,10 @@ class Gaussian(Config):
 
 
 class Uniform(Config):
-    """Uniform distribution on [low, high)."""
+    """Uniform distribution on [low, high).
+
+    A config uses it for quantities that are drawn at random, such as the sizes of blocks (`sample`), in the quantity's unit.
+    """
 
     kind: Literal["uniform"] = "uniform"
     low: float = Field(description="smallest value")
@@ -74,7 +80,10 @@ class Uniform(Config):
 
 
 class Lognormal(Config):
-    """Lognormal distribution: the natural logarithm is normal with mean ln(median) and standard deviation sigma_log."""
+    """Lognormal distribution: the natural logarithm is normal with mean ln(median) and standard deviation sigma_log.
+
+    A config uses it for quantities that are drawn at random, such as the sizes of blocks (`sample`), in the quantity's unit.
+    """
 
     kind: Literal["lognormal"] = "lognormal"
     median: float = Field(gt=0, description="median")
@@ -86,7 +95,11 @@ class Lognormal(Config):
 
 
 class Histogram(Config):
-    """Empirical distribution: bins are drawn in proportion to their counts, values uniformly within a bin."""
+    """Empirical distribution: bins are drawn in proportion to their counts, values uniformly within a bin.
+
+    A config uses it for quantities that are drawn at random, such as measured sizes of blocks (`sample`), in the quantity's
+    unit.
+    """
 
     kind: Literal["histogram"] = "histogram"
     edges: tuple[float, ...] = Field(min_length=2, description="bin edges, increasing, one more than counts")

@@ -43,7 +43,11 @@ class TimeTable(Config):
 
 
 class Course(Config):
-    """How a quantity departs over time from its value in the config: the sum of a random walk, a drift, a cycle and a table."""
+    """How a quantity departs over time from its value in the config: the sum of a random walk, a drift, a cycle and a table.
+
+    The quantity is one of a sensor, such as its zero error or position, in a time series of epochs. All values are in the
+    quantity's unit.
+    """
 
     random_walk: float = Field(0.0, ge=0, description="standard deviation of the change in one day; it grows as the root of time")
     drift: float = Field(0.0, description="change per day")

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 
 class InputError(ValueError):
-    """Wrong input: says what is wrong and where, what is allowed, and how to correct it.
+    """Error for wrong input of a user: says what is wrong and where, what is allowed, and how to correct it.
 
     Commands print it as one message and exit with status 2. In Python it is a ValueError.
 

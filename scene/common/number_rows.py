@@ -107,14 +107,14 @@ def is_grouped(word: str, *, decimal_comma: bool) -> bool:
 
 
 def read_rows(lines: Iterable[str], form: RowForm, where: str) -> tuple[NDArray[np.float64], RowsFound]:
-    """Parse lines of text into numbers.
+    """Parse the rows of a text file, such as a point cloud, into an array of numbers.
 
     Parameters
     ----------
     lines : iterable of str
         The lines from number `form.first_line` on. Empty lines and comments are skipped.
     form : RowForm
-        How the rows are written.
+        How the rows are written: separator, decimal mark, number of columns and so on.
     where : str
         Name of the file in error messages.
 

@@ -22,7 +22,10 @@ _CHUNK = 1 << 18
 
 
 def area_normals(corners: FloatArray) -> FloatArray:
-    """Return the (n, 3) normals of triangles with corners (n, 3, 3). The length of a normal is twice the triangle's area."""
+    """Return the normals (n, 3) of n triangles, as long as twice the triangle's area, for means that are weighted by area.
+
+    corners: (n, 3, 3) array with the three corners of each triangle, counter-clockwise seen from the side of the normal.
+    """
     return np.asarray(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
 
 
@@ -87,7 +90,7 @@ class TriangleMesh:
 
     @property
     def bounds(self) -> FloatArray:
-        """(2, 3) smallest and largest coordinates, m."""
+        """(2, 3) smallest and largest coordinates of the mesh's vertices, m."""
         return np.array([[column.min() for column in self.vertices.T], [column.max() for column in self.vertices.T]])
 
     @cached_property
@@ -158,9 +161,9 @@ class TriangleMesh:
         return self.face_normals()
 
     def vertex_normals(self) -> FloatArray:
-        """Compute outward unit normals (n, 3): the area-weighted mean of the adjacent faces' normals.
+        """Compute outward unit normals (n, 3) at the n vertices: the area-weighted mean of the adjacent faces' normals.
 
-        An unused vertex has NaN.
+        A vertex that no face uses has NaN.
         """
         total = np.zeros((3, len(self.vertices)))
         for start in range(0, len(self.faces), _CHUNK):

@@ -209,7 +209,7 @@ def flip_faces(mesh: TriangleMesh, which: NDArray[np.bool_]) -> TriangleMesh:
 
 
 def triangle_areas(mesh: TriangleMesh) -> FloatArray:
-    """Return the areas (m,) of the triangles, m2."""
+    """Return the area of each of a mesh's m triangles, (m,), m2."""
     return _in_chunks(mesh, _areas, float)
 
 

@@ -344,7 +344,7 @@ def _plane_normal(axis: mi.UInt32, negative: mi.Bool, following: mi.Float64, las
 
 
 def heights(caster: RayCaster, grid: Grid) -> NDArray[np.float32]:
-    """Return the highest z of the mesh at each pixel centre, (height, width), m; NaN where there is no surface."""
+    """Return the highest z of a mesh at each pixel centre of a raster, (height, width), m; NaN where there is no surface."""
     hits, point = caster.look_down(grid)
     z = mi.Float32(dr.select(hits.valid, point.z, np.nan))
     return np.array(z).reshape(grid.shape)

@@ -43,7 +43,10 @@ class MagnitudeFrequency(Config):
 
 
 class VolumeLaw(Config):
-    """Distribution of the volumes of rockfalls."""
+    """Distribution of the volumes of rockfalls.
+
+    It has one key, which selects the only law there is: a magnitude-frequency power law.
+    """
 
     power_law: MagnitudeFrequency = MagnitudeFrequency()
 
@@ -123,7 +126,11 @@ class EventConfig(Config):
 
 
 class DepositsConfig(Config):
-    """Fallen rock at the foot of the wall: fragments with the same volume together, each at rest."""
+    """Fallen rock at the foot of the wall: fragments with the same volume together, each at rest.
+
+    The volume of a rock is divided at random among its fragments; they come to rest near the foot of the wall below the rock's
+    place.
+    """
 
     fragments: int = Field(8, ge=1, le=200, description="number of fragments into which a rock breaks")
     volume_sigma_log: float = Field(

@@ -37,7 +37,7 @@ _SHAPES = RockfallConfig(
 
 @dataclass(frozen=True)
 class Ground:
-    """Directions and level at the foot of a wall, wall frame.
+    """Level ground at the foot of a wall, on which fallen rocks come to rest: directions and height, wall frame.
 
     Attributes
     ----------

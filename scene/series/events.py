@@ -42,11 +42,14 @@ class Rockfall:
 
     @property
     def starts_h(self) -> float:
-        """When the block begins to move, or falls if it does not move before, h."""
+        """Time when the block begins to move, or falls if it does not move before, h after the first epoch."""
         return self.falls_h - (0.0 if self.motion is None else self.motion.lead_h)
 
     def displacement_m(self, time_h: float) -> float | None:
-        """Return how far the block has moved out since the first epoch, m; None once it has fallen."""
+        """Return how far the block has moved out of the wall at a time, m; None once it has fallen.
+
+        time_h: time after the first epoch, h.
+        """
         if time_h >= self.falls_h:
             return None
         if self.motion is None:

@@ -107,7 +107,7 @@ def place_block(
 
 
 def join_blocks(parts: Sequence[Blocks]) -> Blocks:
-    """Join several collections of blocks into one."""
+    """Join several collections of blocks into one, in order; each block's label is its new position plus 1."""
     vertices, faces = ([len(getattr(each, name)) for each in parts] for name in ("vertices", "faces"))
     at = np.concatenate([[0], np.cumsum(vertices)[:-1]]).astype(np.int32)
     face_at = np.concatenate([[0], np.cumsum(faces)[:-1]]).astype(np.int32)

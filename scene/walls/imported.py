@@ -45,7 +45,10 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 class ImportedWall(Config):
-    """A wall from one or several mesh files in any format that trimesh reads."""
+    """A wall from one or several mesh files in any format that trimesh reads.
+
+    Trimesh is a Python library. Survey coordinates are east, north and height; they become the world frame, in m.
+    """
 
     mesh: Path | tuple[Path, ...] = Field(
         description="mesh file (ply, obj, stl, off, glb, ...), or a list of files that make up the scene; in survey coordinates"

@@ -195,7 +195,9 @@ class BlockRule:
 
 @dataclass(frozen=True)
 class JointedBlocks:
-    """Blocks between beds and joints of a wall plane, as tables with a row for each bed and a column for each cm of t.
+    """Blocks into which beds and joints divide a generated wall, stored as tables.
+
+    The tables have a row for each bed and a column for each centimetre of the coordinate t along the beds.
 
     The coordinates follow the rock: s = v - dip u crosses the beds, and t = u - lean v crosses the joints, m, with u along the
     wall, v up its slope, and the slopes `dip` and `lean` of the rule.
@@ -203,7 +205,7 @@ class JointedBlocks:
     Attributes
     ----------
     rule : BlockRule
-        How the rock is divided.
+        Spacing and slopes of beds and joints, and how far blocks protrude.
     row : Table
         Table row as a function of s: a whole number within a bed, rising to the next over `ramp_m` of the rule, so that
         bilinear interpolation of the tables makes the steps between beds.

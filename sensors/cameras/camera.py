@@ -72,7 +72,10 @@ class CameraConfig(Config):
         return check_rotation(rotation)
 
     def camera(self) -> Camera:
-        """Return the camera, world frame. Raises InputError if the distortion cannot be inverted over the whole frame."""
+        """Return the configured camera for computations, world frame.
+
+        Raises InputError if the lens distortion cannot be inverted over the whole image.
+        """
         interior = {name: getattr(self, name) for name in INTERIOR}
         position, rotation = np.array(self.position_m), np.array(self.rotation)
         camera = Camera(self.width, self.height, **interior, position=position, rotation=rotation)
@@ -119,20 +122,20 @@ def check_rotation(rotation: Matrix3) -> Matrix3:
 class Camera:
     """A camera with interior orientation (Metashape's model, px) and pose.
 
-    On the device (`on_device`) the interior orientation holds Dr.Jit scalars instead of floats, so that one compiled kernel
-    serves all values.
+    On the ray-tracing device (`on_device`) the interior orientation holds Dr.Jit scalars instead of floats, so that one
+    compiled kernel serves all values.
 
     Attributes
     ----------
     width, height : int
         Size of the frame, px.
     f_px, cx_px, cy_px, b1, b2, k1, k2, k3, k4, p1, p2
-        Interior orientation in Metashape's model: principal distance, principal point from the frame's centre, affinity and skew
-        (all px), and radial and tangential distortion.
+        Interior orientation in Metashape's model: principal distance, principal point from the frame's centre, affinity and
+        skew (all px), and radial and tangential distortion.
     position : (3,) array
         Perspective centre, m.
     rotation : (3, 3) array
-        Camera to the frame of `position`.
+        Rotation from the camera's frame (x right, y down, z forward) to the frame of `position`.
     """
 
     width: int
@@ -232,12 +235,18 @@ class Camera:
         return replace(self, width=width, height=height, cx_px=cx, cy_px=cy, **scaled)
 
     def turned(self) -> Camera:
-        """Return the same camera with its image read upside down: its pixel (u, v) is this camera's (width - u, height - v)."""
+        """Return the same camera with its image read upside down, which exchanges left and right.
+
+        Its pixel (u, v) is this camera's pixel (width - u, height - v).
+        """
         mirrored = {name: -getattr(self, name) for name in ("cx_px", "cy_px", "p1", "p2")}
         return replace(self, rotation=self.rotation * [-1.0, -1.0, 1.0], **mirrored)
 
     def check_invertible(self) -> None:
-        """Raise InputError if `tangents` does not invert `pixel` over the whole frame, because the distortion folds the image."""
+        """Check that each pixel has one ray: raise InputError if the lens distortion folds the image within the frame.
+
+        Then `tangents` (from pixels to rays) would not invert `pixel` (from rays to pixels).
+        """
         u, v = np.meshgrid(np.linspace(0, self.width, 33), np.linspace(0, self.height, 33))
         with np.errstate(all="ignore"):
             x, y = self.tangents(u, v)
@@ -260,7 +269,7 @@ class CameraPair:
     right: Camera
 
     def in_wall_frame(self, frame: WallFrame) -> CameraPair:
-        """Return the pair with its poses transformed from the world to the wall frame."""
+        """Return the pair with its poses transformed from the world to the wall frame, in which rays are traced."""
         return CameraPair(self.left.in_wall_frame(frame), self.right.in_wall_frame(frame))
 
     def exchanged(self) -> CameraPair:
@@ -272,7 +281,7 @@ class CameraPair:
 
     @property
     def base_m(self) -> float:
-        """Distance between the perspective centres, m."""
+        """Base of the stereo pair: the distance between the perspective centres of its cameras, m."""
         return float(np.linalg.norm(self.right.position - self.left.position))
 
     def changed(self, side: Side, **added: float) -> CameraPair:
@@ -285,14 +294,14 @@ class CameraPair:
         )
 
     def rotated(self, side: Side, axis: int, angle_rad: float) -> CameraPair:
-        """Return the pair with cameras rotated about their own x (0), y (1) or z (2) axis, right-handed.
+        """Return the pair with an error of orientation: cameras rotated about an own axis, right-handed.
 
         Parameters
         ----------
         side : str
             The camera, "left", "right" or "both".
         axis : int
-            Axis of the rotation.
+            Axis of the camera's frame: x (0, right), y (1, down) or z (2, forward).
         angle_rad : float
             Angle, rad.
         """

@@ -43,7 +43,7 @@ class AngleEmpirical(Effect):
 
     @property
     def is_null(self) -> bool:
-        """Whether all values of the curve are zero."""
+        """Whether the effect is off: all values of its curve are zero."""
         return not any(map(any, self.values_rad))
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:

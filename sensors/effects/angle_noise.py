@@ -17,7 +17,7 @@ from sensors.signal_chain.pulses import PulseGeometry, Pulses
 class AngleNoise(Effect):
     """The beam leaves in another direction than is recorded, with white noise in azimuth and zenith.
 
-    aim = recorded - n, with n ~ N(0, sigma) drawn for each angle of each pulse.
+    aim = recorded - n, with a normal error n ~ N(0, sigma) that is drawn for each angle of each pulse.
     """
 
     name: Literal["angle_noise"] = "angle_noise"

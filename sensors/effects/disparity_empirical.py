@@ -38,7 +38,7 @@ class DisparityEmpirical(Effect):
 
     @property
     def is_null(self) -> bool:
-        """Whether all values of the curve or surface are zero."""
+        """Whether the effect is off: all values of its curve or surface are zero."""
         return not any(map(any, self.values_px))
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:

@@ -13,8 +13,9 @@ from sensors.signal_chain.matches import fill_gaps
 class OcclusionFill(RasterEffect):
     """The matcher fills half-occluded strips of a row with the background's disparity.
 
-    d' = min(d_before, d_after) in an unmatched strip at most `reach` wide. The smaller of the disparities at its two ends
-    is farther away (Hirschmueller 2008, 2.5.3). Strips that reach the end of a row stay empty.
+    Half-occluded means that one camera alone sees the rock, so that there is no match. d' = min(d_before, d_after) is the
+    disparity in an unmatched strip at most `reach` wide. The smaller of the disparities at its two ends is farther away
+    (Hirschmueller 2008, 2.5.3). Strips that reach the end of a row stay empty.
     """
 
     name: Literal["occlusion_fill"] = "occlusion_fill"

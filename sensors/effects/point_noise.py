@@ -44,7 +44,7 @@ class PointNoise(Effect):
 
     @property
     def shared_variance(self) -> float:
-        """Variance of the grid-correlated part, averaged over the surface, m2."""
+        """Variance of the part of the noise that neighbouring points share (grid-correlated), averaged over the surface, m2."""
         return MEAN_VARIANCE * self.shared_sigma_m**2
 
     def variance(self, at: Any) -> FloatArray:

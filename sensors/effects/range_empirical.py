@@ -37,7 +37,7 @@ class RangeEmpirical(Effect):
 
     @property
     def is_null(self) -> bool:
-        """Whether all values of the curve or surface are zero."""
+        """Whether the effect is off: all values of its curve or surface are zero."""
         return not any(map(any, self.values_m))
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:

@@ -11,7 +11,10 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 
 class VerticalIndex(AimEffect):
-    """All zenith angles are too large by the same angle, in both faces: dz = offset (Lichti 2007, C0; NIST x4)."""
+    """All zenith angles are too large by the same angle, in both faces: dz = offset (Lichti 2007, C0; NIST x4).
+
+    The faces are the two positions of the telescope or mirror in which a scanner can aim at a point.
+    """
 
     name: Literal["vertical_index"] = "vertical_index"
     means = "All zenith angles are off by one angle: the vertical circle's zero."

@@ -71,7 +71,10 @@ class Divergence(Config):
 
     @property
     def full_angle(self) -> float:
-        """Full divergence at 1/e^2 of the on-axis intensity of a Gaussian beam, in the figure's unit."""
+        """Full divergence of the beam at 1/e^2 of the intensity on its axis, whatever the convention of the data sheet.
+
+        The beam is taken for Gaussian. The unit is that of the figure.
+        """
         return self.value * _FULL_BEAM[self.level] * (2.0 if self.angle == "half" else 1.0)
 
 

@@ -85,7 +85,7 @@ class PoseShift:
 
     @property
     def is_null(self) -> bool:
-        """Whether the real pose is the surveyed one: no displacement and no rotation."""
+        """Whether the sensor's real pose is the surveyed one: no displacement and no rotation."""
         return not (self.position_m.any() or self.rotation_rad.any())
 
 

@@ -25,7 +25,10 @@ VERTICAL = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class Target:
-    """The wall as a sensor's target: a mesh in the world frame, faces counter-clockwise seen from outside."""
+    """The wall as a sensor's target, from which the sensor's place is found: a mesh in the world frame.
+
+    Its faces are counter-clockwise seen from outside.
+    """
 
     mesh: TriangleMesh
 
@@ -135,7 +138,10 @@ EXACT_POSE = PoseSigma()
 
 
 class StationConfig(Config):
-    """Where the laser scanner stands: at given coordinates, or at a distance in front of the wall's centre."""
+    """Where the laser scanner stands: at given coordinates, or at a distance in front of the wall's centre.
+
+    `pose_sigma` says how well position and rotation are known; by default they are exact.
+    """
 
     position_m: Vector3 | None = Field(None, description="scanner's centre, world frame; none: from distance_m and height_m [m]")
     distance_m: float = Field(

@@ -41,7 +41,10 @@ MOST_EFFECTS = 100
 
 
 class TlsNoise(Config):
-    """White noise of a laser scanner, as a data sheet states it."""
+    """White noise of a laser scanner, as a data sheet states it.
+
+    It is drawn anew for each pulse. The two parts of the range's noise add in quadrature.
+    """
 
     range_sigma_m: float = Field(0.003, ge=0, le=10, description="standard deviation of the range [m]")
     range_ppm: float = Field(0.0, ge=0, le=1e5, description="further standard deviation of the range, in proportion to it [ppm]")
@@ -104,7 +107,11 @@ class DrawnParameter(Config):
 
 
 class OrientationNoise(Config):
-    """Noise of the 6 exterior and 11 interior orientation parameters of each camera: real minus calibrated values."""
+    """Noise of the 6 exterior and 11 interior orientation parameters of each camera: real minus calibrated values.
+
+    Each is drawn once for an observation. The exterior orientation is the pose of the camera; the interior orientation is its
+    principal distance, principal point and distortion, in Metashape's model.
+    """
 
     omega_rad: DrawnParameter = Field(DrawnParameter(), description="rotation about the camera's x axis [rad]")
     phi_rad: DrawnParameter = Field(DrawnParameter(), description="rotation about the camera's y axis [rad]")
@@ -163,7 +170,12 @@ class OrientationNoise(Config):
 
 
 class StereoNoise(Config):
-    """Noise of a stereo pair: matching noise, and orientation noise drawn at each observation."""
+    """Noise of a stereo pair: matching noise, and orientation noise drawn at each observation.
+
+    Matching noise is that of disparities. Its white part is independent for each cell; its grid-correlated part is drawn at the
+    nodes of a grid over the image and interpolated between them, so that neighbours share it. Orientation noise is that of the
+    cameras' calibration and pose.
+    """
 
     parallax_sigma_px: float = Field(
         0.3, ge=0, le=1000, description="white noise of the disparity [px of the full-resolution frame]"

@@ -30,7 +30,11 @@ Table = Annotated[Rows, AfterValidator(_rectangular)]
 
 
 class Axis(Config):
-    """Range of the variable that an empirical effect depends on; beyond it the outermost values hold."""
+    """Range of the variable that an empirical effect depends on; beyond it the outermost values hold.
+
+    An empirical effect is a table of errors over a variable x, such as the range, without a known cause; its values are equally
+    spaced from `low` to `high`.
+    """
 
     low: float = Field(0.0, description="x of the first value, in its unit; held below")
     high: float = Field(1.0, description="x of the last value, in its unit; held above")

@@ -27,11 +27,10 @@ def rotated(matrix: FloatArray, vectors: mi.Array3f64) -> mi.Array3f64:
 
 
 def cell_index(place: Any, count: int) -> mi.UInt32:
-    """Return the number of the cell that contains each position.
+    """Return the number of the table's cell that contains each position, to read the table on the ray-tracing device.
 
-    The result is a valid index for `dr.gather` whatever the position.
-
-    A gather outside its array ends the process, so every index that is computed from sensor values should come from here.
+    The result is a valid index for Dr.Jit's `dr.gather` whatever the position. A gather outside its array ends the process, so
+    every index that is computed from sensor values should come from here.
 
     Parameters
     ----------

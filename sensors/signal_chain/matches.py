@@ -86,7 +86,7 @@ class Matches:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, columns) of the depth map."""
+        """(rows, columns) of the depth map to which the cells belong."""
         return self.height // self.reduction, self.width // self.reduction
 
     def raster(self) -> FloatArray:
@@ -112,7 +112,10 @@ class Matches:
         return on_device(mi.Float64, raster)
 
     def with_raster(self, disparity: FloatArray) -> Matches:
-        """Return the same cells with the given disparities (rows, columns), px; cells are matched where these are not NaN."""
+        """Return the same cells with new disparities, after an effect that works on the whole depth map.
+
+        disparity: (rows, columns), px; cells are matched where it is not NaN.
+        """
         return replace(self, disparity=on_device(mi.Float64, disparity), matched=on_device(mi.Bool, ~np.isnan(disparity)))
 
     def _evaluate(self) -> None:

@@ -98,7 +98,7 @@ class Observation:
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """(h, w) True where there is a return."""
+        """(h, w) mask that is True for cells of the observation with a return (or a match)."""
         return ~np.isnan(self.depth)
 
     @property

@@ -19,7 +19,8 @@ def polar(local: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 def polar_axes(azimuth: FloatArray, zenith: FloatArray) -> list[FloatArray]:
     """Return the unit vectors of polar coordinates in the scanner's frame, three arrays (n, 3).
 
-    They point along the beam, towards increasing azimuth and towards increasing zenith angle.
+    They point along the beam, towards increasing azimuth and towards increasing zenith angle. azimuth, zenith: (n,) directions
+    of the beams, rad.
     """
     sin_az, cos_az, sin_ze, cos_ze = np.sin(azimuth), np.cos(azimuth), np.sin(zenith), np.cos(zenith)
     beam = [sin_ze * cos_az, sin_ze * sin_az, cos_ze]

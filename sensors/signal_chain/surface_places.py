@@ -125,7 +125,7 @@ class ShapedSurface:
 
     @property
     def rim(self) -> NDArray[np.int64]:
-        """Numbers of the vertices on the mesh's open borders."""
+        """Numbers (k,) of the vertices on the mesh's open borders."""
         edges, uses = np.unique(self.mesh.edges, return_counts=True)
         return np.unique(np.concatenate(np.divmod(edges[uses == 1], len(self.mesh.vertices))))
 

@@ -35,7 +35,10 @@ WHITE_LEVEL = 0.85
 
 
 class ExposureConfig(Config):
-    """How light is converted to grey values."""
+    """How light is converted to grey values.
+
+    It describes the image sensor of the simulated cameras, which take the photographs that are matched.
+    """
 
     samples_per_side: int = Field(2, ge=1, le=8, description="rays per pixel along a row or a column, averaged")
     compensation_ev: float = Field(

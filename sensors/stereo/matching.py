@@ -30,7 +30,11 @@ SPECKLE_STEP_PX = 1.0
 
 
 class MatchingConfig(Config):
-    """The real matcher; its pixels are those of the pictures it matches, that is the depth map's cells."""
+    """The real matcher; its pixels are those of the pictures it matches, that is the depth map's cells.
+
+    It is OpenCV's semi-global matching, which runs on rendered photographs. The matcher's costs, penalties and paths are those
+    of Hirschmueller (2008).
+    """
 
     block_size_px: int = Field(5, ge=1, le=21, description="side of the window whose costs are summed, odd [px]")
     p1: float = Field(8.0, ge=0, description="penalty of a disparity step of one, per pixel of the window")

@@ -77,7 +77,10 @@ class RectifiedGrid:
 
     @property
     def disparity_offset(self) -> int:
-        """Number of cells to add to a difference of grid columns, left minus right, to get a disparity."""
+        """Number of cells to add to a difference of grid columns, left minus right, to get a disparity.
+
+        The two grids begin at different columns of the rectified images.
+        """
         return self.left_first - self.right_first
 
     def left(self, image: NDArray[np.uint8]) -> Picture:

@@ -40,7 +40,10 @@ LARGEST_SHIFT_PX = 1.5
 
 
 class RefinementConfig(Config):
-    """Least-squares matching after the semi-global one; pixels are the depth map's cells."""
+    """Least-squares matching after the semi-global one; pixels are the depth map's cells.
+
+    It improves each disparity by fitting a small window of the right picture to that of the left one.
+    """
 
     steps: int = Field(3, ge=1, le=50, description="iterations")
     window_px: int = Field(5, ge=3, le=31, description="side of the window, odd [px]")

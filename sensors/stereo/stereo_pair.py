@@ -118,7 +118,7 @@ class StereoPair:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, columns) of the depth map."""
+        """(rows, columns) of the depth map that the pair records."""
         step = REDUCTION[self.quality]
         return self.cameras.left.height // step, self.cameras.left.width // step
 
@@ -302,18 +302,23 @@ def rectified_pixel(
 def rectified_tangents(
     x: mi.Float64, y: mi.Float64, rotation: FloatArray, f: float, u_0: float, v_0: float
 ) -> tuple[mi.Float64, mi.Float64]:
-    """Convert ideal image coordinates to pixels of a rectified image.
+    """Convert ideal image coordinates (directions in a camera's frame) to pixels of a rectified image.
 
     Parameters
     ----------
-    x, y : (n,) tangents X/Z and Y/Z in the camera's frame, without distortion.
-    rotation : (3, 3) rotation from the camera's frame to the rectified frame.
-    f : Principal distance of the rectified image, px.
-    u_0, v_0 : Principal point of the rectified image, px.
+    x, y : (n,)
+        Tangents X/Z and Y/Z in the camera's frame, without distortion.
+    rotation : (3, 3) array
+        Rotation from the camera's frame to the rectified frame.
+    f : float
+        Principal distance of the rectified image, px.
+    u_0, v_0 : float
+        Principal point of the rectified image, px.
 
     Returns
     -------
-    (n,) columns and (n,) rows, px.
+    (n,) and (n,)
+        Columns and rows, px.
     """
     ray = rotated(rotation, mi.Array3f64(x, y, 1.0))
     scale, centre_u, centre_v = opaque(f, u_0, v_0)

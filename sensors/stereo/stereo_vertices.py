@@ -143,7 +143,11 @@ class VertexMatches(Matches):
     before: FloatArray | None = None
 
     def raster(self) -> FloatArray:
-        """Return the disparities (rows, columns), px, of the depth map after the effects so far; NaN without a match."""
+        """Return the disparities (rows, columns), px, of the ray-traced depth map after the effects so far.
+
+        They are NaN without a match. Effects that depend on neighbouring pixels act on this map, because the vertices have no
+        neighbours in rows and columns.
+        """
         return self.cells.matches.raster() if self.before is None else self.before
 
     def albedo_raster(self) -> FloatArray | None:
@@ -151,12 +155,12 @@ class VertexMatches(Matches):
         return self.cells.matches.albedo_raster()
 
     def sampled(self, raster: FloatArray) -> mi.Float64:
-        """Return the values (n,) of a raster (rows, columns) over the depth map, each from the cell in which the vertex lies."""
+        """Read a raster (rows, columns) over the depth map at the n vertices, (n,), in the cell in which each lies."""
         columns, rows = (cell_index(place / self.reduction, count) for place, count in self._axes())
         return dr.gather(mi.Float64, on_device(mi.Float64, raster), rows * dr.opaque(mi.UInt32, self.shape[1]) + columns)
 
     def with_raster(self, disparity: FloatArray) -> Matches:
-        """Transfer an effect on the depth map to the vertices: return matches whose disparities contain the effect's change.
+        """Transfer an effect on the depth map to the mesh's vertices: return matches whose disparities contain its change.
 
         The change of a cell is `disparity` minus `raster()`. A vertex takes the bilinear mean of the changes of the four cells
         round its pixel if all four see the vertex's surface, that is if their disparities differ from its own by less than one
