@@ -402,7 +402,10 @@ def reach_rock(solids: Sequence[BlockShape], position: FloatArray, caster: RayCa
 
 
 def pack_blocks(solids: Sequence[BlockShape], position: FloatArray) -> Blocks:
-    """Move k block shapes to their positions (k, 3), wall frame, m, and join them into one collection."""
+    """Move block shapes to their places on the wall, and join them into one collection.
+
+    solids: the k shapes, around the origin. position: (k, 3) places of their origins, wall frame, m.
+    """
     vertex_start = _starts([len(solid.vertices) for solid in solids])
     face_start = _starts([len(solid.faces) for solid in solids])
     vertices = np.concatenate([solid.vertices + place for solid, place in zip(solids, position, strict=True)])

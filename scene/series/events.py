@@ -103,7 +103,7 @@ def drawn_rockfalls(rate: RockfallRate, precursor: PrecursorConfig | None, end_h
 def given_rockfalls(events: Sequence[EventConfig], falls_h: Sequence[float]) -> list[Rockfall]:
     """Return the rockfalls that a config lists one by one, not yet numbered (all have number 0).
 
-    falls_h: when each falls, h after the first epoch.
+    events: the listed rockfalls. falls_h: when each falls, h after the first epoch.
     """
     return [
         Rockfall(0, f"given {index}", when, event.volume_m3, event.position_m, event.precursor)

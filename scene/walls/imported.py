@@ -129,7 +129,7 @@ def join_meshes(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
 
 
 def read_reference(path: Path) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """Read a surface that measurements are compared with, m, and notes on it for the report.
+    """Read a surface that measurements are compared with from a mesh file, m, and notes on it for the report.
 
     Vertices stay as in the file, because repairs could move what is measured against. Raises InputError if the file cannot be
     used.

@@ -155,9 +155,9 @@ class Camera:
     rotation: FloatArray
 
     def distort(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """Add the lens distortion to ideal image coordinates (X/Z, Y/Z in the camera's frame); arrays of any shape.
+        """Add the lens distortion to image coordinates: convert ideal x = X/Z, y = Y/Z in the camera's frame to distorted ones.
 
-        Returns the distorted x and y, without unit.
+        Arrays of any shape, without unit.
         """
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * (self.k3 + r2 * self.k4)))
@@ -167,9 +167,9 @@ class Camera:
         )
 
     def undistort(self, xd: Any, yd: Any) -> tuple[Any, Any]:
-        """Remove the lens distortion from image coordinates (arrays of any shape, without unit).
+        """Remove the lens distortion from image coordinates: convert distorted xd, yd to ideal X/Z, Y/Z in the camera's frame.
 
-        Returns the ideal image coordinates (X/Z, Y/Z in the camera's frame), by Newton's method with the analytic Jacobian.
+        Arrays of any shape, without unit. Newton's method with the analytic Jacobian is used.
         """
         x, y = xd, yd
         for _ in range(NEWTON_STEPS):

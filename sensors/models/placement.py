@@ -74,7 +74,10 @@ class RigConfig(Config):
     k2: float = Field(0.0, description="radial distortion, r^4")
 
     def place(self, target: Target) -> CameraPair:
-        """Return the pair of cameras in front of a wall, world frame; the left one is on the left as seen from the cameras."""
+        """Return the pair of cameras in front of a wall, world frame; the left one is on the left as seen from the cameras.
+
+        target: the wall.
+        """
         middle = target.stand(self.distance_m, self.height_m)
         shift = self.base_m / 2 * np.cross(-target.outward, VERTICAL)
         return CameraPair(self._camera(middle - shift, target.centre), self._camera(middle + shift, target.centre))
@@ -157,7 +160,10 @@ class StationConfig(Config):
         return None if rotation is None else check_rotation(rotation)
 
     def place(self, target: Target) -> tuple[FloatArray, FloatArray]:
-        """Return where the scanner stands before a wall: position (3,), m, and rotation (3, 3), scanner to world frame."""
+        """Return where the scanner stands before a wall: position (3,), m, and rotation (3, 3), scanner to world frame.
+
+        target: the wall.
+        """
         position = np.array(self.position_m) if self.position_m else target.stand(self.distance_m, self.height_m)
         if self.rotation:
             return position, np.array(self.rotation)

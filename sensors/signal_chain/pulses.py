@@ -139,9 +139,10 @@ class Pulses:
         return PulseGeometry(self.azimuth, self.zenith, range_m=self.true_range, share=self.share, **wide)
 
     def with_angle_error(self, azimuth: Any = 0.0, zenith: Any = 0.0) -> Pulses:
-        """Return the pulses with a further error of the recorded direction, recorded minus true, rad.
+        """Return the pulses with a further error of the recorded direction.
 
-        The recorded direction stays, so the pulse leaves by this much on the opposite side of it.
+        azimuth, zenith: recorded minus true angles, rad, (n,) each or a number. The recorded direction stays, so the pulse
+        leaves by this much on the opposite side of it.
         """
         return replace(self, aim_azimuth=self.aim_azimuth - azimuth, aim_zenith=self.aim_zenith - zenith)
 

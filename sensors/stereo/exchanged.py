@@ -51,7 +51,10 @@ def observe_right(sensor: StereoSensor, scene: RayCaster, random: KeyedRandom) -
 
 
 def depth_cameras(pair: StereoPair) -> tuple[Camera, Camera]:
-    """Return the nominal (calibrated) cameras, wall frame, whose pixels are the cells of the left and right depth maps."""
+    """Return the nominal (calibrated) cameras, wall frame, whose pixels are the cells of the left and right depth maps.
+
+    pair: the stereo pair that makes the depth maps.
+    """
     cameras, step = pair.cameras.in_wall_frame(pair.frame), REDUCTION[pair.quality]
     rows, columns = pair.shape
     rest = float(cameras.right.width - columns * step), float(cameras.right.height - rows * step)

@@ -191,9 +191,10 @@ def _range(depth: mi.Float64, valid: mi.Bool) -> tuple[float, float]:
 
 
 def sampled_disparity(disparity: Disparity, column: mi.Float64, row: mi.Float64) -> mi.Float32:
-    """Interpolate disparities of a depth map (h, w) at n fractional columns and rows.
+    """Interpolate the disparities of a depth map (h, w), NaN without a match, at n places.
 
-    On one surface the interpolation is bilinear; at a depth step it takes the nearest cell's.
+    On one surface the interpolation is bilinear; at a depth step it takes the nearest cell's. column, row: (n,) fractional
+    positions in the map, cells.
     """
     height, width = disparity.shape
     values = on_device(mi.Float32, disparity)

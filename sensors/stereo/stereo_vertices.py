@@ -35,9 +35,9 @@ from sensors.stereo.stereo_pair import REDUCTION, StereoPair, rectified_disparit
 def observe_vertices(pair: StereoPair, scene: RayCaster, random: KeyedRandom) -> TriangleMesh:
     """Return the wall as a stereo pair reconstructs it: a mesh with the true triangles and labels, and vertices with errors.
 
-    Positions are in the wall frame. Vertices outside one of the images or behind a camera are left out. The same `random` draws
-    the same orientation and row displacement as `pair.observe`; the matching noise of a vertex depends on its number. Raises
-    InputError if nothing is left.
+    `scene` is the wall; positions are in the wall frame. Vertices outside one of the images or behind a camera are left out.
+    The same `random` draws the same orientation and row displacement as `pair.observe`; the matching noise of a vertex depends
+    on its number. Raises InputError if nothing is left.
     """
     mesh = scene.mesh
     effects = pair.model.chain(random)
