@@ -20,13 +20,13 @@ from scene.geometry.mesh import FloatArray
 
 
 class Constant(Config):
-    """Always the same value."""
+    """Distribution of a config that always gives the same value."""
 
     kind: Literal["constant"] = "constant"
     value: float = Field(description="the value")
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """Draw values (size,)."""
+        """Return the constant value `size` times, (size,). `generator` is not used."""
         return np.full(size, self.value)
 
 
@@ -45,7 +45,7 @@ class Gaussian(Config):
         return self
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """Draw values (size,), by inversion of the upper tail of the (truncated) distribution function."""
+        """Draw `size` values with the random numbers of `generator`, by inversion of the (truncated) distribution function."""
         from scipy import special
 
         if self.minimum is None or self.sigma == 0:
@@ -69,7 +69,7 @@ class Uniform(Config):
         return self
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """Draw values (size,)."""
+        """Draw `size` values between `low` and `high` with the random numbers of `generator`."""
         return generator.uniform(self.low, self.high, size)
 
 
@@ -81,7 +81,7 @@ class Lognormal(Config):
     sigma_log: float = Field(ge=0, description="standard deviation of the natural logarithm")
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """Draw values (size,)."""
+        """Draw `size` lognormal values with the random numbers of `generator`."""
         return self.median * np.exp(self.sigma_log * generator.standard_normal(size))
 
 
@@ -103,7 +103,10 @@ class Histogram(Config):
         return self
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """Draw values (size,), by inversion of the piecewise linear distribution function."""
+        """Draw `size` values from the histogram, by inversion of its piecewise linear distribution function.
+
+        `generator` is the source of random numbers.
+        """
         edges, counts = np.asarray(self.edges), np.asarray(self.counts)
         filled = counts > 0
         ends = np.cumsum(counts[filled])
@@ -129,7 +132,10 @@ class Mixture(Config):
         return self
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """Draw values (size,)."""
+        """Draw `size` values, for each first a component of the mixture and then a value of it.
+
+        `generator` is the source of random numbers.
+        """
         ends = np.cumsum(self.weights)
         number = np.searchsorted(ends / ends[-1], generator.random(size), side="right")
         drawn = np.stack([component.sample(generator, size) for component in self.components])

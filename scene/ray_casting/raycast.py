@@ -41,7 +41,7 @@ _SIGHTS = 4096
 
 @dataclass(frozen=True)
 class Hits:
-    """What n rays hit, as lazy device arrays. Where `valid` is False, the other entries have no meaning.
+    """What n rays hit: lazy arrays of the ray-tracing device. Where `valid` is False, the other entries have no meaning.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Hits:
     albedo : (n,) float32
         Mean albedo of the face.
     block : (n,) int32
-        Block label of the face; WALL for a miss.
+        Label of the fallen block whose niche the face belongs to; WALL (0) for the wall or a miss.
     """
 
     valid: mi.Bool
@@ -82,6 +82,8 @@ def check_castable(mesh: TriangleMesh) -> None:
 
 class RayCaster:
     """A mesh prepared for ray casting, in a frame whose origin is near (the wall frame).
+
+    The ray tracer works in single precision, which needs small coordinates; distances are then refined to double precision.
 
     Attributes
     ----------
@@ -140,7 +142,7 @@ class RayCaster:
         return sum((dr.gather(mi.Float32, albedo, number) for number in vertex), mi.Float32(0)) / 3
 
     def intersect(self, origin: mi.Array3f64, direction: mi.Array3f64, *, coherent: bool = True, exact: bool = False) -> Hits:
-        """Cast n rays.
+        """Cast n rays and return the first face that each hits, with distance, normal and albedo.
 
         Parameters
         ----------
@@ -211,7 +213,7 @@ class RayCaster:
         return distance, (u >= -_ROUNDING) & (v >= -_ROUNDING) & (u + v <= 1 + _ROUNDING) & (distance > 0)
 
     def occluded(self, origin: mi.Array3f64, direction: mi.Array3f64, length: mi.Float64, *, coherent: bool = True) -> mi.Bool:
-        """Return whether anything lies on each ray nearer than `length` (n,).
+        """Return whether the mesh blocks each of n rays within `length`, such as a ray towards the sun or the other camera.
 
         Parameters
         ----------
@@ -220,19 +222,19 @@ class RayCaster:
         length : (n,) float64
             Distance in lengths of the direction vector (m for unit directions).
         coherent : bool
-            As in `intersect`.
+            Whether neighbouring rays are nearly parallel, which the ray tracer exploits.
         """
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
         ray.maxt = mi.Float(length)
         return self.bare.ray_test(ray, coherent=coherent)
 
     def nearest_vertex_label(self, hits: Hits, point: mi.Array3f64, labels: mi.Int32) -> mi.Int32:
-        """Return, per hit, the label of the face's vertex that is nearest to the hit point.
+        """Return, for each of n hits, the block label of the face's vertex that is nearest to the hit point.
 
         Parameters
         ----------
         hits : Hits
-            The hits (n,).
+            The n hits.
         point : 3 x (n,) float64
             The hit points, m.
         labels : int32, one per vertex
@@ -241,7 +243,20 @@ class RayCaster:
         return label_of_nearest_vertex(self._vertices, self._face_vertices, hits.face, hits.valid, point, labels)
 
     def cast(self, origins: FloatArray, directions: FloatArray) -> tuple[FloatArray, IntArray]:
-        """Cast rays given as NumPy arrays (n, 3), m. Returns the distances (n,) and faces (n,); NaN and -1 for a miss."""
+        """Cast n rays given as NumPy arrays and return where they hit the mesh first.
+
+        Parameters
+        ----------
+        origins : (n, 3) array
+            Starts of the rays, m.
+        directions : (n, 3) array
+            Directions of the rays.
+
+        Returns
+        -------
+        (n,) array and (n,) int array
+            Distances in lengths of the direction vectors, and face numbers; NaN and -1 for a miss.
+        """
         rays = (vectors_on_device(np.broadcast_to(array, directions.shape)) for array in (origins, directions))
         hits = self.intersect(*rays, coherent=False)
         distance = dr.select(hits.valid, hits.distance, np.nan)
@@ -250,9 +265,10 @@ class RayCaster:
         return np.array(distance), np.array(face)
 
     def sides_seen(self, position: FloatArray) -> tuple[IntArray, NDArray[np.bool_]]:
-        """Return the faces that are seen from `position` (3,), and which of them are seen from behind.
+        """Find the faces that a sensor sees, and which of them it sees from behind, to check that it stands before the wall.
 
-        Lines of sight are cast to some thousands of the mesh's vertices.
+        Lines of sight are cast from `position` (3,), m, to some thousands of the mesh's vertices. Returns the numbers (k,) of
+        the faces, and a mask (k,) that is True for those seen from behind.
         """
         vertices = self.mesh.vertices[:: max(len(self.mesh.vertices) // _SIGHTS, 1)]
         sight = vertices - position
@@ -261,9 +277,10 @@ class RayCaster:
         return face[met], np.einsum("ij,ij->i", self.mesh.face_normals(face[met]), sight[met]) > 0
 
     def labels_down(self, grid: Grid, shift_m: NDArray[np.float32]) -> IntArray:
-        """Return the block label (h, w) of the face below each pixel centre, looking along -z.
+        """Return the block label (h, w) of the face below each pixel centre of a raster (`grid`), looking along -z.
 
-        shift_m: (h, w, 2), m in x and y, is subtracted from each pixel centre.
+        It labels the pixels of a difference map. shift_m: (h, w, 2) displacement in x and y, m, which is subtracted from each
+        pixel centre before looking down.
         """
         hits, _ = self.look_down(grid, shift_m)
         return np.array(hits.block).reshape(grid.shape)
@@ -281,7 +298,7 @@ class RayCaster:
         Returns
         -------
         Hits and mi.Array3f64
-            The hits and the hit points, h w each.
+            The hits and the hit points, one for each of the h w pixels.
         """
         index = dr.arange(mi.UInt32, grid.width * grid.height)
         row, column = index // grid.width, index % grid.width

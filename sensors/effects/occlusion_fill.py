@@ -24,5 +24,9 @@ class OcclusionFill(RasterEffect):
     reach_px: float = parameter("widest strip that is filled", unit="px", source="Hirschmueller 2008", typical=80.0, ge=0, le=1e5)
 
     def filtered(self, disparity: FloatArray, cell_px: float, jump_px: float) -> FloatArray:
-        """Return the disparities, px, with narrow strips without a match filled from the background."""
+        """Return the disparities, px, with narrow strips without a match filled from the background.
+
+        disparity: (rows, columns) of the depth map, px, NaN without a match. cell_px: px of the full-resolution frame for each
+        cell. jump_px: smallest difference of neighbours that is a depth step, px; not used.
+        """
         return fill_gaps(disparity, self.reach_px / cell_px)

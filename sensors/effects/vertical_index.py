@@ -23,6 +23,7 @@ class VerticalIndex(AimEffect):
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
         """Return recorded minus true azimuth, which is zero, and zenith, a constant; rad.
 
-        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
+        at: geometry of n pulses. m: elementary functions (sine, logarithm and so on) for its arrays, `HOST` for NumPy or
+        `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
         """
         return 0.0, p.offset_rad

@@ -11,7 +11,7 @@ from scene.geometry.mesh import FloatArray
 
 
 def polar(local: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return range (m), azimuth and zenith angle (rad), each (n,), of points (n, 3) in the scanner's frame."""
+    """Convert points (n, 3) in the scanner's frame to range (m), azimuth and zenith angle (rad), each (n,)."""
     level = np.hypot(local[:, 0], local[:, 1])
     return np.hypot(level, local[:, 2]), np.arctan2(local[:, 1], local[:, 0]), np.arctan2(level, local[:, 2])
 

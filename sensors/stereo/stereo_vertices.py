@@ -33,11 +33,11 @@ from sensors.stereo.stereo_pair import REDUCTION, StereoPair, rectified_disparit
 
 
 def observe_vertices(pair: StereoPair, scene: RayCaster, random: KeyedRandom) -> TriangleMesh:
-    """Return the wall as the pair reconstructs it: triangles and labels, with vertices as recorded.
+    """Return the wall as a stereo pair reconstructs it: a mesh with the true triangles and labels, and vertices with errors.
 
     Positions are in the wall frame. Vertices outside one of the images or behind a camera are left out. The same `random` draws
-    the same orientation and row displacement as `pair.observe`; matching noise is keyed by the vertex. Raises InputError if
-    nothing is left.
+    the same orientation and row displacement as `pair.observe`; the matching noise of a vertex depends on its number. Raises
+    InputError if nothing is left.
     """
     mesh = scene.mesh
     effects = pair.model.chain(random)
@@ -124,10 +124,12 @@ class _TracedCells:
 
 @dataclass(frozen=True)
 class VertexMatches(Matches):
-    """Matches of the n vertices of the wall's mesh instead of a depth map's cells; `index` is the vertex, (u, v) its left pixel.
+    """The n vertices of the wall's mesh as matches of a stereo pair, in place of a depth map's cells.
 
-    An effect that depends on neighbouring pixels, such as smoothing, cannot act on vertices. It acts on the ray-traced depth map
-    of the same observation, and each vertex takes over the change of disparity that the effect made at its pixel.
+    `index` is the number of the vertex, and (u, v) its pixel in the left image.
+
+    An effect that depends on neighbouring pixels, such as smoothing, cannot act on vertices. It acts on the ray-traced depth
+    map of the same observation, and each vertex takes over the change of disparity that the effect made at its pixel.
 
     Attributes
     ----------
