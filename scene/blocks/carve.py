@@ -21,8 +21,8 @@ FRESH_ALBEDO = 0.6
 _HALO_M = 1e-3
 """Margin around the blocks' boxes, so that slivers at the rims always have complete neighbourhoods."""
 
-_CHUNK = 1 << 20
-"""Number of faces processed at a time."""
+_CHUNK = 1 << 15
+"""Number of faces processed at a time, so that what is computed stays in the processor's cache."""
 
 
 @dataclass(frozen=True)

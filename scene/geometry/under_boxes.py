@@ -15,8 +15,8 @@ _MOST_CELLS = 4e6
 _CELLS_PER_BOX = 8
 """Number of cells along the shortest side of the smallest box, if the largest number of cells allows it."""
 
-_CHUNK = 1 << 19
-"""Number of faces looked up at a time, to limit the memory of intermediate arrays."""
+_CHUNK = 1 << 15
+"""Number of faces looked up at a time, so that intermediate arrays stay in the processor's cache."""
 
 
 def faces_under_boxes(mesh: TriangleMesh, boxes: FloatArray, halo_m: float = 0.0) -> IntArray:

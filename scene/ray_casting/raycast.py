@@ -67,6 +67,19 @@ class Hits:
     block: mi.Int32
 
 
+def check_castable(mesh: TriangleMesh) -> None:
+    """Raise InputError if a mesh has no triangles, or lies too far from the origin for single precision."""
+    if len(mesh.faces) == 0:
+        raise InputError("the mesh has no triangles", where="ray casting", remedy="use a mesh with triangles")
+    if not np.abs(mesh.bounds).max() < _LARGEST_COORDINATE:
+        raise InputError(
+            f"coordinates reach {np.abs(mesh.bounds).max():.0f} m, too far from the origin for single precision",
+            where="ray casting",
+            allowed=f"less than {_LARGEST_COORDINATE:.0f} m",
+            remedy="check the mesh's unit, or subtract its centre from the coordinates of mesh and sensor",
+        )
+
+
 class RayCaster:
     """A mesh prepared for ray casting, in a frame whose origin is near (the wall frame).
 
@@ -81,15 +94,7 @@ class RayCaster:
     """
 
     def __init__(self, mesh: TriangleMesh) -> None:
-        if len(mesh.faces) == 0:
-            raise InputError("the mesh has no triangles", where="ray casting", remedy="use a mesh with triangles")
-        if not np.abs(mesh.bounds).max() < _LARGEST_COORDINATE:
-            raise InputError(
-                f"coordinates reach {np.abs(mesh.bounds).max():.0f} m, too far from the origin for single precision",
-                where="ray casting",
-                allowed=f"less than {_LARGEST_COORDINATE:.0f} m",
-                remedy="check the mesh's unit, or subtract its centre from the coordinates of mesh and sensor",
-            )
+        check_castable(mesh)
         self.mesh = mesh
         shape = mi.Mesh("surface", len(mesh.vertices), len(mesh.faces))
         parameters = mi.traverse(shape)
@@ -235,15 +240,7 @@ class RayCaster:
         labels : int32, one per vertex
             Block labels of the mesh's vertices.
         """
-        nearest, result = mi.Float32(np.inf), mi.Int32(WALL)
-        for corner in range(3):
-            vertex = dr.gather(mi.UInt32, self._face_vertices, 3 * hits.face + corner, hits.valid)
-            position = dr.gather(mi.Array3f64, self._vertices, vertex, hits.valid)
-            distance = mi.Float32(dr.squared_norm(position - point))
-            nearer = distance < nearest
-            result = dr.select(nearer, dr.gather(mi.Int32, labels, vertex, hits.valid), result)
-            nearest = dr.select(nearer, distance, nearest)  # dr.minimum aborts in LLVM 15
-        return dr.select(hits.valid, result, WALL)
+        return label_of_nearest_vertex(self._vertices, self._face_vertices, hits.face, hits.valid, point, labels)
 
     def cast(self, origins: FloatArray, directions: FloatArray) -> tuple[FloatArray, IntArray]:
         """Cast n rays given as NumPy arrays and return where they hit the mesh first.
@@ -313,6 +310,38 @@ class RayCaster:
         origin = mi.Array3f64(x, y, start)
         hits = self.intersect(origin, mi.Array3f64(0.0, 0.0, -1.0))
         return hits, mi.Array3f64(origin.x, origin.y, origin.z - hits.distance)
+
+
+def label_of_nearest_vertex(
+    vertices: mi.Float64, face_vertices: mi.UInt32, face: mi.UInt32, valid: mi.Bool, point: mi.Array3f64, labels: mi.Int32
+) -> mi.Int32:
+    """Return, for places on faces of a mesh, the label of the face's vertex that is nearest.
+
+    Parameters
+    ----------
+    vertices, face_vertices : (3 v,) float64 and (3 f,) uint32
+        Coordinates of the mesh's vertices, m, and numbers of the vertices of its faces.
+    face, valid : (n,) uint32 and bool
+        Number of the face at each place, and whether there is one.
+    point : 3 x (n,) float64
+        The places, m.
+    labels : (v,) int32
+        Block labels of the vertices.
+
+    Returns
+    -------
+    (n,) int32
+        The labels; WALL where there is no face.
+    """
+    nearest, result = mi.Float32(np.inf), mi.Int32(WALL)
+    for corner in range(3):
+        vertex = dr.gather(mi.UInt32, face_vertices, 3 * face + corner, valid)
+        position = dr.gather(mi.Array3f64, vertices, vertex, valid)
+        distance = mi.Float32(dr.squared_norm(position - point))
+        nearer = distance < nearest
+        result = dr.select(nearer, dr.gather(mi.Int32, labels, vertex, valid), result)
+        nearest = dr.select(nearer, distance, nearest)  # dr.minimum aborts in LLVM 15
+    return dr.select(valid, result, WALL)
 
 
 def _largest_component(vector: mi.Array3f64) -> tuple[mi.UInt32, mi.Float64]:
