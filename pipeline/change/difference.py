@@ -16,6 +16,7 @@ from scene.common.config import Config
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import WALL, FloatArray, IntArray, TriangleMesh
+from scene.ray_casting.rasterise import FlatMesh
 from scene.ray_casting.raycast import RayCaster
 from scene.ray_casting.upload import on_device
 
@@ -88,7 +89,17 @@ def surface_raster(mesh: TriangleMesh, grid: Grid) -> SurfaceRaster:
     mesh: wall frame, m; the block labels of its faces, or else of its vertices, are rasterised too. grid: the pixels.
     """
     dr.flush_malloc_cache()  # frees the observation's memory: rasterising the surface is the peak of an epoch
-    return cast_raster(RayCaster(mesh), grid)
+    flat = FlatMesh(mesh, grid)
+    if not flat.is_quick:
+        return cast_raster(RayCaster(mesh), grid)
+    top = flat.top_faces()
+    if mesh.face_block is not None:
+        block = dr.gather(mi.Int32, on_device(mi.Int32, mesh.face_block), top.face, top.valid)
+    elif mesh.vertex_block is not None:
+        block = flat.labels(top, on_device(mi.Int32, mesh.vertex_block))
+    else:
+        block = mi.Int32(WALL)
+    return _as_raster(grid, top.valid, top.point.z, dr.select(top.valid, block, WALL))
 
 
 def cast_raster(caster: RayCaster, grid: Grid) -> SurfaceRaster:
@@ -97,15 +108,17 @@ def cast_raster(caster: RayCaster, grid: Grid) -> SurfaceRaster:
     caster: the mesh in the wall frame, m. grid: the pixels.
     """
     hits, point = caster.look_down(grid)
-    z = mi.Float32(dr.select(hits.valid, point.z, np.nan))
-    if caster.mesh.face_block is not None:
-        dr.eval(z, hits.block)
-        return SurfaceRaster(grid, np.array(z).reshape(grid.shape), np.array(hits.block).reshape(grid.shape))
-    if caster.mesh.vertex_block is None:
-        return SurfaceRaster(grid, np.array(z).reshape(grid.shape), np.full(grid.shape, WALL, dtype=np.int32))
-    label = caster.nearest_vertex_label(hits, point, on_device(mi.Int32, caster.mesh.vertex_block))
-    dr.eval(z, label)  # one kernel
-    return SurfaceRaster(grid, np.array(z).reshape(grid.shape), np.array(label).reshape(grid.shape))
+    block = hits.block
+    if caster.mesh.face_block is None and caster.mesh.vertex_block is not None:
+        block = caster.nearest_vertex_label(hits, point, on_device(mi.Int32, caster.mesh.vertex_block))
+    return _as_raster(grid, hits.valid, point.z, block)
+
+
+def _as_raster(grid: Grid, valid: mi.Bool, z: mi.Float64, block: mi.Int32) -> SurfaceRaster:
+    """Bring heights, m, and labels of all pixels from the device; NaN where there is no surface."""
+    height = mi.Float32(dr.select(valid, z, np.nan))
+    dr.eval(height, block)  # one kernel
+    return SurfaceRaster(grid, np.array(height).reshape(grid.shape), np.array(block).reshape(grid.shape))
 
 
 def difference(reference: SurfaceRaster, epoch: SurfaceRaster) -> NDArray[np.float32]:

@@ -61,14 +61,15 @@ def _samples(seen: Observation, registration: Registration | None) -> tuple[Floa
     """Return positions (n, 2) of the samples in the map, m, and the displacement of each, without outliers."""
     if seen.offset is None:
         return np.empty((0, 2)), np.empty((0, 2))
-    points, offset = seen.points[seen.valid], seen.offset[seen.valid].astype(np.float64)
-    if registration is not None:
-        moved = registration.apply(points)
-        offset += (moved - points)[:, :2]
-        points = moved
-    from_median = np.abs(offset - np.median(offset, axis=0))
-    near = (from_median <= _OUTLIER * 1.4826 * np.median(from_median, axis=0) + 1e-9).all(axis=1)
-    return points[near, :2], offset[near]
+    points, offset = seen.points[seen.valid], seen.offset[seen.valid]
+    moved = points if registration is None else registration.apply(points)
+    columns, near = [], np.ones(len(points), dtype=bool)
+    for axis in range(2):
+        column = offset[:, axis].astype(np.float64) + (moved[:, axis] - points[:, axis])
+        from_median = np.abs(column - np.median(column))
+        near &= from_median <= _OUTLIER * 1.4826 * np.median(from_median) + 1e-9
+        columns.append(column)
+    return moved[near, :2], np.stack([column[near] for column in columns], axis=1)
 
 
 def _filled(total: FloatArray, count: NDArray[np.signedinteger]) -> FloatArray:

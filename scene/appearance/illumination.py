@@ -30,23 +30,31 @@ _FAR_M = 1e4
 
 @dataclass(frozen=True)
 class SunPosition:
-    """Direction of the sun: azimuth clockwise from north, and apparent (refracted) elevation above the horizon, rad."""
+    """Direction of the sun in the sky, for the shadows and the shading of simulated photographs.
+
+    Attributes
+    ----------
+    azimuth_rad : float
+        Angle clockwise from north, rad.
+    elevation_rad : float
+        Angle above the horizon, rad, as seen through the refracting atmosphere.
+    """
 
     azimuth_rad: float
     elevation_rad: float
 
     @property
     def direction(self) -> FloatArray:
-        """(3,) unit vector towards the sun, world frame (east, north, up)."""
+        """(3,) unit vector from the rock towards the sun, world frame (x east, y north, z up)."""
         level = np.cos(self.elevation_rad)
         return np.array([level * np.sin(self.azimuth_rad), level * np.cos(self.azimuth_rad), np.sin(self.elevation_rad)])
 
 
 def sun_coordinates(days: float) -> tuple[float, float]:
-    """Compute the sun's right ascension and declination, rad, `days` after J2000 (2000-01-01 12:00 UT).
+    """Compute the sun's right ascension and declination, rad, at a time.
 
     These are the Astronomical Almanac's low-precision formulas, accurate to 0.01 deg from 1950 to 2050 (Michalsky 1988, eq.
-    2-7).
+    2-7). `days` is the time in days after J2000 (2000-01-01 12:00 UT).
     """
     longitude, anomaly = np.radians(280.460 + 0.9856474 * days), np.radians(357.528 + 0.9856003 * days)
     ecliptic = longitude + np.radians(1.915 * np.sin(anomaly) + 0.020 * np.sin(2 * anomaly))
@@ -56,14 +64,14 @@ def sun_coordinates(days: float) -> tuple[float, float]:
 
 
 def sun_position(time: datetime, latitude_rad: float, longitude_rad: float) -> SunPosition:
-    """Compute where the sun stands, accurate to 0.02 deg from 1950 to 2050.
+    """Compute the azimuth and the elevation of the sun at a time and a place, accurate to 0.02 deg from 1950 to 2050.
 
     Parameters
     ----------
     time : datetime
-        UTC if it has no time zone.
+        Date and time; UTC if it has no time zone.
     latitude_rad, longitude_rad : float
-        The place, north and east positive.
+        Geographic coordinates of the place, rad; north and east are positive.
 
     Notes
     -----
@@ -96,7 +104,11 @@ def _refraction(elevation_rad: float) -> float:
 
 
 class IlluminationConfig(Config):
-    """Sun and sky while the two photographs are taken; a time and a place take precedence over a given direction."""
+    """Sun and sky while the two photographs are taken; a time and a place take precedence over a given direction.
+
+    The photographs are those of a simulated stereo pair. `sky_share` is the part of the light that comes from the sky, without
+    shadows.
+    """
 
     sun_azimuth_deg: float = Field(225.0, ge=0, lt=360, description="direction of the sun, clockwise from north (world y) [deg]")
     sun_elevation_deg: float = Field(45.0, gt=0, le=90, description="height of the sun above the horizon [deg]")
@@ -119,7 +131,10 @@ class IlluminationConfig(Config):
         return self
 
     def sun(self) -> SunPosition:
-        """Return the direction of the sun. Raises InputError if it is below the horizon at the given time and place."""
+        """Return the direction of the sun, from the configured time and place or else the configured angles.
+
+        Raises InputError if the sun is below the horizon at that time and place.
+        """
         if self.time_utc is None or self.latitude_deg is None or self.longitude_deg is None:
             return SunPosition(np.radians(self.sun_azimuth_deg), np.radians(self.sun_elevation_deg))
         sun = sun_position(self.time_utc, np.radians(self.latitude_deg), np.radians(self.longitude_deg))
@@ -132,21 +147,24 @@ class IlluminationConfig(Config):
         return sun
 
     def in_wall_frame(self, frame: WallFrame) -> Illumination:
-        """Return sun and sky with directions in the wall frame."""
+        """Return sun and sky as unit vectors in the wall frame, in which photographs are rendered.
+
+        `frame` is the transform from the world frame (east, north, up) to the wall frame.
+        """
         up = frame.direction_to_wall(np.array([0.0, 0.0, 1.0]))
         return Illumination(frame.direction_to_wall(self.sun().direction), up, self.sky_share)
 
 
 @dataclass(frozen=True)
 class Illumination:
-    """Sun and sky in the frame of the scene.
+    """Light of sun and sky on the rock, in the frame in which photographs are rendered (the wall frame).
 
     Attributes
     ----------
     sun, up : (3,) array
         Unit vectors towards the sun and the zenith.
     sky_share : float
-        Share of skylight in the total light on a face that points at the sun.
+        Share of skylight in the total light on a face that points at the sun, from 0 to 1.
     """
 
     sun: FloatArray
@@ -156,16 +174,16 @@ class Illumination:
     def irradiance(self, scene: RayCaster, point: mi.Array3f64, normal: mi.Vector3f) -> mi.Float32:
         """Compute the irradiance (n,) of surface elements, relative to an unshadowed one that points at the sun.
 
-        E = (1 - s) V max(0, n . sun) + s (1 + n . up) / 2, where V is 1 if a shadow ray reaches the sun and s is the sky's
-        share. The sky has uniform brightness. The part of it that the wall hides is not subtracted, and light reflected
-        between rocks is ignored.
+        E = (1 - s) V max(0, n . sun) + s (1 + n . up) / 2, where n is the normal, V is 1 if a shadow ray reaches the sun (else
+        0) and s is the sky's share. The sky has uniform brightness. The part of it that the wall hides is not subtracted, and
+        light reflected between rocks is ignored.
 
         Parameters
         ----------
         scene : RayCaster
             The surface that casts shadows.
         point : 3 x (n,)
-            Positions, m.
+            Positions of the surface elements in the scene's frame, m, as device vectors.
         normal : 3 x (n,)
             Unit normals of the surface.
         """

@@ -20,28 +20,35 @@ _PRIMES = (0x8DA6B343, 0xD8163841, 0xCB1AB31F)
 
 
 class TextureConfig(Config):
-    """Texture of the rock beyond the mesh's albedo; only the image matcher sees it."""
+    """Texture of the rock beyond the mesh's albedo; only the image matcher sees it.
+
+    It is fractal noise: a sum of octaves, each with half the grain size of the one before. It modulates the rock's reflectance
+    in rendered photographs, so that a matcher finds details in them.
+    """
 
     contrast: float = Field(0.12, ge=0, le=1, description="standard deviation of each octave, as a share of the albedo")
     coarsest_m: float = Field(1.0, gt=0, le=100, description="grain of the coarsest octave; finer ones follow by halves [m]")
 
     def texture(self, random: KeyedRandom) -> RockTexture:
-        """Return the texture that `random` draws. It is the same in every epoch of a run."""
+        """Return the rock texture with these settings, drawn with the random numbers of `random`.
+
+        Call it once for a run: the texture is then the same in every epoch.
+        """
         return RockTexture(self.contrast, self.coarsest_m, random.key & 0xFFFFFFFF)
 
 
 @dataclass(frozen=True)
 class RockTexture:
-    """Fractal value noise in space.
+    """Fractal value noise in space, which gives the rock of rendered photographs details that a matcher can find.
 
-    Octaves have equal contrast, so that the power spectrum falls with 1/f^2, as in natural images.
+    Octaves have equal contrast, so that the power spectrum falls with 1/f^2 (f: spatial frequency), as in natural images.
 
     Attributes
     ----------
     contrast : float
         Standard deviation of each octave, as a share of the albedo.
     coarsest_m : float
-        Grain size of the coarsest octave, m.
+        Grain size of the coarsest octave, m; each further octave has half the size of the one before.
     key : int
         Seed of the noise, 32 bits.
     """
@@ -51,10 +58,11 @@ class RockTexture:
     key: int
 
     def factor(self, point: mi.Array3f64, footprint_m: float) -> mi.Float32:
-        """Return the factor (n,) on the albedo at points 3 x (n,), m. Its logarithm has mean 0 and is nearly Gaussian.
+        """Return the factor (n,) by which the texture multiplies the rock's albedo at points 3 x (n,), m.
 
-        Octaves end at `footprint_m`, the size of a pixel on the rock, because finer grain averages out within a pixel. An
-        octave between half the footprint and the footprint fades in, so that the rock looks alike from similar distances.
+        The factor's logarithm has mean 0 and is nearly Gaussian. Octaves end at `footprint_m`, the size of a pixel on the rock,
+        m, because finer grain averages out within a pixel. An octave between half the footprint and the footprint fades in, so
+        that the rock looks alike from similar distances.
         """
         octaves = max(1, int(np.ceil(np.log2(self.coarsest_m / footprint_m))) + 1)
         total = mi.Float32(0)
@@ -66,7 +74,9 @@ class RockTexture:
 
 
 def solid_noise(point: mi.Array3f64, grain_m: float, key: int) -> mi.Float32:
-    """Evaluate smooth noise (n,) with mean 0 and standard deviation 1 at points 3 x (n,), m.
+    """Evaluate smooth random noise in space at n points; used for rock texture, wet patches and vegetation.
+
+    The values (n,) have mean 0 and standard deviation 1.
 
     Hashed random numbers on a lattice with spacing `grain_m` are interpolated with smoothstep weights 3 f^2 - 2 f^3 (Perlin
     1985); the hash of the nodes follows Teschner et al. (2003).

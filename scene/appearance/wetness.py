@@ -21,7 +21,10 @@ _SAMPLES = 1 << 18
 
 
 class WetnessConfig(Config):
-    """Wet rock: the albedo of the patches is multiplied by a factor, in the same places in every epoch."""
+    """Wet rock: the albedo of the patches is multiplied by a factor, in the same places in every epoch.
+
+    Wet patches return weaker echoes to a laser scanner and are darker in photographs. They are drawn at random from `seed`.
+    """
 
     share: float = Field(0.3, ge=0, le=1, description="share of the rock that is wet, on a wall much larger than a patch")
     albedo_factor: float = Field(
@@ -34,7 +37,10 @@ class WetnessConfig(Config):
     seed: int = Field(1, ge=0, lt=2**63, description="seed of the patches")
 
     def with_wet_patches(self, mesh: TriangleMesh) -> TriangleMesh:
-        """Return the mesh (wall frame) with lower albedo at wet vertices; the mesh itself if nothing is wet or darkened."""
+        """Return the mesh (wall frame) with lower albedo at wet vertices, as a sensor meets the wet rock.
+
+        It is the given mesh itself if nothing is wet or darkened.
+        """
         if self.share == 0 or self.albedo_factor == 1:
             return mesh
         dry = np.full(len(mesh.vertices), DEFAULT_ALBEDO, np.float32) if mesh.vertex_albedo is None else mesh.vertex_albedo
@@ -42,7 +48,10 @@ class WetnessConfig(Config):
         return replace(mesh, vertex_albedo=(dry * factor).astype(np.float32))
 
     def wetness(self, points: FloatArray) -> FloatArray:
-        """Return how wet the rock is, (n,), at points (n, 3), m, wall frame: 0 dry, 1 wet, with a smooth transition."""
+        """Return how wet the rock is, (n,), at points (n, 3), m, wall frame: 0 dry, 1 wet, with a smooth transition.
+
+        Wet patches lie at the same places in every epoch; elsewhere the rock is dry.
+        """
         key = KeyedRandom(self.seed).child("wetness").key & 0xFFFFFFFF
         ramp = np.clip((_noise(points / self.patch_m, key) - _threshold(self.share)) / _RAMP + 0.5, 0, 1)
         return ramp * ramp * (3 - 2 * ramp)

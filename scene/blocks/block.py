@@ -47,7 +47,11 @@ MOST_BLOCKS = 20_000
 
 
 class RockfallConfig(Config):
-    """How many blocks fall, what they look like and where they may lie."""
+    """How many blocks fall, what they look like and where they may lie.
+
+    A block is a random solid; where it overlaps the wall, rock is removed, which leaves a niche. Distributions draw a value for
+    each block (sizes, rotations) or for each vertex (irregularity).
+    """
 
     count: int = Field(40, ge=1, le=MOST_BLOCKS, description="number of blocks")
     shape: Literal["cube", "sphere", "mixed"] = Field("mixed", description="primitive; mixed draws one for each block")
@@ -79,7 +83,9 @@ HEIGHTS = {"relief": highest_under, "highest_vertex": highest_vertex_under, "mea
 
 @dataclass(frozen=True)
 class Blocks:
-    """k closed blocks in the wall frame, stored one after the other. The block with index i has the label i + 1.
+    """k closed blocks of rock in the wall frame, which are cut out of the wall as simulated rockfalls.
+
+    The meshes are stored one after the other. The block with index i has the label i + 1.
 
     Attributes
     ----------
@@ -88,9 +94,9 @@ class Blocks:
     faces : (m, 3) int32 array
         Vertex indices, counter-clockwise seen from outside.
     vertex_start, face_start : (k + 1,) int32 arrays
-        Where each block's vertices and faces begin.
+        Row of each block's first vertex and face; the last entry is the number of all vertices or faces.
     shape : tuple of k str
-        Name of each block's primitive.
+        Name of each block's primitive, "cube" or "sphere".
     size_m : (k, 3) array
         Lengths of the axes before rotation, m.
     position_m : (k, 3) array
@@ -110,23 +116,23 @@ class Blocks:
 
     @cached_property
     def bbox(self) -> FloatArray:
-        """(k, 2, 3) smallest and largest coordinates of each block, wall frame, m."""
+        """(k, 2, 3) smallest and largest coordinates of each of the k blocks, wall frame, m."""
         low = np.minimum.reduceat(self.vertices, self.vertex_start[:-1], axis=0)
         return np.stack([low, np.maximum.reduceat(self.vertices, self.vertex_start[:-1], axis=0)], axis=1)
 
     @cached_property
     def face_label(self) -> IntArray:
-        """(m,) label, 1 to k, of each face's block."""
+        """(m,) label, 1 to k, of the block to which each of the m faces belongs."""
         return np.repeat(np.arange(1, len(self) + 1, dtype=np.int32), np.diff(self.face_start))
 
     def mesh(self, index: int) -> TriangleMesh:
-        """Return the mesh of the block with this index (0 to k - 1)."""
+        """Return one block as a mesh of its own, wall frame. `index` counts the blocks from 0."""
         vertices = slice(self.vertex_start[index], self.vertex_start[index + 1])
         faces = self.faces[self.face_start[index] : self.face_start[index + 1]] - self.vertex_start[index]
         return TriangleMesh(self.vertices[vertices], faces)
 
     def only(self, index: int) -> Blocks:
-        """Return a collection that holds only the block with this index."""
+        """Return the same kind of collection with one of the blocks alone. `index` counts the blocks from 0."""
         mesh, one = self.mesh(index), slice(index, index + 1)
         vertex_start, face_start = (np.array([0, len(array)], dtype=np.int32) for array in (mesh.vertices, mesh.faces))
         placed = self.shape[one], self.size_m[one], self.position_m[one]
@@ -135,7 +141,19 @@ class Blocks:
 
 @dataclass(frozen=True)
 class BlockShape:
-    """A block around the origin, before placement. The middle of its z range is 0."""
+    """A block of rock around the origin, before it is placed on the wall. The middle of its z range is 0.
+
+    Attributes
+    ----------
+    shape : str
+        Primitive that it was made from, "cube" or "sphere".
+    size_m : (3,) array
+        Lengths of the axes before rotation, m.
+    vertices : (n, 3) array
+        Vertices, rotated and roughened, m.
+    faces : (m, 3) int32 array
+        Vertex indices, counter-clockwise seen from outside.
+    """
 
     shape: str
     size_m: FloatArray
@@ -144,18 +162,18 @@ class BlockShape:
 
     @cached_property
     def bbox(self) -> FloatArray:
-        """(2, 3) smallest and largest coordinates, m."""
+        """(2, 3) smallest and largest coordinates of the block's vertices, m."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
 
 def place_blocks(config: RockfallConfig, mesh: TriangleMesh, random: KeyedRandom, caster: RayCaster | None = None) -> Blocks:
     """Draw `config.count` blocks and place them on the wall.
 
-    A block keeps its shape and is tried at positions drawn uniformly from the safe zone, until its bounding box lies inside
-    the zone and far enough from those of the other blocks. Large blocks are placed first, so that small ones do not take their
-    room. The middle of a block's z range then lies at the largest z of the wall within its contour (`placement: relief`), at
-    that of the wall's vertices (`highest_vertex`), or at the median z (`mean_surface`). The thesis, section 3.3, has the sign
-    of this height wrong. A block that does not reach into the rock there is placed again.
+    A block keeps its shape and is tried at positions drawn uniformly from the safe zone (the wall without a strip along its
+    border and its holes), until its bounding box lies inside the zone and far enough from those of the other blocks. Large
+    blocks are placed first, so that small ones do not take their room. The middle of a block's z range then lies at the largest
+    z of the wall within its contour (`placement: relief`), at that of the wall's vertices (`highest_vertex`), or at the median
+    z (`mean_surface`). A block that does not reach into the rock there is placed again.
 
     Parameters
     ----------
@@ -197,7 +215,7 @@ def place_blocks(config: RockfallConfig, mesh: TriangleMesh, random: KeyedRandom
 def make_regular_blocks(
     position_m: FloatArray, size_m: FloatArray, rotation_rad: FloatArray, shape: str, subdivisions: int
 ) -> Blocks:
-    """Make regular cubes or spheres at given positions, wall frame.
+    """Make regular cubes or spheres at given positions, wall frame, for walls with blocks of known place and size.
 
     Parameters
     ----------
@@ -206,9 +224,9 @@ def make_regular_blocks(
     rotation_rad : (k, 3) array
         Rotations about x, then y, then z, rad.
     shape : str
-        "cube" or "sphere".
+        "cube" or "sphere", for all blocks.
     subdivisions : int
-        Fineness, as in RockfallConfig.
+        Fineness n of the mesh: a sphere has 20 * 4^n triangles, a cube about as many.
     """
     from scipy.spatial.transform import Rotation
 
@@ -284,9 +302,10 @@ def _require_room(area: FloatArray, zone: SafeZone) -> None:
 
 
 def draw_shape(config: RockfallConfig, random: KeyedRandom) -> BlockShape:
-    """Draw a block at random: scale a primitive along its axes, rotate it and roughen its surface.
+    """Draw the shape of a block at random: scale a cube or sphere along its axes, rotate it and roughen its surface.
 
-    The primitive has unit size. Roughness is a radial offset of each vertex.
+    Sizes, rotations and roughness come from the distributions in `config`. Roughness is a radial offset of each vertex. Raises
+    InputError if a length of zero or less is drawn.
     """
     from scipy.spatial.transform import Rotation
 
@@ -358,7 +377,19 @@ def _require_fit(solids: Sequence[BlockShape], mesh: TriangleMesh) -> None:
 
 
 def reach_rock(solids: Sequence[BlockShape], position: FloatArray, caster: RayCaster) -> NDArray[np.bool_]:
-    """Return whether each block (k,), at its position, has a vertex at least the required depth below the surface."""
+    """Return whether each of k blocks reaches far enough into the rock to remove something: a bool array (k,).
+
+    A block does if a vertex lies below the surface, along z, by at least a tenth of the block's height.
+
+    Parameters
+    ----------
+    solids : sequence of k BlockShape
+        The blocks, around the origin.
+    position : (k, 3) array
+        Where they are to be placed, wall frame, m.
+    caster : RayCaster
+        The wall, wall frame.
+    """
     counts = np.array([len(solid.vertices) for solid in solids])
     points = np.concatenate([solid.vertices for solid in solids]) + np.repeat(position, counts, axis=0)
     start = points.copy()
@@ -371,7 +402,10 @@ def reach_rock(solids: Sequence[BlockShape], position: FloatArray, caster: RayCa
 
 
 def pack_blocks(solids: Sequence[BlockShape], position: FloatArray) -> Blocks:
-    """Store solids, moved to their positions, one after the other."""
+    """Move block shapes to their places on the wall, and join them into one collection.
+
+    solids: the k shapes, around the origin. position: (k, 3) places of their origins, wall frame, m.
+    """
     vertex_start = _starts([len(solid.vertices) for solid in solids])
     face_start = _starts([len(solid.faces) for solid in solids])
     vertices = np.concatenate([solid.vertices + place for solid, place in zip(solids, position, strict=True)])

@@ -21,21 +21,22 @@ FRESH_ALBEDO = 0.6
 _HALO_M = 1e-3
 """Margin around the blocks' boxes, so that slivers at the rims always have complete neighbourhoods."""
 
-_CHUNK = 1 << 20
-"""Number of faces processed at a time."""
+_CHUNK = 1 << 15
+"""Number of faces processed at a time, so that what is computed stays in the processor's cache."""
 
 
 @dataclass(frozen=True)
 class Carved:
-    """A wall without its blocks.
+    """A wall after its blocks have been cut out, with the volumes of rock that were removed.
 
     Attributes
     ----------
     mesh : TriangleMesh
-        The surface. `face_block` is the label (1 to k) of the block whose niche a face belongs to, WALL elsewhere.
+        The surface. `face_block` is the label (1 to k) of the block whose niche a face belongs to, WALL (0) elsewhere.
         `vertex_block` is the same for vertices inside niches; vertices on a rim, which also lie on the old surface, are WALL.
     removed_volume_m3 : (k,) array
-        Volume of rock that each block removed. It is the boolean's, corrected for the removal of slivers at the rim.
+        Volume of rock that each block removed. It includes the small change of volume by which slivers (needle-shaped
+        triangles) at the rim of the niche were removed.
     wall_volume_m3 : float
         Volume of the wall before carving; for an open surface the volume above its lowest point.
     balance_m3 : float
@@ -50,19 +51,19 @@ class Carved:
 
 @dataclass(frozen=True)
 class BlockMeshes:
-    """The meshes that show how one block is cut out of the wall (thesis, section 3.3), wall frame.
+    """The meshes that show how one block is cut out of the wall, wall frame.
 
     Attributes
     ----------
     wall_difference : TriangleMesh
         The wall around the block, with the hole.
     intersection : TriangleMesh
-        The closed solid that is removed. `face_block` distinguishes the wall's surface (WALL) from the block's side (its
-        label).
+        The closed solid of rock that is removed. Its `face_block` is WALL (0) on the wall's surface and the block's label on
+        the block's side.
     niche : TriangleMesh
         The surface left in the wall.
     removed_block : TriangleMesh
-        The closed part of the block that protrudes from the wall. Nothing else uses it.
+        The closed part of the block that protrudes from the wall, for display alone.
     """
 
     wall_difference: TriangleMesh
@@ -97,19 +98,24 @@ class _Surface:
 
 
 def carve(mesh: TriangleMesh, blocks: Blocks, fresh_albedo: float = FRESH_ALBEDO, first_label: int | None = None) -> Carved:
-    """Carve all blocks out of a wall, open or closed. An open wall keeps its boundary loops.
+    """Cut blocks out of a wall, open or closed, so that a niche remains of each. An open wall keeps its boundary loops.
 
     Parameters
     ----------
     mesh : TriangleMesh
         The wall, wall frame.
     blocks : Blocks
-        Disjoint blocks.
+        Disjoint blocks, wall frame.
     fresh_albedo : float
-        Albedo of the niches, if the wall has an albedo.
+        Albedo (0 to 1) of the niches, if the wall has an albedo.
     first_label : int, optional
-        Label of the first block; the others follow. Smaller labels from earlier carvings are then kept. None: labels from 1
-        on, and earlier labels become WALL.
+        Label of the first block's niche; the others follow. Smaller labels from earlier carvings are then kept. None: labels
+        from 1 on, and earlier labels become WALL (0).
+
+    Returns
+    -------
+    Carved
+        The wall with niches, and the removed volumes.
 
     Raises
     ------
@@ -129,9 +135,10 @@ def carve(mesh: TriangleMesh, blocks: Blocks, fresh_albedo: float = FRESH_ALBEDO
 
 
 def block_records(blocks: Blocks, removed_volume_m3: FloatArray) -> list[dict[str, Any]]:
-    """Make the record of each block for blocks.json: label, shape, sizes, removed volume and place.
+    """Make the record of each block for the file blocks.json: label, shape, sizes, removed volume and place.
 
-    All values are in SI units; bounding box and position are in the wall frame.
+    All values are in SI units; bounding box and position are in the wall frame. `removed_volume_m3` is (k,): the volume of rock
+    that each of the k blocks removed.
     """
     return [
         {
@@ -147,7 +154,9 @@ def block_records(blocks: Blocks, removed_volume_m3: FloatArray) -> list[dict[st
 
 
 def block_meshes(mesh: TriangleMesh, blocks: Blocks, index: int) -> BlockMeshes:
-    """Compute wall difference, intersection, niche and removed block of one block, from the patch of the wall around it.
+    """Compute the meshes that show how one block is cut out of the wall, such as the niche and the removed rock.
+
+    Only the part of the wall around the block is used.
 
     Parameters
     ----------
@@ -180,10 +189,11 @@ def _part(whole: Piece, chosen: NDArray[np.bool_], label: int | IntArray) -> Tri
 
 
 def removed_rocks(mesh: TriangleMesh, blocks: Blocks) -> TriangleMesh:
-    """Return the rocks that disjoint blocks cut out of a wall, each closed and in its place.
+    """Return the rocks that disjoint blocks cut out of a wall, each as a closed mesh in its place, wall frame.
 
-    `face_block` and `vertex_block` are the label (1 to k) of the rock. Albedo is that of the nearest vertex of the wall on the
-    wall's surface and that of fresh rock elsewhere, if the wall has an albedo.
+    A rock is the part of a block that lies inside the wall. `face_block` and `vertex_block` are the label (1 to k) of the rock.
+    Albedo is that of the nearest vertex of the wall on the wall's surface and that of fresh rock elsewhere, if the wall has an
+    albedo.
     """
     rows = faces_under_boxes(mesh, blocks.bbox, _HALO_M)
     wall, _ = close_patch(mesh, rows, float(blocks.bbox[:, 0, 2].min()))

@@ -20,18 +20,21 @@ from scene.geometry.mesh import FloatArray
 
 
 class Constant(Config):
-    """Always the same value."""
+    """Distribution of a config that always gives the same value."""
 
     kind: Literal["constant"] = "constant"
     value: float = Field(description="the value")
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """Draw values (size,)."""
+        """Return the constant value `size` times, (size,). `generator` is not used."""
         return np.full(size, self.value)
 
 
 class Gaussian(Config):
-    """Normal distribution, truncated from below if a minimum is given."""
+    """Normal distribution, truncated from below if a minimum is given.
+
+    A config uses it for quantities that are drawn at random, such as the sizes of blocks (`sample`), in the quantity's unit.
+    """
 
     kind: Literal["gaussian"] = "gaussian"
     mean: float = Field(description="mean, before truncation")
@@ -45,7 +48,7 @@ class Gaussian(Config):
         return self
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """Draw values (size,), by inversion of the upper tail of the (truncated) distribution function."""
+        """Draw `size` values with the random numbers of `generator`, by inversion of the (truncated) distribution function."""
         from scipy import special
 
         if self.minimum is None or self.sigma == 0:
@@ -56,7 +59,10 @@ class Gaussian(Config):
 
 
 class Uniform(Config):
-    """Uniform distribution on [low, high)."""
+    """Uniform distribution on [low, high).
+
+    A config uses it for quantities that are drawn at random, such as the sizes of blocks (`sample`), in the quantity's unit.
+    """
 
     kind: Literal["uniform"] = "uniform"
     low: float = Field(description="smallest value")
@@ -69,24 +75,31 @@ class Uniform(Config):
         return self
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """Draw values (size,)."""
+        """Draw `size` values between `low` and `high` with the random numbers of `generator`."""
         return generator.uniform(self.low, self.high, size)
 
 
 class Lognormal(Config):
-    """Lognormal distribution: the natural logarithm is normal with mean ln(median) and standard deviation sigma_log."""
+    """Lognormal distribution: the natural logarithm is normal with mean ln(median) and standard deviation sigma_log.
+
+    A config uses it for quantities that are drawn at random, such as the sizes of blocks (`sample`), in the quantity's unit.
+    """
 
     kind: Literal["lognormal"] = "lognormal"
     median: float = Field(gt=0, description="median")
     sigma_log: float = Field(ge=0, description="standard deviation of the natural logarithm")
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """Draw values (size,)."""
+        """Draw `size` lognormal values with the random numbers of `generator`."""
         return self.median * np.exp(self.sigma_log * generator.standard_normal(size))
 
 
 class Histogram(Config):
-    """Empirical distribution: bins are drawn in proportion to their counts, values uniformly within a bin."""
+    """Empirical distribution: bins are drawn in proportion to their counts, values uniformly within a bin.
+
+    A config uses it for quantities that are drawn at random, such as measured sizes of blocks (`sample`), in the quantity's
+    unit.
+    """
 
     kind: Literal["histogram"] = "histogram"
     edges: tuple[float, ...] = Field(min_length=2, description="bin edges, increasing, one more than counts")
@@ -103,7 +116,10 @@ class Histogram(Config):
         return self
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """Draw values (size,), by inversion of the piecewise linear distribution function."""
+        """Draw `size` values from the histogram, by inversion of its piecewise linear distribution function.
+
+        `generator` is the source of random numbers.
+        """
         edges, counts = np.asarray(self.edges), np.asarray(self.counts)
         filled = counts > 0
         ends = np.cumsum(counts[filled])
@@ -129,7 +145,10 @@ class Mixture(Config):
         return self
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """Draw values (size,)."""
+        """Draw `size` values, for each first a component of the mixture and then a value of it.
+
+        `generator` is the source of random numbers.
+        """
         ends = np.cumsum(self.weights)
         number = np.searchsorted(ends / ends[-1], generator.random(size), side="right")
         drawn = np.stack([component.sample(generator, size) for component in self.components])

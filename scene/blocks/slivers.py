@@ -31,7 +31,10 @@ IndexArray = NDArray[np.intp]
 
 
 def smallest_height(corners: FloatArray) -> FloatArray:
-    """Return the height (m,) of each triangle (m, 3, 3) over its longest side, m."""
+    """Return the height (m,) of each of m triangles over its longest side, m, to find needle-shaped triangles (slivers).
+
+    corners: (m, 3, 3) array with the three corners of each triangle, m.
+    """
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     longest = np.sqrt(np.maximum(np.maximum(_square(b - a), _square(c - b)), _square(a - c)))
     return np.sqrt(_square(_normal(corners))) / np.maximum(longest, 1e-300)
@@ -69,16 +72,17 @@ class _RankedEdges:
 
 @dataclass(frozen=True)
 class MendedSurface:
-    """A surface without slivers at the cut.
+    """The surface of a wall with niches after the slivers (needle-shaped triangles) along the cuts were removed.
 
     Attributes
     ----------
     faces : (m, 3) int32 array
-        Vertex indices.
+        Vertex indices of the m remaining triangles.
     label : (m,) int32 array
-        Block label of each face.
+        Label of the block whose niche each face belongs to; 0 on the wall.
     gain_m3 : (largest label + 1,) array
-        Volume below the surface (towards -z) that the removal of slivers has added, by the label near which it happened, m3.
+        Volume below the surface (towards -z) that the removal of slivers has added, m3: entry i for slivers near faces of label
+        i.
     """
 
     faces: IntArray
@@ -87,7 +91,9 @@ class MendedSurface:
 
 
 def remove_slivers(vertices: FloatArray, faces: IntArray, label: IntArray, rank: NDArray[np.int8]) -> MendedSurface:
-    """Remove the slivers at the cut; other faces stay.
+    """Remove the slivers (needle-shaped triangles) that cutting blocks out of a wall leaves along the cut.
+
+    Edges are collapsed or flipped; faces away from slivers stay.
 
     Parameters
     ----------
@@ -96,10 +102,10 @@ def remove_slivers(vertices: FloatArray, faces: IntArray, label: IntArray, rank:
     faces : (m, 3) int32 array
         Vertex indices.
     label : (m,) int32 array
-        Block label of each face.
+        Label of the block whose niche each face belongs to; 0 on the wall.
     rank : (n,) int8 array
-        0 for vertices that must stay, 1 for original ones, 2 for those on the cut. Of an edge's two vertices, the one with the
-        higher rank is preferably removed.
+        0 for vertices that must stay, 1 for those of the original wall, 2 for those on the cut. Of an edge's two vertices, the
+        one with the higher rank is preferably removed.
     """
     cut, gain = rank == 2, np.zeros(int(label.max(initial=0)) + 1)
     suspects = np.flatnonzero(_touch(cut, faces))

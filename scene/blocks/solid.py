@@ -27,7 +27,11 @@ neighbours included."""
 
 @dataclass(frozen=True)
 class Solid:
-    """A Manifold solid whose triangles keep their row numbers through booleans; `identity` is Manifold's id of it."""
+    """A closed mesh in the form of the library Manifold, which computes differences and intersections of solids (booleans).
+
+    Each triangle of a result still tells its row number in this mesh. `identity` is Manifold's number of this mesh, by which
+    the result tells from which mesh a triangle comes.
+    """
 
     manifold: Manifold
     identity: int
@@ -35,7 +39,7 @@ class Solid:
 
 @dataclass(frozen=True)
 class Piece:
-    """Triangles that result from a difference or intersection of two solids.
+    """Mesh that results from a difference or intersection of two solids, with the origin of each face.
 
     Attributes
     ----------
@@ -44,9 +48,9 @@ class Piece:
     faces : (m, 3) int32 array
         Vertex indices.
     source : (m,) int array
-        Row of the triangle that each face is a part of, in the solid that it came from.
+        Row of the original triangle that each face is a part of.
     first : (m,) bool array
-        Whether that is the first of the boolean's two solids.
+        True where that triangle belongs to the first of the two solids (the wall), False for the second (the blocks).
     """
 
     vertices: FloatArray
@@ -56,7 +60,22 @@ class Piece:
 
 
 def solid_of(vertices: FloatArray, faces: IntArray, name: str) -> Solid:
-    """Make a solid of closed triangles. Raises InputError, which calls it `name`, if they do not close."""
+    """Make a solid, for differences and intersections, of a closed mesh.
+
+    Parameters
+    ----------
+    vertices : (n, 3) array
+        Positions, m.
+    faces : (m, 3) int array
+        Vertex indices.
+    name : str
+        What error messages call the mesh.
+
+    Raises
+    ------
+    InputError
+        If the triangles do not enclose a solid.
+    """
     identity = Manifold.reserve_ids(1)
     manifold = Manifold(
         Mesh64(
@@ -79,13 +98,19 @@ def solid_of(vertices: FloatArray, faces: IntArray, name: str) -> Solid:
 
 
 def split_wall(wall: Solid, blocks: Solid) -> tuple[Piece, Piece]:
-    """Cut the blocks out of the wall. Returns what is removed, and what is left with the blocks' imprint."""
+    """Cut the blocks out of the wall.
+
+    Returns two meshes: the rock that is removed, and the wall that is left, with its niches.
+    """
     removed, left = wall.manifold.split(blocks.manifold)
     return read_piece(removed, wall), read_piece(left, wall)
 
 
 def read_piece(result: Manifold, first: Solid) -> Piece:
-    """Read the triangles that result from a difference or intersection of the solid `first` with another solid."""
+    """Read the mesh that Manifold computed as the difference or intersection of the solid `first` with another one.
+
+    The result tells which faces come from `first`.
+    """
     mesh = result.to_mesh64()
     run_end = np.asarray(mesh.run_index).astype(np.int64) // 3
     runs = run_end[1:] - run_end[:-1]
@@ -95,10 +120,21 @@ def read_piece(result: Manifold, first: Solid) -> Piece:
 
 
 def close_patch(mesh: TriangleMesh, rows: IntArray, bottom_m: float) -> tuple[Solid, FloatArray]:
-    """Close the patch of `mesh` that consists of the faces `rows`. Triangle i < len(rows) of the solid is the face rows[i].
+    """Close a part of an open wall from below, to a solid from which blocks can be cut.
 
-    `bottom_m` is a height z below which the closure's bottom must lie. Returns the solid and the corners (r, 3, 3) of the
-    patch's faces.
+    Parameters
+    ----------
+    mesh : TriangleMesh
+        The wall, wall frame.
+    rows : (r,) int array
+        Faces of the part.
+    bottom_m : float
+        Height z, m, below which the bottom of the solid must lie.
+
+    Returns
+    -------
+    Solid and (r, 3, 3) array
+        The solid, whose first r triangles are the faces `rows` in their order, and the corners of these faces, m.
     """
     used, faces = compact_vertices(mesh.faces[rows])
     vertices = mesh.vertices[used]
@@ -113,7 +149,10 @@ def close_patch(mesh: TriangleMesh, rows: IntArray, bottom_m: float) -> tuple[So
 
 
 def boundary(faces: IntArray) -> tuple[IntArray, IntArray]:
-    """Return start and end vertex of the directed edges that have no face on their other side."""
+    """Find the open edges of a mesh with faces (m, 3): those that belong to one face only.
+
+    Returns their start vertices (k,) and end vertices (k,), in the direction in which the face runs.
+    """
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     key = np.minimum(start, end).astype(np.int64) << 32 | np.maximum(start, end)
     order = np.argsort(key, kind="stable")
@@ -180,7 +219,10 @@ def _split_pinched(vertices: FloatArray, faces: IntArray, pinched: NDArray[np.bo
 
 
 def prism_volumes(vertices: FloatArray, faces: IntArray, base_m: float = 0.0) -> FloatArray:
-    """(m,) signed volume of the vertical prism between each face and z = base_m (divergence theorem, field (0, 0, z))."""
+    """Compute the signed volume (m,), m3, of the vertical prism between each face (m, 3) and the plane z = `base_m`.
+
+    The volume of a closed mesh is their sum (divergence theorem, field (0, 0, z)). `vertices` is (n, 3), m.
+    """
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     u, v = b - a, c - a
     return (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) * ((a[:, 2] + b[:, 2] + c[:, 2]) / 3 - base_m) / 2

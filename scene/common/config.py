@@ -24,7 +24,8 @@ class Config(BaseModel):
     """Base class of every config section: immutable, and unknown keys are errors.
 
     Field names carry their unit (`_m`, `_rad`, `_px`, `_ppm`). Infinite and NaN values are refused. A subclass lists in
-    `short_forms` the keys that a file may use although they are no fields, because other keys replace them before parsing.
+    `short_forms` the keys that a file may contain although they are no fields of the section, such as `preset`. They are
+    replaced by the keys that they stand for before the section is parsed.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -36,7 +37,7 @@ ConfigT = TypeVar("ConfigT", bound=BaseModel)
 
 
 def parse(model: type[ConfigT], values: Any, where: str) -> ConfigT:
-    """Validate `values` as the config section `model`.
+    """Check values that a user gave and turn them into a config section of class `model`.
 
     Parameters
     ----------
@@ -71,9 +72,9 @@ _MOST_YAML_BYTES = 4_000_000
 
 
 def load_yaml(path: Path) -> Any:
-    """Read a YAML file (see `parse_yaml` for the dialect) or, by its suffix, a JSON file.
+    """Read a config file: YAML without tags for Python objects or, by its suffix, JSON.
 
-    Raises InputError if the file cannot be read or is malformed.
+    Returns plain data (dict, list, str, numbers, None). Raises InputError if the file cannot be read or is malformed.
     """
     if path.suffix == ".json":
         return read_json(path)

@@ -13,7 +13,11 @@ FloatArray = NDArray[np.float64]
 
 
 class Cycle(Config):
-    """A periodic departure, such as a daily one: a sine over time."""
+    """A periodic departure, such as a daily one: a sine over time.
+
+    It describes how a quantity, such as the scanner's zero error, differs from its configured value through the epochs of a
+    time series.
+    """
 
     amplitude: float = Field(description="half the difference of largest and smallest value, in the quantity's unit")
     period_h: float = Field(24.0, gt=0, description="period [h]")
@@ -21,7 +25,10 @@ class Cycle(Config):
 
 
 class TimeTable(Config):
-    """Values at some times, with straight lines between them and the first and last value beyond."""
+    """Values at some times, with straight lines between them and the first and last value beyond.
+
+    They are what a quantity, such as the scanner's zero error, is to differ by from its configured value in a time series.
+    """
 
     hours: tuple[float, ...] = Field(min_length=1, description="times after the first epoch, increasing [h]")
     values: tuple[float, ...] = Field(min_length=1, description="values at these times, in the quantity's unit")
@@ -36,7 +43,11 @@ class TimeTable(Config):
 
 
 class Course(Config):
-    """How a quantity departs over time from its value in the config: the sum of a random walk, a drift, a cycle and a table."""
+    """How a quantity departs over time from its value in the config: the sum of a random walk, a drift, a cycle and a table.
+
+    The quantity is one of a sensor, such as its zero error or position, in a time series of epochs. All values are in the
+    quantity's unit.
+    """
 
     random_walk: float = Field(0.0, ge=0, description="standard deviation of the change in one day; it grows as the root of time")
     drift: float = Field(0.0, description="change per day")
@@ -50,7 +61,11 @@ class Course(Config):
         return self
 
     def values(self, hours: FloatArray, random: KeyedRandom) -> FloatArray:
-        """Return the departure (n,) at some times (n,), h, increasing, of which the first is the start of a random walk."""
+        """Return by how much the quantity departs from its configured value at n epochs, (n,), in the quantity's unit.
+
+        hours: (n,) times of the epochs, h, increasing; a random walk and a drift start at the first. random: source of the
+        random walk.
+        """
         days = hours / 24
         steps = random.generator().standard_normal(len(hours)) * np.sqrt(np.diff(days, prepend=days[0]))
         values = self.random_walk * np.cumsum(steps) + self.drift * (days - days[0])

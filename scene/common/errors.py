@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 
 class InputError(ValueError):
-    """Wrong input: says what is wrong and where, what is allowed, and how to correct it.
+    """Error for wrong input of a user: says what is wrong and where, what is allowed, and how to correct it.
 
     Commands print it as one message and exit with status 2. In Python it is a ValueError.
 
@@ -35,7 +35,7 @@ class InputError(ValueError):
 
 
 class OutsideError(RuntimeError):
-    """A failure that the input did not cause, such as worker processes that die.
+    """Failure that the user's input did not cause, such as worker processes that die.
 
     Commands print it as one message and exit with status 1.
     """
@@ -46,7 +46,7 @@ _LONGEST = 600
 
 
 def one_line(part: str) -> str:
-    """Return `part` on one line without control characters, which a terminal would obey.
+    """Return a text on one line without control characters, for use in error messages: a terminal would obey these characters.
 
     The middle of a long text is left out.
     """
@@ -55,6 +55,9 @@ def one_line(part: str) -> str:
 
 
 def nearest(word: str, words: Iterable[str]) -> str:
-    """Return "did you mean '...'?" with the word of `words` most like `word`, or "" if none is similar."""
+    """Suggest a correction for a misspelt word: "did you mean '...'?" with the most similar of the allowed `words`.
+
+    Returns "" if none is similar.
+    """
     near = difflib.get_close_matches(word, list(words), n=1, cutoff=0.6)
     return f"did you mean '{near[0]}'?" if near else ""

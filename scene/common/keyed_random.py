@@ -16,34 +16,47 @@ from scene.common.backend import dr, mi
 
 @dataclass(frozen=True)
 class KeyedRandom:
-    """A source of random numbers for one seed and one path of purposes, such as ("epoch", 3, "tls", "range_noise")."""
+    """Source of random numbers for one purpose, so that each part of a simulation draws its own, whatever else is drawn.
+
+    Attributes
+    ----------
+    seed : int
+        Seed of the run.
+    path : tuple of str or int
+        The purpose, from wide to narrow, such as ("epoch", 3, "tls", "range_noise").
+    """
 
     seed: int
     path: tuple[str | int, ...] = ()
 
     def child(self, *purpose: str | int) -> KeyedRandom:
-        """Return the source for a narrower purpose. Children for different purposes are independent of each other."""
+        """Return the source for a narrower purpose, whose words or numbers are appended to this source's.
+
+        Children for different purposes are independent of each other; the same purpose always gives the same numbers.
+        """
         return KeyedRandom(self.seed, self.path + purpose)
 
     @property
     def key(self) -> int:
-        """64-bit BLAKE2b hash of the seed and the path."""
+        """64-bit number that starts this source's random numbers: the BLAKE2b hash of the seed and the purpose."""
         text = repr((self.seed, self.path)).encode()
         return int.from_bytes(hashlib.blake2b(text, digest_size=8).digest(), "little")
 
     def generator(self) -> np.random.Generator:
-        """Return a new NumPy generator, which starts at the beginning of this key's stream on every call."""
+        """Return a new NumPy generator, which starts at the beginning of this source's random numbers on every call."""
         return np.random.Generator(np.random.Philox(key=self.key))
 
     def normals(self, index: mi.UInt32, field: int | mi.UInt32 = 0) -> mi.Array4f:
-        """Draw four independent standard normal numbers per element, on the device.
+        """Draw four independent standard normal numbers for each of n elements (pixels, pulses), on the ray-tracing device.
+
+        The numbers of an element depend on its number alone, not on which other elements are drawn.
 
         Parameters
         ----------
         index : mi.UInt32, (n,)
             Element numbers.
         field : int or mi.UInt32, () or (n,)
-            A second number of the key, such as the pass over the elements.
+            A second number of the key, to draw other numbers for the same elements.
 
         Returns
         -------
@@ -52,7 +65,10 @@ class KeyedRandom:
         return self._philox(index, field).next_float32x4_normal()
 
     def uniforms(self, index: mi.UInt32, field: int | mi.UInt32 = 0) -> mi.Array4f:
-        """Draw four independent numbers in [0, 1) per element, on the device. Arguments as in `normals`."""
+        """Draw four independent numbers in [0, 1) for each of n elements (pixels, pulses), on the ray-tracing device.
+
+        index: (n,) element numbers. field: a second number of the key, to draw other numbers for the same elements.
+        """
         return self._philox(index, field).next_float32x4()
 
     def _philox(self, index: mi.UInt32, field: int | mi.UInt32) -> mi.Philox4x32:

@@ -9,9 +9,10 @@ from typing import Any
 
 
 def lazy_attributes(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Make the `__getattr__` and `__dir__` of a package, which import a module only when one of its names is first used.
+    """Make the `__getattr__` and `__dir__` of a package that imports its modules only when a name is first used.
 
-    homes: for each public name of the package, the module that defines it.
+    This keeps the start of a program fast. package: name of the package. homes: for each public name, the module that defines
+    it.
     """
 
     def load(name: str) -> Any:

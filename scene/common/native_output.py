@@ -11,7 +11,10 @@ from contextlib import contextmanager
 
 @contextmanager
 def suppress_stderr() -> Iterator[None]:
-    """Discard what the process writes to stderr inside the `with` block, C libraries included, unless an exception leaves it."""
+    """Discard what the process writes to stderr inside the `with` block, C libraries included.
+
+    If an exception leaves the block, the text is written after all.
+    """
     sys.stderr.flush()
     stderr = os.dup(2)
     with tempfile.TemporaryFile() as written:

@@ -31,7 +31,7 @@ _UNGROUPED = "export the numbers without thousands separators, as 6389450.123"
 
 @dataclass(frozen=True)
 class RowForm:
-    """How the rows of a text file are written.
+    """How the rows of numbers in a text file (such as a point cloud in .xyz or .csv) are written.
 
     Attributes
     ----------
@@ -59,14 +59,14 @@ class RowForm:
 
 @dataclass
 class RowsFound:
-    """What the parser found besides the values.
+    """What the parser of a text file with rows of numbers found besides the values.
 
     Attributes
     ----------
     missing : int
         Number of missing values.
     blocks : list of (int, int, int)
-        For each block of rows: the stated number of rows, the actual number, and the line that states it.
+        For each block of rows whose length a line states: the stated number of rows, the actual number, and that line's number.
     """
 
     missing: int = 0
@@ -74,9 +74,9 @@ class RowsFound:
 
 
 def split_row(line: str, separator: str | None) -> list[str]:
-    """Split a line into values, without quotation marks and a trailing comment.
+    """Split a line of a text file into its values, without quotation marks and a trailing comment.
 
-    The last value is empty if the line ends with a separator.
+    separator: character between values; None for white space. The last value is empty if the line ends with a separator.
     """
     if "#" in line or "//" in line:
         line = _TRAILING.split(line, maxsplit=1)[0]
@@ -87,28 +87,34 @@ def split_row(line: str, separator: str | None) -> list[str]:
 
 
 def is_number(word: str) -> bool:
-    """Return whether a word is a number. Missing and infinite values, decimal commas and grouped digits count as numbers."""
+    """Return whether a word of a text file is a number, to tell rows of data from headings.
+
+    Missing and infinite values, decimal commas and grouped digits (6,389,450.1) count as numbers.
+    """
     plain = word.lower()
     number = _POINT.fullmatch(word) or _COMMA.fullmatch(word) or _GROUPED.fullmatch(word)
     return bool(number) or plain.removeprefix("-") in _MISSING | _INFINITE or plain in _INFINITE
 
 
 def is_grouped(word: str, *, decimal_comma: bool) -> bool:
-    """Return whether a word is a number with thousands separators: 6,389,450.1, 6.389.450,1, 6'389'450 or 6 389 450."""
+    """Return whether a word is a number with thousands separators: 6,389,450.1, 6.389.450,1, 6'389'450 or 6 389 450.
+
+    decimal_comma: whether numbers use a comma as the decimal mark.
+    """
     if not _GROUPED.fullmatch(word):
         return False
     return not (_POINT.fullmatch(word) or (decimal_comma and _COMMA.fullmatch(word)))
 
 
 def read_rows(lines: Iterable[str], form: RowForm, where: str) -> tuple[NDArray[np.float64], RowsFound]:
-    """Parse lines of text into numbers.
+    """Parse the rows of a text file, such as a point cloud, into an array of numbers.
 
     Parameters
     ----------
     lines : iterable of str
         The lines from number `form.first_line` on. Empty lines and comments are skipped.
     form : RowForm
-        How the rows are written.
+        How the rows are written: separator, decimal mark, number of columns and so on.
     where : str
         Name of the file in error messages.
 

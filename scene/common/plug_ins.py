@@ -10,7 +10,7 @@ from scene.common.errors import InputError
 
 
 def load_plug_ins(group: str, needs: str, is_one: Callable[[Any], bool], taken: Collection[str]) -> dict[str, Any]:
-    """Load the objects that the entry points of a group name ("name = package.module:object").
+    """Load the plug-ins that installed packages offer as entry points of a group ("name = package.module:object").
 
     Parameters
     ----------

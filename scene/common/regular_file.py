@@ -23,7 +23,7 @@ READ_LIMIT = "SCARPSIM_READ_GB"
 def check_file(
     path: Path, *, most_bytes: int | None = None, remedy: str = "check the path", smaller: str = "give a smaller one"
 ) -> Path:
-    """Check that `path` is a regular file that can be read, and return it.
+    """Check that a path is a regular file that can be read, before it is opened; return the path.
 
     Parameters
     ----------
@@ -68,14 +68,16 @@ def read_text(path: Path, *, most_bytes: int | None = None, remedy: str = "check
     path : Path
         The file.
     most_bytes : int, optional
-        Size limit. By default the larger of MOST_TEXT_BYTES and the environment variable READ_LIMIT.
-    remedy, smaller : str
-        What the message advises, as in `check_file`.
+        Size limit, bytes. By default 512 MB, or what the environment variable SCARPSIM_READ_GB allows if that is more.
+    remedy : str
+        What the message advises if the file cannot be used.
+    smaller : str, optional
+        What the message advises if the file is too large; by default to give a smaller one or to raise the limit.
 
     Raises
     ------
     InputError
-        As `check_file` does, and if the file is not UTF-8.
+        If the file is missing, not a regular file, too large or not UTF-8.
     """
     most = max(MOST_TEXT_BYTES, int(read_limit_gb() * 1e9)) if most_bytes is None else most_bytes
     check_file(path, most_bytes=most, remedy=remedy, smaller=smaller or f"give a smaller one, or set the variable {READ_LIMIT}")
@@ -92,10 +94,10 @@ def read_text(path: Path, *, most_bytes: int | None = None, remedy: str = "check
 
 
 def read_json(path: Path, *, remedy: str = "make it again") -> Any:
-    """Read a JSON file.
+    """Read a JSON file; `remedy` is what the error message advises.
 
-    Raises InputError as `read_text` does, if the file is not JSON, and, before reading it, if its contents might take more
-    memory than MOST_JSON_GB or the environment variable READ_LIMIT allows.
+    Raises InputError if the file cannot be read or is not JSON. It also does, before reading, if the contents might take more
+    memory than 1.7 GB or the limit in the environment variable SCARPSIM_READ_GB, whichever is more.
     """
     most = max(MOST_JSON_GB, read_limit_gb())
     size = check_file(path, remedy=remedy).stat().st_size
@@ -120,7 +122,10 @@ def read_json(path: Path, *, remedy: str = "make it again") -> Any:
 
 
 def read_limit_gb() -> float:
-    """Return the limit that the environment variable READ_LIMIT sets, in GB; 0 if it is not set."""
+    """Return how much a user allows to read from one file, GB: the environment variable SCARPSIM_READ_GB; 0 if not set.
+
+    Raises InputError if the variable is not a number above 0.
+    """
     given = os.environ.get(READ_LIMIT)
     if not given:
         return 0.0
@@ -154,9 +159,9 @@ def _json_gb(path: Path, size: int, enough: float) -> float:
 
 
 def bounded_lines(file: IO[AnyStr], count: int, longest: int = 65_536) -> Iterator[AnyStr]:
-    """Yield at most `count` lines of an open file.
+    """Yield at most `count` lines of an open file, such as those that tell its format.
 
-    Raises ValueError for a line longer than `longest`, which would fill the memory.
+    Raises ValueError for a line with more than `longest` characters (bytes of a binary file), which would fill the memory.
     """
     for _ in range(count):
         line = file.readline(longest)

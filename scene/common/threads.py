@@ -13,12 +13,12 @@ Result = TypeVar("Result")
 
 
 def executor(threads: int | None = None) -> ThreadPoolExecutor:
-    """Make a thread pool with `threads` threads, or as many as the process may use cores."""
+    """Make a pool of worker threads. `threads` is their number; None: as many as the process may use processor cores."""
     return ThreadPoolExecutor(threads or len(os.sched_getaffinity(0)))
 
 
 def map_in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Return `work(item)` for every item, in order, computed in threads.
+    """Return `work(item)` for every item, in the order of the items, computed in parallel threads.
 
     Useful for NumPy work that releases Python's global lock. The items must not share data that `work` changes.
     """

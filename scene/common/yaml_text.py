@@ -82,7 +82,10 @@ class _Dumper(yaml.SafeDumper):
 
 
 def parse_yaml(text: str) -> Any:
-    """Parse YAML text into plain data. Raises yaml.YAMLError if it is malformed or asks for other than plain data."""
+    """Parse the text of a YAML file into plain data: dict, list, str, numbers, booleans and None.
+
+    Raises yaml.YAMLError if the text is malformed or asks for other objects.
+    """
     try:
         return yaml.load(text, Loader=_Loader)
     except RecursionError:
@@ -90,6 +93,6 @@ def parse_yaml(text: str) -> Any:
 
 
 def yaml_line(value: Any) -> str:
-    """Write plain data as one line of YAML, which `parse_yaml` reads back."""
+    """Write plain data (dict, list, str, numbers, booleans, None) as one line of YAML, which `parse_yaml` reads back."""
     text = yaml.dump(value, Dumper=_Dumper, default_flow_style=True, width=10**9, allow_unicode=True, sort_keys=False)
     return text.removesuffix("\n").removesuffix("\n...")

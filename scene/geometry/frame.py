@@ -23,7 +23,10 @@ direction up the wall.
 
 
 class FrameConfig(Config):
-    """The direction of the wall frame's z axis, along which difference maps measure change."""
+    """The direction of the wall frame's z axis, along which difference maps measure change.
+
+    The wall frame is a coordinate system whose z axis points out of the rock.
+    """
 
     normal: Literal["mean_plane", "sensor"] | tuple[float, float, float] = Field(
         "mean_plane",
@@ -32,7 +35,7 @@ class FrameConfig(Config):
     )
 
     def fit(self, vertices: FloatArray, towards: FloatArray) -> WallFrame:
-        """Fit the wall frame to a wall.
+        """Fit the wall frame (a coordinate system whose z axis points out of the rock) to a wall, as configured.
 
         Parameters
         ----------
@@ -70,8 +73,8 @@ class FrameConfig(Config):
 class WallFrame:
     """The rigid transform from the world frame to the wall frame: x_wall = R (x_world - origin).
 
-    The world frame has the survey's coordinates, m. The origin is subtracted first, so that micrometres survive with UTM-sized
-    coordinates.
+    R is `rotation`. The wall frame's z axis points out of the rock, so that x and y run along the wall. The world frame has the
+    survey's coordinates, m. The origin is subtracted first, so that micrometres survive with UTM-sized coordinates.
 
     Attributes
     ----------
@@ -86,14 +89,14 @@ class WallFrame:
 
     @classmethod
     def fit(cls, vertices: FloatArray, towards: FloatArray) -> WallFrame:
-        """Fit a frame whose z axis is the normal of the vertices' mean plane (least squares, by SVD).
+        """Fit the wall frame to a wall: its z axis is the normal of the vertices' mean plane (least squares, by SVD).
 
         The origin lies in the mean plane at the smallest x and y of the vertices.
 
         Parameters
         ----------
         vertices : (n, 3) array
-            World frame, m.
+            Vertices of the wall, world frame, m.
         towards : (3,) array
             A point on the sensors' side of the wall, world frame, m. It fixes the sign of the normal.
 
@@ -115,7 +118,7 @@ class WallFrame:
 
     @classmethod
     def along(cls, normal: FloatArray, vertices: FloatArray, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> WallFrame:
-        """Make the frame with a given z axis, whose y axis points up the wall.
+        """Make the wall frame with a given z axis, whose y axis points up the wall.
 
         The origin lies in the plane through the mean of the vertices, at their smallest x and y.
 
@@ -124,7 +127,7 @@ class WallFrame:
         normal : (3,) array
             Unit vector along z, world frame.
         vertices : (n, 3) array
-            World frame, m.
+            Vertices of the wall, world frame, m.
         up : tuple of 3 floats
             The vertical, world frame.
         """
@@ -140,7 +143,7 @@ class WallFrame:
 
     @classmethod
     def identity(cls) -> WallFrame:
-        """Return the frame that equals the world frame."""
+        """Return the frame that equals the world frame, for data whose coordinates need no transformation."""
         return cls(np.eye(3), np.zeros(3))
 
     @property
@@ -160,5 +163,5 @@ class WallFrame:
         return np.einsum("ji,...j->...i", self.rotation, points) + self.origin
 
     def direction_to_wall(self, directions: FloatArray) -> FloatArray:
-        """Rotate direction vectors (..., 3) from the world to the wall frame; the origin plays no role."""
+        """Rotate direction vectors (..., 3) from the world to the wall frame, without the shift of origin that points need."""
         return np.einsum("ij,...j->...i", self.rotation, directions)

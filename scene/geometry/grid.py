@@ -11,7 +11,7 @@ from scene.geometry.mesh import FloatArray
 
 @dataclass(frozen=True)
 class Grid:
-    """A raster of square pixels, with row 0 at the top (largest y) and column 0 at the left (smallest x).
+    """A raster of square pixels over the wall, with row 0 at the top (largest y) and column 0 at the left (smallest x).
 
     The centre of pixel (row, column) is (x_min + (column + 0.5) gsd, y_max - (row + 0.5) gsd).
 
@@ -33,7 +33,10 @@ class Grid:
 
     @classmethod
     def over(cls, bounds: FloatArray, gsd: float) -> Grid:
-        """Make the grid of all whole pixels inside `bounds`, (2, 2 or 3) smallest and largest coordinates, m."""
+        """Make the raster of all whole pixels with side `gsd`, m, inside `bounds`.
+
+        bounds: (2, 2) or (2, 3) array of smallest and largest coordinates, m.
+        """
         extent = bounds[1] - bounds[0]
         width, height = (max(int(np.floor(extent[axis] / gsd + 1e-9)), 1) for axis in (0, 1))
         return cls(float(bounds[0, 0]), float(bounds[1, 1]), gsd, width, height)
@@ -44,9 +47,9 @@ class Grid:
         return self.height, self.width
 
     def columns(self, x: FloatArray) -> FloatArray:
-        """Convert x, m, to columns in pixels from the left edge. The centre of pixel k is at k + 0.5."""
+        """Convert coordinates x, m, of any shape to columns in pixels from the left edge; the centre of column k is k + 0.5."""
         return (x - self.x_min) / self.gsd
 
     def rows(self, y: FloatArray) -> FloatArray:
-        """Convert y, m, to rows in pixels from the top edge. The centre of pixel k is at k + 0.5."""
+        """Convert coordinates y, m, of any shape to rows in pixels from the top edge; the centre of row k is k + 0.5."""
         return (self.y_max - y) / self.gsd

@@ -22,20 +22,27 @@ _CHUNK = 1 << 18
 
 
 def area_normals(corners: FloatArray) -> FloatArray:
-    """Return the (n, 3) normals of triangles with corners (n, 3, 3). The length of a normal is twice the triangle's area."""
+    """Return the normals (n, 3) of n triangles, as long as twice the triangle's area, for means that are weighted by area.
+
+    corners: (n, 3, 3) array with the three corners of each triangle, counter-clockwise seen from the side of the normal.
+    """
     return np.asarray(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
 
 
 def signed_volumes(corners: FloatArray) -> FloatArray:
     """Return six times the signed volumes (n,) of the tetrahedra from the origin to triangles with corners (n, 3, 3).
 
-    A volume is positive if the triangle's normal points away from the origin.
+    Their sum over a closed mesh is six times its volume. A volume is positive if the triangle's normal points away from the
+    origin.
     """
     return np.asarray(np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])))
 
 
 def barycentric(point: FloatArray, corners: FloatArray) -> FloatArray:
-    """Return the barycentric weights (n, 3) of points (n, 3) in triangles with corners (n, 3, 3)."""
+    """Return the barycentric weights (n, 3) of points in triangles, to interpolate values given at the triangles' corners.
+
+    point: (n, 3), one in the plane of each triangle. corners: (n, 3, 3).
+    """
     one, other, within = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], point - corners[:, 0]
     a, b, c = (np.einsum("ni,ni->n", *pair) for pair in ((one, one), (one, other), (other, other)))
     d, e = (np.einsum("ni,ni->n", within, side) for side in (one, other))
@@ -45,7 +52,7 @@ def barycentric(point: FloatArray, corners: FloatArray) -> FloatArray:
 
 
 def compact_vertices(faces: NDArray[np.integer]) -> tuple[NDArray[np.int64], IntArray]:
-    """Find the vertices that faces use and renumber the faces accordingly.
+    """Find the vertices that some faces (m, 3) use, and renumber the faces accordingly, to make a mesh of part of another.
 
     Returns the used vertices (k,) in ascending order, and the faces (m, 3) as positions in that list.
     """
@@ -61,7 +68,7 @@ def compact_vertices(faces: NDArray[np.integer]) -> tuple[NDArray[np.int64], Int
 
 @dataclass(frozen=True)
 class TriangleMesh:
-    """Triangles with shared vertices, counter-clockwise seen from outside (for a wall: from the sensors' side).
+    """A mesh of triangles with shared vertices, counter-clockwise seen from outside (for a wall: from the sensors' side).
 
     Attributes
     ----------
@@ -72,7 +79,7 @@ class TriangleMesh:
     vertex_albedo : (n,) float32 array, optional
         Albedo in [0, 1].
     vertex_block, face_block : (n,) and (m,) int32 arrays, optional
-        The block whose removal created this vertex or face; WALL (0) elsewhere.
+        Label of the fallen block whose removal created this vertex or face; WALL (0) elsewhere.
     """
 
     vertices: FloatArray
@@ -83,38 +90,47 @@ class TriangleMesh:
 
     @property
     def bounds(self) -> FloatArray:
-        """(2, 3) smallest and largest coordinates, m."""
+        """(2, 3) smallest and largest coordinates of the mesh's vertices, m."""
         return np.array([[column.min() for column in self.vertices.T], [column.max() for column in self.vertices.T]])
 
     @cached_property
     def edges(self) -> NDArray[np.int64]:
-        """Return an integer for each of the 3 m sides of the m triangles.
+        """Return an integer (3 m,) for each side of the m triangles, to find sides that triangles share.
 
-        Sides between the same two vertices have the same integer in either direction. Sides 0-1 of all triangles come first, then
-        1-2, then 2-0.
+        Sides between the same two vertices have the same integer in either direction. Sides 0-1 (between a triangle's corners 0
+        and 1) of all triangles come first, then 1-2, then 2-0.
         """
         start, stop = self.faces.T.ravel(), self.faces[:, [1, 2, 0]].T.ravel()
         return np.minimum(start, stop).astype(np.int64) * len(self.vertices) + np.maximum(start, stop)
 
     @cached_property
     def edge_order(self) -> NDArray[np.int64]:
-        """(3 m,) indices that sort `edges`; equal ones keep their order."""
+        """(3 m,) indices that sort the integers of the triangles' sides (`edges`), so that shared sides follow one another.
+
+        Equal ones keep their order.
+        """
         return np.argsort(self.edges, kind="stable")
 
     @cached_property
     def shared_edges(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """The two positions (k,) in `edges` of each edge that exactly two triangles share."""
+        """Positions (k,) and (k,) in the array `edges` of the two sides of each edge that exactly two triangles share.
+
+        Position p is a side of triangle p modulo m, where m is the number of triangles.
+        """
         order, ordered = self.edge_order, self.edges[self.edge_order]
         again = np.concatenate([[False], ordered[1:] == ordered[:-1], [False]])
         twin = np.flatnonzero(again[1:-1] & ~again[:-2] & ~again[2:])
         return order[twin], order[twin + 1]
 
     def with_vertices(self, vertices: FloatArray) -> TriangleMesh:
-        """Return the same triangles with moved vertices."""
+        """Return a mesh with the same triangles and labels, but with vertices moved to new positions (n, 3), m."""
         return replace(self, vertices=vertices)
 
     def submesh(self, faces: NDArray[np.integer] | NDArray[np.bool_] | slice = slice(None)) -> TriangleMesh:
-        """Return a mesh of some of the faces, or all of them, with only the vertices that they use."""
+        """Return a mesh of some of the faces, or all of them, with only the vertices that they use.
+
+        faces: numbers (k,) of the faces, a mask (m,) or a slice.
+        """
         used, numbered = compact_vertices(self.faces[faces])
         return TriangleMesh(
             self.vertices[used],
@@ -125,23 +141,29 @@ class TriangleMesh:
         )
 
     def corners(self, faces: NDArray[np.integer] | slice = slice(None)) -> FloatArray:
-        """Return the corners (k, 3, 3) of some of the faces, or of all."""
+        """Return the coordinates (k, 3, 3), m, of the three corners of some of the faces, or of all.
+
+        faces: numbers (k,) of the faces, or a slice.
+        """
         return self.vertices[self.faces[faces]]
 
     def face_normals(self, faces: NDArray[np.integer] | slice = slice(None)) -> FloatArray:
-        """Return the unit normals (k, 3) of some of the faces, or of all; zero for a face without area."""
+        """Return the unit normals (k, 3) of some of the faces, or of all; zero for a face without area.
+
+        faces: numbers (k,) of the faces, or a slice.
+        """
         normal = area_normals(self.corners(faces))
         return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
 
     @cached_property
     def normals(self) -> FloatArray:
-        """(m, 3) unit normals of all faces. They are cached for meshes that are hit by many rays repeatedly."""
+        """(m, 3) unit normals of all faces, computed once and then kept."""
         return self.face_normals()
 
     def vertex_normals(self) -> FloatArray:
-        """Compute outward unit normals (n, 3): the area-weighted mean of the adjacent faces' normals.
+        """Compute outward unit normals (n, 3) at the n vertices: the area-weighted mean of the adjacent faces' normals.
 
-        An unused vertex has NaN.
+        A vertex that no face uses has NaN.
         """
         total = np.zeros((3, len(self.vertices)))
         for start in range(0, len(self.faces), _CHUNK):

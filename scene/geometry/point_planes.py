@@ -28,7 +28,9 @@ _AS_WHITE = 1.2
 
 @dataclass(frozen=True)
 class PointPlanes:
-    """Least-squares planes through the 24 nearest neighbours of each point, the point itself included.
+    """Planes fitted to a point cloud by least squares, one through the 24 nearest neighbours of each point (itself included).
+
+    They give the surface's normals, and how rough or noisy it is.
 
     Attributes
     ----------
@@ -37,7 +39,7 @@ class PointPlanes:
     scatter_m : (n,) array
         Root mean square distance of the 24 points from their plane, m.
     median_scatter_m : float
-        Median of the scatter along the rays from the viewpoint, m.
+        Median over the points of the scatter, measured along the rays from the viewpoint, m.
     noise_dominates : bool
         Whether the scatter is mostly independent noise of each point rather than relief.
     """
@@ -49,10 +51,11 @@ class PointPlanes:
 
     @classmethod
     def of(cls, points: FloatArray, viewpoint: FloatArray) -> PointPlanes:
-        """Fit the planes to points (n, 3), m, seen from `viewpoint` (3,), m.
+        """Fit a plane to the 24 nearest neighbours of each point of a cloud.
 
-        The normal is the eigenvector of the neighbours' covariance with the smallest eigenvalue (Hoppe et al. 1992, Surface
-        reconstruction from unorganized points); the scatter is the square root of that eigenvalue.
+        points: (n, 3), m. viewpoint: (3,) position of the sensor, m. The normal is the eigenvector of the neighbours'
+        covariance with the smallest eigenvalue (Hoppe et al. 1992, Surface reconstruction from unorganized points); the scatter
+        is the square root of that eigenvalue.
         """
         normal, scatter = _planes(points)
         ray = points - viewpoint
@@ -61,7 +64,10 @@ class PointPlanes:
         return cls(normal, scatter, float(np.median(_along(ray, normal, scatter))), noise_dominates)
 
     def along(self, rays: FloatArray, point: NDArray[np.int32]) -> FloatArray:
-        """Return the scatter (n, k), m, about the planes of points `point` (n, k), measured along unit rays (n, 3)."""
+        """Return the scatter (n, k), m, of points about their fitted planes, measured along rays, not normal to the planes.
+
+        rays: (n, 3) unit vectors. point: (n, k) numbers of the points whose planes are meant, k for each ray.
+        """
         return _along(rays[:, None], self.normal[point], self.scatter_m[point])
 
 
@@ -93,9 +99,10 @@ def _along(rays: FloatArray, normal: FloatArray, scatter: FloatArray) -> FloatAr
 def estimate_point_noise(points: FloatArray, viewpoint: FloatArray) -> float | None:
     """Estimate the standard deviation, m, of the independent noise of points (n, 3) along the rays from `viewpoint` (3,).
 
-    A sample of points is compared with two planes: through the 8 nearest neighbours, and through the 16 after those.
-    Independent noise gives nearly the same residuals from both, while relief gives larger ones from the second. Returns None
-    if the second are too large for noise to dominate, or if there are too few points.
+    For a sample of points, the distance of each point from two planes is compared: the plane through its 8 nearest neighbours,
+    and the one through the 16 after those. Independent noise gives nearly the same residuals from both, while relief gives
+    larger ones from the second. Returns None if the second are too large for noise to dominate, or if there are too few points.
+    All lengths are in m.
     """
     from scipy.spatial import cKDTree
 

@@ -15,14 +15,15 @@ _MOST_CELLS = 4e6
 _CELLS_PER_BOX = 8
 """Number of cells along the shortest side of the smallest box, if the largest number of cells allows it."""
 
-_CHUNK = 1 << 19
-"""Number of faces looked up at a time, to limit the memory of intermediate arrays."""
+_CHUNK = 1 << 15
+"""Number of faces looked up at a time, so that intermediate arrays stay in the processor's cache."""
 
 
 def faces_under_boxes(mesh: TriangleMesh, boxes: FloatArray, halo_m: float = 0.0) -> IntArray:
-    """Find all faces that lie under one of the boxes, and a few beside them (within one raster cell).
+    """Find the faces of a wall that lie under boxes, such as those of fallen blocks, to process only this part of the wall.
 
-    A face lies under a box if their projections on XY overlap, at any height.
+    A face lies under a box if their projections on the xy plane overlap, at any height. A few faces beside the boxes, within
+    one cell of the raster that the search uses, may be included.
 
     Parameters
     ----------
@@ -62,7 +63,10 @@ def faces_under_boxes(mesh: TriangleMesh, boxes: FloatArray, halo_m: float = 0.0
 
 
 def integral_image(raster: NDArray[np.generic]) -> IntArray:
-    """Return the integral image (h + 1, w + 1) of a raster: entry (i, j) is the sum over rows below i and columns below j."""
+    """Return the integral image (h + 1, w + 1) of a raster (h, w), from which sums over rectangles are read quickly.
+
+    Entry (i, j) is the sum over rows below i and columns below j.
+    """
     sums = np.zeros((raster.shape[0] + 1, raster.shape[1] + 1), dtype=np.int32)
     np.cumsum(raster, axis=0, dtype=np.int32, out=sums[1:, 1:])
     np.cumsum(sums[1:, 1:], axis=1, out=sums[1:, 1:])

@@ -35,12 +35,12 @@ _DIRECTION = np.array([0.5377, 0.6349, 0.5548])
 
 
 def clean(mesh: TriangleMesh, where: str, origin: FloatArray | None = None) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """Repair a mesh and report what was repaired.
+    """Repair a mesh that a user imports (duplicate vertices and triangles, wrong winding) and report what was repaired.
 
     Parameters
     ----------
     mesh : TriangleMesh
-        In local coordinates near the origin, m, so that float64 resolves far less than a micrometre.
+        The mesh, in local coordinates near the origin, m, so that float64 resolves far less than a micrometre.
     where : str
         Name of the mesh in error messages, such as its file.
     origin : (3,) array, optional
@@ -74,9 +74,9 @@ def clean(mesh: TriangleMesh, where: str, origin: FloatArray | None = None) -> t
 
 
 def weld(mesh: TriangleMesh) -> Repaired:
-    """Merge vertices that lie within WELD_M of each other, directly or through a chain of such vertices.
+    """Merge vertices that lie within 1 micrometre of each other, directly or through a chain of such vertices.
 
-    The first one is kept.
+    The first one is kept. Returns the repaired mesh, and the repair in words with its count ("" if none).
     """
     first, inverse = unique_rows(mesh.vertices + 0.0)  # + 0.0: minus zero is zero
     near = _near_pairs(mesh.vertices[first])
@@ -92,13 +92,20 @@ def weld(mesh: TriangleMesh) -> Repaired:
 
 
 def drop_degenerate(mesh: TriangleMesh) -> Repaired:
-    """Remove triangles without an area: two equal corners, or three corners on one line."""
+    """Remove triangles without an area: two equal corners, or three corners on one line.
+
+    Returns the repaired mesh, and the repair in words with its count ("" if none).
+    """
     keep = _in_chunks(mesh, _has_area, bool)
     return _drop_faces(mesh, keep, "degenerate triangles removed")
 
 
 def drop_duplicates(mesh: TriangleMesh, origin: FloatArray | None = None) -> Repaired:
-    """Remove all but the first of the triangles with the same three vertices, whatever their winding."""
+    """Remove all but the first of the triangles with the same three vertices, whatever their winding.
+
+    origin: (3,) origin of the mesh's coordinates in the user's coordinate system, m, for the report alone. Returns the repaired
+    mesh, and the repair in words with its count ("" if none).
+    """
     first, _ = unique_rows(np.sort(mesh.faces, axis=1))
     keep = np.zeros(len(mesh.faces), bool)
     keep[first] = True
@@ -106,17 +113,22 @@ def drop_duplicates(mesh: TriangleMesh, origin: FloatArray | None = None) -> Rep
 
 
 def unify_winding(mesh: TriangleMesh, where: str) -> Repaired:
-    """Flip the triangles that are wound opposite to the majority of their connected piece."""
+    """Flip the triangles that are wound opposite to the majority of their connected piece.
+
+    where: name of the mesh in error messages. Returns the repaired mesh, and the repair in words with its count ("" if none).
+    Raises InputError for a surface with only one side.
+    """
     odd = inconsistent_faces(mesh, where)
     return (flip_faces(mesh, odd), f"{int(odd.sum())} triangles wound the other way round") if odd.any() else (mesh, "")
 
 
 def inconsistent_faces(mesh: TriangleMesh, where: str) -> NDArray[np.bool_]:
-    """Find the triangles (m,) that are wound opposite to the majority of their connected piece. Vertices must be welded.
+    """Find the triangles that are wound opposite to the majority of their connected piece: a bool array (m,).
 
-    Each triangle is represented twice in a graph, as it is and flipped; neighbours are joined so that their windings agree. A
-    piece whose two copies are connected has only one side, which raises InputError. Triangles are not neighbours across an
-    edge that more than two of them share.
+    Vertices must be welded (no two at the same place). Each triangle is represented twice in a graph, as it is and flipped;
+    neighbours are joined so that their windings agree. A piece whose two copies are connected has only one side, which raises
+    InputError. Triangles are not neighbours across an edge that more than two of them share. `where` is the name of the mesh in
+    error messages.
     """
     count = len(mesh.faces)
     pair, same = _neighbours(mesh)
@@ -141,7 +153,8 @@ def separate_touching_parts(mesh: TriangleMesh) -> Repaired:
     """Give parts of the surface that touch in a vertex or along an edge vertices of their own.
 
     No triangle is removed. Parts that touch, such as a rock on the ground, keep their positions but are no longer connected.
-    Triangles are connected across an edge that exactly two of them share. The mesh must be consistently wound.
+    Triangles are connected across an edge that exactly two of them share. The mesh must be consistently wound. Returns the
+    repaired mesh, and the repair in words with its count ("" if none).
     """
     pinched = _pinched(mesh)
     if not pinched.any():
@@ -169,14 +182,17 @@ def separate_touching_parts(mesh: TriangleMesh) -> Repaired:
 
 
 def drop_unused(mesh: TriangleMesh) -> Repaired:
-    """Remove the vertices that no triangle uses."""
+    """Remove the vertices that no triangle uses.
+
+    Returns the repaired mesh, and the repair in words with its count ("" if none).
+    """
     kept = mesh.submesh()
     unused = len(mesh.vertices) - len(kept.vertices)
     return (kept, f"{unused} unused vertices removed") if unused else (mesh, "")
 
 
 def describe_pieces(mesh: TriangleMesh) -> str:
-    """Describe the pieces that are not connected to the main surface; "" if there are none."""
+    """Describe in words, for a report, the pieces of a mesh that are not connected to its largest one; "" if there are none."""
     label = connected_groups(mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2), len(mesh.vertices))
     sizes = np.sort(np.bincount(label[mesh.faces[:, 0]]))
     if len(sizes) == 1:
@@ -185,12 +201,15 @@ def describe_pieces(mesh: TriangleMesh) -> str:
 
 
 def flip_faces(mesh: TriangleMesh, which: NDArray[np.bool_]) -> TriangleMesh:
-    """Return the mesh with the winding of the triangles `which` reversed."""
+    """Return the mesh with the winding of some triangles reversed, so that they face the other side.
+
+    which: (m,) mask of the triangles to flip.
+    """
     return replace(mesh, faces=np.where(which[:, None], mesh.faces[:, ::-1], mesh.faces))
 
 
 def triangle_areas(mesh: TriangleMesh) -> FloatArray:
-    """Return the areas (m,) of the triangles, m2."""
+    """Return the area of each of a mesh's m triangles, (m,), m2."""
     return _in_chunks(mesh, _areas, float)
 
 
@@ -224,10 +243,10 @@ def _squared(vectors: FloatArray) -> FloatArray:
 
 
 def unique_rows(rows: NDArray[np.generic]) -> tuple[Index, Index]:
-    """Find groups of equal rows (n, 3).
+    """Find groups of equal rows in an array (n, 3), such as vertices at the same place.
 
-    Returns the index of the first row of each group, in order of appearance, and the group of every row. Rows are sorted by a
-    64-bit hash; should two different rows share a hash, they are sorted in full.
+    Returns the index of the first row of each group, in order of appearance, and the group of every row (n,). Rows are sorted
+    by a 64-bit hash; should two different rows share a hash, they are sorted in full.
     """
     key = np.zeros(len(rows), np.uint64)
     for column in rows.T.astype(f"{rows.dtype.kind}8"):
@@ -263,7 +282,10 @@ def _near_pairs(vertices: FloatArray) -> Index:
 
 
 def connected_groups(pairs: NDArray[np.integer], count: int) -> Index:
-    """Return the connected group (count,) of each element, given linked pairs (k, 2); groups are numbered by first appearance.
+    """Find which elements, such as triangles, are connected, directly or through others.
+
+    pairs: (k, 2) numbers of linked elements. count: number of elements. Returns the number of each element's group (count,);
+    groups are numbered by first appearance.
 
     Every element points to the smallest member of its group known so far. A round links the groups that a pair joins to the
     smaller one, then follows the pointers to their ends (Shiloach and Vishkin 1982). SciPy's version takes as long, and its

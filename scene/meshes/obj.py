@@ -26,16 +26,19 @@ _HEAD_BYTES = 4096
 
 
 def has_plain_faces(text: bytes) -> bool:
-    """Return whether all faces of an OBJ file are triangles with positive indices, which trimesh reads correctly."""
+    """Return whether all faces of an OBJ file are triangles with positive indices, which the library trimesh reads correctly.
+
+    text: the contents of the file.
+    """
     return _OTHER_FACE.search(text) is None
 
 
 def with_plain_faces(text: bytes) -> bytes:
-    """Replace negative indices by positive ones, and concave polygons by triangles.
+    """Rewrite an OBJ file's text so that other readers understand it: positive indices, and triangles for concave polygons.
 
     An index of -1 refers to the last vertex before the face, not to the last one of the file (Wavefront, "Object Files",
-    section on referencing vertices). Texture coordinates and normals are counted separately in the same way. Only polygons
-    that a fan of triangles would not fill are divided.
+    section on referencing vertices). Texture coordinates and normals are counted separately in the same way. Only polygons that
+    a fan of triangles would not fill are divided.
     """
     counts = {b"v": 0, b"vt": 0, b"vn": 0}
     vertices: list[list[bytes]] = []
@@ -85,10 +88,10 @@ def _absolute(corner: bytes, counts: tuple[int, ...]) -> bytes:
 
 
 def unit_in_comments(text: bytes) -> tuple[str, str] | None:
-    """Find the unit of length that a comment at the beginning of the file states.
+    """Find the unit of length that a comment at the beginning of an OBJ file states.
 
-    Comments such as "# units: mm" and "# ..., where 1 unit = 1.000000 mm" are understood; a count other than 1 is not. Returns
-    the unit (a key of `METRES`) and the comment, or None.
+    Comments such as "# units: mm" and "# ..., where 1 unit = 1.000000 mm" are understood; a count other than 1 is not. `text`
+    is the file's contents. Returns the unit, such as "mm", and the comment, or None.
     """
     for found in _UNIT_IN_COMMENT.finditer(text[:_HEAD_BYTES]):
         unit = _UNITS.get(found["unit"].decode().lower())

@@ -19,10 +19,11 @@ _WITHOUT_LETTERS = bytes.maketrans(b"vf", b"  ")
 
 
 def read_triangles(text: bytes) -> TriangleMesh | None:
-    """Read an OBJ file of triangles with positive indices; vertices and triangles keep the file's order.
+    """Read an OBJ file of triangles with positive indices, quickly; vertices and triangles keep the file's order.
 
-    Texture coordinates, normals, groups and materials are ignored. Returns None for a file with anything else, such as polygons,
-    negative indices, vertex colours, curves or malformed lines; a complete reader then has to judge it.
+    `text` is the file's contents. Texture coordinates, normals, groups and materials are ignored. Returns None for a file with
+    anything else, such as polygons, negative indices, vertex colours, curves or malformed lines; a complete reader then has to
+    judge it.
     """
     if b"\\" in text:  # lines that go on in the next one
         return None

@@ -46,7 +46,7 @@ class _Element:
 
 
 def read_elements(path: Path, only: str = "") -> dict[str, Columns]:
-    """Read the elements of a PLY file.
+    """Read the elements (tables such as "vertex" and "face") of a PLY file, a format for meshes and point clouds.
 
     Parameters
     ----------
@@ -83,7 +83,10 @@ def read_elements(path: Path, only: str = "") -> dict[str, Columns]:
 
 
 def header_remarks(path: Path) -> list[str]:
-    """Return the comments in the header of a file that `read_elements` has read."""
+    """Return the comments in the header of a PLY file, which may state its unit or origin.
+
+    The file must be one that `read_elements` has read without an error.
+    """
     with path.open("rb") as file:
         return [" ".join(words[1:]) for words in _header_lines(file) if words[:1] in (["comment"], ["obj_info"])]
 

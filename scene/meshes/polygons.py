@@ -36,7 +36,11 @@ def triangulate_polygons(vertices: FloatArray, polygons: NDArray[np.integer]) ->
 
 
 def fan_is_valid(vertices: FloatArray, polygons: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Return, for each polygon (p,), whether all triangles of a fan about its first corner face the polygon's own side."""
+    """Find which polygons may be divided into a fan of triangles about their first corner: a bool array (p,).
+
+    They are those for which all triangles of the fan face the polygon's own side. vertices: (n, 3) coordinates. polygons: (p,
+    k) vertices of each polygon, in order.
+    """
     spokes = vertices[polygons[:, 1:]] - vertices[polygons[:, :1]]
     normals = np.cross(spokes[:, :-1], spokes[:, 1:])
     return np.asarray(np.all(np.einsum("ptj,pj->pt", normals, normals.sum(axis=1)) >= 0.0, axis=1))

@@ -38,7 +38,7 @@ _FACES = 100_000
 
 @dataclass(frozen=True)
 class RoundedAxis:
-    """An axis whose coordinates were rounded.
+    """A coordinate axis along which the coordinates of a mesh or point cloud were rounded, and to what.
 
     Attributes
     ----------
@@ -47,9 +47,9 @@ class RoundedAxis:
     step_m : float
         All coordinates are multiples of this step, m.
     binary : bool
-        Whether the step is a power of 2, as single precision leaves it.
+        Whether the step is a power of 2, as single precision (float32) leaves it.
     float32 : bool
-        Whether single precision of the present coordinates explains the step.
+        Whether storing the present coordinates in single precision explains the step.
     largest_m : float
         Largest absolute coordinate, m.
     """
@@ -66,7 +66,10 @@ class RoundedAxis:
 
 
 def rounding_step(values: FloatArray) -> float:
-    """Return the coarsest step, a power of 2 or of 10, that divides all differences of `values` (n,); 0 if there is none."""
+    """Find the step to which numbers (n,) were rounded: the coarsest power of 2 or of 10 that divides all their differences.
+
+    Returns 0 if there is none.
+    """
     apart = values - values[0]
     noise = 8 * np.finfo(float).eps * float(np.abs(values).max())
     few = apart[:: max(len(apart) // _SAMPLE, 1)]
@@ -77,14 +80,14 @@ def rounding_step(values: FloatArray) -> float:
 
 
 def check_rounding(mesh: TriangleMesh, metres: float, where: str) -> tuple[str, ...]:
-    """Check whether the coordinates of a mesh were rounded.
+    """Check whether the coordinates of an imported mesh were rounded, for example by a file format in single precision.
 
     Parameters
     ----------
     mesh : TriangleMesh
         The mesh as read, in the file's unit.
     metres : float
-        Metres per unit.
+        Metres per unit of the mesh's coordinates.
     where : str
         Name of the file in error messages.
 
@@ -96,8 +99,8 @@ def check_rounding(mesh: TriangleMesh, metres: float, where: str) -> tuple[str, 
     Raises
     ------
     InputError
-        If the rounding spoils the surface: its step exceeds 1 mm and a twentieth of the median edge or, with single precision,
-        5 mm.
+        If the rounding spoils the surface: its step exceeds 1 mm and also a twentieth of the median edge length or, with single
+        precision, 5 mm.
     """
     corners = mesh.vertices[mesh.faces[:: max(len(mesh.faces) // _FACES, 1)]]
     sides = np.abs(corners - np.roll(corners, 1, axis=1))
@@ -127,7 +130,7 @@ def check_steps(rounded: Sequence[RoundedAxis], spacing_m: float, where: str, sp
     Raises
     ------
     InputError
-        If a step exceeds 1 mm and a twentieth of the spacing or, if it stems from single precision, 5 mm.
+        If a step exceeds 1 mm and also a twentieth of the spacing or, if it stems from single precision, 5 mm.
     """
     limit = max(_HARMLESS_M, _SHARE_OF_EDGE * spacing_m)
     limits = {each.axis: min(limit, _HARMFUL_M) if each.binary else limit for each in rounded}
@@ -152,7 +155,8 @@ def rounded_axes(points: FloatArray, metres: float = 1.0, sides: FloatArray | No
     metres : float
         Metres per unit of the coordinates.
     sides : (m, 3, 3) array, optional
-        Absolute coordinate differences along the sides of the triangles between the points.
+        Absolute coordinate differences along the sides of the m triangles between the points; None for a cloud without
+        triangles.
 
     Returns
     -------

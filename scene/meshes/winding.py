@@ -21,7 +21,9 @@ _GEOCENTRIC_M = 6.3e6, 6.5e6
 def orient_to_sensors(
     mesh: TriangleMesh, viewpoints: list[FloatArray], where: str, *, cleaned: bool = False, scene: RayCaster | None = None
 ) -> Repaired:
-    """Wind each connected piece of a mesh consistently, and counter-clockwise as seen from the sensors.
+    """Order the corners of all triangles counter-clockwise as seen from the sensors, so that normals point to them.
+
+    This is done for each connected piece of the mesh.
 
     A piece that mostly shows its back is flipped. Vertices do not change.
 
@@ -65,7 +67,7 @@ def orient_to_sensors(
 
 
 def check_distances(vertices: FloatArray, viewpoints: Mapping[str, FloatArray], where: str) -> None:
-    """Raise InputError if a sensor is so far from the surface that the two cannot be in one coordinate system.
+    """Check that sensors and surface are in one coordinate system: raise InputError if a sensor is implausibly far away.
 
     Parameters
     ----------

@@ -41,7 +41,7 @@ _SIGHTS = 4096
 
 @dataclass(frozen=True)
 class Hits:
-    """What n rays hit, as lazy device arrays. Where `valid` is False, the other entries have no meaning.
+    """What n rays hit: lazy arrays of the ray-tracing device. Where `valid` is False, the other entries have no meaning.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Hits:
     albedo : (n,) float32
         Mean albedo of the face.
     block : (n,) int32
-        Block label of the face; WALL for a miss.
+        Label of the fallen block whose niche the face belongs to; WALL (0) for the wall or a miss.
     """
 
     valid: mi.Bool
@@ -67,8 +67,23 @@ class Hits:
     block: mi.Int32
 
 
+def check_castable(mesh: TriangleMesh) -> None:
+    """Raise InputError if a mesh has no triangles, or lies too far from the origin for single precision."""
+    if len(mesh.faces) == 0:
+        raise InputError("the mesh has no triangles", where="ray casting", remedy="use a mesh with triangles")
+    if not np.abs(mesh.bounds).max() < _LARGEST_COORDINATE:
+        raise InputError(
+            f"coordinates reach {np.abs(mesh.bounds).max():.0f} m, too far from the origin for single precision",
+            where="ray casting",
+            allowed=f"less than {_LARGEST_COORDINATE:.0f} m",
+            remedy="check the mesh's unit, or subtract its centre from the coordinates of mesh and sensor",
+        )
+
+
 class RayCaster:
     """A mesh prepared for ray casting, in a frame whose origin is near (the wall frame).
+
+    The ray tracer works in single precision, which needs small coordinates; distances are then refined to double precision.
 
     Attributes
     ----------
@@ -79,15 +94,7 @@ class RayCaster:
     """
 
     def __init__(self, mesh: TriangleMesh) -> None:
-        if len(mesh.faces) == 0:
-            raise InputError("the mesh has no triangles", where="ray casting", remedy="use a mesh with triangles")
-        if not np.abs(mesh.bounds).max() < _LARGEST_COORDINATE:
-            raise InputError(
-                f"coordinates reach {np.abs(mesh.bounds).max():.0f} m, too far from the origin for single precision",
-                where="ray casting",
-                allowed=f"less than {_LARGEST_COORDINATE:.0f} m",
-                remedy="check the mesh's unit, or subtract its centre from the coordinates of mesh and sensor",
-            )
+        check_castable(mesh)
         self.mesh = mesh
         shape = mi.Mesh("surface", len(mesh.vertices), len(mesh.faces))
         parameters = mi.traverse(shape)
@@ -135,7 +142,7 @@ class RayCaster:
         return sum((dr.gather(mi.Float32, albedo, number) for number in vertex), mi.Float32(0)) / 3
 
     def intersect(self, origin: mi.Array3f64, direction: mi.Array3f64, *, coherent: bool = True, exact: bool = False) -> Hits:
-        """Cast n rays.
+        """Cast n rays and return the first face that each hits, with distance, normal and albedo.
 
         Parameters
         ----------
@@ -206,7 +213,7 @@ class RayCaster:
         return distance, (u >= -_ROUNDING) & (v >= -_ROUNDING) & (u + v <= 1 + _ROUNDING) & (distance > 0)
 
     def occluded(self, origin: mi.Array3f64, direction: mi.Array3f64, length: mi.Float64, *, coherent: bool = True) -> mi.Bool:
-        """Return whether anything lies on each ray nearer than `length` (n,).
+        """Return whether the mesh blocks each of n rays within `length`, such as a ray towards the sun or the other camera.
 
         Parameters
         ----------
@@ -215,36 +222,41 @@ class RayCaster:
         length : (n,) float64
             Distance in lengths of the direction vector (m for unit directions).
         coherent : bool
-            As in `intersect`.
+            Whether neighbouring rays are nearly parallel, which the ray tracer exploits.
         """
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
         ray.maxt = mi.Float(length)
         return self.bare.ray_test(ray, coherent=coherent)
 
     def nearest_vertex_label(self, hits: Hits, point: mi.Array3f64, labels: mi.Int32) -> mi.Int32:
-        """Return, per hit, the label of the face's vertex that is nearest to the hit point.
+        """Return, for each of n hits, the block label of the face's vertex that is nearest to the hit point.
 
         Parameters
         ----------
         hits : Hits
-            The hits (n,).
+            The n hits.
         point : 3 x (n,) float64
             The hit points, m.
         labels : int32, one per vertex
             Block labels of the mesh's vertices.
         """
-        nearest, result = mi.Float32(np.inf), mi.Int32(WALL)
-        for corner in range(3):
-            vertex = dr.gather(mi.UInt32, self._face_vertices, 3 * hits.face + corner, hits.valid)
-            position = dr.gather(mi.Array3f64, self._vertices, vertex, hits.valid)
-            distance = mi.Float32(dr.squared_norm(position - point))
-            nearer = distance < nearest
-            result = dr.select(nearer, dr.gather(mi.Int32, labels, vertex, hits.valid), result)
-            nearest = dr.select(nearer, distance, nearest)  # dr.minimum aborts in LLVM 15
-        return dr.select(hits.valid, result, WALL)
+        return label_of_nearest_vertex(self._vertices, self._face_vertices, hits.face, hits.valid, point, labels)
 
     def cast(self, origins: FloatArray, directions: FloatArray) -> tuple[FloatArray, IntArray]:
-        """Cast rays given as NumPy arrays (n, 3), m. Returns the distances (n,) and faces (n,); NaN and -1 for a miss."""
+        """Cast n rays given as NumPy arrays and return where they hit the mesh first.
+
+        Parameters
+        ----------
+        origins : (n, 3) array
+            Starts of the rays, m.
+        directions : (n, 3) array
+            Directions of the rays.
+
+        Returns
+        -------
+        (n,) array and (n,) int array
+            Distances in lengths of the direction vectors, and face numbers; NaN and -1 for a miss.
+        """
         rays = (vectors_on_device(np.broadcast_to(array, directions.shape)) for array in (origins, directions))
         hits = self.intersect(*rays, coherent=False)
         distance = dr.select(hits.valid, hits.distance, np.nan)
@@ -253,9 +265,10 @@ class RayCaster:
         return np.array(distance), np.array(face)
 
     def sides_seen(self, position: FloatArray) -> tuple[IntArray, NDArray[np.bool_]]:
-        """Return the faces that are seen from `position` (3,), and which of them are seen from behind.
+        """Find the faces that a sensor sees, and which of them it sees from behind, to check that it stands before the wall.
 
-        Lines of sight are cast to some thousands of the mesh's vertices.
+        Lines of sight are cast from `position` (3,), m, to some thousands of the mesh's vertices. Returns the numbers (k,) of
+        the faces, and a mask (k,) that is True for those seen from behind.
         """
         vertices = self.mesh.vertices[:: max(len(self.mesh.vertices) // _SIGHTS, 1)]
         sight = vertices - position
@@ -264,9 +277,10 @@ class RayCaster:
         return face[met], np.einsum("ij,ij->i", self.mesh.face_normals(face[met]), sight[met]) > 0
 
     def labels_down(self, grid: Grid, shift_m: NDArray[np.float32]) -> IntArray:
-        """Return the block label (h, w) of the face below each pixel centre, looking along -z.
+        """Return the block label (h, w) of the face below each pixel centre of a raster (`grid`), looking along -z.
 
-        shift_m: (h, w, 2), m in x and y, is subtracted from each pixel centre.
+        It labels the pixels of a difference map. shift_m: (h, w, 2) displacement in x and y, m, which is subtracted from each
+        pixel centre before looking down.
         """
         hits, _ = self.look_down(grid, shift_m)
         return np.array(hits.block).reshape(grid.shape)
@@ -284,7 +298,7 @@ class RayCaster:
         Returns
         -------
         Hits and mi.Array3f64
-            The hits and the hit points, h w each.
+            The hits and the hit points, one for each of the h w pixels.
         """
         index = dr.arange(mi.UInt32, grid.width * grid.height)
         row, column = index // grid.width, index % grid.width
@@ -296,6 +310,38 @@ class RayCaster:
         origin = mi.Array3f64(x, y, start)
         hits = self.intersect(origin, mi.Array3f64(0.0, 0.0, -1.0))
         return hits, mi.Array3f64(origin.x, origin.y, origin.z - hits.distance)
+
+
+def label_of_nearest_vertex(
+    vertices: mi.Float64, face_vertices: mi.UInt32, face: mi.UInt32, valid: mi.Bool, point: mi.Array3f64, labels: mi.Int32
+) -> mi.Int32:
+    """Return, for places on faces of a mesh, the label of the face's vertex that is nearest.
+
+    Parameters
+    ----------
+    vertices, face_vertices : (3 v,) float64 and (3 f,) uint32
+        Coordinates of the mesh's vertices, m, and numbers of the vertices of its faces.
+    face, valid : (n,) uint32 and bool
+        Number of the face at each place, and whether there is one.
+    point : 3 x (n,) float64
+        The places, m.
+    labels : (v,) int32
+        Block labels of the vertices.
+
+    Returns
+    -------
+    (n,) int32
+        The labels; WALL where there is no face.
+    """
+    nearest, result = mi.Float32(np.inf), mi.Int32(WALL)
+    for corner in range(3):
+        vertex = dr.gather(mi.UInt32, face_vertices, 3 * face + corner, valid)
+        position = dr.gather(mi.Array3f64, vertices, vertex, valid)
+        distance = mi.Float32(dr.squared_norm(position - point))
+        nearer = distance < nearest
+        result = dr.select(nearer, dr.gather(mi.Int32, labels, vertex, valid), result)
+        nearest = dr.select(nearer, distance, nearest)  # dr.minimum aborts in LLVM 15
+    return dr.select(valid, result, WALL)
 
 
 def _largest_component(vector: mi.Array3f64) -> tuple[mi.UInt32, mi.Float64]:
@@ -327,7 +373,7 @@ def _plane_normal(axis: mi.UInt32, negative: mi.Bool, following: mi.Float64, las
 
 
 def heights(caster: RayCaster, grid: Grid) -> NDArray[np.float32]:
-    """Return the highest z of the mesh at each pixel centre, (height, width), m; NaN where there is no surface."""
+    """Return the highest z of a mesh at each pixel centre of a raster, (height, width), m; NaN where there is no surface."""
     hits, point = caster.look_down(grid)
     z = mi.Float32(dr.select(hits.valid, point.z, np.nan))
     return np.array(z).reshape(grid.shape)

@@ -29,7 +29,10 @@ _DTYPES: dict[Any, type] = {
 
 
 def on_device(kind: Any, values: NDArray[Any]) -> Any:
-    """Copy `values`, of any shape, to a device array (n,) in C order of the Dr.Jit type `kind`, such as mi.Float64 or mi.Bool."""
+    """Copy a NumPy array of any shape to an array (n,) of the ray-tracing device, in C order.
+
+    kind: Dr.Jit type of the result, such as mi.Float64 or mi.Bool.
+    """
     buffer: NDArray[Any] = np.empty(values.size + 2 * _SPARE, _DTYPES[kind])
     start = -(buffer.ctypes.data // buffer.itemsize) % _SPARE
     array = buffer[start : start + values.size]
@@ -38,5 +41,5 @@ def on_device(kind: Any, values: NDArray[Any]) -> Any:
 
 
 def vectors_on_device(vectors: FloatArray) -> mi.Array3f64:
-    """Copy vectors (n, 3) to a device vector of 3 x (n,)."""
+    """Copy a NumPy array of vectors (n, 3) to the ray-tracing device, as a vector of three arrays (n,)."""
     return mi.Array3f64(*(on_device(mi.Float64, component) for component in vectors.T))

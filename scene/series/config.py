@@ -18,8 +18,9 @@ LAST_SHARE = 0.01
 class MagnitudeFrequency(Config):
     """Magnitude-frequency law of rockfalls: N(> V) = a V^-exponent between the smallest and the largest volume.
 
-    Dussauge, Grasso, Helmstetter (2003), "Statistical analysis of rockfall volume distributions: implications for rockfall
-    dynamics", JGR 108(B6), found exponents of 0.5 +- 0.2 on subvertical cliffs.
+    N(> V) is the number of rockfalls with more than the volume V, m3; the rate of rockfalls fixes the constant a. Dussauge,
+    Grasso, Helmstetter (2003), "Statistical analysis of rockfall volume distributions: implications for rockfall dynamics", JGR
+    108(B6), found exponents of 0.5 +- 0.2 on subvertical cliffs.
     """
 
     exponent: float = Field(0.5, gt=0, le=5, description="b in N(> V) = a V^-b; 0.5 on subvertical cliffs (Dussauge et al. 2003)")
@@ -33,19 +34,28 @@ class MagnitudeFrequency(Config):
         return self
 
     def volume(self, share: float) -> float:
-        """Return the volume, m3, that a share (0 to 1) of all rockfalls does not exceed (inverse distribution function)."""
+        """Return the volume, m3, that a share (0 to 1) of all rockfalls does not exceed (inverse distribution function).
+
+        A uniform random share gives the volume of a random rockfall.
+        """
         ends = self.smallest**-self.exponent, self.largest**-self.exponent
         return float((ends[0] - share * (ends[0] - ends[1])) ** (-1 / self.exponent))
 
 
 class VolumeLaw(Config):
-    """Distribution of the volumes of rockfalls."""
+    """Distribution of the volumes of rockfalls.
+
+    It has one key, which selects the only law there is: a magnitude-frequency power law.
+    """
 
     power_law: MagnitudeFrequency = MagnitudeFrequency()
 
 
 class RockfallRate(Config):
-    """Rockfalls at random: a Poisson process in time, with a magnitude-frequency law."""
+    """Rockfalls at random: a Poisson process in time, with a magnitude-frequency law.
+
+    Their times and volumes are drawn for the whole duration of a time series.
+    """
 
     rate_per_day: float = Field(gt=0, le=1e5, description="mean number of rockfalls per day on the whole wall")
     volume_m3: VolumeLaw = VolumeLaw()
@@ -87,13 +97,20 @@ class Motion(Config):
 
 
 class PrecursorConfig(Motion):
-    """Motion before the fall, of a share of the rockfalls drawn at random."""
+    """Motion before the fall, of a share of the rockfalls drawn at random.
+
+    A precursor is the slow motion of a block out of the wall, in the hours before it falls. Its other keys say how the block
+    moves.
+    """
 
     share: float = Field(1.0, ge=0, le=1, description="share of the rockfalls that move before they fall")
 
 
 class EventConfig(Config):
-    """A rockfall by hand."""
+    """A rockfall by hand.
+
+    Its time, volume and place are given in the config of a time series, instead of drawn at random.
+    """
 
     time: datetime | None = Field(None, description="when it falls, ISO 8601; or `after_h`")
     after_h: float | None = Field(None, gt=0, le=1e6, description="when it falls, after the first epoch; or `time` [h]")
@@ -109,7 +126,11 @@ class EventConfig(Config):
 
 
 class DepositsConfig(Config):
-    """Fallen rock at the foot of the wall: fragments with the same volume together, each at rest."""
+    """Fallen rock at the foot of the wall: fragments with the same volume together, each at rest.
+
+    The volume of a rock is divided at random among its fragments; they come to rest near the foot of the wall below the rock's
+    place.
+    """
 
     fragments: int = Field(8, ge=1, le=200, description="number of fragments into which a rock breaks")
     volume_sigma_log: float = Field(

@@ -33,7 +33,17 @@ class Cover:
     vegetation_m: float = 0.0
 
     def on(self, mesh: TriangleMesh, up: FloatArray, random: KeyedRandom) -> TriangleMesh:
-        """Return the wall with its snow and vegetation added. up: (3,) unit vector against gravity. random: where plants grow."""
+        """Return the wall with the thickness of its snow and vegetation added to the rock, as a sensor meets it.
+
+        Parameters
+        ----------
+        mesh : TriangleMesh
+            The rock.
+        up : (3,) array
+            Unit vector against gravity, in the mesh's frame.
+        random : KeyedRandom
+            Source of the random places where plants grow.
+        """
         if self.snow_m <= 0 and self.vegetation_m <= 0:
             return mesh
         normals = np.nan_to_num(mesh.vertex_normals())

@@ -37,7 +37,7 @@ _SHAPES = RockfallConfig(
 
 @dataclass(frozen=True)
 class Ground:
-    """Directions and level at the foot of a wall, wall frame.
+    """Level ground at the foot of a wall, on which fallen rocks come to rest: directions and height, wall frame.
 
     Attributes
     ----------
@@ -54,7 +54,10 @@ class Ground:
 
     @classmethod
     def below(cls, wall: TriangleMesh, up: FloatArray) -> Ground:
-        """Return the ground at the lowest point of a wall. up: (3,) direction against gravity, wall frame."""
+        """Return the ground at the foot of a wall: level, at the height of the wall's lowest point.
+
+        up: (3,) direction against gravity, wall frame.
+        """
         outward = np.array([0.0, 0.0, 1.0]) - up[2] * up
         if np.linalg.norm(outward) < 1e-3:  # terrain seen from above: any horizontal direction
             outward = np.array([1.0, 0.0, 0.0]) - up[0] * up
@@ -64,16 +67,16 @@ class Ground:
 
 @dataclass(frozen=True)
 class Deposit:
-    """The fragments of one rock.
+    """The fragments of one fallen rock, which lie at the foot of the wall.
 
     Attributes
     ----------
     number : int
-        Number of the rockfall.
+        Number of the rockfall, from 1.
     mesh : TriangleMesh
         Closed fragments at rest, wall frame.
     circles : (k, 3) array
-        Place of each on the ground (along `aside` and `outward`) and its radius, m.
+        Circle that each fragment covers on the ground, m: centre along the wall, centre away from the wall, and radius.
     """
 
     number: int
@@ -89,12 +92,13 @@ def lay_fragments(
     config: DepositsConfig,
     random: KeyedRandom,
 ) -> Deposit:
-    """Break a rock into fragments and let each come to rest.
+    """Break a fallen rock into fragments and let each come to rest at the foot of the wall.
 
     Parameters
     ----------
     rock : (int, float, (2, 3) array)
-        Number, volume, m3, and box of the rock where it was in the wall, m.
+        Number of the rockfall, volume (m3) and bounding box (smallest and largest coordinates, wall frame, m) of the rock in
+        the wall.
     wall : TriangleMesh
         The wall without the rock.
     ground : Ground

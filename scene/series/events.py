@@ -15,7 +15,7 @@ MOST_EVENTS = 20_000
 
 @dataclass(frozen=True)
 class Rockfall:
-    """A rockfall that is to happen. Times count in hours from the first epoch.
+    """A rockfall that is to happen in a simulated time series. Times count in hours from the first epoch.
 
     Attributes
     ----------
@@ -26,7 +26,7 @@ class Rockfall:
     falls_h : float
         Time of the fall, h.
     volume_m3 : float
-        Volume of the rock.
+        Volume of the rock, m3.
     position_m : (x, y), optional
         Place of the block, wall frame, m; None: at random.
     motion : Motion, optional
@@ -42,11 +42,14 @@ class Rockfall:
 
     @property
     def starts_h(self) -> float:
-        """When the block begins to move, or falls if it does not move before, h."""
+        """Time when the block begins to move, or falls if it does not move before, h after the first epoch."""
         return self.falls_h - (0.0 if self.motion is None else self.motion.lead_h)
 
     def displacement_m(self, time_h: float) -> float | None:
-        """Return how far the block has moved out since the first epoch, m; None once it has fallen."""
+        """Return how far the block has moved out of the wall at a time, m; None once it has fallen.
+
+        time_h: time after the first epoch, h.
+        """
         if time_h >= self.falls_h:
             return None
         if self.motion is None:
@@ -55,14 +58,14 @@ class Rockfall:
 
 
 def drawn_rockfalls(rate: RockfallRate, precursor: PrecursorConfig | None, end_h: float, random: KeyedRandom) -> list[Rockfall]:
-    """Draw rockfalls between the first epoch and the last one, and those later ones that already move by then.
+    """Draw the rockfalls of a time series at random: those until the last epoch, and later ones that already move by then.
 
     Parameters
     ----------
     rate : RockfallRate
-        How often and how large.
+        How many rockfalls happen per day, and the distribution of their volumes.
     precursor : PrecursorConfig, optional
-        How a share of them moves before.
+        How a share of them moves before the fall; None: none moves.
     end_h : float
         Time of the last epoch, h.
     random : KeyedRandom
@@ -98,7 +101,10 @@ def drawn_rockfalls(rate: RockfallRate, precursor: PrecursorConfig | None, end_h
 
 
 def given_rockfalls(events: Sequence[EventConfig], falls_h: Sequence[float]) -> list[Rockfall]:
-    """Return the rockfalls that a config lists, not yet numbered. falls_h: when each falls, h."""
+    """Return the rockfalls that a config lists one by one, not yet numbered (all have number 0).
+
+    events: the listed rockfalls. falls_h: when each falls, h after the first epoch.
+    """
     return [
         Rockfall(0, f"given {index}", when, event.volume_m3, event.position_m, event.precursor)
         for index, (event, when) in enumerate(zip(events, falls_h, strict=True))
@@ -106,7 +112,7 @@ def given_rockfalls(events: Sequence[EventConfig], falls_h: Sequence[float]) -> 
 
 
 def numbered(rockfalls: Sequence[Rockfall]) -> tuple[Rockfall, ...]:
-    """Number rockfalls in the order in which they begin."""
+    """Number rockfalls from 1 in the order in which they begin to move, or fall if they do not move before."""
     ordered = sorted(rockfalls, key=lambda each: (each.starts_h, each.falls_h, each.key))
     return tuple(
         Rockfall(number, each.key, each.falls_h, each.volume_m3, each.position_m, each.motion)

@@ -34,7 +34,7 @@ class Rules:
     Attributes
     ----------
     zone : SafeZone
-        Where blocks may lie.
+        Part of the wall, away from its border and holes, where blocks may lie.
     shapes : RockfallConfig
         Shapes and placement of the blocks.
     deposits : DepositsConfig, optional
@@ -55,11 +55,18 @@ class Rules:
     random: KeyedRandom
 
     def label(self, number: int, kind: str) -> int:
-        """Return the label of what a rockfall leaves in a mesh. kind: "missing" (niche), "moved" (block) or "deposit"."""
+        """Return the label by which the faces of a mesh tell what a rockfall left there.
+
+        number: number of the rockfall. kind: "missing" (its niche), "moved" (its block, moved but not fallen) or "deposit" (its
+        fragments).
+        """
         return KINDS.index(kind) * len(self.rockfalls) + number
 
     def rockfall_of(self, label: int) -> tuple[Rockfall, str]:
-        """Return the rockfall and the kind (see `label`) to which a label above 0 belongs."""
+        """Return the rockfall to which a face's label (above 0) belongs, and whether the face is its niche, block or fragments.
+
+        The latter is "missing", "moved" or "deposit".
+        """
         kind, index = divmod(label - 1, len(self.rockfalls))
         return self.rockfalls[index], KINDS[kind]
 
@@ -75,7 +82,7 @@ class Loose:
     block : Blocks
         The block that cut it out.
     volume_m3 : float
-        Volume of the rock.
+        Volume of the rock, m3.
     rock : TriangleMesh, optional
         The rock as a closed mesh in its place, for one that moves before it falls.
     """
@@ -88,7 +95,7 @@ class Loose:
 
 @dataclass(frozen=True)
 class WallState:
-    """The wall at one time.
+    """The wall at one time of a time series of rockfalls.
 
     Attributes
     ----------
@@ -97,13 +104,13 @@ class WallState:
     base : TriangleMesh
         The wall with all niches, wall frame.
     loose : tuple of Loose
-        All rocks cut out so far, fallen or not, by number.
+        All rocks cut out so far, fallen or not, in the order of the rockfalls' numbers.
     deposits : tuple of Deposit
-        Fragments of fallen rocks.
+        Fragments of fallen rocks at the foot of the wall.
     balance_m3 : float
-        Volume of the first wall minus that of `base` minus the rocks' volumes: 0 except for rounding.
+        Volume of the first wall minus that of `base` minus the rocks' volumes, m3: 0 except for rounding.
     wall_volume_m3 : float
-        Volume of the first wall.
+        Volume of the wall at the first epoch, m3.
     """
 
     time_h: float
@@ -115,16 +122,19 @@ class WallState:
 
     @property
     def fallen(self) -> tuple[Loose, ...]:
-        """The rocks that have fallen."""
+        """The rocks that have fallen by the time of this state."""
         return tuple(each for each in self.loose if each.rockfall.falls_h <= self.time_h)
 
     @property
     def hanging(self) -> tuple[Loose, ...]:
-        """The rocks that have moved but not fallen."""
+        """The rocks that have moved by the time of this state but not fallen."""
         return tuple(each for each in self.loose if each.rockfall.falls_h > self.time_h)
 
     def mesh(self, rules: Rules) -> TriangleMesh:
-        """Return the wall with its moving blocks and deposits as a sensor meets it; `face_block` tells them apart."""
+        """Return the wall with its moving blocks and fallen fragments, as a sensor meets it.
+
+        `face_block` of the mesh tells them apart: 0 for rock in its place, else the label that `rules` gives (`Rules.label`).
+        """
         parts = [self.base]
         for each in self.hanging:
             moved = each.rockfall.displacement_m(self.time_h) or 0.0
@@ -136,14 +146,15 @@ class WallState:
 
 
 def advanced(state: WallState, time_h: float, rules: Rules) -> WallState:
-    """Return the wall at a later time: rocks begin to move, others fall.
+    """Return the wall at a later time of a time series: rocks begin to move, others fall.
 
-    A state without loose rocks is an untouched wall: of the rocks that fell before its time nothing is seen.
+    If no rock has been cut out of `state` yet, it is taken for the untouched first wall: rockfalls before its time leave no
+    trace.
 
     Parameters
     ----------
     state : WallState
-        The wall now.
+        The wall at the earlier time.
     time_h : float
         The later time, h since the first epoch.
     rules : Rules
@@ -183,7 +194,7 @@ def advanced(state: WallState, time_h: float, rules: Rules) -> WallState:
 
 
 def joined_meshes(parts: Sequence[TriangleMesh]) -> TriangleMesh:
-    """Join meshes into one, with labels and albedo."""
+    """Join meshes, such as the wall and fallen fragments, into one, with their labels and albedo."""
     at = np.concatenate([[0], np.cumsum([len(each.vertices) for each in parts])[:-1]]).astype(np.int32)
 
     def column(name: str, size: str, default: float, kind: type) -> NDArray[Any]:

@@ -27,7 +27,19 @@ _PATCH = 2.0
 
 @dataclass(frozen=True)
 class BlockRequest:
-    """A block to place: its volume of rock, m3, where (x, y), m, or None, and the source of its random numbers."""
+    """A block that is to be placed on the wall.
+
+    Attributes
+    ----------
+    volume_m3 : float
+        Volume of the rock that it is to remove, m3.
+    position_m : (x, y), optional
+        Where its centre is to lie, wall frame, m; None: at random.
+    random : KeyedRandom
+        Source of random numbers for its shape and place.
+    name : str
+        What error messages call it.
+    """
 
     volume_m3: float
     position_m: tuple[float, float] | None
@@ -38,7 +50,9 @@ class BlockRequest:
 def place_block(
     request: BlockRequest, wall: TriangleMesh, zone: SafeZone, taken: Sequence[FloatArray], config: RockfallConfig
 ) -> Blocks:
-    """Place one block on the wall as it is now. Its shape is drawn from `config`, its size follows from the volume.
+    """Place one block, which is to fall, on the wall as it is now.
+
+    Its shape is drawn from `config`, its size follows from the volume.
 
     Parameters
     ----------
@@ -47,7 +61,7 @@ def place_block(
     wall : TriangleMesh
         The wall with the niches of earlier rockfalls, wall frame.
     zone : SafeZone
-        Where blocks may lie that have no given place.
+        Part of the wall in which a random place is drawn, for a block without a given place.
     taken : sequence of (2, 3) arrays
         Boxes of blocks that it may not touch, m.
     config : RockfallConfig
@@ -56,7 +70,7 @@ def place_block(
     Returns
     -------
     Blocks
-        One block.
+        A collection with this one block, wall frame.
 
     Raises
     ------
@@ -93,7 +107,7 @@ def place_block(
 
 
 def join_blocks(parts: Sequence[Blocks]) -> Blocks:
-    """Join several collections of blocks into one."""
+    """Join several collections of blocks into one, in order; each block's label is its new position plus 1."""
     vertices, faces = ([len(getattr(each, name)) for each in parts] for name in ("vertices", "faces"))
     at = np.concatenate([[0], np.cumsum(vertices)[:-1]]).astype(np.int32)
     face_at = np.concatenate([[0], np.cumsum(faces)[:-1]]).astype(np.int32)
@@ -171,6 +185,6 @@ def _touch(box: FloatArray, other: FloatArray, distance_m: float) -> bool:
 
 
 def no_blocks() -> Blocks:
-    """Return an empty collection of blocks."""
+    """Return a collection of blocks without any block, for an epoch in which nothing falls."""
     start = np.zeros(1, dtype=np.int32)
     return Blocks(np.empty((0, 3)), np.empty((0, 3), dtype=np.int32), start, start, (), np.empty((0, 3)), np.empty((0, 3)))

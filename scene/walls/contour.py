@@ -22,14 +22,16 @@ outline.
 
 
 def highest_under(caster: RayCaster, outlines: Sequence[FloatArray]) -> FloatArray:
-    """Return the largest z (k,) of the wall within each contour, m; -inf where there is no wall.
+    """Return the largest z (k,) of the wall within the contour of each of k blocks, m; -inf where there is no wall.
+
+    It tells how high a block lies on the relief.
 
     Parameters
     ----------
     caster : RayCaster
         The wall, wall frame.
     outlines : sequence of (n, 2) arrays
-        For each block, points whose convex hull is its contour, m.
+        For each block, points (x, y), wall frame, m, whose convex hull is its contour.
     """
     hulls = [_Hull(points) for points in outlines]
     tops = np.array([values.max(initial=-np.inf) for values in _heights(caster, hulls)])
@@ -37,7 +39,17 @@ def highest_under(caster: RayCaster, outlines: Sequence[FloatArray]) -> FloatArr
 
 
 def highest_vertex_under(caster: RayCaster, outlines: Sequence[FloatArray]) -> FloatArray:
-    """Return the largest z (k,) of the wall's vertices within each contour, m; of the surface if a contour contains no vertex."""
+    """Return the largest z (k,) of the wall's vertices within the contour of each of k blocks, m.
+
+    Where a contour contains no vertex, it is the largest z of the surface.
+
+    Parameters
+    ----------
+    caster : RayCaster
+        The wall, wall frame.
+    outlines : sequence of (n, 2) arrays
+        For each block, points (x, y), wall frame, m, whose convex hull is its contour.
+    """
     tops = _highest_vertex(caster.mesh, [_Hull(points) for points in outlines])
     bare = np.flatnonzero(np.isneginf(tops))
     if bare.size:
@@ -46,7 +58,15 @@ def highest_vertex_under(caster: RayCaster, outlines: Sequence[FloatArray]) -> F
 
 
 def median_under(caster: RayCaster, outlines: Sequence[FloatArray]) -> FloatArray:
-    """Return the median z (k,) of the wall over each contour, m; -inf where there is no wall. Arguments as in `highest_under`."""
+    """Return the median z (k,) of the wall within the contour of each of k blocks, m; -inf where there is no wall.
+
+    Parameters
+    ----------
+    caster : RayCaster
+        The wall, wall frame.
+    outlines : sequence of (n, 2) arrays
+        For each block, points (x, y), wall frame, m, whose convex hull is its contour.
+    """
     found = _heights(caster, [_Hull(points) for points in outlines], edges=False)
     return np.array([np.median(values) if values.size else -np.inf for values in found])
 

@@ -45,7 +45,10 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 class ImportedWall(Config):
-    """A wall from one or several mesh files in any format that trimesh reads."""
+    """A wall from one or several mesh files in any format that trimesh reads.
+
+    Trimesh is a Python library. Survey coordinates are east, north and height; they become the world frame, in m.
+    """
 
     mesh: Path | tuple[Path, ...] = Field(
         description="mesh file (ply, obj, stl, off, glb, ...), or a list of files that make up the scene; in survey coordinates"
@@ -78,7 +81,7 @@ class ImportedWall(Config):
         return self.mesh if isinstance(self.mesh, tuple) else (self.mesh,)
 
     def load(self) -> tuple[TriangleMesh, tuple[str, ...]]:
-        """Read, join and repair the meshes.
+        """Read the configured mesh files, join them into one wall and repair it.
 
         Returns the mesh in the world frame, m, and the repairs in words. Raises InputError if a file cannot be used.
         """
@@ -109,7 +112,10 @@ class ImportedWall(Config):
 
 
 def join_meshes(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
-    """Join meshes into one, in order. If any of them has an albedo, those without one get the default albedo."""
+    """Join the meshes of several files into one, in order.
+
+    If any of them has an albedo, those without one get the default albedo.
+    """
     if len(meshes) == 1:
         return meshes[0]
     start = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
@@ -123,11 +129,10 @@ def join_meshes(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
 
 
 def read_reference(path: Path) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """Read a reference surface, m, and notes on it.
+    """Read a surface that measurements are compared with from a mesh file, m, and notes on it for the report.
 
-    Vertices stay as in the file, because repairs could move what is measured against.
-
-    Raises InputError if the file cannot be used.
+    Vertices stay as in the file, because repairs could move what is measured against. Raises InputError if the file cannot be
+    used.
     """
     mesh, notes = read_mesh(path)
     if (extent := _extent(mesh)) > _LARGEST_M:
@@ -142,7 +147,7 @@ def read_reference(path: Path) -> tuple[TriangleMesh, tuple[str, ...]]:
 
 
 def read_mesh(path: Path, unit: str = "m") -> tuple[TriangleMesh, tuple[str, ...]]:
-    """Read the triangles of a file, converted to m, and notes on their coordinates.
+    """Read a triangle mesh from a file, converted from `unit` to m, and notes on its coordinates for the report.
 
     Raises InputError if the file cannot be read, or if coordinates are not finite, implausibly large or spoilt by rounding.
     """

@@ -40,13 +40,13 @@ class Band:
     Attributes
     ----------
     at : float
-        Lower edge of the seam, as a share of the wall's height.
+        Height of the seam's lower edge, as a share (0 to 1) of the wall's height.
     thickness_m : float
         Thickness along the slope, m.
     recess_m : float
         How far the seam lies behind the rest of the wall, m.
     blocks : tuple of BlockRule
-        How its rock is jointed.
+        How beds and joints divide its rock into blocks.
     roughness : float
         Factor on the roughness of the rest of the wall.
     albedo : float
@@ -63,7 +63,7 @@ class Band:
 
 @dataclass(frozen=True)
 class Site:
-    """The parameters of one site's rock.
+    """The parameters of the rock of one real site, in whose style walls are generated.
 
     Attributes
     ----------
@@ -72,21 +72,21 @@ class Site:
     slope_rad : float
         Inclination of the mean plane from the horizontal, rad.
     blocks : tuple of BlockRule
-        How the rock is jointed, coarsest first.
+        How beds and joints divide the rock into blocks, coarsest first.
     undulation_m : float
         Amplitude of forms of 4 m and more, m.
     bend_m : float
         How far beds and joints depart from straight lines, m.
     ledge_bed_m, ledge_m, bed_dip : float
-        Spacing of alternating hard and soft beds, how far hard ones protrude (m), and their slope along the wall.
+        Spacing of alternating hard and soft beds (m), how far hard ones protrude (m), and their slope along the wall (1).
     fault_m, throw_m : float
-        Spacing and throw of the faults that offset the beds, m.
+        Spacing of the faults, and how far they offset the beds, m.
     roughness, hurst : float
-        Amplitude of the fractal relief at a scale of 1 m, and its Hurst exponent.
+        Amplitude of the fractal relief at a scale of 1 m (m), and its Hurst exponent (1).
     albedo, bed_tone, block_tone, streaks : float
-        Mean albedo, and the contrast of beds, of blocks and of water streaks.
+        Mean albedo (0 to 1), and the contrast of beds, of blocks and of water streaks.
     notches_per_m2, notch_m : float
-        Number density and median size (m) of erosional notches.
+        Number of erosional notches per m2, and their median size (m).
     band : Band, optional
         A seam of another rock.
     """
@@ -248,18 +248,19 @@ class ProceduralWall(Config):
 
     @property
     def site(self) -> Site:
-        """The parameters of the chosen style."""
+        """The parameters of the site's rock that the configured style stands for."""
         return SITES[self.style]
 
     @property
     def size(self) -> Size:
-        """Width and height of the wall plane, m."""
+        """Width along the wall and height up its slope, m: the configured ones, or else those of the site."""
         return self.width_m or self.site.width_m, self.height_m or self.site.height_m
 
     def mesh(self, random: KeyedRandom) -> TriangleMesh:
-        """Generate the wall in the world frame, m.
+        """Generate the wall as a triangle mesh in the world frame, m.
 
         x runs along the wall, z is up and y points into the slope. The toe is near y = z = 0; sensors stand at negative y.
+        `random` is the source of random numbers.
         """
         source = random if self.seed is None else KeyedRandom(self.seed)
         rock = Rock.make(source.child("wall", self.style), self.size, self.site)
@@ -276,7 +277,27 @@ class ProceduralWall(Config):
 
 @dataclass(frozen=True)
 class Rock:
-    """Relief (m, out of the wall plane) and albedo of one wall as functions of the position in its plane."""
+    """Relief (m, out of the wall plane) and albedo of one generated wall as functions of the position in its plane.
+
+    The position is u along the wall and v up its slope, m.
+
+    Attributes
+    ----------
+    site, size
+        Parameters of the site's rock, and width and height of the wall plane, m.
+    undulation, roughness : Fractal
+        Relief of coarse forms and of the surface, m.
+    bend_u, bend_v : Fractal
+        How far beds and joints depart from straight lines, m.
+    fault, ledge, bed_tone : Table
+        Offset of the beds by faults (m), relief of hard and soft beds (m), and tone of the beds.
+    blocks, band_blocks : tuple of JointedBlocks
+        Blocks between beds and joints, of the wall and of its seam of another rock.
+    notches : Notches, optional
+        Erosional notches.
+    patches, streaks, grain
+        Variation of the albedo: patches, water streaks and grain.
+    """
 
     site: Site
     size: Size
@@ -296,7 +317,10 @@ class Rock:
 
     @classmethod
     def make(cls, random: KeyedRandom, size: Size, site: Site) -> Rock:
-        """Draw all parts of the rock of `site` for a wall plane of `size` (width, height), m."""
+        """Draw all parts of a wall's rock at random, in the style of a site.
+
+        size: width and height of the wall plane, m. site: the parameters of the site's rock.
+        """
 
         def fractal(name: str, amplitude: float, hurst: float, steps_m: tuple[float, float], aspect: float = 1.0) -> Fractal:
             return Fractal.make(random.child(name), size, amplitude, hurst, steps_m, aspect)
@@ -326,9 +350,10 @@ class Rock:
         )
 
     def surface(self, u: FloatArray, v: FloatArray) -> tuple[Field, Field]:
-        """Evaluate relief, m, and albedo, (len(v), len(u)) each, on the regular grid of the axes u and v.
+        """Evaluate relief, m, and albedo of the wall on a regular grid, (len(v), len(u)) each.
 
-        The relief's mean plane is removed.
+        u, v: coordinates of the grid's columns, along the wall, and of its rows, up the slope, m. The relief's mean plane is
+        removed.
         """
         relief = np.empty((len(v), len(u)), np.float32)
         albedo = np.empty_like(relief)

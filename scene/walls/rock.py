@@ -32,14 +32,16 @@ _RAMP_PER_STEP = 0.25
 
 @dataclass(frozen=True)
 class SplineNoise:
-    """Smooth noise with unit standard deviation: a uniform cubic B-spline over a lattice of keyed normal numbers.
+    """Smooth random field over the wall plane, with unit standard deviation, for relief and albedo of generated rock.
+
+    It is a uniform cubic B-spline over a lattice of independent normal numbers.
 
     Attributes
     ----------
     lattice : (rows, columns) float32 array
-        Control values; row k lies at v = (k - 1) step_v_m.
+        Control values; row k lies at height v = (k - 1) step_v_m up the slope.
     step_u_m, step_v_m : float
-        Spacing of the lattice, m.
+        Spacing of the lattice along the wall and up its slope, m.
     """
 
     lattice: Field
@@ -48,14 +50,27 @@ class SplineNoise:
 
     @classmethod
     def make(cls, random: KeyedRandom, size: Size, step_u_m: float, step_v_m: float | None = None) -> SplineNoise:
-        """Draw the lattice for a wall plane of `size`. step_v_m: as step_u_m by default."""
+        """Draw the lattice of random numbers for a smooth random field over a wall plane.
+
+        Parameters
+        ----------
+        random : KeyedRandom
+            Source of random numbers.
+        size : (float, float)
+            Width and height of the wall plane, m.
+        step_u_m, step_v_m : float
+            Spacing of the lattice along the wall and up its slope, m; the second equals the first by default.
+        """
         step_v_m = step_u_m if step_v_m is None else step_v_m
         shape = int(size[1] / step_v_m) + 5, int(size[0] / step_u_m) + 5
         deviation = 0.4795  # of the spline between its knots: the mean square over a cell is (151/315)^2
         return cls(random.generator().standard_normal(shape, dtype=np.float32) / deviation, step_u_m, step_v_m)
 
     def at(self, u: FloatArray, v: FloatArray) -> Field:
-        """Evaluate the noise (len(v), len(u)) on the regular grid of the axes u and v."""
+        """Evaluate the random field on a regular grid, (len(v), len(u)).
+
+        u, v: coordinates of the grid's columns, along the wall, and of its rows, up the slope, m.
+        """
         column, weight_u = _spline_weights(u, self.step_u_m)
         row, weight_v = _spline_weights(v, self.step_v_m)
         lattice = self.lattice[row[0] : row[-1] + 4]
@@ -73,7 +88,11 @@ def _spline_weights(x: FloatArray, step: float) -> tuple[NDArray[np.intp], Field
 
 @dataclass(frozen=True)
 class Fractal:
-    """Self-affine roughness: noise summed over octaves with amplitude amplitude_m (step / 1 m)^hurst."""
+    """Self-affine random roughness of rock: a sum of smooth random fields (octaves), the finer ones with smaller amplitudes.
+
+    The amplitude of an octave is amplitude (step / 1 m)^hurst, with the spacing `step` of its lattice. `octaves` holds
+    amplitude and field of each.
+    """
 
     octaves: tuple[tuple[float, SplineNoise], ...]
 
@@ -81,16 +100,16 @@ class Fractal:
     def make(
         cls, random: KeyedRandom, size: Size, amplitude: float, hurst: float, steps_m: tuple[float, float], aspect: float
     ) -> Fractal:
-        """Draw the octaves.
+        """Draw the octaves (random fields of decreasing grain size) of a self-affine roughness.
 
         Parameters
         ----------
         random : KeyedRandom
-            Source of the lattices.
+            Source of random numbers.
         size : (float, float)
             Width and height of the wall plane, m.
         amplitude : float
-            Amplitude at a scale of 1 m, m.
+            Amplitude at a scale of 1 m, in m for a relief.
         hurst : float
             Hurst exponent.
         steps_m : (float, float)
@@ -104,7 +123,10 @@ class Fractal:
         return cls(tuple((amplitude * step**hurst, noise) for step, noise in zip(steps, noises, strict=True)))
 
     def at(self, u: FloatArray, v: FloatArray) -> Field:
-        """Evaluate the sum of all octaves (len(v), len(u)) on the regular grid of the axes u and v."""
+        """Evaluate the roughness, the sum of all octaves, on a regular grid, (len(v), len(u)).
+
+        u, v: coordinates of the grid's columns, along the wall, and of its rows, up the slope, m.
+        """
         total = np.zeros((len(v), len(u)), np.float32)
         for amplitude, noise in self.octaves:
             total += np.float32(amplitude) * noise.at(u, v)
@@ -113,19 +135,25 @@ class Fractal:
 
 @dataclass(frozen=True)
 class Table:
-    """A function of one coordinate: samples every centimetre from `start`, linearly interpolated, constant beyond its ends."""
+    """A function of one coordinate, such as the relief of beds as a function of height.
+
+    It has samples (`values`) every centimetre from `start` (m), is linear between them and constant beyond its ends.
+    """
 
     start: float
     values: Field
 
     @classmethod
     def through(cls, knots: FloatArray, values: FloatArray) -> Table:
-        """Make the piecewise linear function through (knots, values); knots are ascending."""
+        """Make the piecewise linear function through points, given by positions and values of equal shape (n,).
+
+        knots: positions, m, ascending. values: the function's values there.
+        """
         x = np.arange(knots[0], knots[-1] + _TABLE_STEP_M, _TABLE_STEP_M)
         return cls(float(knots[0]), np.interp(x, knots, values).astype(np.float32))
 
     def at(self, x: Field) -> Field:
-        """Evaluate the function at positions of any shape."""
+        """Evaluate the function at positions x, m, of any shape."""
         column = (x - np.float32(self.start)) / np.float32(_TABLE_STEP_M)
         return _look_up(self.values[None], column, np.zeros_like(column))
 
@@ -134,7 +162,8 @@ class Table:
 class BlockRule:
     """How one generation of beds and joints divides the rock into blocks, and how far the blocks protrude.
 
-    Beds are spaced along s = v - dip u, joints along t = u - lean v, with u along the wall and v up its slope, m.
+    A block lies between two beds and two joints. Beds are spaced along s = v - dip u, joints along t = u - lean v, with u along
+    the wall and v up its slope, m.
 
     Attributes
     ----------
@@ -143,7 +172,7 @@ class BlockRule:
     offset_m : float
         Scale of the blocks' offsets, m. They are heavy-tailed: most blocks stay near the plane, few protrude or are missing.
     tilt : float
-        Standard deviation of the slope of a block's face.
+        Standard deviation of the slope (1) of a block's face against the wall plane.
     dip : float
         Slope of the beds along the wall.
     lean : float
@@ -166,7 +195,9 @@ class BlockRule:
 
 @dataclass(frozen=True)
 class JointedBlocks:
-    """Blocks between beds and joints of a wall plane, as tables with a row for each bed and a column for each cm of t.
+    """Blocks into which beds and joints divide a generated wall, stored as tables.
+
+    The tables have a row for each bed and a column for each centimetre of the coordinate t along the beds.
 
     The coordinates follow the rock: s = v - dip u crosses the beds, and t = u - lean v crosses the joints, m, with u along the
     wall, v up its slope, and the slopes `dip` and `lean` of the rule.
@@ -174,7 +205,7 @@ class JointedBlocks:
     Attributes
     ----------
     rule : BlockRule
-        How the rock is divided.
+        Spacing and slopes of beds and joints, and how far blocks protrude.
     row : Table
         Table row as a function of s: a whole number within a bed, rising to the next over `ramp_m` of the rule, so that
         bilinear interpolation of the tables makes the steps between beds.
@@ -197,7 +228,10 @@ class JointedBlocks:
 
     @classmethod
     def make(cls, random: KeyedRandom, size: Size, rule: BlockRule) -> JointedBlocks:
-        """Draw the blocks for a wall plane of `size`."""
+        """Draw the blocks between beds and joints at random.
+
+        size: width and height of the wall plane, m. rule: how beds and joints divide the rock.
+        """
         draw = random.generator()
         reach_s, reach_t = _MARGIN_M + abs(rule.dip) * size[0], _MARGIN_M + abs(rule.lean) * size[1]
         beds = draw_partings(draw, -reach_s, size[1] + reach_s, rule.bed_m, rule.spread)
@@ -210,7 +244,11 @@ class JointedBlocks:
         return cls(rule, row_table, Table.through(knots, knots - middles), float(t[0]), height, slope, tone)
 
     def at(self, u: Field, v: Field) -> tuple[Field, Field]:
-        """Return the offset of the face, m, and the tone (standard normal per block) at bent positions u, v, m."""
+        """Return the relief of the blocks' faces, m, and the tone of the blocks at positions in the wall plane.
+
+        u, v: (any shape) positions along the wall and up its slope, m, after the bends of beds and joints. The tone is a
+        standard normal number for each block, which makes its albedo higher or lower.
+        """
         s = v - np.float32(self.rule.dip) * u
         t = u - np.float32(self.rule.lean) * v
         column = (t - np.float32(self.start)) / np.float32(_TABLE_STEP_M)
@@ -222,16 +260,28 @@ class JointedBlocks:
 
 @dataclass(frozen=True)
 class Notches:
-    """Concave erosional notches: a steep roof above and a longer floor below.
+    """Erosional notches of a generated wall, concave forms with a steep roof above and a longer floor below.
 
-    They are depths (m, positive inwards) on a lattice of 5 cm.
+    `depth` holds their depths (m, positive into the rock) on a lattice with a spacing of 5 cm over the wall plane.
     """
 
     depth: Field
 
     @classmethod
     def make(cls, random: KeyedRandom, size: Size, per_m2: float, median_m: float) -> Notches:
-        """Draw notches for a wall plane of `size`. per_m2: their number density; median_m: their median size, m."""
+        """Draw erosional notches at random.
+
+        Parameters
+        ----------
+        random : KeyedRandom
+            Source of random numbers.
+        size : (float, float)
+            Width and height of the wall plane, m.
+        per_m2 : float
+            Number of notches per m2.
+        median_m : float
+            Their median size, m.
+        """
         draw = random.generator()
         u, v = (np.arange(0.0, extent + _NOTCH_STEP_M, _NOTCH_STEP_M) for extent in size)
         depth = np.zeros((len(v), len(u)), np.float32)
@@ -248,12 +298,15 @@ class Notches:
         return cls(depth)
 
     def at(self, u: Field, v: Field) -> Field:
-        """Return the depth, m, at bent positions u, v, m."""
+        """Return the depth of the notches, m, at positions in the wall plane.
+
+        u, v: (any shape) positions along the wall and up its slope, m, after the bends of beds and joints.
+        """
         return _look_up(self.depth, u / np.float32(_NOTCH_STEP_M), v / np.float32(_NOTCH_STEP_M))
 
 
 def draw_partings(draw: np.random.Generator, start: float, stop: float, mean: float, spread: float) -> FloatArray:
-    """Draw the positions of beds or joints: ascending, with lognormal spacings.
+    """Draw the positions of beds or joints of a generated wall: ascending, with lognormal spacings.
 
     Parameters
     ----------
@@ -273,7 +326,11 @@ def draw_partings(draw: np.random.Generator, start: float, stop: float, mean: fl
 
 
 def ramp_knots(edges: FloatArray, ramp: float | FloatArray) -> FloatArray:
-    """Return two knots about each edge, where a step begins and ends: `ramp` apart, or closer where edges are close together."""
+    """Return the positions (2 n,), m, between which each of n steps of the relief rises, two for each step.
+
+    edges: (n,) positions of the steps (beds or joints), m, ascending. ramp: width over which a step rises, m; it is less where
+    edges are close together.
+    """
     half = np.broadcast_to(np.asarray(ramp) / 2, edges.shape).copy()
     gap = np.diff(edges)
     half[1:] = np.minimum(half[1:], 0.4 * gap)

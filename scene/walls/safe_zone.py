@@ -21,14 +21,14 @@ _CELLS = 2e6
 
 @dataclass(frozen=True)
 class SafeZone:
-    """The part of the wall where blocks may be placed.
+    """The part of the wall where blocks may be placed: away from its border and its holes.
 
     Attributes
     ----------
     grid : Grid
-        Raster over the wall frame's XY plane.
+        Raster over the wall frame's xy plane.
     free : (height, width) bool array
-        True where a block's bounding box may lie.
+        True for cells of the raster that a block's bounding box may cover.
     """
 
     grid: Grid
@@ -36,7 +36,7 @@ class SafeZone:
 
     @cached_property
     def cells(self) -> NDArray[np.intp]:
-        """Flat indices of the free cells."""
+        """Numbers of the free raster cells, counted row by row."""
         return np.flatnonzero(self.free)
 
     @cached_property
@@ -45,7 +45,7 @@ class SafeZone:
         return integral_image(~self.free)
 
     def sample(self, generator: np.random.Generator, size: int) -> FloatArray:
-        """Draw points (size, 2) uniformly from the zone, m."""
+        """Draw `size` points (size, 2), x and y, wall frame, m, uniformly from the zone, as random places of blocks."""
         row, column = np.divmod(self.cells[generator.integers(len(self.cells), size=size)], self.grid.width)
         within = generator.random((2, size))
         x = self.grid.x_min + (column + within[0]) * self.grid.gsd
@@ -53,7 +53,10 @@ class SafeZone:
         return np.stack([x, y], axis=1)
 
     def holds(self, boxes: FloatArray) -> NDArray[np.bool_]:
-        """Return, for boxes (n, 2, 2) with smallest and largest x and y, m, whether each touches only free cells."""
+        """Return, for each of n boxes, whether it lies wholly in the zone, so that a block may be placed there.
+
+        boxes: (n, 2, 2) smallest and largest x and y of each, wall frame, m.
+        """
         column, row = self.grid.columns(boxes[:, :, 0]), self.grid.rows(boxes[:, ::-1, 1])
         inside = (column[:, 0] >= 0) & (row[:, 0] >= 0) & (column[:, 1] < self.grid.width) & (row[:, 1] < self.grid.height)
         (x0, x1), (y0, y1) = (np.clip(np.floor(index), 0, n - 1).astype(int).T for index, n in self._axes(column, row))
@@ -67,9 +70,9 @@ class SafeZone:
 
 
 def safe_zone(caster: RayCaster, offset_m: float) -> SafeZone:
-    """Make the safe zone: the wall as seen along -z, eroded by `offset_m` from its border and its holes.
+    """Find the part of a wall where blocks may be placed: farther than `offset_m`, m, from its border and its holes.
 
-    `caster` holds the wall in the wall frame. Raises InputError if nothing is left.
+    Border and holes are those seen along -z. `caster` holds the wall in the wall frame. Raises InputError if nothing is left.
     """
     bounds = caster.mesh.bounds
     extent = bounds[1, :2] - bounds[0, :2]

@@ -16,12 +16,12 @@ from scene.walls.procedural import ProceduralWall
 
 @dataclass(frozen=True)
 class Wall:
-    """A rock wall.
+    """A rock wall, generated or imported, before any rockfall.
 
     Attributes
     ----------
     mesh : TriangleMesh
-        World frame, m, float64.
+        The surface, world frame, m.
     repairs : tuple of str
         What was repaired in it, in words with counts.
     name : str
@@ -50,9 +50,9 @@ WallConfig = Annotated[
 
 
 def build_wall(config: ProceduralWall | ImportedWall, random: KeyedRandom) -> Wall:
-    """Build the wall that `config` describes. `random` serves a procedural wall without a seed of its own.
+    """Build the wall that a config describes: generate it, or read and repair its mesh files.
 
-    Raises InputError if the mesh file cannot be used.
+    `random` serves a generated wall whose config has no seed of its own. Raises InputError if a mesh file cannot be used.
     """
     if isinstance(config, ProceduralWall):
         return Wall(config.mesh(random), (), config.style)

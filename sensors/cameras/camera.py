@@ -44,7 +44,11 @@ INTERIOR = ("f_px", "cx_px", "cy_px", "b1", "b2", "k1", "k2", "k3", "k4", "p1", 
 
 
 class CameraConfig(Config):
-    """One camera: interior orientation in Metashape's model, exterior orientation in the world frame."""
+    """One camera: interior orientation in Metashape's model, exterior orientation in the world frame.
+
+    The interior orientation is the principal distance, the principal point and the distortion; the exterior orientation is the
+    position and the direction of view.
+    """
 
     width: int = Field(gt=0, le=100_000, description="frame width [px]")
     height: int = Field(gt=0, le=100_000, description="frame height [px]")
@@ -68,7 +72,10 @@ class CameraConfig(Config):
         return check_rotation(rotation)
 
     def camera(self) -> Camera:
-        """Return the camera, world frame. Raises InputError if the distortion cannot be inverted over the whole frame."""
+        """Return the configured camera for computations, world frame.
+
+        Raises InputError if the lens distortion cannot be inverted over the whole image.
+        """
         interior = {name: getattr(self, name) for name in INTERIOR}
         position, rotation = np.array(self.position_m), np.array(self.rotation)
         camera = Camera(self.width, self.height, **interior, position=position, rotation=rotation)
@@ -77,7 +84,7 @@ class CameraConfig(Config):
 
 
 def checked_camera(where: str, size: tuple[float, float], interior: Mapping[str, float], pose: Pose) -> Camera:
-    """Make a camera from another program's file, with the same limits as for our own files (`CameraConfig`).
+    """Make a camera from the values in another program's file, after checking them against the limits of `CameraConfig`.
 
     Parameters
     ----------
@@ -86,9 +93,9 @@ def checked_camera(where: str, size: tuple[float, float], interior: Mapping[str,
     size : (float, float)
         Width and height, px.
     interior : mapping
-        Interior orientation by the names of INTERIOR; missing ones are 0.
+        Interior orientation by name (f_px, cx_px, k1 and so on, as in `CameraConfig`); missing ones are 0.
     pose : Pose
-        Exterior orientation, world frame.
+        Exterior orientation, world frame: position (3,), m, and rotation (3, 3), camera to world.
 
     Raises
     ------
@@ -101,7 +108,10 @@ def checked_camera(where: str, size: tuple[float, float], interior: Mapping[str,
 
 
 def check_rotation(rotation: Matrix3) -> Matrix3:
-    """Return the rotation unchanged. Raises ValueError if it is not orthonormal (to 1e-6) with determinant +1."""
+    """Check a rotation matrix from a config, and return it unchanged.
+
+    Raises ValueError if it is not orthonormal (to 1e-6) with determinant +1.
+    """
     matrix = np.array(rotation)
     if not (np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) and np.linalg.det(matrix) > 0):
         raise ValueError("is not a rotation matrix (rows must be orthonormal, determinant +1)")
@@ -112,20 +122,20 @@ def check_rotation(rotation: Matrix3) -> Matrix3:
 class Camera:
     """A camera with interior orientation (Metashape's model, px) and pose.
 
-    On the device (`on_device`) the interior orientation holds Dr.Jit scalars instead of floats, so that one compiled kernel
-    serves all values.
+    On the ray-tracing device (`on_device`) the interior orientation holds Dr.Jit scalars instead of floats, so that one
+    compiled kernel serves all values.
 
     Attributes
     ----------
     width, height : int
         Size of the frame, px.
     f_px, cx_px, cy_px, b1, b2, k1, k2, k3, k4, p1, p2
-        Interior orientation in Metashape's model: principal distance, principal point from the frame's centre, affinity and skew
-        (all px), and radial and tangential distortion.
+        Interior orientation in Metashape's model: principal distance, principal point from the frame's centre, affinity and
+        skew (all px), and radial and tangential distortion.
     position : (3,) array
         Perspective centre, m.
     rotation : (3, 3) array
-        Camera to the frame of `position`.
+        Rotation from the camera's frame (x right, y down, z forward) to the frame of `position`.
     """
 
     width: int
@@ -145,7 +155,10 @@ class Camera:
     rotation: FloatArray
 
     def distort(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """Convert ideal image coordinates (X/Z, Y/Z) to distorted ones; arrays of any shape."""
+        """Add the lens distortion to image coordinates: convert ideal x = X/Z, y = Y/Z in the camera's frame to distorted ones.
+
+        Arrays of any shape, without unit.
+        """
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * (self.k3 + r2 * self.k4)))
         return (
@@ -154,7 +167,10 @@ class Camera:
         )
 
     def undistort(self, xd: Any, yd: Any) -> tuple[Any, Any]:
-        """Convert distorted image coordinates to ideal ones, by Newton's method with the analytic Jacobian."""
+        """Remove the lens distortion from image coordinates: convert distorted xd, yd to ideal X/Z, Y/Z in the camera's frame.
+
+        Arrays of any shape, without unit. Newton's method with the analytic Jacobian is used.
+        """
         x, y = xd, yd
         for _ in range(NEWTON_STEPS):
             fx, fy = self.distort(x, y)
@@ -175,23 +191,30 @@ class Camera:
         )
 
     def pixel(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """Convert ideal image coordinates (X/Z, Y/Z) to pixels (u, v)."""
+        """Project points into the image: convert ideal image coordinates x = X/Z, y = Y/Z to pixels (u, v), with distortion.
+
+        X, Y, Z are coordinates in the camera's frame (x right, y down, z forward). Arrays of any shape; u is the column and v
+        the row, px.
+        """
         xd, yd = self.distort(x, y)
         u = self.width / 2 + self.cx_px + xd * self.f_px + xd * self.b1 + yd * self.b2
         return u, self.height / 2 + self.cy_px + yd * self.f_px
 
     def tangents(self, u: Any, v: Any) -> tuple[Any, Any]:
-        """Convert pixels (u, v) to ideal image coordinates (X/Z, Y/Z): the exact inverse of `pixel`."""
+        """Convert pixels to rays: from column u and row v, px, to ideal image coordinates (X/Z, Y/Z in the camera's frame).
+
+        Arrays of any shape. This is the exact inverse of `pixel`.
+        """
         yd = (v - self.height / 2 - self.cy_px) / self.f_px
         xd = (u - self.width / 2 - self.cx_px - yd * self.b2) / (self.f_px + self.b1)
         return self.undistort(xd, yd)
 
     def on_device(self) -> Camera:
-        """Return the same camera with its interior orientation as Dr.Jit scalars."""
+        """Return the same camera for use on the ray-tracing device: its interior orientation is held in Dr.Jit scalars."""
         return replace(self, **{name: dr.opaque(mi.Float64, float(getattr(self, name))) for name in INTERIOR})
 
     def in_wall_frame(self, frame: WallFrame) -> Camera:
-        """Return the same camera with its pose transformed from the world to the wall frame."""
+        """Return the same camera with its pose transformed from the world to the wall frame, in which rays are traced."""
         return replace(self, position=frame.to_wall(self.position), rotation=frame.rotation @ self.rotation)
 
     def reduced(self, step: float, width: int, height: int, corner: tuple[float, float] = (0.0, 0.0)) -> Camera:
@@ -212,12 +235,18 @@ class Camera:
         return replace(self, width=width, height=height, cx_px=cx, cy_px=cy, **scaled)
 
     def turned(self) -> Camera:
-        """Return the same camera with its image read upside down: its pixel (u, v) is this camera's (width - u, height - v)."""
+        """Return the same camera with its image read upside down, which exchanges left and right.
+
+        Its pixel (u, v) is this camera's pixel (width - u, height - v).
+        """
         mirrored = {name: -getattr(self, name) for name in ("cx_px", "cy_px", "p1", "p2")}
         return replace(self, rotation=self.rotation * [-1.0, -1.0, 1.0], **mirrored)
 
     def check_invertible(self) -> None:
-        """Raise InputError if `tangents` does not invert `pixel` over the whole frame, because the distortion folds the image."""
+        """Check that each pixel has one ray: raise InputError if the lens distortion folds the image within the frame.
+
+        Then `tangents` (from pixels to rays) would not invert `pixel` (from rays to pixels).
+        """
         u, v = np.meshgrid(np.linspace(0, self.width, 33), np.linspace(0, self.height, 33))
         with np.errstate(all="ignore"):
             x, y = self.tangents(u, v)
@@ -240,33 +269,39 @@ class CameraPair:
     right: Camera
 
     def in_wall_frame(self, frame: WallFrame) -> CameraPair:
-        """Return the pair with its poses transformed from the world to the wall frame."""
+        """Return the pair with its poses transformed from the world to the wall frame, in which rays are traced."""
         return CameraPair(self.left.in_wall_frame(frame), self.right.in_wall_frame(frame))
 
     def exchanged(self) -> CameraPair:
-        """Return the pair with both cameras upside down, so that the right camera becomes the left one."""
+        """Return the pair with both cameras upside down, so that the right camera becomes the left one.
+
+        With it, a depth map of the right image is made like one of the left image.
+        """
         return CameraPair(self.right.turned(), self.left.turned())
 
     @property
     def base_m(self) -> float:
-        """Distance between the perspective centres, m."""
+        """Base of the stereo pair: the distance between the perspective centres of its cameras, m."""
         return float(np.linalg.norm(self.right.position - self.left.position))
 
     def changed(self, side: Side, **added: float) -> CameraPair:
-        """Return the pair with `added` values added to interior parameters of the left, the right or both cameras."""
+        """Return the pair with an error of interior orientation, such as of the principal distance.
+
+        side: the camera, "left", "right" or "both". added: what to add to interior parameters, by name, such as f_px=2.0.
+        """
         return self._each(
             side, lambda camera: replace(camera, **{key: getattr(camera, key) + value for key, value in added.items()})
         )
 
     def rotated(self, side: Side, axis: int, angle_rad: float) -> CameraPair:
-        """Return the pair with cameras rotated about their own x (0), y (1) or z (2) axis, right-handed.
+        """Return the pair with an error of orientation: cameras rotated about an own axis, right-handed.
 
         Parameters
         ----------
         side : str
             The camera, "left", "right" or "both".
         axis : int
-            Axis of the rotation.
+            Axis of the camera's frame: x (0, right), y (1, down) or z (2, forward).
         angle_rad : float
             Angle, rad.
         """
@@ -274,7 +309,10 @@ class CameraPair:
         return self._each(side, lambda camera: replace(camera, rotation=camera.rotation @ turn))
 
     def shifted(self, side: Side, shift_m: FloatArray) -> CameraPair:
-        """Return the pair with perspective centres moved by `shift_m` (3,), m, along the axes of the pair's frame."""
+        """Return the pair with an error of the perspective centres.
+
+        side: the camera, "left", "right" or "both". shift_m: (3,) displacement, m, along the axes of the pair's frame.
+        """
         return self._each(side, lambda camera: replace(camera, position=camera.position + shift_m))
 
     def _each(self, side: Side, change: Any) -> CameraPair:
@@ -284,7 +322,7 @@ class CameraPair:
 
 
 def axis_rotation(axis: int, angle_rad: float) -> FloatArray:
-    """Return the right-handed rotation matrix (3, 3) about coordinate axis 0, 1 or 2."""
+    """Return the right-handed rotation matrix (3, 3) about coordinate axis x (0), y (1) or z (2), by an angle in rad."""
     sine, cosine = np.sin(angle_rad), np.cos(angle_rad)
     matrix = np.eye(3)
     first, second = (axis + 1) % 3, (axis + 2) % 3

@@ -18,10 +18,11 @@ from sensors.cameras.camera import Camera, CameraPair
 
 @dataclass(frozen=True)
 class Rectification:
-    """Two virtual cameras whose rows are epipolar lines.
+    """The rectified image pair: two virtual cameras, one for each real one, whose rows are epipolar lines.
 
-    A point (x, y, z) in the rectified left frame has u = f x/z + u_left, v = f y/z + v and disparity d = u_l - u_r, so that z
-    = f base / (d - (u_left - u_right)).
+    A point (x, y, z) in the rectified left frame has the column u_l = f x / z + u_left and the row f y / z + v in the left
+    image, and the column u_r in the right image. Its disparity is d = u_l - u_r, so that z = f base_m / (d - (u_left -
+    u_right)).
 
     Attributes
     ----------
@@ -30,7 +31,7 @@ class Rectification:
     f : float
         Principal distance, px.
     u_left, u_right, v : float
-        Principal points, px.
+        Columns of the two principal points, and their common row, px.
     base_m : float
         Distance between the perspective centres, m.
     """
@@ -45,14 +46,15 @@ class Rectification:
 
     @property
     def offset(self) -> float:
-        """Disparity of a point at infinity, px."""
+        """Disparity of a point at infinity, px: the difference of the principal points, left minus right."""
         return self.u_left - self.u_right
 
 
 def rectify(pair: CameraPair) -> Rectification:
-    """Rectify a pair of cameras in one frame. Lens distortion is not part of this; see Camera.tangents.
+    """Rectify a pair of cameras: find two virtual cameras whose rows are epipolar lines, so that disparities give depths.
 
-    Raises InputError if the cameras are exchanged, stand at the same place, or above each other.
+    Both cameras are in one frame. Lens distortion is not part of this; `Camera.tangents` removes it. Raises InputError if the
+    cameras are exchanged, stand at the same place, or above each other.
     """
     left, right = pair.left, pair.right
     rotation = right.rotation.T @ left.rotation

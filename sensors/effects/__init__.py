@@ -58,12 +58,18 @@ FURTHER_EFFECTS: Effects = tuple(each for each in EFFECTS if not each.catalogue 
 
 
 def effect_of(name: str) -> type[Effect]:
-    """Return an effect's class by its name, with or without the sensor's prefix. Raises KeyError."""
+    """Return the class of a sensor effect (a systematic error or noise) by its name, such as "tls.wobble" or "wobble".
+
+    Raises KeyError for an unknown name.
+    """
     return _BY_NAME[name.rpartition(".")[2]]
 
 
 def catalogue(sensor: Sensor) -> Effects:
-    """Return the effects of one sensor that `scarpsim gap` may name."""
+    """Return the effects (systematic errors and noise) of one sensor that `scarpsim gap` may name as a cause.
+
+    sensor: "tls" (laser scanner) or "stereo".
+    """
     return TLS_EFFECTS if sensor == "tls" else STEREO_EFFECTS
 
 

@@ -11,7 +11,10 @@ from sensors.effects.camera_effect import CameraEffect
 
 
 class AffinitySkew(CameraEffect):
-    """Pixels are not square, or rows and columns not perpendicular, other than the calibration says: b_real = b_nominal + b."""
+    """Pixels are not square, or rows and columns not perpendicular, other than the calibration says: b_real = b_nominal + b.
+
+    Affinity b1 stretches the columns against the rows, and skew b2 shifts columns in proportion to the row.
+    """
 
     name: Literal["affinity_skew"] = "affinity_skew"
     means = "Pixels are not square or rows not at right angles to columns as calibrated: often a scanned or resampled picture."
@@ -23,5 +26,8 @@ class AffinitySkew(CameraEffect):
     b2_px: float = parameter("real minus calibrated skew", unit="px", source="Metashape user manual, appendix D", ge=-1e4, le=1e4)
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
-        """Add the errors of affinity and skew, b1 and b2, px, to the real camera's."""
+        """Add the errors of affinity and skew, px, to the parameters b1 and b2 of the real camera.
+
+        state: the cameras before this effect. `random` is not used.
+        """
         return state.changed(self.camera, b1=self.b1_px, b2=self.b2_px)

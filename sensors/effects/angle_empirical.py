@@ -17,7 +17,7 @@ Angle = Literal["azimuth", "zenith"]
 class AngleEmpirical(Effect):
     """An angle is recorded wrong by d(angle) = c(x), a piecewise linear curve of an angle.
 
-    Empirical: `scarpsim gap` adds it; it is not in the shared catalogue. As with every error of an angle, the beam leaves by
+    Empirical: `scarpsim gap` adds it for a pattern without a known cause. As with every error of an angle, the beam leaves by
     this much on the opposite side of the recorded direction.
     """
 
@@ -43,11 +43,14 @@ class AngleEmpirical(Effect):
 
     @property
     def is_null(self) -> bool:
-        """Whether all values of the curve are zero."""
+        """Whether the effect is off: all values of its curve are zero."""
         return not any(map(any, self.values_rad))
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Add the curve's value at each pulse's covariate, rad, to the recorded azimuth or zenith."""
+        """Add the curve's value at each pulse's covariate, rad, to the recorded azimuth or zenith.
+
+        state: the pulses of a scan before this effect. `random` is not used.
+        """
         x = state.azimuth if self.covariate == "azimuth" else state.zenith
         error = interpolate(x, x, self.along, Axis(), self.values_rad)
         return state.with_angle_error(**{self.angle: error})

@@ -17,7 +17,7 @@ from sensors.signal_chain.pulses import PulseGeometry, Pulses
 class AngleNoise(Effect):
     """The beam leaves in another direction than is recorded, with white noise in azimuth and zenith.
 
-    aim = recorded - n, with n ~ N(0, sigma) drawn for each angle of each pulse.
+    aim = recorded - n, with a normal error n ~ N(0, sigma) that is drawn for each angle of each pulse.
     """
 
     name: Literal["angle_noise"] = "angle_noise"
@@ -38,12 +38,18 @@ class AngleNoise(Effect):
     )
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Draw each pulse's errors of azimuth and zenith, rad, independently."""
+        """Draw each pulse's errors of azimuth and zenith, rad, independently.
+
+        state: the pulses of a scan before this effect. random: source of random numbers.
+        """
         noise = state.normals(random)
         azimuth, zenith = opaque(self.azimuth_sigma_rad, self.zenith_sigma_rad)
         return state.with_angle_error(azimuth * mi.Float64(noise.x), zenith * mi.Float64(noise.y))
 
     def variance(self, at: PulseGeometry) -> FloatArray:
-        """Return the variance (n,) that the angle errors add to the range, m2, to first order: large on inclined rock."""
+        """Return the variance (n,) that the angle errors add to the range, m2, to first order: large on inclined rock.
+
+        at: geometry of n pulses, as NumPy arrays.
+        """
         by_azimuth, by_zenith = self.azimuth_sigma_rad * at.by_azimuth, self.zenith_sigma_rad * at.by_zenith
         return np.asarray(by_azimuth**2 + by_zenith**2)

@@ -21,7 +21,12 @@ Sensor = Literal["tls", "stereo"]
 
 
 class Stage(IntEnum):
-    """Where in a sensor's chain an effect acts. The chain runs in this order, whatever the order in a config."""
+    """Where in a sensor's chain of measurement an effect (an error or noise) acts, from the aim of a beam to recorded points.
+
+    A simulation applies the effects in the order of the stages, whatever the order in a config. AIM, FOOTPRINT, RANGE, POWER
+    and RETURN belong to a laser scanner; CAMERA, EXPOSE (image rows), MATCH (disparities), FILL (cells without a match) and
+    POINT (recorded points) to a stereo pair.
+    """
 
     AIM = 1  # TLS: from the pattern's direction to the emitted one
     FOOTPRINT = 2  # TLS: the beam's sub-rays
@@ -36,10 +41,11 @@ class Stage(IntEnum):
 
 
 class ShowsIn(StrEnum):
-    """How an effect becomes visible in a measurement.
+    """How an effect (a sensor's error or noise) becomes visible in a measurement.
 
-    MEAN: ranges or disparities are off. SPREAD: they scatter more. VALUES: they crowd at some values. RETURNS: some are
-    missing. EDGES: edges of the surface are displaced. `scarpsim gap` searches each kind by another method.
+    MEAN: ranges or disparities are systematically wrong. SPREAD: they scatter more. VALUES: they crowd at some values, as after
+    rounding. RETURNS: some are missing. EDGES: edges of the surface are displaced. `scarpsim gap` searches each kind by another
+    method.
     """
 
     MEAN = "mean"
@@ -51,18 +57,18 @@ class ShowsIn(StrEnum):
 
 @dataclass(frozen=True)
 class Search:
-    """Declares that an effect is a sine whose period `scarpsim gap` searches.
+    """Declares that an effect is an error that repeats as a sine, and between which periods `scarpsim gap` searches.
 
     Attributes
     ----------
     period : str
         Name of the parameter that holds the period.
     along : str
-        Covariate along which the sine repeats.
+        Quantity along which the sine repeats, such as the range or the image row.
     shortest, longest : float
-        Range of periods, in the covariate's unit; longest is None if the covariate's range is the limit.
+        Shortest and longest period, in that quantity's unit; longest is None if the extent of the data is the limit.
     cycles : float
-        Smallest number of cycles within the covariate's range.
+        Smallest number of cycles within the extent of the data.
     """
 
     period: str
@@ -73,44 +79,47 @@ class Search:
 
 
 class Effect(Config, ABC):
-    """Base class of all effects: a frozen set of parameters and a pure `apply`.
+    """Base class of all effects, that is systematic errors and noise by which a real sensor differs from an ideal one.
+
+    An effect is a frozen set of parameters with a method `apply` without side effects.
 
     A subclass declares `name` (as a Literal field, because configs contain it), `sensor`, `stage`, its parameters through
-    `parameter`, and `evaluate(state, random)`. At the null values of all parameters `apply` is the identity, bit for bit. Sign
-    convention: recorded = true + effect. Effects of a stage act by ascending `order`, and equal ones in the config's order.
+    `parameter`, and `evaluate(state, random)`. Where all parameters have their null values, at which the effect is off, `apply`
+    changes nothing. Sign convention: recorded = true + effect. Effects of a stage act by ascending `order`, and equal ones in
+    the config's order.
 
     Attributes
     ----------
     name : str
         Name in configs and in the catalogue.
     sensor, stage, order
-        Where the effect acts.
+        The sensor ("tls" or "stereo"), the stage of its chain of measurement, and the order within the stage.
     shows_in : ShowsIn
         How it becomes visible in a measurement.
     looks_at : str
         What it depends on: its own pulse or pixel ("element"), neighbouring ones, or the whole scan or image.
     needs : tuple of str
-        Fields that a measurement must have to fit it.
+        Fields that the geometry of a measurement must have so that the effect can be fitted.
     catalogue : bool
         Whether `scarpsim gap` may name it.
     empirical : bool
         Whether it describes a pattern without naming a cause.
     planned : bool
-        Whether `scarpsim inspect` takes it into account.
+        Whether `scarpsim inspect`, which predicts precision before a survey, takes it into account.
     means, act : str
         What it says about an instrument, and what to do about it, in sentences for reports.
     told_by : str
-        For a noise that depends on something: what to measure to distinguish it from others.
+        For a noise that depends on a quantity, such as the range: what to measure to distinguish it from other noise.
     searched : Search, optional
-        For a sine whose period is unknown.
+        For an error that repeats as a sine of unknown period: where to search the period.
     sets : tuple of tuples of str
         Sets of parameters that `scarpsim gap` fits; by default all that switch the effect on, together.
     trials : (str, tuple of float), optional
-        A parameter that is not fitted, and the values that are tried.
+        A parameter that `scarpsim gap` does not fit but tries at some values, and these values.
     shared : bool
-        For noise: whether neighbours share it.
+        For noise: whether neighbouring pixels have similar errors.
     held_out_gain : float
-        Log score on validation data that it must exceed to be accepted.
+        Increase of the log score on validation data above which `scarpsim gap` accepts the effect; 0: the usual threshold.
     """
 
     name: str
@@ -140,22 +149,28 @@ class Effect(Config, ABC):
 
     @classmethod
     def tag(cls) -> str:
-        """Return the name that configs contain."""
+        """Return the name by which configs select this effect, such as "wobble"."""
         return cast(str, cls.model_fields["name"].default)
 
     @classmethod
     def scored(cls) -> bool:
-        """Return whether a Gaussian log score of residuals measures the effect."""
+        """Return whether the effect can be judged by a Gaussian log score of residuals.
+
+        It can if it changes the mean or the scatter of ranges or disparities.
+        """
         return cls.shows_in in (ShowsIn.MEAN, ShowsIn.SPREAD)
 
     @classmethod
     def known(cls, at: Any) -> bool:
-        """Return whether a geometry holds all that the effect's equation needs."""
+        """Return whether the geometry of a measurement holds all that the effect's equation needs, such as the received power.
+
+        at: geometry of pulses or pixels, whose missing quantities are None.
+        """
         return all(getattr(at, name, None) is not None for name in cls.needs)
 
     @classmethod
     def typical_sizes(cls) -> dict[str, float]:
-        """Return typical values of the parameters that are 0 when the effect is off."""
+        """Return typical values of the effect's parameters, by name, for those parameters that are 0 when the effect is off."""
         found = {key: info.json_schema_extra for key, info in cls.model_fields.items()}
         return {
             key: float(known["typical"])  # type: ignore[arg-type]
@@ -164,51 +179,66 @@ class Effect(Config, ABC):
         }
 
     def argument(self, at: Any) -> FloatArray:
-        """Return the argument (n,) of a searched sine, in the unit of its period. Raises TypeError for other effects."""
+        """Return the quantity (n,) along which the effect repeats as a sine, such as the range, in the unit of its period.
+
+        at: geometry of n pulses of a scanner or n pixels of a stereo pair, as NumPy arrays. Raises TypeError for an effect that
+        is no sine with a searched period.
+        """
         raise TypeError(f"{self.name} is not a searched sine")
 
     def mean(self, at: Any) -> FloatArray:
-        """Return the mean change (n,) of a recorded range (m) or disparity (px).
+        """Return by how much the effect changes recorded ranges (m) or disparities (px) on average, (n,); 0 for pure noise.
 
-        at: geometry for the sensor's equations, as host arrays (`PulseGeometry`, or the pixels' geometry of a stereo pair).
+        at: geometry of n pulses of a scanner (`PulseGeometry`) or n pixels of a stereo pair, as NumPy arrays.
         """
         return np.zeros(len(at))
 
     def variance(self, at: Any) -> FloatArray:
-        """Return the variance (n,) that the effect adds to a recorded range (m2) or disparity (px2)."""
+        """Return the variance (n,) that the effect adds to recorded ranges (m2) or disparities (px2).
+
+        at: geometry of n pulses of a scanner or n pixels of a stereo pair, as NumPy arrays.
+        """
         return np.zeros(len(at))
 
     def kept(self, at: Any) -> FloatArray:
-        """Return the probability (n,) that a return is not lost to the effect."""
+        """Return the probability (n,) that the return of each pulse is not lost to the effect, such as rain.
+
+        at: geometry of n pulses of a scanner, as NumPy arrays.
+        """
         return np.ones(len(at))
 
     @property
     def is_null(self) -> bool:
-        """Whether every parameter has the value at which the effect is off."""
+        """Whether the effect is off: every parameter has its null value."""
         return all(getattr(self, key) == null for key, null in self.nulls().items())
 
     @classmethod
     def nulls(cls) -> dict[str, float]:
-        """Return the value at which the effect is off, by parameter; a period or a phase has none."""
+        """Return the values of the effect's parameters, by name, at which the effect is off; a period or a phase has none."""
         extras = ((key, info.json_schema_extra) for key, info in cls.model_fields.items())
         return {
             key: cast(float, extra["null"]) for key, extra in extras if isinstance(extra, dict) and extra.get("null") is not None
         }
 
     def apply(self, state: StateT, random: KeyedRandom) -> StateT:
-        """Return the state (`Pulses`, `Beam`, `CameraPair`, `ImageRows`, `Matches` or `RecordedPoints`) after this effect.
+        """Apply the effect to a simulated measurement: return its state after the effect.
 
-        `random` is the effect's own source of random numbers.
+        state: what the effect's stage acts on, such as `Pulses` of a scanner or `Matches` of a stereo pair. random: the
+        effect's own source of random numbers.
         """
         return state if self.is_null else self.evaluate(state, random)
 
     @abstractmethod
     def evaluate(self, state: Any, random: KeyedRandom) -> Any:
-        """Return the state after this effect, for parameters that are not null."""
+        """Compute the state of a simulated measurement after this effect, for an effect that is not off; a subclass defines it.
+
+        state: what the effect's stage acts on, such as `Pulses` of a scanner or `Matches` of a stereo pair. random: the
+        effect's own source of random numbers.
+        """
 
 
 def apply_stage(effects: Sequence[Effect], stage: Stage, state: StateT, random: KeyedRandom) -> StateT:
-    """Apply the effects of one stage by ascending `order`.
+    """Apply the effects (errors and noise) of one stage of a sensor's simulation, by ascending `order`.
 
     Each effect draws from a child of `random` named after the effect and its number among those of the same name, so that the
     other effects of a config do not change its random numbers.
@@ -220,7 +250,7 @@ def apply_stage(effects: Sequence[Effect], stage: Stage, state: StateT, random: 
     stage : Stage
         The stage to apply.
     state
-        What the stage acts on.
+        What the stage acts on, such as `Pulses` of a scanner or `Matches` of a stereo pair.
     random : KeyedRandom
         Source of random numbers.
 
@@ -245,7 +275,7 @@ def parameter(
     typical: float | None = None,
     **bounds: float,
 ) -> Any:
-    """Declare a parameter of an effect.
+    """Declare a parameter of an effect, as a field of its class.
 
     Parameters
     ----------
@@ -261,9 +291,9 @@ def parameter(
     default : float, optional
         Default value; by default `null`.
     typical : float, optional
-        Value that the gallery shows; by default `default`.
+        Value of typical size, for the example on the effect's page; by default `default`.
     **bounds : float
-        Limits: ge, gt, le, lt.
+        Limits of the value: ge (at least), gt (above), le (at most), lt (below).
     """
     value = null if default is None else default
     extra: dict[str, Any] = {"unit": unit, "null": null, "source": source, "typical": default if typical is None else typical}

@@ -7,9 +7,10 @@ from sensors.effects.base import Effect, ShowsIn, Stage
 
 
 class CameraEffect(Effect):
-    """An effect by which the real camera pair differs from the nominal (calibrated) one; `camera` says which camera it alters.
+    """Base class of effects by which the real cameras differ from the calibrated (nominal) ones; `camera` says which.
 
-    Its effect on disparities is the difference between projecting the rock into the real and into the nominal pair.
+    Depths are computed with the nominal cameras. The effect on disparities is therefore the difference between projecting the
+    rock into the real and into the nominal pair.
     """
 
     sensor = "stereo"

@@ -22,5 +22,8 @@ class CameraKappa(CameraEffect):
     angle_rad: float = parameter("real minus nominal rotation", unit="rad", source="photogrammetry", typical=1e-4, ge=-1, le=1)
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
-        """Rotate the real camera by the angle, rad, about its own z (viewing) axis."""
+        """Rotate the real camera by the angle, rad, about its own z (viewing) axis.
+
+        state: the cameras before this effect. `random` is not used.
+        """
         return state.rotated(self.camera, axis=2, angle_rad=self.angle_rad)

@@ -26,5 +26,8 @@ class CameraPhi(CameraEffect):
     angle_rad: float = parameter("real minus nominal rotation", unit="rad", source="photogrammetry", typical=5e-5, ge=-1, le=1)
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
-        """Rotate the real camera by the angle, rad, about its own y axis."""
+        """Rotate the real camera by the angle, rad, about its own y axis.
+
+        state: the cameras before this effect. `random` is not used.
+        """
         return state.rotated(self.camera, axis=1, angle_rad=self.angle_rad)

@@ -25,5 +25,8 @@ class CameraShift(CameraEffect):
     z_m: float = parameter("real minus nominal perspective centre, world z", unit="m", source="photogrammetry", ge=-10, le=10)
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
-        """Shift the real camera's perspective centre by (x, y, z), m, world frame."""
+        """Shift the real camera's perspective centre by (x, y, z), m, world frame.
+
+        state: the cameras before this effect. `random` is not used.
+        """
         return state.shifted(self.camera, np.array([self.x_m, self.y_m, self.z_m]))

@@ -13,8 +13,8 @@ from sensors.signal_chain.pulses import PulseGeometry
 class Collimation(AimEffect):
     """The line of sight is not perpendicular to the trunnion axis, which makes the azimuth wrong.
 
-    daz = c / sin z, to first order in c (Lichti 2007, B6). A zenith angle z beyond pi (second face) reverses the sign. Not
-    valid towards the zenith, where an azimuth has no meaning.
+    daz = c / sin z, to first order in the angle c (Lichti 2007, B6). A zenith angle z beyond pi (second face) reverses the
+    sign. Not valid towards the zenith, where an azimuth has no meaning.
     """
 
     name: Literal["collimation"] = "collimation"
@@ -27,6 +27,7 @@ class Collimation(AimEffect):
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
         """Return recorded minus true azimuth and zenith, rad: the collimation error over sin(zenith), and zero.
 
-        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
+        at: geometry of n pulses. m: elementary functions (sine, logarithm and so on) for its arrays, `HOST` for NumPy or
+        `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
         """
         return p.angle_rad / m.sin(at.zenith), 0.0

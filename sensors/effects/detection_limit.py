@@ -17,7 +17,8 @@ from sensors.signal_chain.pulses import PulseGeometry, Pulses
 class DetectionLimit(Effect):
     """An echo below a minimum power gives no return.
 
-    The power is rho cos i (100 m / R)^2, relative to that of albedo 1 at 100 m and normal incidence (lidar range equation).
+    The power is rho cos i (100 m / R)^2, with albedo rho, incidence angle i and range R. It is relative to that of albedo 1 at
+    100 m and normal incidence (lidar range equation).
     """
 
     name: Literal["detection_limit"] = "detection_limit"
@@ -37,9 +38,15 @@ class DetectionLimit(Effect):
     )
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Drop the returns whose received power is below the minimum."""
+        """Drop the returns whose received power is below the minimum.
+
+        state: the pulses of a scan before this effect. `random` is not used.
+        """
         return replace(state, returned=state.returned & (state.power >= dr.opaque(mi.Float32, self.minimum_power)))
 
     def kept(self, at: PulseGeometry) -> FloatArray:
-        """Return 1 for a received power of at least the minimum and 0 below it, (n,)."""
+        """Return 1 for a received power of at least the minimum and 0 below it, (n,).
+
+        at: geometry of n pulses, as NumPy arrays.
+        """
         return np.asarray(at.power >= self.minimum_power, dtype=np.float64)

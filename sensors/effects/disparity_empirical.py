@@ -17,10 +17,10 @@ Covariate = Literal["image_x", "image_y", "radius", "disparity", "disparity_frac
 
 
 class DisparityEmpirical(Effect):
-    """The disparity is wrong by dd = c(x) or c(x, y), piecewise linear.
+    """The disparity is wrong by dd = c(x) or c(x, y), a piecewise linear curve or surface.
 
-    x and y are column, row or distance from the centre of the left image (px), the disparity or its fraction (px), or the
-    depth (m). Empirical: `scarpsim gap` adds it; it is not in the shared catalogue.
+    x and y are column, row or distance from the centre of the left image (px), the disparity or its fraction (px), or the depth
+    (m). Empirical: `scarpsim gap` adds it for a pattern without a known cause.
     """
 
     name: Literal["disparity_empirical"] = "disparity_empirical"
@@ -38,11 +38,14 @@ class DisparityEmpirical(Effect):
 
     @property
     def is_null(self) -> bool:
-        """Whether all values of the curve or surface are zero."""
+        """Whether the effect is off: all values of its curve or surface are zero."""
         return not any(map(any, self.values_px))
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        """Add c(x, y), px, the curve or surface `values_px` interpolated at each match, to the match's disparity."""
+        """Add c(x, y), px, the curve or surface `values_px` interpolated at each match, to the match's disparity.
+
+        state: the matched cells of the depth map before this effect. `random` is not used.
+        """
         x, y = (self._of(state, each) for each in (self.covariate, self.second or self.covariate))
         return replace(state, disparity=state.disparity + interpolate(x, y, self.along, self.across, self.values_px))
 

@@ -17,13 +17,13 @@ _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], dtype=np.uint8)
 
 
 class EdgeFattening(RasterEffect):
-    """At depth steps the foreground grows over the background by r: outlines become larger, niches smaller.
+    """At depth steps the foreground grows over the background by the radius r: outlines become larger, niches smaller.
 
-    d'(p) = max of d(q) over |q - p| <= r: cell p gets the largest disparity of the cells q within r that lie on the near
-    side of a depth step. A depth step is where neighbouring cells differ by more than one pixel of the matched image (the
-    discontinuities of semi-global matching, Hirschmueller 2008); for a matcher that follows steeper slopes, increase
-    `step_px`. Smaller slopes do not change. Half-occluded cells within r get the foreground's disparity too, since the
-    outlines in both images grow alike and pass the left-right check. r is rounded down to whole cells.
+    d'(p) = max of d(q) over |q - p| <= r: cell p gets the largest disparity of the cells q within r that lie on the near side
+    of a depth step. A depth step is where neighbouring cells differ by more than one pixel of the matched image (the
+    discontinuities of semi-global matching, Hirschmueller 2008); for a matcher that follows steeper slopes, increase `step_px`.
+    Smaller slopes do not change. Half-occluded cells within r get the foreground's disparity too, since the outlines in both
+    images grow alike and pass the left-right check. r is rounded down to whole cells.
     """
 
     name: Literal["edge_fattening"] = "edge_fattening"
@@ -40,19 +40,23 @@ class EdgeFattening(RasterEffect):
     )
 
     def filtered(self, disparity: FloatArray, cell_px: float, jump_px: float) -> FloatArray:
-        """Return the disparities, px, with the near side of each depth step grown by the radius, in whole cells."""
+        """Return the disparities, px, with the near side of each depth step grown by the radius, in whole cells.
+
+        disparity: (rows, columns) of the depth map, px, NaN without a match. cell_px: px of the full-resolution frame for each
+        cell. jump_px: smallest difference of neighbours that is a depth step, px.
+        """
         return fattened(disparity, int(self.radius_px / cell_px + 1e-9), max(self.step_px, jump_px))
 
 
 def fattened(disparity: FloatArray, radius: int, step_px: float) -> FloatArray:
-    """Let the near side of each depth step grow.
+    """Let the near side of each depth step grow over the far side, as in a matcher's depth map, and return the new disparities.
 
     Parameters
     ----------
     disparity : (rows, columns) array
         Disparities, px, NaN where unmatched.
     radius : int
-        How far the foreground grows, cells.
+        How far the foreground grows, cells of the depth map.
     step_px : float
         Neighbours that differ by more than this are a depth step, px. An unmatched strip counts as background.
     """

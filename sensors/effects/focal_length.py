@@ -29,5 +29,8 @@ class FocalLength(CameraEffect):
     )
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
-        """Add the error, px, to the real camera's principal distance."""
+        """Add the error, px, to the real camera's principal distance.
+
+        state: the cameras before this effect. `random` is not used.
+        """
         return state.changed(self.camera, f_px=self.delta_px)

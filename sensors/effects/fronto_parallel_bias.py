@@ -15,9 +15,10 @@ from sensors.signal_chain.matches import Matches
 class FrontoParallelBias(Effect):
     """A matcher with windows of one disparity is biased in proportion to the gradient of the disparity.
 
-    dd = min(max(a |grad d| + b d_u, -L), L), which lies between -L and L. A window on a slanted surface contains a range of
-    disparities and takes one of them (Bleyer et al. 2011, 1). An asymmetric window takes that of a place beside its centre,
-    b px along the row (Kanade & Okutomi 1994). Registration absorbs most of b, because it displaces the whole surface.
+    dd = min(max(a |grad d| + b d_u, -L), L), with the slope a, the displacement b, the limit L and the change d_u of the
+    disparity d per column. It lies between -L and L. A window on a slanted surface contains a range of disparities and takes
+    one of them (Bleyer et al. 2011, 1). An asymmetric window takes that of a place beside its centre, b px along the row
+    (Kanade & Okutomi 1994). Registration absorbs most of b, because it displaces the whole surface.
     """
 
     name: Literal["fronto_parallel_bias"] = "fronto_parallel_bias"
@@ -49,18 +50,27 @@ class FrontoParallelBias(Effect):
     limit_px: float = parameter("largest bias", unit="px", source="empirical", null=None, default=1.0, gt=0)
 
     def bias(self, along_row: FloatArray, along_column: FloatArray) -> FloatArray:
-        """Return the change of the disparity, px, for its derivatives by column u and by row v, px per px."""
+        """Return the bias of a matcher's disparity, px, on a slanted surface.
+
+        along_row, along_column: derivatives of the disparity by column u and by row v, px per px, arrays of equal shape.
+        """
         linear = self.slope_px * np.hypot(along_row, along_column) + self.row_px * along_row
         return np.clip(linear, -self.limit_px, self.limit_px)
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        """Add the bias to the disparities, px; a cell whose neighbours have no match keeps its disparity."""
+        """Add the bias to the disparities, px; a cell whose neighbours have no match keeps its disparity.
+
+        state: the matched cells of the depth map before this effect. `random` is not used.
+        """
         disparity = state.raster()
         along_column, along_row = (_derivative(disparity, axis) / state.reduction for axis in (0, 1))
         return state.with_raster(disparity + self.bias(along_row, along_column))
 
     def mean(self, at: Any) -> FloatArray:
-        """Return the change of the disparity (n,), px."""
+        """Return the bias of the disparity on slanted surfaces, (n,), px.
+
+        at: geometry of n matched pixels of the stereo pair, as NumPy arrays.
+        """
         return self.bias(at.along_row, at.along_column)
 
 

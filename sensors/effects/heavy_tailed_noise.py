@@ -19,10 +19,10 @@ from sensors.signal_chain.node_grid import smooth_field, uniform_field_correlati
 class HeavyTailedNoise(NodeNoise):
     """Matching noise whose size varies log-normally over the image.
 
-    dd = sigma a exp(t b - t^2), where a and b are independent. The standard deviation is
-    sigma, the kurtosis 3 exp(4 t^2). Both fields have Gaussian values on a grid of nodes `step` apart, with bilinear
-    interpolation. The model was fitted to OpenCV's semi-global matching of rendered and real pictures
-    (docs/explanation/matching.md). `scarpsim gap` does not look for it.
+    dd = sigma a exp(t b - t^2), where a and b are independent smooth random fields of variance 1 and t is the tail parameter.
+    The standard deviation is sigma, the kurtosis 3 exp(4 t^2). Both fields have Gaussian values on a grid of nodes `step`
+    apart, with bilinear interpolation. The model was fitted to OpenCV's semi-global matching of rendered and real pictures
+    (docs/explanation/matching.md). It is for simulation only; `scarpsim gap` does not look for it.
     """
 
     name: Literal["heavy_tailed_noise"] = "heavy_tailed_noise"
@@ -46,18 +46,23 @@ class HeavyTailedNoise(NodeNoise):
     )
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        """Add smooth noise, px, to the disparities, with a local size that itself varies smoothly."""
+        """Add smooth noise, px, to the disparities, with a local size that itself varies smoothly.
+
+        state: the matched cells of the depth map before this effect. random: source of random numbers.
+        """
         error, size = (smooth_field(state, self.step_px, random.child(part), even=True) for part in ("error", "size"))
         sigma, tail = (dr.opaque(mi.Float32, value) for value in (self.sigma_px, self.tail))
         noise = sigma * error * dr.exp(tail * size - dr.square(tail))
         return replace(state, disparity=state.disparity + mi.Float64(noise))
 
     def semivariogram(self, lag: FloatArray) -> FloatArray:
-        """Return half the mean squared difference (k,), px2, of two pixels `lag` (k, 2), px, apart.
+        """Return the semivariogram (k,), px2: half the mean squared difference of the errors of pixels that are `lag` apart.
 
         It is sigma^2 (1 - <r exp(t^2 (r - 1))>), where t is the tail parameter, r the correlation of the fields at two
-        positions, and < > the average over positions. This follows from E exp(t (b + b')) = exp(t^2 (1 + r)) for normal b,
-        b' of variance 1.
+        positions, and < > the average over positions. This follows from E exp(t (b + b')) = exp(t^2 (1 + r)) for normal b, b'
+        of variance 1.
+
+        lag: (k, 2) columns and rows from one pixel to the other, px.
         """
         correlation = uniform_field_correlation(lag / self.step_px)
         kept = correlation * np.exp(self.tail**2 * (correlation - 1))

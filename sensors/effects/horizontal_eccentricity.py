@@ -13,7 +13,7 @@ from sensors.signal_chain.pulses import PulseGeometry
 class HorizontalEccentricity(AimEffect):
     """The horizontal circle is not centred on its axis, which gives an azimuth error that repeats once per turn.
 
-    daz = a sin(az + phase) (Lichti 2007, B2 and B3).
+    daz = a sin(az + phase), with the amplitude a (Lichti 2007, B2 and B3).
     """
 
     name: Literal["horizontal_eccentricity"] = "horizontal_eccentricity"
@@ -29,6 +29,7 @@ class HorizontalEccentricity(AimEffect):
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
         """Return recorded minus true azimuth, a sine of the azimuth, and zenith, which is zero; rad.
 
-        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
+        at: geometry of n pulses. m: elementary functions (sine, logarithm and so on) for its arrays, `HOST` for NumPy or
+        `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
         """
         return p.amplitude_rad * m.sin(at.azimuth + p.phase_rad), 0.0

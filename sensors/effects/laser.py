@@ -20,10 +20,11 @@ from sensors.signal_chain.pulses import PulseGeometry, Pulses
 
 
 class AimEffect(Effect):
-    """An effect by which the beam leaves in another direction than is recorded.
+    """Base class of errors of a scanner's angles: the beam leaves in another direction than is recorded.
 
-    With an error d of a recorded angle the beam leaves by -d, and the recorded range is that of where it went: dR = -d
-    dR/dangle, to first order.
+    If a recorded angle is too large by d, the beam leaves at an angle that is smaller by d. The scanner records the range of
+    the rock that this beam meets. On inclined rock the range is therefore wrong by dR = -d dR/dangle, to first order, where
+    dR/dangle is the change of the range with the angle (m/rad).
     """
 
     sensor = "tls"
@@ -32,24 +33,31 @@ class AimEffect(Effect):
 
     @abstractmethod
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
-        """Return recorded minus true azimuth and zenith, (n,) each, rad; a number if it is the same for all pulses.
+        """Return the errors of azimuth and zenith, recorded minus true, rad: arrays (n,), or a number valid for all pulses.
 
-        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
+        at: geometry of n pulses. m: elementary functions (sine, logarithm and so on) for its arrays, `HOST` for NumPy or
+        `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
         """
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Add the angle errors to the pulses: recorded minus true azimuth and zenith, rad."""
+        """Add the angle errors to the pulses: recorded minus true azimuth and zenith, rad.
+
+        state: the pulses of a scan before this effect. `random` is not used.
+        """
         azimuth, zenith = self.angles(state.geometry(), DEVICE, DeviceParameters(self))
         return state.with_angle_error(azimuth, zenith)
 
     def mean(self, at: PulseGeometry) -> FloatArray:
-        """Return the range error (n,), m, that the angle errors cause on an inclined surface, to first order."""
+        """Return the range error (n,), m, that the angle errors cause on an inclined surface, to first order.
+
+        at: geometry of n pulses, as NumPy arrays.
+        """
         azimuth, zenith = self.angles(at, HOST, self)
         return np.asarray(-azimuth * at.by_azimuth - zenith * at.by_zenith)
 
 
 class RangeEffect(Effect):
-    """An effect that changes the recorded range systematically."""
+    """Base class of systematic errors of a scanner's range. A subclass gives the equation of the error."""
 
     sensor = "tls"
     stage = Stage.RANGE
@@ -59,20 +67,27 @@ class RangeEffect(Effect):
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
         """Return recorded minus true range (n,), m; a number if it is the same for all pulses.
 
-        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
+        at: geometry of n pulses. m: elementary functions (sine, logarithm and so on) for its arrays, `HOST` for NumPy or
+        `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
         """
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Add the systematic error, m, to each recorded range."""
+        """Add the systematic error, m, to each recorded range.
+
+        state: the pulses of a scan before this effect. `random` is not used.
+        """
         return state.with_range_error(self.error(state.geometry(), DEVICE, DeviceParameters(self)))
 
     def mean(self, at: PulseGeometry) -> FloatArray:
-        """Return the systematic range error (n,), recorded minus true, m."""
+        """Return the systematic range error (n,), recorded minus true, m.
+
+        at: geometry of n pulses, as NumPy arrays.
+        """
         return np.broadcast_to(self.error(at, HOST, self), len(at)).astype(np.float64)
 
 
 class RangeSpread(Effect):
-    """An effect that adds white noise to the recorded range, independent for each pulse."""
+    """Base class of white noise of a scanner's range, independent for each pulse. A subclass gives its standard deviation."""
 
     sensor = "tls"
     stage = Stage.RANGE
@@ -83,14 +98,21 @@ class RangeSpread(Effect):
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
         """Return the standard deviation of the range (n,), m; a number if it is the same for all pulses.
 
-        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
+        at: geometry of n pulses. m: elementary functions (sine, logarithm and so on) for its arrays, `HOST` for NumPy or
+        `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
         """
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Add normal noise, m, to each recorded range, independently for each pulse."""
+        """Add normal noise, m, to each recorded range, independently for each pulse.
+
+        state: the pulses of a scan before this effect. random: source of random numbers.
+        """
         sigma = self.sigma(state.geometry(), DEVICE, DeviceParameters(self))
         return state.with_range_error(sigma * mi.Float64(state.normals(random).x))
 
     def variance(self, at: PulseGeometry) -> FloatArray:
-        """Return the variance (n,) of the range noise, m2."""
+        """Return the variance (n,) of the range noise, m2.
+
+        at: geometry of n pulses, as NumPy arrays.
+        """
         return np.broadcast_to(np.square(self.sigma(at, HOST, self)), len(at)).astype(np.float64)

@@ -12,7 +12,7 @@ from sensors.effects.base import Effect, ShowsIn, Stage, parameter
 
 
 class MatchingNoise(Effect):
-    """Noise of the disparity whose semivariogram is known in closed form."""
+    """Base class of noise of the disparity whose semivariogram (half the mean squared difference of two pixels) is known."""
 
     sensor = "stereo"
     stage = Stage.MATCH
@@ -21,25 +21,40 @@ class MatchingNoise(Effect):
 
     @abstractmethod
     def semivariogram(self, lag: FloatArray) -> FloatArray:
-        """Return half the mean squared difference (k,) of two pixels `lag` (k, 2) apart, px2; lag in px, columns and rows."""
+        """Return the semivariogram (k,), px2: half the mean squared difference of the errors of pixels that are `lag` apart.
+
+        lag: (k, 2) columns and rows from one pixel to the other, px.
+        """
 
     @property
     def total_variance(self) -> float:
-        """Mean variance of a disparity over the image, px2: the limit of the semivariogram at large lags."""
+        """Variance of the disparity that this noise causes, averaged over the image, px2.
+
+        It is the limit of the semivariogram at large lags.
+        """
         far = np.array([[1e9, 1e9]])
         return float(self.semivariogram(far)[0])
 
     def covariance(self, lag: FloatArray) -> FloatArray:
-        """Return the covariance (k,) of two pixels `lag` (k, 2), px, apart, px2."""
+        """Return the covariance (k,), px2, of the errors of two pixels that are `lag` apart.
+
+        lag: (k, 2) columns and rows from one pixel to the other, px.
+        """
         return self.total_variance - self.semivariogram(lag)
 
     def variance(self, at: Any) -> FloatArray:
-        """Return the variance of a disparity, px2, the same for all pixels (n,)."""
+        """Return the variance of the disparity that this noise causes, px2, the same for all pixels (n,).
+
+        at: geometry of n matched pixels of the stereo pair, as NumPy arrays.
+        """
         return np.full(len(at), self.total_variance)
 
 
 class NodeNoise(MatchingNoise):
-    """Grid-correlated noise: random numbers on the nodes of a grid, interpolated between them."""
+    """Base class of grid-correlated noise: random numbers on the nodes of a grid over the image, interpolated between them.
+
+    `step_px` is the distance between nodes, in px of the full-resolution frame.
+    """
 
     shared = True
     step_px: float = parameter("distance between nodes", unit="px", source="empirical", null=None, default=32.0, gt=0)

@@ -25,10 +25,18 @@ class ParallaxNoise(MatchingNoise):
     sigma_px: float = parameter("standard deviation of the disparity", unit="px", source="empirical", typical=0.3, ge=0, le=1000)
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        """Add normal noise, px, to each disparity, independently for each cell."""
+        """Add normal noise, px, to each disparity, independently for each cell.
+
+        state: the matched cells of the depth map before this effect. random: source of random numbers.
+        """
         noise = mi.Float64(random.normals(state.index).x)
         return replace(state, disparity=state.disparity + dr.opaque(mi.Float64, self.sigma_px) * noise)
 
     def semivariogram(self, lag: FloatArray) -> FloatArray:
-        """Return sigma^2, px2, for any lag (k, 2): different cells are independent."""
+        """Return the semivariogram (k,), px2: half the mean squared difference of the errors of pixels that are `lag` apart.
+
+        It is sigma^2 for any lag, because different cells of the depth map are independent.
+
+        lag: (k, 2) columns and rows from one pixel to the other, px.
+        """
         return np.full(len(lag), self.sigma_px**2)

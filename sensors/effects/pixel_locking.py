@@ -20,9 +20,10 @@ from sensors.signal_chain.matches import Matches
 class PixelLocking(Effect):
     """The matcher's sub-pixel disparities are biased towards whole pixels.
 
-    dd = A sin(2 pi d / n + phase), with n the reduction of the matched image by default (2, 4, 8 for high, medium, low), so
-    that d / n counts its pixels. Semi-global matching has A of about 0.2 to 0.25 px of the matched image, that is n times
-    as much here (Shimizu & Okutomi 2005). The effect acts last, after all noise.
+    dd = A sin(2 pi d / n + phase), with the amplitude A and the disparity d. The period n is by default the reduction of the
+    matched image (2, 4, 8 for high, medium, low quality), so that d / n counts its pixels. Semi-global matching has A of about
+    0.2 to 0.25 px of the matched image, that is n times as much here (Shimizu & Okutomi 2005). The effect acts last, after all
+    noise.
     """
 
     name: Literal["pixel_locking"] = "pixel_locking"
@@ -45,7 +46,10 @@ class PixelLocking(Effect):
     )
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        """Add the sine of the matched disparity, px, to the noisy disparity."""
+        """Add the sine of the matched disparity, px, to the noisy disparity.
+
+        state: the matched cells of the depth map before this effect. `random` is not used.
+        """
         amplitude, period, phase = opaque(self.amplitude_px, self.period_px or state.reduction, self.phase_rad)
         matched = state.disparity
         if self.tilt_rad:
@@ -53,7 +57,10 @@ class PixelLocking(Effect):
         return replace(state, disparity=state.disparity + amplitude * _wave(matched / period, phase, DEVICE))
 
     def mean(self, at: Any) -> FloatArray:
-        """Return the change (n,) of the disparity, px, at the disparities that were found."""
+        """Return the change (n,) of the disparity, px, at the disparities that were found.
+
+        at: geometry of n matched pixels of the stereo pair, as NumPy arrays.
+        """
         matched = at.found
         if self.tilt_rad:
             matched = _turned(matched, at.tangent, at.infinity, math.tan(self.tilt_rad))

@@ -16,9 +16,10 @@ from sensors.signal_chain.surface_places import RecordedPoints
 class PointNoise(Effect):
     """Points lie above or below the surface, along its normal, by white and by grid-correlated noise.
 
-    The white part has the standard deviation sqrt(sigma^2 + (steep b)^2), with b the slope against the wall's plane in
-    radians. The correlated part is sum_ij w_ij(x, y) g_ij with g_ij ~ N(0, shared) at nodes a step apart on the wall's plane.
-    Empirical: `scarpsim gap` and `scarpsim measurement` estimate it; it is not in the shared catalogue.
+    The white part is independent for each point. Its standard deviation is sqrt(sigma_m^2 + (steep_sigma_m b)^2), with the
+    slope b against the wall's plane in radians. The correlated part is interpolated bilinearly between the nodes of a grid on
+    the wall's plane, which are `shared_step_m` apart and have independent normal values of standard deviation `shared_sigma_m`.
+    Empirical: `scarpsim gap` and `scarpsim measurement` estimate it; no publication gives its values.
     """
 
     name: Literal["point_noise"] = "point_noise"
@@ -43,11 +44,14 @@ class PointNoise(Effect):
 
     @property
     def shared_variance(self) -> float:
-        """Variance of the grid-correlated part, averaged over the surface, m2."""
+        """Variance of the part of the noise that neighbouring points share (grid-correlated), averaged over the surface, m2."""
         return MEAN_VARIANCE * self.shared_sigma_m**2
 
     def variance(self, at: Any) -> FloatArray:
-        """Return the variance (n,) of a point's height over the surface, m2: white and grid-correlated parts."""
+        """Return the variance (n,) of a point's height over the surface, m2: white and grid-correlated parts.
+
+        at: n places on the surface.
+        """
         return self._own_variance(at) + self.shared_variance
 
     def _own_variance(self, at: Any) -> FloatArray:
@@ -56,7 +60,10 @@ class PointNoise(Effect):
         return own + (self.steep_sigma_m * np.nan_to_num(at.covariates["slope"])) ** 2 if self.steep_sigma_m else own
 
     def evaluate(self, state: RecordedPoints, random: KeyedRandom) -> RecordedPoints:
-        """Move each point along the surface's normal by white and grid-correlated noise, m."""
+        """Move each point along the surface's normal by white and grid-correlated noise, m.
+
+        state: the recorded points before this effect. random: source of random numbers.
+        """
         white = np.sqrt(self._own_variance(state.places)) * random.child("point").generator().standard_normal(len(state.above))
         return state.with_height_error(
             white + self.shared_sigma_m * self._field(state.places.point[:, :2], random.child("nodes"))

@@ -18,10 +18,10 @@ from sensors.signal_chain.pulses import PulseGeometry, Pulses
 class Precipitation(Effect):
     """Rain, snow or dust absorbs echoes, and some drops return one themselves.
 
-    A return is lost with probability 1 - exp(-2 beta R). The share `early_share` of the lost ones returns early, from a
-    drop. The drop's range r has the density exp(-2 beta r), normalised between the instrument's minimum range and R. An early
-    return keeps the pulse's range errors and its power, because a drop's brightness is not modelled. It belongs to no block.
-    Pulses that hit nothing do not return from drops.
+    A return at range R is lost with probability 1 - exp(-2 beta R). The share `early_share` of the lost ones returns early,
+    from a drop. The drop's range r has the density exp(-2 beta r), normalised between the instrument's minimum range and R. An
+    early return keeps the pulse's range errors and its power, because a drop's brightness is not modelled. It belongs to no
+    block. Pulses that hit nothing do not return from drops.
     """
 
     name: Literal["precipitation"] = "precipitation"
@@ -36,7 +36,10 @@ class Precipitation(Effect):
     )
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Lose returns at random by their range, and give back a share of them at the range of a drop, m."""
+        """Lose returns at random by their range, and give back a share of them at the range of a drop, m.
+
+        state: the pulses of a scan before this effect. random: source of random numbers.
+        """
         double_rate, early_share = opaque(2 * self.rate_per_m, self.early_share)
         nearest: mi.Float64 = state.minimum_range
         true_range: mi.Float64 = state.true_range
@@ -53,5 +56,10 @@ class Precipitation(Effect):
         )
 
     def kept(self, at: PulseGeometry) -> FloatArray:
-        """Return the probability (n,) that the rock's own echo is recorded, exp(-2 beta R)."""
+        """Return the probability (n,) that rain, snow or dust lets the rock's own echo through.
+
+        It is exp(-2 beta R), with the extinction coefficient beta and the range R.
+
+        at: geometry of n pulses, as NumPy arrays.
+        """
         return np.exp(-2 * self.rate_per_m * np.asarray(at.range_m, dtype=np.float64))

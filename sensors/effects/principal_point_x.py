@@ -28,5 +28,8 @@ class PrincipalPointX(CameraEffect):
     )
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
-        """Shift the real camera's principal point along x by the error, px."""
+        """Shift the real camera's principal point along x by the error, px.
+
+        state: the cameras before this effect. `random` is not used.
+        """
         return state.changed(self.camera, cx_px=self.delta_px)

@@ -28,5 +28,8 @@ class PrincipalPointY(CameraEffect):
     )
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
-        """Shift the real camera's principal point along y by the error, px."""
+        """Shift the real camera's principal point along y by the error, px.
+
+        state: the cameras before this effect. `random` is not used.
+        """
         return state.changed(self.camera, cy_px=self.delta_px)

@@ -14,7 +14,7 @@ class RadialDistortion(CameraEffect):
     """The real radial distortion differs from the calibrated one, which domes or dishes the surface.
 
     k_real = k_nominal + k. On a rectified pair the doming is in the ratio 3 : 1 along u and v: dZ = -Z k1 [3 (u - b/2)^2 + v^2
-    + b^2/4] (James & Robson 2014).
+    + b^2/4], where Z is the depth, u and v are tangents of the angles from the axis, and b is base / Z (James & Robson 2014).
     """
 
     name: Literal["radial_distortion"] = "radial_distortion"
@@ -32,5 +32,8 @@ class RadialDistortion(CameraEffect):
     k4: float = parameter("real minus calibrated k4", unit="1", source="Metashape user manual, appendix D", ge=-100, le=100)
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
-        """Add the errors of k1 to k4 to the real camera's radial distortion."""
+        """Add the errors of k1 to k4 to the real camera's radial distortion.
+
+        state: the cameras before this effect. `random` is not used.
+        """
         return state.changed(self.camera, k1=self.k1, k2=self.k2, k3=self.k3, k4=self.k4)

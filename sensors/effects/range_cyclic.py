@@ -17,7 +17,7 @@ from sensors.signal_chain.pulses import PulseGeometry
 class RangeCyclic(RangeEffect):
     """The range error repeats with the range, from crosstalk in the phase measurement.
 
-    dR = A sin(2 pi R / period + phase) (Lichti 2007, A3 and A4).
+    dR = A sin(2 pi R / period + phase), with the amplitude A and the range R (Lichti 2007, A3 and A4).
     """
 
     name: Literal["range_cyclic"] = "range_cyclic"
@@ -38,10 +38,14 @@ class RangeCyclic(RangeEffect):
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
         """Return the range error (n,), m, a sine of the range.
 
-        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
+        at: geometry of n pulses. m: elementary functions (sine, logarithm and so on) for its arrays, `HOST` for NumPy or
+        `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
         """
         return p.amplitude_m * m.sin(2 * math.pi * at.range_m / p.period_m + p.phase_rad)
 
     def argument(self, at: PulseGeometry) -> FloatArray:
-        """Return the range (n,), m, over which the error repeats."""
+        """Return the range (n,), m: the quantity along which the error repeats as a sine.
+
+        at: geometry of n pulses, as NumPy arrays.
+        """
         return np.asarray(at.range_m, dtype=np.float64)

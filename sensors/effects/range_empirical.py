@@ -17,10 +17,10 @@ Covariate = Literal["range", "azimuth", "zenith", "incidence", "intensity", "tim
 
 
 class RangeEmpirical(Effect):
-    """The range is wrong by dR = c(x) or c(x, y), piecewise linear.
+    """The range is wrong by dR = c(x) or c(x, y), a piecewise linear curve or surface.
 
     x and y are range (m), azimuth, zenith or incidence angle (rad), the logarithm of the received power, or the elapsed share
-    of the scan's duration. Empirical: `scarpsim gap` adds it; it is not in the shared catalogue.
+    of the scan's duration. Empirical: `scarpsim gap` adds it for a pattern without a known cause.
     """
 
     name: Literal["range_empirical"] = "range_empirical"
@@ -37,11 +37,14 @@ class RangeEmpirical(Effect):
 
     @property
     def is_null(self) -> bool:
-        """Whether all values of the curve or surface are zero."""
+        """Whether the effect is off: all values of its curve or surface are zero."""
         return not any(map(any, self.values_m))
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Add the value at each pulse's covariates, m, to its recorded range."""
+        """Add the value at each pulse's covariates, m, to its recorded range.
+
+        state: the pulses of a scan before this effect. `random` is not used.
+        """
         x, y = (self._of(state, each) for each in (self.covariate, self.second or self.covariate))
         return state.with_range_error(interpolate(x, y, self.along, self.across, self.values_m))
 

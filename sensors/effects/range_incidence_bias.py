@@ -13,7 +13,7 @@ from sensors.signal_chain.pulses import PulseGeometry, slant
 class RangeIncidenceBias(RangeEffect):
     """The range error grows with the incidence angle, because the stretched echo of an inclined surface is timed late or early.
 
-    dR = k (1 / cos i - 1) (from comparisons of scanners with laser trackers).
+    dR = k (1 / cos i - 1), with the coefficient k and the incidence angle i (from comparisons of scanners with laser trackers).
     """
 
     name: Literal["range_incidence_bias"] = "range_incidence_bias"
@@ -26,6 +26,7 @@ class RangeIncidenceBias(RangeEffect):
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
         """Return the range error (n,), m, in proportion to 1 / cos i - 1.
 
-        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
+        at: geometry of n pulses. m: elementary functions (sine, logarithm and so on) for its arrays, `HOST` for NumPy or
+        `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
         """
         return p.coefficient_m * slant(at.cos_incidence, m)

@@ -17,9 +17,9 @@ from sensors.signal_chain.pulses import PulseGeometry, Pulses
 class RangeIntensityBias(RangeEffect):
     """The range error depends on the received power (time walk).
 
-    dR = k ln(I / I_0), with I_0 a given power or the median of all pulses that return. A weaker echo
-    crosses a fixed threshold later, so k is negative there. The median belongs to one scan: give I_0 if several scans, or
-    parts of a scan, have to agree. Pulses that are lost only at the return stage count in the median.
+    dR = k ln(I / I_0), with the coefficient k, the received power I, and I_0 a given power or the median of all pulses that
+    return. A weaker echo crosses a fixed threshold later, so k is negative there. The median belongs to one scan: give I_0 if
+    several scans, or parts of a scan, have to agree. Pulses that are lost only at the return stage count in the median.
     """
 
     name: Literal["range_intensity_bias"] = "range_intensity_bias"
@@ -42,19 +42,28 @@ class RangeIntensityBias(RangeEffect):
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
         """Return the range error (n,), m, in proportion to the logarithm of the received power over the reference power.
 
-        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
+        at: geometry of n pulses. m: elementary functions (sine, logarithm and so on) for its arrays, `HOST` for NumPy or
+        `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
         """
         return p.coefficient_m * m.log(at.power / p.reference_power)
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Add the range error, m. If no reference power is given, it is the median power of all pulses that return."""
+        """Add the range error, m. Without a given reference power, the median power of all pulses that return is taken.
+
+        state: the pulses of a scan before this effect. random: source of random numbers.
+        """
         if self.reference_power:
             return super().evaluate(state, random)
         state = state.evaluated()
         return self._about(np.array(state.power)[np.array(state.returned)]).evaluate(state, random)
 
     def mean(self, at: PulseGeometry) -> FloatArray:
-        """Return the range error (n,), m. If no reference power is given, it is the median power of the given pulses."""
+        """Return the range error (n,), m, that the received power causes.
+
+        If the effect has no reference power, the pulses' median power is taken.
+
+        at: geometry of n pulses, as NumPy arrays.
+        """
         return super().mean(at) if self.reference_power else self._about(at.power).mean(at)
 
     def _about(self, power: FloatArray) -> RangeIntensityBias:

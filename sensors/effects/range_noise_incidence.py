@@ -13,8 +13,8 @@ from sensors.signal_chain.pulses import PulseGeometry, slant
 class RangeNoiseIncidence(RangeSpread):
     """Range noise grows with the incidence angle.
 
-    dR ~ N(0, sigma (1 / cos i - 1)), independent for each pulse (Soudarissanane et al. 2011). The factor of sigma is 0 at
-    normal incidence and 1 at 60 degrees.
+    dR ~ N(0, sigma (1 / cos i - 1)), with the incidence angle i, independent for each pulse (Soudarissanane et al. 2011). The
+    factor of sigma is 0 at normal incidence and 1 at 60 degrees.
     """
 
     name: Literal["range_noise_incidence"] = "range_noise_incidence"
@@ -28,6 +28,7 @@ class RangeNoiseIncidence(RangeSpread):
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
         """Return the standard deviation of the range (n,), m, in proportion to 1 / cos i - 1.
 
-        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
+        at: geometry of n pulses. m: elementary functions (sine, logarithm and so on) for its arrays, `HOST` for NumPy or
+        `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
         """
         return p.sigma_m * slant(at.cos_incidence, m)

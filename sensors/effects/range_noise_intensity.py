@@ -41,6 +41,7 @@ class RangeNoiseIntensity(RangeSpread):
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
         """Return the standard deviation of the range (n,), m, a power of the received power.
 
-        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
+        at: geometry of n pulses. m: elementary functions (sine, logarithm and so on) for its arrays, `HOST` for NumPy or
+        `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
         """
         return p.a_m * at.power**p.exponent

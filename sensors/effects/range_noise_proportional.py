@@ -13,7 +13,8 @@ from sensors.signal_chain.pulses import PulseGeometry
 class RangeNoiseProportional(RangeSpread):
     """Range noise grows with the range.
 
-    dR ~ N(0, ppm 1e-6 R), independent for each pulse. It is the second figure of data sheets that state "1 mm + 10 ppm".
+    dR ~ N(0, ppm 1e-6 R) with the range R, independent for each pulse. It is the second figure of data sheets that state "1 mm
+    + 10 ppm".
     """
 
     name: Literal["range_noise_proportional"] = "range_noise_proportional"
@@ -25,6 +26,7 @@ class RangeNoiseProportional(RangeSpread):
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
         """Return the standard deviation of the range (n,), m, in proportion to the range.
 
-        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
+        at: geometry of n pulses. m: elementary functions (sine, logarithm and so on) for its arrays, `HOST` for NumPy or
+        `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
         """
         return p.ppm * 1e-6 * at.range_m

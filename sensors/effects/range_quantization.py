@@ -31,10 +31,16 @@ class RangeQuantization(Effect):
     step_m: float = parameter("step of the recorded range", unit="m", source="datasheets", typical=0.001, ge=0, le=100)
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Round each recorded range to a multiple of the step, m."""
+        """Round each recorded range to a multiple of the step, m.
+
+        state: the pulses of a scan before this effect. `random` is not used.
+        """
         step = dr.opaque(mi.Float64, self.step_m)
         return replace(state, range_m=step * dr.round(state.range_m / step))
 
     def variance(self, at: PulseGeometry) -> FloatArray:
-        """Return the variance of a rounding error, step^2 / 12, m2, the same for all pulses (n,)."""
+        """Return the variance of a rounding error, step^2 / 12, m2, the same for all pulses (n,).
+
+        at: geometry of n pulses, as NumPy arrays.
+        """
         return np.full(len(at), self.step_m**2 / 12)

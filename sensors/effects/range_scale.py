@@ -11,7 +11,7 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 
 class RangeScale(RangeEffect):
-    """Ranges are wrong in proportion to their length: dR = scale 1e-6 R.
+    """Ranges R are wrong in proportion to their length: dR = scale 1e-6 R.
 
     Causes are the instrument's scale, and air temperature and pressure (about +1 ppm/K, -0.28 ppm/hPa; Lichti 2007, A1).
     """
@@ -31,6 +31,7 @@ class RangeScale(RangeEffect):
     def error(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
         """Return the range error (n,), m, in proportion to the range.
 
-        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
+        at: geometry of n pulses. m: elementary functions (sine, logarithm and so on) for its arrays, `HOST` for NumPy or
+        `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
         """
         return p.scale_ppm * 1e-6 * at.range_m

@@ -11,7 +11,7 @@ from sensors.signal_chain.matches import Matches
 
 
 class RasterEffect(Effect):
-    """An effect that is a pure function of the raster of disparities."""
+    """Base class of effects that filter the depth map: each disparity changes by its neighbours, without random numbers."""
 
     sensor = "stereo"
     stage = Stage.MATCH
@@ -20,19 +20,22 @@ class RasterEffect(Effect):
 
     @abstractmethod
     def filtered(self, disparity: FloatArray, cell_px: float, jump_px: float) -> FloatArray:
-        """Return the changed disparities.
+        """Return the disparities (rows, columns), px, after the effect; a subclass defines the filter.
 
         Parameters
         ----------
         disparity : (rows, columns) array
             Disparities, px, NaN without a match.
         cell_px : float
-            Frame px per cell.
+            Size of a cell of the depth map, px of the full-resolution frame.
         jump_px : float
             Neighbours that differ by more than this are a depth step, px.
         """
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        """Filter the raster of disparities, px; a step of more than one matched pixel counts as a depth step."""
+        """Filter the raster of disparities, px; a step of more than one matched pixel counts as a depth step.
+
+        state: the matched cells of the depth map before this effect. `random` is not used.
+        """
         step = float(state.reduction)
         return state.with_raster(self.filtered(state.raster(), step, step))

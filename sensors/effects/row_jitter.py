@@ -19,10 +19,11 @@ from sensors.signal_chain.matches import ImageRows
 class RowJitter(Effect):
     """Image rows are displaced sideways by a wave, as by a rolling shutter or vibration during the exposure.
 
-    dx = A sin(2 pi v / n + phase) is the recorded minus the ideal column of a pixel in row v; the wave repeats after n rows.
-    In the left image this changes the disparity by +dx, and each pixel sees what lies dx px to the left. In the right image it
-    changes the disparity by -dx at the right image's row. If both cameras shake alike (`both`), the two changes cancel where a
-    point has the same row in both images. Where its rows differ, the difference of the two displacements remains.
+    dx = A sin(2 pi v / n + phase) is the recorded minus the ideal column of a pixel in row v, with the amplitude A; the wave
+    repeats after n rows. In the left image this changes the disparity by +dx, and each pixel sees what lies dx px to the left.
+    In the right image it changes the disparity by -dx at the right image's row. If both cameras shake alike (`both`), the two
+    changes cancel where a point has the same row in both images. Where its rows differ, the difference of the two displacements
+    remains.
     """
 
     name: Literal["row_jitter"] = "row_jitter"
@@ -38,25 +39,35 @@ class RowJitter(Effect):
     phase_rad: float = parameter("phase at the frame's top", unit="rad", source="empirical", null=None, default=0.0)
 
     def shift(self, row: Any, m: Functions, p: Any) -> Any:
-        """Return recorded minus ideal column (n,), px: the sine wave dx of the row.
+        """Return by how far image rows are displaced sideways, (n,), px: recorded minus ideal column, a sine of the row.
 
-        row: (n,) px from the top of the frame; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's
-        parameters.
+        row: (n,) px from the top of the frame. m: elementary functions (sine, logarithm and so on) for its array, `HOST` for
+        NumPy or `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
         """
         return p.amplitude_px * m.sin(2 * math.pi * row / p.rows_per_cycle + p.phase_rad)
 
     def evaluate(self, state: ImageRows, random: KeyedRandom) -> ImageRows:
-        """Displace the columns of the camera's image by the wave at their row, px."""
+        """Displace the columns of the camera's image by the wave at their row, px.
+
+        state: pixels of one camera's image before this effect. `random` is not used.
+        """
         if self.camera not in (state.camera, "both"):
             return state
         return replace(state, du=state.du + self.shift(state.v, DEVICE, DeviceParameters(self)))
 
     def mean(self, at: Any) -> FloatArray:
-        """Return the change of the disparity (n,), px: the left image's displacement minus the right one's."""
+        """Return the change of the disparity (n,), px: the left image's displacement minus the right one's.
+
+        at: geometry of n matched pixels of the stereo pair, as NumPy arrays.
+        """
         left = self.shift(at.v, HOST, self) if self.camera != "right" else 0.0
         right = self.shift(at.v_right, HOST, self) if self.camera != "left" else 0.0
         return np.asarray(left - right)
 
     def argument(self, at: Any) -> FloatArray:
-        """Return the image row (n,), px, over which the wave repeats: the right image's if only that camera shakes."""
+        """Return the image row (n,), px from the top of the frame: the quantity along which the displacement repeats as a sine.
+
+        It is the row in the right image if only the right camera shakes, else the row in the left image. at: geometry of n
+        matched pixels of the stereo pair, as NumPy arrays.
+        """
         return np.asarray(at.v_right if self.camera == "right" else at.v)

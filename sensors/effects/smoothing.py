@@ -16,9 +16,10 @@ from sensors.effects.raster_effect import RasterEffect
 class Smoothing(RasterEffect):
     """Disparities are low-pass filtered, as by the matcher's windows and smoothness terms.
 
-    d' = (G * m d) / (G * m), where * is the convolution over the image. Unmatched cells neither count nor are filled
-    (normalised convolution, Knutsson & Westin 1993). Near them and at the image's border the mean is one-sided: where the
-    disparity changes by s px per px, it is wrong by up to 0.8 s sigma.
+    d' = (G * m d) / (G * m), where G is a Gaussian of standard deviation sigma, m is 1 where there is a match (else 0), and *
+    is the convolution over the image. Unmatched cells neither count nor are filled (normalised convolution, Knutsson & Westin
+    1993). Near them and at the image's border the mean is one-sided: where the disparity changes by s px per px, it is wrong by
+    up to 0.8 s sigma.
     """
 
     name: Literal["smoothing"] = "smoothing"
@@ -30,24 +31,31 @@ class Smoothing(RasterEffect):
 
     @classmethod
     def scored(cls) -> bool:
-        """Return True: smoothing changes disparities on every curved part of the surface, not only at edges."""
+        """Return whether the effect can be judged by a log score of residuals: True.
+
+        Smoothing changes disparities on every curved part of the surface, not only at edges.
+        """
         return True
 
     def filtered(self, disparity: FloatArray, cell_px: float, jump_px: float) -> FloatArray:
-        """Return the disparities, px, after the Gaussian low-pass."""
+        """Return the disparities, px, after the Gaussian low-pass.
+
+        disparity: (rows, columns) of the depth map, px, NaN without a match. cell_px: px of the full-resolution frame for each
+        cell. jump_px: smallest difference of neighbours that is a depth step, px; not used.
+        """
         return smoothed(disparity, self.sigma_px / cell_px)
 
 
 @dataclass(frozen=True)
 class LowPass:
-    """A low-pass filter for rasters with matches in the same cells.
+    """A Gaussian low-pass filter for depth maps that have matches in the same cells; it averages over matched cells alone.
 
     Attributes
     ----------
     matched : (rows, columns) bool array
         Cells with a match.
     weight : (rows, columns) array
-        The low-passed `matched`.
+        `matched` (1 or 0) after the low-pass, by which filtered values are divided.
     sigma : float
         Standard deviation of the Gaussian, cells.
     """
@@ -58,17 +66,26 @@ class LowPass:
 
     @classmethod
     def over(cls, matched: NDArray[np.bool_], sigma: float) -> LowPass:
-        """Prepare the filter for rasters with the given matches."""
+        """Prepare the low-pass filter for depth maps with given matches.
+
+        matched: (rows, columns) mask of the cells with a match. sigma: standard deviation of the Gaussian, cells.
+        """
         return cls(matched, _gaussian(matched.astype(np.float64), sigma), sigma)
 
     def of(self, disparity: FloatArray) -> FloatArray:
-        """Return the low-passed values (rows, columns), NaN without a match."""
+        """Return the values of a depth map after the low-pass, (rows, columns), NaN without a match.
+
+        disparity: (rows, columns) values, in any unit, with matches where the filter was prepared for them.
+        """
         total = _gaussian(np.where(self.matched, disparity, 0.0), self.sigma)
         return np.divide(total, self.weight, out=np.full_like(total, np.nan), where=self.matched)
 
 
 def smoothed(disparity: FloatArray, sigma: float) -> FloatArray:
-    """Low-pass disparities (rows, columns), px, NaN where unmatched, with a Gaussian of `sigma` cells over the matched ones."""
+    """Return disparities (rows, columns), px, after a Gaussian low-pass over the matched cells; NaN stays where unmatched.
+
+    disparity: (rows, columns), px, NaN where unmatched. sigma: standard deviation of the Gaussian, cells.
+    """
     return LowPass.over(~np.isnan(disparity), sigma).of(disparity)
 
 

@@ -14,10 +14,11 @@ from sensors.signal_chain.surface_places import Covariate, RecordedPoints, Surfa
 
 
 class SurfaceEmpirical(Effect):
-    """Points lie above the surface, along its normal, by dn = c(x) or c(x, y), piecewise linear.
+    """Points lie above the surface, along its normal, by dn = c(x) or c(x, y), a piecewise linear curve or surface (m).
 
-    x and y are the position along the wall, up it or out of its plane (m), the slope against that plane (rad), roughness,
-    convexity, or the distance to the nearest edge (m). Empirical: `scarpsim gap` adds it; it is not in the shared catalogue.
+    x and y are the position along the wall, up it or out of its plane (m), the slope against that plane (rad), the roughness
+    and convexity of the rock around the point (m), or the distance to the nearest edge (m). Empirical: `scarpsim gap` adds it
+    for a pattern without a known cause.
     """
 
     name: Literal["surface_empirical"] = "surface_empirical"
@@ -34,16 +35,22 @@ class SurfaceEmpirical(Effect):
 
     @property
     def is_null(self) -> bool:
-        """Whether all values of the curve or surface are zero."""
+        """Whether the effect is off: all values of its curve or surface are zero."""
         return not any(map(any, self.values_m))
 
     def mean(self, at: SurfacePlaces) -> FloatArray:
-        """Return the height error (n,) of the points along the surface's normal, m, by their covariates."""
+        """Return the height error (n,) of the points along the surface's normal, m, by their covariates.
+
+        at: n places on the surface.
+        """
         found = at.covariates
         return interpolate_on_host(
             found[self.covariate], found[self.second or self.covariate], self.along, self.across, self.values_m
         )
 
     def evaluate(self, state: RecordedPoints, random: KeyedRandom) -> RecordedPoints:
-        """Move each point along the surface's normal by the value at its covariates, m."""
+        """Move each point along the surface's normal by the value at its covariates, m.
+
+        state: the recorded points before this effect. `random` is not used.
+        """
         return state.with_height_error(self.mean(state.places))

@@ -33,5 +33,8 @@ class TangentialDistortion(CameraEffect):
     )
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
-        """Add the errors of p1 and p2 to the real camera's tangential distortion."""
+        """Add the errors of p1 and p2 to the real camera's tangential distortion.
+
+        state: the cameras before this effect. `random` is not used.
+        """
         return state.changed(self.camera, p1=self.p1, p2=self.p2)

@@ -27,10 +27,10 @@ LARGEST_SIGMA_PX = 1.0
 class TextureNoise(Effect):
     """Matching noise grows where the rock has little texture, by the Cramer-Rao bound of matching a window.
 
-    sigma_d^2 = k sigma_I^2 / sum gx^2, at most 1 px^2. The sum of the squared gradients runs over the 5 x 5 cells of the
-    depth map about each cell. sigma_I is 1 grey value of 255. For the simulated matcher the image is 255 x albedo (no
-    shading, no texture finer than the wall's triangles). k = 2 is the bound for two equally noisy images. Real rock has
-    finer texture, so its k is smaller.
+    sigma_d^2 = k sigma_I^2 / sum gx^2, at most 1 px^2, is the variance of the disparity. The sum of the squared horizontal
+    gradients gx runs over the 5 x 5 cells of the depth map about each cell. The noise sigma_I of the image is 1 grey value of
+    255. For the simulated matcher the image is 255 x albedo (no shading, no texture finer than the wall's triangles). k = 2 is
+    the bound for two equally noisy images. Real rock has finer texture, so its k is smaller.
     """
 
     name: Literal["texture_noise"] = "texture_noise"
@@ -49,6 +49,8 @@ class TextureNoise(Effect):
         """Add normal noise, px, to each disparity, larger where the albedo has little texture.
 
         Raises InputError if the wall has no albedo.
+
+        state: the matched cells of the depth map before this effect. random: source of random numbers.
         """
         albedo = state.albedo_raster()
         if albedo is None:
@@ -63,9 +65,11 @@ class TextureNoise(Effect):
 
 
 def texture(image: FloatArray, reduction: int) -> FloatArray:
-    """Sum the squared horizontal gradients over the window (rows, columns), in (grey values per px of the frame)^2.
+    """Measure the texture of an image, on which the matching noise depends.
 
-    image: grey values, NaN where unknown; gradients that need an unknown value count as 0. reduction: frame px per cell.
+    Returns for each cell (rows, columns) the sum of the squared horizontal gradients in a window about it, in (grey values per
+    px of the frame)^2. image: grey values of the cells, NaN where unknown; gradients that need an unknown value count as 0.
+    reduction: px of the full-resolution frame per cell.
     """
     from scipy.ndimage import correlate1d
 

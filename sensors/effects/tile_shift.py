@@ -17,9 +17,9 @@ from sensors.signal_chain.matches import Matches
 class TileShift(Effect):
     """A matcher that works in tiles shifts neighbouring tiles against each other.
 
-    dd = A (-1)^(i + j), with the tile's column i = floor(u / n) and row j = floor(v / n), counted from the frame's corner.
-    Tiles are matched one by one to save memory (Hirschmueller 2008, 2.6); each has its own offset, and the seams show. This
-    effect is the pattern with the sharpest seams: the tiles of a checkerboard.
+    dd = A (-1)^(i + j), with the amplitude A and the tile's column i = floor(u / n) and row j = floor(v / n), counted from the
+    frame's corner; n is the side of a tile. Tiles are matched one by one to save memory (Hirschmueller 2008, 2.6); each has its
+    own offset, and the seams show. This effect is the pattern with the sharpest seams: the tiles of a checkerboard.
     """
 
     name: Literal["tile_shift"] = "tile_shift"
@@ -35,14 +35,24 @@ class TileShift(Effect):
     tile_px: float = parameter("side of a tile", unit="px", source="empirical", null=None, default=256.0, gt=0)
 
     def shift(self, u: Any, v: Any, m: Functions, p: Any) -> Any:
-        """Return the change of the disparity (n,), px, at pixels (u, v) of the left image."""
+        """Return the change of the disparity (n,), px, that the tile of each pixel has.
+
+        u, v: (n,) columns and rows in the left image, px. m: elementary functions for these arrays, `HOST` for NumPy or
+        `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
+        """
         half = 0.5 * (m.floor(u / p.tile_px) + m.floor(v / p.tile_px))
         return p.amplitude_px * (1 - 4 * (half - m.floor(half)))
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        """Shift the disparities, px, of each tile."""
+        """Shift the disparities, px, of each tile.
+
+        state: the matched cells of the depth map before this effect. `random` is not used.
+        """
         return replace(state, disparity=state.disparity + self.shift(state.u, state.v, DEVICE, DeviceParameters(self)))
 
     def mean(self, at: Any) -> FloatArray:
-        """Return the change of the disparity (n,), px."""
+        """Return the change of the disparity (n,), px, that the tile of each pixel has.
+
+        at: geometry of n matched pixels of the stereo pair, as NumPy arrays.
+        """
         return np.asarray(self.shift(at.u, at.v, HOST, self))

@@ -13,10 +13,10 @@ from sensors.signal_chain.pulses import PulseGeometry
 class TiltDrift(AimEffect):
     """The scanner tilts during the scan, so that directions are rotated by angles that grow from 0 to the given rates.
 
-    w = s (rate_x, rate_y, 0) is the rotation vector. The rotations are
-    right-handed about the scanner's axes. A direction u is recorded as u + w x u, that is
-    daz = -cot z (w_x cos az + w_y sin az) and dz = w_y cos az - w_x sin az. The scanner itself tilts by -w. The equations are
-    of first order in the angles: for a tilt of 60 arcsec their error is below 0.01 mm at 100 m.
+    w = s (rate_x, rate_y, 0) is the rotation vector, with s the elapsed share of the scan's duration. The rotations are
+    right-handed about the scanner's axes. A direction u is recorded as u + w x u, that is daz = -cot z (w_x cos az + w_y sin
+    az) and dz = w_y cos az - w_x sin az. The scanner itself tilts by -w. The equations are of first order in the angles: for a
+    tilt of 60 arcsec their error is below 0.01 mm at 100 m.
     """
 
     name: Literal["tilt_drift"] = "tilt_drift"
@@ -43,7 +43,8 @@ class TiltDrift(AimEffect):
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
         """Return recorded minus true azimuth and zenith, rad, which grow with the elapsed share of the scan.
 
-        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
+        at: geometry of n pulses. m: elementary functions (sine, logarithm and so on) for its arrays, `HOST` for NumPy or
+        `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
         """
         turn_x, turn_y = p.rate_x_rad * at.share, p.rate_y_rad * at.share
         sin_azimuth, cos_azimuth = m.sin(at.azimuth), m.cos(at.azimuth)

@@ -13,8 +13,8 @@ from sensors.signal_chain.pulses import PulseGeometry
 class TrunnionTilt(AimEffect):
     """The trunnion axis is not perpendicular to the standing axis, which makes the azimuth wrong in proportion to cot z.
 
-    daz = t cot z, to first order in t (Lichti 2007, B7; NIST x7). A zenith angle z beyond pi (second face) reverses the sign.
-    Not valid towards the zenith, where an azimuth has no meaning.
+    daz = t cot z, to first order in the angle t (Lichti 2007, B7; NIST x7). A zenith angle z beyond pi (second face) reverses
+    the sign. Not valid towards the zenith, where an azimuth has no meaning.
     """
 
     name: Literal["trunnion_tilt"] = "trunnion_tilt"
@@ -32,6 +32,7 @@ class TrunnionTilt(AimEffect):
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
         """Return recorded minus true azimuth and zenith, rad: the tilt times cot(zenith), and zero.
 
-        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
+        at: geometry of n pulses. m: elementary functions (sine, logarithm and so on) for its arrays, `HOST` for NumPy or
+        `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
         """
         return p.angle_rad * m.cos(at.zenith) / m.sin(at.zenith), 0.0

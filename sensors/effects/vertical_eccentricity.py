@@ -13,7 +13,7 @@ from sensors.signal_chain.pulses import PulseGeometry
 class VerticalEccentricity(AimEffect):
     """The vertical circle is not centred on its axis, which gives a zenith error that repeats once per turn.
 
-    dz = a sin(z + phase) (Lichti 2007, C2).
+    dz = a sin(z + phase), with the amplitude a (Lichti 2007, C2).
     """
 
     name: Literal["vertical_eccentricity"] = "vertical_eccentricity"
@@ -29,6 +29,7 @@ class VerticalEccentricity(AimEffect):
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
         """Return recorded minus true azimuth, which is zero, and zenith, a sine of the zenith; rad.
 
-        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
+        at: geometry of n pulses. m: elementary functions (sine, logarithm and so on) for its arrays, `HOST` for NumPy or
+        `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
         """
         return 0.0, p.amplitude_rad * m.sin(at.zenith + p.phase_rad)

@@ -11,7 +11,10 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 
 class VerticalIndex(AimEffect):
-    """All zenith angles are too large by the same angle, in both faces: dz = offset (Lichti 2007, C0; NIST x4)."""
+    """All zenith angles are too large by the same angle, in both faces: dz = offset (Lichti 2007, C0; NIST x4).
+
+    The faces are the two positions of the telescope or mirror in which a scanner can aim at a point.
+    """
 
     name: Literal["vertical_index"] = "vertical_index"
     means = "All zenith angles are off by one angle: the vertical circle's zero."
@@ -23,6 +26,7 @@ class VerticalIndex(AimEffect):
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
         """Return recorded minus true azimuth, which is zero, and zenith, a constant; rad.
 
-        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
+        at: geometry of n pulses. m: elementary functions (sine, logarithm and so on) for its arrays, `HOST` for NumPy or
+        `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
         """
         return 0.0, p.offset_rad

@@ -17,7 +17,7 @@ from sensors.signal_chain.pulses import PulseGeometry
 class Wobble(AimEffect):
     """The standing axis wobbles as the scanner rotates, which tilts whole scan lines by a wave.
 
-    dz = a sin(2 pi line / n + phase). There is one line for each azimuth step.
+    dz = a sin(2 pi line / n + phase), with the amplitude a and n lines in a cycle. There is one line for each azimuth step.
     """
 
     name: Literal["wobble"] = "wobble"
@@ -38,10 +38,14 @@ class Wobble(AimEffect):
     def angles(self, at: PulseGeometry, m: Functions, p: Any) -> tuple[Any, Any]:
         """Return recorded minus true azimuth, which is zero, and zenith, a sine of the scan line; rad.
 
-        at: geometry of n pulses; m: `HOST` for NumPy or `DEVICE` for Dr.Jit arrays; p: object with the effect's parameters.
+        at: geometry of n pulses. m: elementary functions (sine, logarithm and so on) for its arrays, `HOST` for NumPy or
+        `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
         """
         return 0.0, p.amplitude_rad * m.sin(2 * math.pi * at.line / p.lines_per_cycle + p.phase_rad)
 
     def argument(self, at: PulseGeometry) -> FloatArray:
-        """Return the scan line (n,) over which the wave repeats."""
+        """Return the number of the scan line (n,): the quantity along which the error repeats as a sine.
+
+        at: geometry of n pulses, as NumPy arrays.
+        """
         return np.asarray(at.line, dtype=np.float64)

@@ -12,11 +12,11 @@ from sensors.signal_chain.observation import Observation
 
 
 def mean_of_faces(first: Observation, second: Observation, tolerance_m: float) -> Observation:
-    """Average two scans (h, w) of the same directions from the same place.
+    """Average the scans of the first and the second face of a scanner, in which errors of its axes cancel.
 
-    A cell holds the mean if the two ranges differ by at most `tolerance_m`. Otherwise it holds the first face's point, because
-    a mean across a depth edge would lie in the air; if only one face has a return, it holds that one. Labels and times are
-    those of the first face.
+    Both scans (h, w) have the same directions from the same place. A cell holds the mean if the two ranges differ by at most
+    `tolerance_m`. Otherwise it holds the first face's point, because a mean across a depth edge would lie in the air; if only
+    one face has a return, it holds that one. Labels and times are those of the first face.
 
     Parameters
     ----------

@@ -25,14 +25,14 @@ _FULL_BEAM = {"1/e2": 1.0, "1/e": sqrt(2.0), "fwhm": sqrt(2.0 / log(2.0))}
 
 
 class Figure(Config):
-    """A figure of a data sheet that is no error, such as the pulse rate, with its source."""
+    """A figure of a scanner's data sheet that is no error, such as the pulse rate, with its source."""
 
     value: float = Field(gt=0, description="value, in the unit that the key names")
     source: str = Field(min_length=1, description="where the figure is from")
 
 
 class Window(Config):
-    """A range of directions that a scanner covers, with its source."""
+    """The range of directions that a scanner covers, from its data sheet, with the source."""
 
     value: tuple[Annotated[float, Field(ge=0, le=180)], Annotated[float, Field(ge=0, le=180)]] = Field(
         description="smallest and largest direction, in the unit that the key names"
@@ -41,7 +41,10 @@ class Window(Config):
 
 
 class Accuracy(Config):
-    """A bound on the deviation from the true value, mostly systematic; it is never used as noise."""
+    """Accuracy figure of a data sheet: a bound on the deviation from the true value, mostly systematic.
+
+    It is never used as noise.
+    """
 
     value: float = Field(ge=0, description="value, in the unit that the key names")
     ppm: float = Field(0.0, ge=0, description="further part in proportion to the range")
@@ -50,7 +53,7 @@ class Accuracy(Config):
 
 
 class Precision(Config):
-    """Standard deviation of repeated measurements, which is used as noise."""
+    """Precision figure of a data sheet: the standard deviation of repeated measurements, which is used as noise."""
 
     value: float = Field(ge=0, description="value, in the unit that the key names")
     at_m: float | None = Field(None, gt=0, description="range at which the value holds; none: at any range")
@@ -59,7 +62,7 @@ class Precision(Config):
 
 
 class Divergence(Config):
-    """Divergence of the beam, with the convention in which it is stated."""
+    """Divergence of a laser beam, from a data sheet, with the convention in which it is stated."""
 
     value: float = Field(gt=0, description="value, in the unit that the key names")
     level: Literal["1/e2", "1/e", "fwhm"] = Field(description="share of the intensity on the axis at which the width is measured")
@@ -68,12 +71,18 @@ class Divergence(Config):
 
     @property
     def full_angle(self) -> float:
-        """Full divergence at 1/e^2 of the on-axis intensity of a Gaussian beam, in the figure's unit."""
+        """Full divergence of the beam at 1/e^2 of the intensity on its axis, whatever the convention of the data sheet.
+
+        The beam is taken for Gaussian. The unit is that of the figure.
+        """
         return self.value * _FULL_BEAM[self.level] * (2.0 if self.angle == "half" else 1.0)
 
 
 class ScannerPreset(Config):
-    """A laser scanner as an instrument; unknown properties are left out."""
+    """A model of laser scanner, described by its data sheet; unknown properties are left out.
+
+    Users choose it by name instead of giving the scanner's properties.
+    """
 
     name: str = Field(min_length=1, description="manufacturer and model")
     ranging: Literal["pulse", "phase"] = Field("pulse", description="how the range is measured")
@@ -102,7 +111,7 @@ class ScannerPreset(Config):
         return self
 
     def scanner_values(self) -> dict[str, Any]:
-        """Return the keys and values of a `ScannerConfig` that the preset knows."""
+        """Return what the data sheet tells of the instrument, as keys and values of a `ScannerConfig`, in its units."""
         known: dict[str, Any] = {"name": self.name}
         if self.zenith_limits_deg is not None:
             known["zenith_limits_rad"] = tuple(float(np.radians(limit)) for limit in self.zenith_limits_deg.value)
@@ -114,11 +123,14 @@ class ScannerPreset(Config):
         return known
 
     def scanner(self) -> ScannerConfig:
-        """Return the instrument; what the preset does not know has its default."""
+        """Return the instrument's config from the data sheet; what is not known there has its default."""
         return ScannerConfig(**self.scanner_values())
 
     def model(self) -> TlsModel:
-        """Return the sensor model: noise from the precision figures only, and the beam. What is not known has its default."""
+        """Return the scanner's errors from the data sheet: noise from the precision figures only, and the width of the beam.
+
+        What is not known has its default.
+        """
         known = self._range_noise()
         if self.angle_precision_arcsec is not None:
             known["angle_sigma_rad"] = float(np.radians(self.angle_precision_arcsec.value / 3600))

@@ -43,7 +43,10 @@ _BYTES_PER_PULSE = 400
 
 
 class ScannerConfig(Config):
-    """A laser scanner as an instrument, and the window it scans."""
+    """A laser scanner as an instrument, and the window it scans.
+
+    Its noise and systematic errors are configured elsewhere (`TlsModel`). A file may name a `preset` instead of the properties.
+    """
 
     short_forms: ClassVar[tuple[str, ...]] = ("preset",)
     name: str | None = Field(None, min_length=1, description="manufacturer and model; a preset gives its own")
@@ -79,13 +82,25 @@ class ScannerConfig(Config):
 
     @property
     def extinction_per_m(self) -> float:
-        """Extinction coefficient of the air, 1/m; 0 without a visibility."""
+        """Extinction coefficient of the air, 1/m, by which haze or fog weakens echoes; 0 if no visibility is configured."""
         return 0.0 if self.visibility_m is None else extinction_per_m(self.visibility_m, self.wavelength_nm)
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """Nominal directions: scan lines in azimuth, pulses of a line in zenith; start and step in rad."""
+    """The grid of nominal directions that a scanner scans: lines at equal steps of azimuth, pulses at equal steps of zenith.
+
+    Attributes
+    ----------
+    azimuth_start, azimuth_step : float
+        Azimuth of the first scan line, and step to the next, rad.
+    lines : int
+        Number of scan lines.
+    zenith_start, zenith_step : float
+        Zenith angle of a line's first pulse, and step to the next, rad.
+    pulses : int
+        Number of pulses of a line.
+    """
 
     azimuth_start: float
     azimuth_step: float
@@ -96,9 +111,10 @@ class Pattern:
 
     @classmethod
     def over(cls, azimuth: Window, zenith: Window, config: ScannerConfig) -> Pattern:
-        """Make the pattern that starts at the start of the windows and ends at or before their stop.
+        """Make the grid of directions over a window, starting at the window's start and ending at or before its stop.
 
-        Raises InputError if it would not fit in the free memory.
+        azimuth, zenith: (start, stop), rad. config: the instrument, which gives the steps. Raises InputError if the scan would
+        not fit in the free memory.
         """
         lines, pulses = (
             int(np.floor((stop - start) / step + 1e-9)) + 1
@@ -115,7 +131,10 @@ class Pattern:
         return cls(azimuth[0], config.azimuth_step_rad, lines, zenith[0], config.zenith_step_rad, pulses)
 
     def second_face(self) -> Pattern:
-        """Return the same directions in the second face: azimuth + pi, and 2 pi minus the zenith angle."""
+        """Return the directions with which the scanner aims at the same points in its second face.
+
+        They are azimuth + pi, and 2 pi minus the zenith angle.
+        """
         return replace(
             self,
             azimuth_start=self.azimuth_start + np.pi,
@@ -126,28 +145,28 @@ class Pattern:
 
 @dataclass(frozen=True)
 class LaserScanner:
-    """A scanner on its station.
+    """A laser scanner at its place, ready to scan.
 
     Attributes
     ----------
     position : (3,) array
-        As surveyed, wall frame, m.
+        Position as surveyed, wall frame, m.
     rotation : (3, 3) array
-        Scanner to wall frame, as surveyed.
+        Rotation from scanner to wall frame, as surveyed.
     pattern : Pattern
         The directions that are scanned.
     config : ScannerConfig
         The instrument.
     model : TlsModel
-        Its noise and effects.
+        Its noise and other errors.
     truth : bool
-        Whether to keep error-free channels.
+        Whether observations keep error-free quantities, such as the true range.
     pose_sigma : PoseSigma
-        Standard deviations of the surveyed pose.
+        Standard deviations of the surveyed pose (position and rotation).
     shift_m : (3,) array, optional
         Real minus surveyed position, wall frame, m, before `pose_sigma`; None: none.
     turn : (3, 3) array, optional
-        Rotation of the real against the surveyed pose, in the wall frame; None: none.
+        Rotation of the real against the surveyed scanner, in the wall frame; None: none.
     """
 
     position: FloatArray
@@ -171,12 +190,12 @@ class LaserScanner:
         truth: bool = False,
         pose_sigma: PoseSigma = EXACT_POSE,
     ) -> LaserScanner:
-        """Make a scanner whose window, unless the config states one, covers the whole wall.
+        """Make a scanner at a place, which scans the window of its config or else the whole wall.
 
         Parameters
         ----------
         station : (position, rotation)
-            Position (3,), m, and rotation (3, 3), scanner to world.
+            Position (3,), world frame, m, and rotation (3, 3), scanner to world.
         frame : WallFrame
             The wall frame.
         vertices : (n, 3) array
@@ -184,11 +203,11 @@ class LaserScanner:
         config : ScannerConfig
             The instrument.
         model : TlsModel
-            Its noise and effects.
+            Its noise and other errors.
         truth : bool
-            Whether to keep error-free channels.
+            Whether observations keep error-free quantities, such as the true range.
         pose_sigma : PoseSigma
-            Standard deviations of the surveyed pose.
+            Standard deviations of the surveyed pose (position and rotation).
 
         Raises
         ------
@@ -211,7 +230,8 @@ class LaserScanner:
     def observe(self, scene: RayCaster, random: KeyedRandom) -> Observation:
         """Scan the scene once. Rows are scan lines (azimuth), columns the pulses of a line (zenith).
 
-        Points are computed with the surveyed pose; pulses leave from the real one: shifted, turned, and drawn with `pose_sigma`.
+        scene: the wall, wall frame. random: source of random numbers. Points are computed with the surveyed pose; pulses leave
+        from the real one: shifted, turned, and drawn with `pose_sigma`.
         """
         moved = self.position if self.shift_m is None else self.position + self.shift_m
         rotated = self.rotation if self.turn is None else self.turn @ self.rotation
@@ -240,12 +260,20 @@ class LaserScanner:
         return replace(seen, further=self._further(real, scene, random, seen, echo.returns))
 
     def emitted(self, pulses: Pulses, random: KeyedRandom) -> tuple[Pulses, Beam]:
-        """Apply the effects on aim and footprint: return the pulses as they actually leave, and the beam."""
+        """Apply the errors of the beam's direction and width to pulses, before they are traced.
+
+        pulses: nominal pulses. random: source of random numbers. Returns the pulses as they actually leave, and the beam with
+        its width.
+        """
         effects = self.model.chain()
         return apply_stage(effects, Stage.AIM, pulses, random), apply_stage(effects, Stage.FOOTPRINT, Beam(), random)
 
     def measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
-        """Apply the effects on range, power and returns to the pulses, given their echoes."""
+        """Apply the errors of range, power and returns to pulses that have been traced.
+
+        pulses: the pulses as they left. echo: their echoes. random: source of random numbers. Returns the pulses with recorded
+        ranges.
+        """
         pulses = replace(
             pulses,
             true_range=echo.range_m,
@@ -263,15 +291,18 @@ class LaserScanner:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(lines, pulses per line) of an observation."""
+        """(lines, pulses per line), the shape of an observation's arrays."""
         return self.pattern.lines, self.pattern.pulses
 
     def emit(self) -> Pulses:
-        """Return all pulses of the pattern, line by line, before any effect."""
+        """Return all pulses of a scan with their nominal directions, line by line, before any error."""
         return self.pulses_at(dr.arange(mi.UInt32, self.pattern.lines * self.pattern.pulses))
 
     def pulses_at(self, index: mi.UInt32) -> Pulses:
-        """Return the pulses with these numbers, which count line by line through the pattern, before any effect."""
+        """Return some pulses of a scan with their nominal directions, before any error.
+
+        index: (n,) numbers of the pulses, counted line by line.
+        """
         pattern = self.pattern
         line = index // dr.opaque(mi.UInt32, pattern.pulses)
         pulse = index - line * dr.opaque(mi.UInt32, pattern.pulses)
@@ -291,10 +322,9 @@ class LaserScanner:
         )
 
     def echo(self, scene: RayCaster, pulses: Pulses, beam: Beam, merge: Callable[[SubRays], Echo]) -> Echo:
-        """Ray-trace the emitted beams.
+        """Ray-trace the emitted beams and return the echo of each pulse.
 
-        Rays start from evaluated memory and echoes end there, so that one compiled kernel serves whatever effects come before
-        and after.
+        Pulses and echoes are held in memory before and after, so that one compiled kernel serves whatever errors are simulated.
 
         Parameters
         ----------

@@ -34,7 +34,8 @@ A random walk is drawn for each axis independently.
 class PoseCourses(Config):
     """How the sensor's real pose departs from the surveyed one over a series of epochs.
 
-    Each quantity is a course, that is a function of time: a random walk, a drift, a cycle or a table.
+    The pose is position and rotation. Each quantity is a course, that is a function of time: a random walk, a drift, a cycle or
+    a table.
     """
 
     position_m: AxisCourses | None = Field(None, description="real minus surveyed position, world x, y, z [m]")
@@ -74,9 +75,9 @@ EffectCourses = Annotated[dict[str, dict[str, Course]], BeforeValidator(_paramet
 
 @dataclass(frozen=True)
 class PoseShift:
-    """Real minus surveyed pose at one epoch, along and about the axes of the world frame.
+    """Difference of a sensor's real from its surveyed pose (position and rotation) at one epoch, world frame.
 
-    position_m: (3,) displacement, m. rotation_rad: (3,) rotation, rad.
+    position_m: (3,) displacement along the axes, m. rotation_rad: (3,) rotation about the axes, rad.
     """
 
     position_m: FloatArray
@@ -84,12 +85,26 @@ class PoseShift:
 
     @property
     def is_null(self) -> bool:
-        """Whether the real pose is the surveyed one: no displacement and no rotation."""
+        """Whether the sensor's real pose is the surveyed one: no displacement and no rotation."""
         return not (self.position_m.any() or self.rotation_rad.any())
 
 
 def pose_shifts(courses: PoseCourses | None, hours: FloatArray, random: KeyedRandom) -> list[PoseShift]:
-    """Return the real minus the surveyed pose at n times `hours`, h after the first epoch; null without a course."""
+    """Draw the difference of a sensor's real from its surveyed pose at each of n epochs.
+
+    Parameters
+    ----------
+    courses : PoseCourses, optional
+        How the pose departs over time; None: not at all.
+    hours : (n,) array
+        Times of the epochs, h after the first.
+    random : KeyedRandom
+        Source of random numbers.
+
+    Returns
+    -------
+    list of n PoseShift
+    """
     found = np.zeros((2, len(hours), 3))
     for row, name in enumerate(("position_m", "rotation_rad")):
         given: AxisCourses | None = None if courses is None else getattr(courses, name)
@@ -101,7 +116,22 @@ def pose_shifts(courses: PoseCourses | None, hours: FloatArray, random: KeyedRan
 
 
 def effect_values(courses: EffectCourses, hours: FloatArray, random: KeyedRandom) -> dict[str, dict[str, FloatArray]]:
-    """Return by how much each parameter of an effect is larger at n times `hours`, h: arrays (n,) by effect and parameter."""
+    """Draw by how much each parameter of a sensor's errors (effects) is larger than configured at each of n epochs.
+
+    Parameters
+    ----------
+    courses : mapping
+        By effect and parameter, how the parameter departs over time.
+    hours : (n,) array
+        Times of the epochs, h after the first.
+    random : KeyedRandom
+        Source of random numbers.
+
+    Returns
+    -------
+    dict of dict of (n,) arrays
+        Departures by effect and parameter, in the parameter's unit.
+    """
     return {
         name: {key: course.values(hours, random.child(name, key)) for key, course in parameters.items()}
         for name, parameters in courses.items()
@@ -109,15 +139,36 @@ def effect_values(courses: EffectCourses, hours: FloatArray, random: KeyedRandom
 
 
 def with_effects(model: TlsModel, values: Mapping[str, Mapping[str, float]]) -> TlsModel:
-    """Return a scanner's model whose parameters are larger by `values`, by effect and parameter; other sensors' are ignored.
+    """Return a scanner's model with changed parameters of its errors, such as those of one epoch of a time series.
 
-    An effect that the model does not have begins at its null values. Raises InputError for a value out of its bounds.
+    Parameters
+    ----------
+    model : TlsModel
+        The model as configured.
+    values : mapping
+        What to add, by effect and parameter. Effects of other sensors are ignored. An effect that the model does not have
+        begins at its null values, at which it is off.
+
+    Raises
+    ------
+    InputError
+        If a value is then out of its bounds.
     """
     return model.model_copy(update={"effects": _changed(model.effects, "tls", values)})
 
 
 def with_stereo_effects(model: StereoModel, values: Mapping[str, Mapping[str, float]], shift: PoseShift) -> StereoModel:
-    """Return a stereo pair's model whose parameters are larger by `values`, with both cameras moved by `shift`."""
+    """Return a stereo pair's model with changed parameters of its errors, such as those of one epoch of a time series.
+
+    Parameters
+    ----------
+    model : StereoModel
+        The model as configured.
+    values : mapping
+        What to add, by effect and parameter. Effects of other sensors are ignored.
+    shift : PoseShift
+        Difference of the real from the surveyed pose of both cameras.
+    """
     effects = _changed(model.effects, "stereo", values)
     if not shift.is_null:
         moved = [{"name": "camera_shift", **dict(zip(("x_m", "y_m", "z_m"), shift.position_m.tolist(), strict=True))}]

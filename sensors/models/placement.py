@@ -25,18 +25,21 @@ VERTICAL = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class Target:
-    """The wall as a sensor's target: a mesh in the world frame, faces counter-clockwise seen from outside."""
+    """The wall as a sensor's target, from which the sensor's place is found: a mesh in the world frame.
+
+    Its faces are counter-clockwise seen from outside.
+    """
 
     mesh: TriangleMesh
 
     @cached_property
     def centre(self) -> FloatArray:
-        """(3,) centre of the bounding box, m."""
+        """(3,) centre of the wall's bounding box, world frame, m, at which sensors look."""
         return self.mesh.bounds.mean(axis=0)
 
     @cached_property
     def outward(self) -> FloatArray:
-        """(3,) horizontal unit vector from the wall towards the side that its faces look to.
+        """(3,) horizontal unit vector, world frame, from the wall towards the side that its faces look to, where sensors stand.
 
         Raises InputError if the mesh faces straight up or down or is closed, so that it has no front.
         """
@@ -49,9 +52,9 @@ class Target:
         return horizontal / np.linalg.norm(horizontal)
 
     def stand(self, distance_m: float, height_m: float | None) -> FloatArray:
-        """Return the point (3,) at `distance_m` horizontally in front of the wall's centre.
+        """Return the place (3,), world frame, m, at `distance_m` horizontally in front of the wall's centre, for a sensor.
 
-        It lies `height_m` above the toe, or level with the centre if that is None.
+        It lies `height_m` above the wall's lowest point, or level with the wall's centre if that is None.
         """
         position = self.centre + distance_m * self.outward
         return position if height_m is None else np.append(position[:2], self.mesh.bounds[0, 2] + height_m)
@@ -71,7 +74,10 @@ class RigConfig(Config):
     k2: float = Field(0.0, description="radial distortion, r^4")
 
     def place(self, target: Target) -> CameraPair:
-        """Return the pair in front of `target`, world frame. Seen from the cameras, the left one stands on the left."""
+        """Return the pair of cameras in front of a wall, world frame; the left one is on the left as seen from the cameras.
+
+        target: the wall.
+        """
         middle = target.stand(self.distance_m, self.height_m)
         shift = self.base_m / 2 * np.cross(-target.outward, VERTICAL)
         return CameraPair(self._camera(middle - shift, target.centre), self._camera(middle + shift, target.centre))
@@ -88,7 +94,10 @@ class RigConfig(Config):
 
 
 def look_at(position: FloatArray, aim: FloatArray) -> FloatArray:
-    """Return the rotation (3, 3), camera to world, of a level camera at `position` whose axis passes through `aim`."""
+    """Return the rotation (3, 3), camera to world, of a level camera at `position` whose axis passes through the point `aim`.
+
+    Both are (3,), world frame, m.
+    """
     forward = (aim - position) / np.linalg.norm(aim - position)
     right = np.cross(forward, VERTICAL)
     right /= np.linalg.norm(right)
@@ -96,13 +105,31 @@ def look_at(position: FloatArray, aim: FloatArray) -> FloatArray:
 
 
 class PoseSigma(Config):
-    """How well a station's pose is known; the difference between real and surveyed pose is drawn for each observation."""
+    """How well a station's pose is known; the difference between real and surveyed pose is drawn for each observation.
+
+    A station is the place where the scanner stands; its pose is position and rotation.
+    """
 
     position_m: float = Field(0.0, ge=0, description="standard deviation of each coordinate [m]")
     rotation_rad: float = Field(0.0, ge=0, le=0.1, description="standard deviation of the rotation about each axis [rad]")
 
     def displaced(self, position: FloatArray, rotation: FloatArray, random: KeyedRandom) -> tuple[FloatArray, FloatArray]:
-        """Draw the real pose of a scanner with the surveyed position (3,), m, and rotation (3, 3), scanner to frame."""
+        """Draw the real pose of a scanner at random about its surveyed one.
+
+        Parameters
+        ----------
+        position : (3,) array
+            Surveyed position, m.
+        rotation : (3, 3) array
+            Surveyed rotation, scanner to the frame of `position`.
+        random : KeyedRandom
+            Source of random numbers.
+
+        Returns
+        -------
+        (3,) array and (3, 3) array
+            Real position, m, and real rotation.
+        """
         if self.position_m == self.rotation_rad == 0:
             return position, rotation
         shift, turn = random.generator().standard_normal((2, 3)) * [[self.position_m], [self.rotation_rad]]
@@ -114,7 +141,10 @@ EXACT_POSE = PoseSigma()
 
 
 class StationConfig(Config):
-    """Where the laser scanner stands: at given coordinates, or at a distance in front of the wall's centre."""
+    """Where the laser scanner stands: at given coordinates, or at a distance in front of the wall's centre.
+
+    `pose_sigma` says how well position and rotation are known; by default they are exact.
+    """
 
     position_m: Vector3 | None = Field(None, description="scanner's centre, world frame; none: from distance_m and height_m [m]")
     distance_m: float = Field(
@@ -130,7 +160,10 @@ class StationConfig(Config):
         return None if rotation is None else check_rotation(rotation)
 
     def place(self, target: Target) -> tuple[FloatArray, FloatArray]:
-        """Return position (3,), m, and rotation (3, 3), scanner to world."""
+        """Return where the scanner stands before a wall: position (3,), m, and rotation (3, 3), scanner to world frame.
+
+        target: the wall.
+        """
         position = np.array(self.position_m) if self.position_m else target.stand(self.distance_m, self.height_m)
         if self.rotation:
             return position, np.array(self.rotation)
@@ -142,9 +175,10 @@ class StationConfig(Config):
 
 
 def check_in_front(scene: RayCaster, position: FloatArray, where: str) -> None:
-    """Raise InputError if a sensor at `position` (3,), in the scene's frame, sees the rock mostly from inside or from behind.
+    """Check that a sensor sees the rock from outside: raise InputError if it sees it mostly from inside or from behind.
 
-    This is decided from the sides of the faces that lines of sight hit first.
+    This is decided from the sides of the faces that lines of sight hit first. position: (3,), in the scene's frame, m. where:
+    the config key in the error message.
     """
     _, from_behind = scene.sides_seen(position)
     if 2 * int(from_behind.sum()) > len(from_behind):

@@ -41,7 +41,10 @@ MOST_EFFECTS = 100
 
 
 class TlsNoise(Config):
-    """White noise of a laser scanner, as a data sheet states it."""
+    """White noise of a laser scanner, as a data sheet states it.
+
+    It is drawn anew for each pulse. The two parts of the range's noise add in quadrature.
+    """
 
     range_sigma_m: float = Field(0.003, ge=0, le=10, description="standard deviation of the range [m]")
     range_ppm: float = Field(0.0, ge=0, le=1e5, description="further standard deviation of the range, in proportion to it [ppm]")
@@ -49,7 +52,10 @@ class TlsNoise(Config):
 
 
 class TlsModel(Config):
-    """Sensor model of a laser scanner: base noise and effects."""
+    """Sensor model of a laser scanner: base noise and effects.
+
+    Effects are further errors, systematic or random, by their names in the catalogue.
+    """
 
     sensor: Literal["tls"] = "tls"
     noise: TlsNoise = TlsNoise()
@@ -64,15 +70,18 @@ class TlsModel(Config):
         return self
 
     def without_noise(self) -> TlsModel:
-        """Return the model with the same effects but no base noise."""
+        """Return the model with the same effects (further errors) but no base noise, to see what the effects do alone."""
         return self.model_copy(update={"noise": TlsNoise(range_sigma_m=0.0, angle_sigma_rad=0.0)})
 
     def variance(self, at: PulseGeometry) -> FloatArray:
-        """Return the variance (n,) of a recorded range that the model predicts, m2."""
+        """Return the variance of recorded ranges that the model predicts, (n,), m2.
+
+        at: geometry of n pulses, as NumPy arrays.
+        """
         return np.asarray(sum((effect.variance(at) for effect in self.chain()), np.zeros(len(at))))
 
     def chain(self) -> tuple[Effect, ...]:
-        """Return the base noise and the effects as one list of effects."""
+        """Return the base noise and the further errors as one list of effects, as the simulation applies them."""
         noise = self.noise
         return (
             AngleNoise(azimuth_sigma_rad=noise.angle_sigma_rad, zenith_sigma_rad=noise.angle_sigma_rad),
@@ -83,7 +92,10 @@ class TlsModel(Config):
 
 
 class DrawnParameter(Config):
-    """Mean and standard deviation of an orientation parameter, drawn at each observation; a single number is the latter."""
+    """Mean and standard deviation of an orientation parameter, drawn at each observation; a single number is the sigma.
+
+    The parameter is a difference of real from calibrated orientation of a camera.
+    """
 
     mean: float = Field(0.0, description="mean, in the parameter's unit")
     sigma: float = Field(0.0, ge=0, description="standard deviation, in the parameter's unit")
@@ -95,7 +107,11 @@ class DrawnParameter(Config):
 
 
 class OrientationNoise(Config):
-    """Noise of the 6 exterior and 11 interior orientation parameters of each camera: real minus calibrated values."""
+    """Noise of the 6 exterior and 11 interior orientation parameters of each camera: real minus calibrated values.
+
+    Each is drawn once for an observation. The exterior orientation is the pose of the camera; the interior orientation is its
+    principal distance, principal point and distortion, in Metashape's model.
+    """
 
     omega_rad: DrawnParameter = Field(DrawnParameter(), description="rotation about the camera's x axis [rad]")
     phi_rad: DrawnParameter = Field(DrawnParameter(), description="rotation about the camera's y axis [rad]")
@@ -116,9 +132,10 @@ class OrientationNoise(Config):
     p2: DrawnParameter = Field(DrawnParameter(), description="tangential distortion, Metashape's order")
 
     def draw(self, side: Side, random: KeyedRandom) -> tuple[Effect, ...]:
-        """Draw all parameters of one camera, as effects. Each parameter has its own random number.
+        """Draw the errors of all orientation parameters of a camera, as effects.
 
-        Raises InputError if a drawn value exceeds an effect's bounds.
+        side: the camera, "left", "right" or "both" (the same errors for both). random: source of random numbers; each parameter
+        has its own. Raises InputError if a drawn value exceeds an effect's bounds.
         """
         value = {name: self._draw(name, random.child(name)) for name in type(self).model_fields}
         try:
@@ -153,7 +170,12 @@ class OrientationNoise(Config):
 
 
 class StereoNoise(Config):
-    """Noise of a stereo pair: matching noise, and orientation noise drawn at each observation."""
+    """Noise of a stereo pair: matching noise, and orientation noise drawn at each observation.
+
+    Matching noise is that of disparities. Its white part is independent for each cell; its grid-correlated part is drawn at the
+    nodes of a grid over the image and interpolated between them, so that neighbours share it. Orientation noise is that of the
+    cameras' calibration and pose.
+    """
 
     parallax_sigma_px: float = Field(
         0.3, ge=0, le=1000, description="white noise of the disparity [px of the full-resolution frame]"
@@ -178,19 +200,28 @@ class StereoNoise(Config):
     )
 
     def draw(self, random: KeyedRandom) -> tuple[Effect, ...]:
-        """Draw the orientation noise of one observation, as effects."""
+        """Draw the cameras' errors of orientation (real minus calibrated) for one observation, as effects.
+
+        random: source of random numbers of that observation.
+        """
         sides: tuple[Side, ...] = ("both",) if self.orientation_drawn == "both_alike" else ("left", "right")
         return tuple(effect for side in sides for effect in self.orientation.draw(side, random.child(side)))
 
     @property
     def of_points(self) -> PointNoise:
-        """Noise of the points in metres, as an effect."""
+        """Noise of recorded points along the surface's normal, as an effect with the values of the three keys `point_...`, m.
+
+        It serves for a point cloud that comes without cameras, where noise of the disparity cannot be given.
+        """
         sigma, shared, step = self.point_sigma_m, self.point_shared_sigma_m, self.point_shared_step_m
         return PointNoise(sigma_m=sigma, shared_sigma_m=shared, shared_step_m=step)
 
 
 class StereoModel(Config):
-    """Sensor model of a stereo pair: base noise and effects."""
+    """Sensor model of a stereo pair: base noise and effects.
+
+    Effects are further errors, systematic or random, by their names in the catalogue.
+    """
 
     sensor: Literal["stereo"] = "stereo"
     noise: StereoNoise = StereoNoise()
@@ -199,12 +230,12 @@ class StereoModel(Config):
     )
 
     def without_noise(self) -> StereoModel:
-        """Return the model with the same effects but no base noise."""
+        """Return the model with the same effects (further errors) but no base noise, to see what the effects do alone."""
         return self.model_copy(update={"noise": StereoNoise(parallax_sigma_px=0.0, regularization_sigma_px=0.0)})
 
     @property
     def matching_noise(self) -> tuple[MatchingNoise, ...]:
-        """The base noise and effects that make disparities scatter with a known semivariogram."""
+        """The parts of the base noise and of the further errors by which disparities scatter, with a known semivariogram."""
         noise = self.noise
         base = (
             ParallaxNoise(sigma_px=noise.parallax_sigma_px),
@@ -214,15 +245,21 @@ class StereoModel(Config):
 
     @property
     def variance(self) -> float:
-        """Mean variance of a disparity over the image that the model predicts, px2."""
+        """Variance of a disparity that the model predicts, averaged over the image, px2."""
         return sum(effect.total_variance for effect in self.matching_noise)
 
     def semivariogram(self, lag: FloatArray) -> FloatArray:
-        """Return the semivariogram (k,) of a disparity that the model predicts, px2, at `lag` (k, 2), px."""
+        """Return the semivariogram (k,), px2, that the model predicts: half the mean squared difference of disparity errors.
+
+        lag: (k, 2) columns and rows from one pixel to the other, px.
+        """
         return np.asarray(sum((effect.semivariogram(lag) for effect in self.matching_noise), np.zeros(len(lag))))
 
     def chain(self, random: KeyedRandom) -> tuple[Effect, ...]:
-        """Return the base noise and the effects as one list of effects; the orientation noise is drawn from `random`."""
+        """Return the base noise and the further errors as one list of effects, as the simulation applies them.
+
+        random: source of the cameras' errors of orientation, which are drawn for each observation.
+        """
         noise = self.noise
         return (
             *noise.draw(random.child("orientation")),
@@ -233,5 +270,8 @@ class StereoModel(Config):
         )
 
     def of_points(self) -> tuple[Effect, ...]:
-        """Return the base noise and the effects that act on recorded points, in metres."""
+        """Return those of the model's errors that act on recorded points, in metres, instead of on disparities.
+
+        They include the base noise of points and the effects of the same kind.
+        """
         return (self.noise.of_points, *(effect for effect in self.effects if effect.stage == Stage.POINT))

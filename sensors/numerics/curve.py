@@ -30,7 +30,11 @@ Table = Annotated[Rows, AfterValidator(_rectangular)]
 
 
 class Axis(Config):
-    """Range of the variable that an empirical effect depends on; beyond it the outermost values hold."""
+    """Range of the variable that an empirical effect depends on; beyond it the outermost values hold.
+
+    An empirical effect is a table of errors over a variable x, such as the range, without a known cause; its values are equally
+    spaced from `low` to `high`.
+    """
 
     low: float = Field(0.0, description="x of the first value, in its unit; held below")
     high: float = Field(1.0, description="x of the last value, in its unit; held above")
@@ -43,9 +47,9 @@ class Axis(Config):
         return self
 
     def place(self, x: Any, count: int) -> tuple[Any, Any]:
-        """Locate x, a device array, among `count` equally spaced values.
+        """Locate values of x, a device array (n,), among `count` equally spaced values of a table, to interpolate between them.
 
-        Returns the index of the value before x, and the position between it and the next as a share in [0, 1].
+        Returns the index of the table's value before each x, and the position between it and the next as a share in [0, 1].
         """
         if count < 2:
             return mi.UInt32(0), mi.Float64(0.0)
@@ -58,7 +62,10 @@ class Axis(Config):
         return index, place - mi.Float64(index)
 
     def place_on_host(self, x: FloatArray, count: int) -> tuple[Any, FloatArray]:
-        """Locate the values of a NumPy array (n,) among `count` equally spaced ones, as `place` does on the device."""
+        """Locate values of x, a NumPy array (n,), among `count` equally spaced values of a table, to interpolate between them.
+
+        Returns the index of the table's value before each x, and the position between it and the next as a share in [0, 1].
+        """
         if count < 2:
             return np.zeros(len(x), dtype=np.int64), np.zeros(len(x))
         turned = np.mod(x, self.period) if self.period else x
@@ -68,7 +75,7 @@ class Axis(Config):
 
 
 def interpolate(x: Any, y: Any, along: Axis, across: Axis, rows_of_values: Rows) -> mi.Float64:
-    """Evaluate a table at x, y on the device, bilinearly; a single row is a curve of x.
+    """Evaluate a table of an empirical error at x, y on the ray-tracing device, bilinearly; a single row is a curve of x.
 
     Parameters
     ----------
@@ -95,7 +102,22 @@ def _between(table: mi.Float64, index: mi.UInt32, share: mi.Float64) -> mi.Float
 
 
 def interpolate_on_host(x: FloatArray, y: FloatArray, along: Axis, across: Axis, rows_of_values: Rows) -> FloatArray:
-    """Evaluate a table at NumPy arrays x, y (n,), as `interpolate` does on the device; NaN where x or y is NaN."""
+    """Evaluate a table of an empirical error at x, y with NumPy, bilinearly; a single row is a curve of x.
+
+    Parameters
+    ----------
+    x, y : (n,) arrays
+        Where to evaluate. y plays no role for a single row.
+    along, across : Axis
+        Ranges of x and of y.
+    rows_of_values : Table
+        Rows along y, each with values along x.
+
+    Returns
+    -------
+    (n,) array
+        Interpolated values; NaN where x or y is NaN.
+    """
     values = np.asarray(rows_of_values, dtype=np.float64)
     rows, columns = values.shape
     (i, a), (j, b) = across.place_on_host(y, rows), along.place_on_host(x, columns)

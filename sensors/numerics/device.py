@@ -9,26 +9,28 @@ from scene.geometry.mesh import FloatArray
 
 
 def opaque(*values: float) -> list[mi.Float64]:
-    """Convert numbers to device scalars that are arguments of the compiled kernel, not constants in it."""
+    """Convert numbers to scalars of the ray-tracing device that a compiled kernel takes as arguments, not as constants.
+
+    Other numbers then need no new compilation.
+    """
     return [dr.opaque(mi.Float64, float(value)) for value in values]
 
 
 def vector(values: FloatArray) -> mi.Array3f64:
-    """Convert a NumPy vector (3,) to a device vector."""
+    """Convert a NumPy vector (3,) to a vector of the ray-tracing device."""
     return mi.Array3f64(*opaque(*values))
 
 
 def rotated(matrix: FloatArray, vectors: mi.Array3f64) -> mi.Array3f64:
-    """Multiply a NumPy matrix (3, 3) with device vectors 3 x (n,)."""
+    """Multiply a NumPy matrix (3, 3), such as a rotation, with n vectors on the ray-tracing device, 3 x (n,)."""
     return mi.Array3f64(*(dr.dot(vector(row), vectors) for row in matrix))
 
 
 def cell_index(place: Any, count: int) -> mi.UInt32:
-    """Return the number of the cell that contains each position.
+    """Return the number of the table's cell that contains each position, to read the table on the ray-tracing device.
 
-    The result is a valid index for `dr.gather` whatever the position.
-
-    A gather outside its array ends the process, so every index that is computed from sensor values should come from here.
+    The result is a valid index for Dr.Jit's `dr.gather` whatever the position. A gather outside its array ends the process, so
+    every index that is computed from sensor values should come from here.
 
     Parameters
     ----------
@@ -49,5 +51,8 @@ def cell_index(place: Any, count: int) -> mi.UInt32:
 
 
 def bounded(value: Any, low: Any, high: Any) -> Any:
-    """Clip `value`, a device array of any type, to [low, high]. dr.clip would do, but its minimum aborts in LLVM 15."""
+    """Clip `value`, an array of the ray-tracing device of any type, to the interval from `low` to `high`.
+
+    dr.clip would do, but its minimum aborts in LLVM 15.
+    """
     return dr.select(value < low, low, dr.select(value > high, high, value))

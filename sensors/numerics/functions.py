@@ -15,8 +15,8 @@ from scene.common.backend import dr, mi
 class Functions:
     """Elementary functions for one kind of array: those of the ray-tracing device or NumPy's.
 
-    The equations of the effects take it as argument `m`, so that one equation serves the simulation (`DEVICE`) and the
-    diagnosis (`HOST`). select(condition, a, b) is a where the condition holds, else b.
+    The equations of the sensors' errors take it as argument `m`, so that one equation serves the simulation (`DEVICE`) and the
+    diagnosis of measurements (`HOST`). select(condition, a, b) is a where the condition holds, else b.
     """
 
     sin: Callable[[Any], Any]
@@ -34,7 +34,10 @@ DEVICE = Functions(dr.sin, dr.cos, dr.log, dr.exp, dr.floor, dr.select)
 
 
 class DeviceParameters:
-    """Presents the numeric attributes of a model as device scalars: arguments of the compiled kernel, not constants in it."""
+    """Presents the numeric parameters of an effect as scalars of the ray-tracing device, for use in the effect's equation.
+
+    They are arguments of the compiled kernel, not constants in it, so that other values need no new compilation.
+    """
 
     def __init__(self, model: Any) -> None:
         self._model = model

@@ -36,16 +36,17 @@ _NOWHERE_M = 1e30
 
 @dataclass(frozen=True)
 class Echo:
-    """The echo of one ray of each of n pulses, or the return of each pulse, as device arrays (n,).
+    """The echo of one ray of each of n pulses, or the return of each pulse, as arrays (n,) of the ray-tracing device.
 
     Attributes
     ----------
     range_m, cos_incidence, albedo, power, block, returned
-        As in `Pulses`.
+        Range (m), cosine of the incidence angle, albedo, relative received power and block label of the rock that was hit, and
+        whether there is an echo.
     returns : (n,) uint32, optional
         Number of returns of the pulse; None if only one is recorded.
     strongest : (n,) bool, optional
-        Whether this is the strongest of them; None if only one is recorded.
+        Whether this is the strongest of the pulse's returns; None if only one is recorded.
     """
 
     range_m: mi.Float64
@@ -58,12 +59,12 @@ class Echo:
     strongest: mi.Bool | None = None
 
     def at(self, index: mi.UInt32) -> Echo:
-        """Return the echoes at the given indices."""
+        """Return some of the echoes, given their indices (k,)."""
         return Echo(**{name: dr.gather(type(value), value, index) for name, value in self._known()})
 
     @staticmethod
     def joined(parts: Sequence[Echo]) -> Echo:
-        """Concatenate the echoes of all parts."""
+        """Join several sets of echoes into one, in order."""
         return Echo(**{name: dr.concat([getattr(part, name) for part in parts]) for name, _ in parts[0]._known()})
 
     def _known(self) -> list[tuple[str, Any]]:
@@ -73,15 +74,19 @@ class Echo:
 
 @dataclass(frozen=True)
 class SubRays:
-    """The echoes of all sub-rays of n pulses, kept in memory: `many` sub-rays a pulse, those of one pulse side by side."""
+    """The echoes of all sub-rays of n pulses, by which the width of a beam is simulated, kept in memory.
+
+    echoes: (n many,) the sub-rays of one pulse side by side. many: number of sub-rays of a pulse.
+    """
 
     echoes: Echo
     many: int
 
     def over(self, step: Callable[..., tuple[Any, ...]], *state: Any) -> tuple[Any, ...]:
-        """Run `step(echo, *state)` once for each sub-ray, for all pulses together; return the final state.
+        """Run a function once for each sub-ray, for all pulses together, to combine the echoes of each pulse.
 
-        The sub-rays follow one another in a loop of the compiled kernel.
+        step(echo, *state) gets the echo of one sub-ray of all pulses, and the state so far; it returns the new state. Returns
+        the final state. The sub-rays follow one another in a loop of the compiled kernel.
         """
         many = dr.opaque(mi.UInt32, self.many)
         first = many * dr.arange(mi.UInt32, dr.width(self.echoes.range_m) // self.many)
@@ -95,18 +100,21 @@ class SubRays:
 
 @dataclass(frozen=True)
 class Beam:
-    """A beam and its receiver. Without a footprint effect the beam is a single ray.
+    """A laser beam with its width, and how its receiver makes one return of several echoes.
+
+    By default the beam is a single ray without width.
 
     Attributes
     ----------
     divergence_rad : float
         Full divergence (1/e^2), rad.
     sub_rays : int
-        Number of sub-rays, 1 + 3 m (m + 1) for m rings.
+        Number of sub-rays that represent the beam: one on the axis and m rings around it, 1 + 3 m (m + 1).
     mode : str
-        Which of several returns is recorded. "multiple" records the strongest in the scan's grid, and all others beside it.
+        Which of several returns is recorded: "first", "strongest", "mean" or "multiple". The last records the strongest in the
+        scan's grid, and all others beside it.
     separation_m : float
-        Echoes closer than this, c tau / 2, merge into one return, m.
+        Echoes closer than this merge into one return, m: half the speed of light times the pulse width.
     modulation_wavelength_m : float, optional
         Finest measuring wave of a phase scanner, m; None for a pulse scanner.
     """
@@ -118,7 +126,7 @@ class Beam:
     modulation_wavelength_m: float | None = None
 
     def sub_ray(self, axis: mi.Array3f64, across: Sequence[mi.Array3f64], number: mi.UInt32) -> mi.Array3f64:
-        """Return the unit vectors 3 x (n,) of sub-rays.
+        """Return the directions of n sub-rays, which represent the width of the beam, as unit vectors 3 x (n,).
 
         Parameters
         ----------
@@ -137,7 +145,7 @@ class Beam:
         return along * axis + first * across[0] + second * across[1]
 
     def combine_echoes(self, rays: SubRays) -> Echo:
-        """Combine the echoes of each pulse's sub-rays into the return that is recorded."""
+        """Combine the echoes of each pulse's sub-rays into the one return that the scan's grid records."""
         if rays.many == 1:
             return rays.echoes
         if self.modulation_wavelength_m is not None:
@@ -150,11 +158,14 @@ class Beam:
 
     @property
     def records_several(self) -> bool:
-        """Whether a pulse may have more returns than the one of `combine_echoes`."""
+        """Whether the receiver records more returns of a pulse than the one in the scan's grid."""
         return self.mode == "multiple" and self.sub_rays > 1 and self.modulation_wavelength_m is None
 
     def return_of_number(self, rays: SubRays, number: mi.UInt32) -> Echo:
-        """Return each pulse's return of a given number, counted by range from 1. The strongest is the one of `combine_echoes`."""
+        """Return the return of a given number, counted by range from 1, of each pulse with several returns.
+
+        rays: echoes of the sub-rays of n pulses. number: (n,). The strongest return is the one that `combine_echoes` gives.
+        """
         _, chosen, strongest = self._separated(rays, number)
         return replace(_merged(rays, chosen.holds), strongest=chosen.low == strongest.low)
 
@@ -217,9 +228,9 @@ class _Span:
 
 
 def unit_offsets(sub_rays: int) -> FloatArray:
-    """Return the offsets (k, 2) of the sub-rays from the axis, for a divergence D of 1.
+    """Return the offsets (k, 2) of a beam's k sub-rays from its axis, in units of the beam's full divergence (1/e^2).
 
-    They are those that the module describes. Ring j is rotated by j golden angles.
+    One sub-ray lies on the axis, the others on rings about it. Ring j is rotated by j golden angles.
     """
     rings = round((np.sqrt(12 * sub_rays - 3) - 3) / 6)
     bounds = np.cumsum([0, 1, *(6 * ring for ring in range(1, rings + 1))]) / sub_rays

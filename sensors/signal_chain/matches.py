@@ -19,16 +19,18 @@ from scene.ray_casting.upload import on_device
 
 @dataclass(frozen=True)
 class ImageRows:
-    """n pixels of one camera during the exposure, as lazy device arrays (n,), in px of the full-resolution frame.
+    """n pixels of one camera during the exposure, for errors that displace image rows.
+
+    Arrays (n,) are lazy arrays of the ray-tracing device, in px of the full-resolution frame.
 
     Attributes
     ----------
     camera : str
         "left" or "right".
     v : mi.Float64
-        Row.
+        Row of each pixel.
     du : mi.Float64
-        Recorded minus ideal column.
+        Recorded minus ideal column of each pixel.
     """
 
     camera: Literal["left", "right"]
@@ -38,12 +40,14 @@ class ImageRows:
 
 @dataclass(frozen=True)
 class Matches:
-    """n cells of the left depth map as lazy device arrays (n,); image quantities in px of the full-resolution frame.
+    """n cells of the left depth map with their disparities, on which errors of the matching act.
+
+    Arrays (n,) are lazy arrays of the ray-tracing device; image quantities are in px of the full-resolution frame.
 
     Attributes
     ----------
     index : mi.UInt32
-        Number of the cell, row by row; it keys the cell's random numbers.
+        Number of the cell, counted row by row; the cell's random numbers depend on it.
     u, v : mi.Float64
         Centre of the cell in the left image.
     disparity : mi.Float64
@@ -51,7 +55,7 @@ class Matches:
     matched : mi.Bool
         Whether the cell has a match.
     block : mi.Int32
-        Block label of the surface that the left camera sees there.
+        Label of the fallen block whose niche the left camera sees there; 0 is the wall.
     true_depth : mi.Float64
         Depth of that surface along the real left camera's axis, m.
     albedo : mi.Float32 or None
@@ -82,27 +86,36 @@ class Matches:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, columns) of the depth map."""
+        """(rows, columns) of the depth map to which the cells belong."""
         return self.height // self.reduction, self.width // self.reduction
 
     def raster(self) -> FloatArray:
-        """Return the disparities (rows, columns), px, NaN without a match, for effects that depend on a cell's neighbours."""
+        """Return the disparities of the depth map as a raster (rows, columns), px, NaN without a match.
+
+        Effects that depend on a cell's neighbours use it.
+        """
         self._evaluate()
         return np.where(self.matched.numpy(), self.disparity.numpy(), np.nan).reshape(self.shape)
 
     def albedo_raster(self) -> FloatArray | None:
-        """Return the albedo (rows, columns), NaN without a match; None for a wall without albedo."""
+        """Return the albedo of the rock in each cell of the depth map (rows, columns), NaN without a match.
+
+        Returns None for a wall without albedo.
+        """
         if self.albedo is None:
             return None
         self._evaluate()
         return np.where(self.matched.numpy(), self.albedo.numpy(), np.nan).reshape(self.shape)
 
     def sampled(self, raster: FloatArray) -> mi.Float64:
-        """Return the values (n,) of a raster (rows, columns) over the depth map, one for each cell, row by row."""
+        """Read the values of a raster (rows, columns) over the depth map as a device array (n,), one per cell, row by row."""
         return on_device(mi.Float64, raster)
 
     def with_raster(self, disparity: FloatArray) -> Matches:
-        """Return the same cells with the given disparities (rows, columns), px; cells are matched where these are not NaN."""
+        """Return the same cells with new disparities, after an effect that works on the whole depth map.
+
+        disparity: (rows, columns), px; cells are matched where it is not NaN.
+        """
         return replace(self, disparity=on_device(mi.Float64, disparity), matched=on_device(mi.Bool, ~np.isnan(disparity)))
 
     def _evaluate(self) -> None:
@@ -111,16 +124,16 @@ class Matches:
 
 
 def fill_gaps(disparity: FloatArray, reach: float) -> FloatArray:
-    """Fill unmatched runs between two matched cells of a row with the background's disparity, the smaller of the two.
+    """Fill gaps between two matched cells of a row with the background's disparity, the smaller of the two.
 
-    Runs at the end of a row remain unmatched.
+    Gaps at the end of a row remain unmatched. Returns the new disparities (rows, columns).
 
     Parameters
     ----------
     disparity : (rows, columns) array
-        NaN where unmatched.
+        Disparities, px, NaN where unmatched.
     reach : float
-        Longest run that is filled, cells.
+        Widest gap that is filled, cells.
     """
     rows, columns = disparity.shape
     matched, column = ~np.isnan(disparity), np.arange(columns, dtype=np.int32)

@@ -16,20 +16,22 @@ from sensors.signal_chain.matches import Matches
 
 
 def smooth_field(state: Matches, step_px: float, random: KeyedRandom, *, even: bool = False) -> mi.Float32:
-    """Evaluate a random field (n,) at the cells of `state`: sum_ij w_ij(u, v) g_ij with g_ij ~ N(0, 1).
+    """Draw a smooth random field over the image and evaluate it at the cells of a depth map, (n,).
+
+    It has independent standard normal values at the nodes of a grid, with bilinear interpolation between them.
 
     The variance is 1 at the nodes, 1/4 midway between them and 4/9 on average.
 
     Parameters
     ----------
     state : Matches
-        The cells.
+        The n cells of the depth map.
     step_px : float
         Distance between nodes, px; nodes lie at multiples of it.
     random : KeyedRandom
         Source of the node values.
     even : bool
-        Whether to divide by the root of sum w_ij^2, which makes the variance 1 everywhere.
+        Whether to scale the field so that the variance is 1 everywhere, not only at the nodes.
     """
     columns, rows = (int(np.ceil(size / step_px)) + 1 for size in (state.width, state.height))
     nodes = on_device(mi.Float32, random.generator().standard_normal((rows, columns)))
@@ -54,10 +56,11 @@ _PHASES = (np.arange(24) + 0.5) / 24
 
 
 def node_semivariogram(lag: FloatArray) -> FloatArray:
-    """Compute the semivariogram (k,) of a field with variance 1 at the nodes, averaged over positions.
+    """Compute the semivariogram (k,) of grid-correlated noise with variance 1 at its nodes, averaged over positions.
 
-    It is 4/9 - B(x) B(y), where B is the cubic B-spline (2/3 at 0, 0 from 2 on), the convolution of two hat functions. `lag`
-    is (k, 2), in steps of the nodes.
+    The semivariogram is half the mean squared difference of two places. lag: (k, 2) distance of the places along both axes of
+    the grid, in units of the distance between nodes. It is 4/9 - B(x) B(y) at the lag (x, y), where B is the cubic B-spline
+    (2/3 at 0, 0 from 2 on), the convolution of two hat functions.
     """
     across, down = (_spline(np.abs(lag[:, axis])) for axis in (0, 1))
     return np.asarray(MEAN_VARIANCE - across * down)
@@ -70,9 +73,10 @@ def _spline(x: FloatArray) -> FloatArray:
 
 
 def uniform_field_correlation(lag: FloatArray) -> FloatArray:
-    """Compute the correlation (k, m) of a field with uniform variance (`even`) at `lag` (k, 2), in steps of the nodes.
+    """Compute the correlation (k, m) of two places in grid-correlated noise that is scaled to the same variance everywhere.
 
-    It depends on the position within a cell; m positions are evaluated.
+    lag: (k, 2) distance of the places along both axes of the grid, in units of the distance between nodes. The correlation
+    depends on the position between the nodes; it is evaluated for m positions.
     """
     across, down = (_along_axis(np.abs(lag[:, axis])) for axis in (0, 1))
     return np.asarray((across[:, :, None] * down[:, None, :]).reshape(len(lag), -1))

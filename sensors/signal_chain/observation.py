@@ -16,7 +16,7 @@ from scene.ray_casting.raycast import RayCaster
 
 @dataclass(frozen=True)
 class FurtherReturns:
-    """The returns of a scan beyond those in its grid, for pulses with several returns.
+    """The returns of a scan that are not in its grid, which has one return a pulse, for pulses with several returns.
 
     There are n of them, sorted by cell and then by range.
 
@@ -31,11 +31,11 @@ class FurtherReturns:
     depth : (n,) float64 array
         Range, m.
     block : (n,) int32 array
-        Block label.
+        Label of the fallen block whose niche was hit; 0 is the wall.
     intensity : (n,) float32 array
         Relative received power.
     truth : dict of (n,) arrays
-        Channels as in the grid.
+        Error-free quantities by name, as for the returns in the grid.
     grid_number, grid_count : (h, w) uint8 arrays
         Return number of the point in the grid, and the pulse's number of returns.
     """
@@ -53,7 +53,7 @@ class FurtherReturns:
 
 @dataclass(frozen=True)
 class Observation:
-    """One observation in the sensor's own organisation, wall frame.
+    """What a sensor records in one observation of the wall: a grid of points in the wall frame.
 
     Rows and columns are the sensor's: those of the depth map (stereo), or scan lines and the pulses of a line (TLS: azimuth,
     zenith). Cells without a return are NaN in the float arrays and WALL in `block`.
@@ -75,7 +75,7 @@ class Observation:
     pulse_interval_s : float, optional
         Time from one cell to the next, in order of rows.
     truth : dict of (h, w) arrays
-        Error-free channels, such as `true_range_m`, if the sensor was asked for them.
+        Error-free quantities by name, such as `true_range_m`, if the sensor was asked for them.
     further : FurtherReturns, optional
         Returns beyond those in the grid; None if no pulse has any.
     zenith_rad : (w,) array, optional
@@ -98,30 +98,42 @@ class Observation:
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """(h, w) True where there is a return."""
+        """(h, w) mask that is True for cells of the observation with a return (or a match)."""
         return ~np.isnan(self.depth)
 
     @property
     def gps_time(self) -> FloatArray | None:
-        """(h, w) float64, s since the start of the scan; None for a sensor that records everything at once."""
+        """Time of each cell's measurement, (h, w) float64, s since the start of the scan.
+
+        None for a sensor that records everything at once.
+        """
         if self.pulse_interval_s is None:
             return None
         return self.pulse_interval_s * np.arange(self.depth.size, dtype=np.float64).reshape(self.depth.shape)
 
 
 def packed(point: mi.Array3f64) -> mi.Float64:
-    """Flatten device points 3 x (n,) into one array (3 n,), point by point, which is written once and needs no transpose."""
+    """Flatten points of the ray-tracing device, 3 x (n,), into one array (3 n,), point by point.
+
+    NumPy can then read it as (n, 3) without a transpose.
+    """
     return dr.ravel(point)
 
 
 def offset_of(recorded: mi.Array3f64, true: mi.Array3f64) -> mi.Float32:
-    """Return x and y of the recorded minus the true points as one array (2 n,), point by point."""
+    """Return how far recorded points lie from the true ones in x and y, as one array (2 n,), point by point.
+
+    recorded, true: 3 x (n,) points of the ray-tracing device, m.
+    """
     return dr.ravel(mi.Array2f(recorded.x - true.x, recorded.y - true.y))
 
 
 class Sensor(Protocol):
-    """A sensor: anything that observes a scene with a keyed source of random numbers."""
+    """Anything that can observe a scene, such as a laser scanner or a stereo pair at its place."""
 
     def observe(self, scene: RayCaster, random: KeyedRandom) -> Observation:
-        """Observe `scene` (wall frame) once. The same `random` gives the same observation to the byte."""
+        """Observe the scene once, and return what the sensor records.
+
+        scene: the wall, wall frame. random: source of random numbers; the same source gives the same observation to the byte.
+        """
         ...

@@ -11,7 +11,7 @@ from scene.geometry.mesh import FloatArray
 
 
 def polar(local: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return range (m), azimuth and zenith angle (rad), each (n,), of points (n, 3) in the scanner's frame."""
+    """Convert points (n, 3) in the scanner's frame to range (m), azimuth and zenith angle (rad), each (n,)."""
     level = np.hypot(local[:, 0], local[:, 1])
     return np.hypot(level, local[:, 2]), np.arctan2(local[:, 1], local[:, 0]), np.arctan2(level, local[:, 2])
 
@@ -19,7 +19,8 @@ def polar(local: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 def polar_axes(azimuth: FloatArray, zenith: FloatArray) -> list[FloatArray]:
     """Return the unit vectors of polar coordinates in the scanner's frame, three arrays (n, 3).
 
-    They point along the beam, towards increasing azimuth and towards increasing zenith angle.
+    They point along the beam, towards increasing azimuth and towards increasing zenith angle. azimuth, zenith: (n,) directions
+    of the beams, rad.
     """
     sin_az, cos_az, sin_ze, cos_ze = np.sin(azimuth), np.cos(azimuth), np.sin(zenith), np.cos(zenith)
     beam = [sin_ze * cos_az, sin_ze * sin_az, cos_ze]

@@ -18,7 +18,7 @@ MOST_RETURNS = 15
 
 @dataclass(frozen=True)
 class RecordedReturns:
-    """The recorded returns of n pulses; NaN and WALL where there is none.
+    """The recorded returns of n pulses of a scan, wall frame; NaN and WALL (0) where there is none.
 
     Attributes
     ----------
@@ -27,9 +27,9 @@ class RecordedReturns:
     offset : (n, 2) array
         x and y of the recorded minus the true points, m.
     depth, intensity, block : (n,) arrays
-        Range (m), relative received power, block label.
+        Range (m), relative received power, and label of the fallen block whose niche was hit (0: the wall).
     truth : dict of (n,) arrays
-        Error-free channels.
+        Error-free quantities by name, such as `true_range_m`.
     """
 
     points: FloatArray
@@ -43,15 +43,15 @@ class RecordedReturns:
 def further_returns(
     found: Sequence[tuple[NDArray[np.int64], NDArray[np.bool_], RecordedReturns]], seen: Observation
 ) -> FurtherReturns:
-    """Order returns by cell and range, and number those that were recorded.
+    """Collect the returns that a scan's grid does not hold, for pulses with several returns, in order of cell and range.
 
     Effects may have lost returns: numbers and counts refer to the remaining ones.
 
     Parameters
     ----------
     found : sequence of (cells, in_grid, returns)
-        By increasing return number: the cells of pulses with several returns, whether each return is the one in the grid of
-        `seen`, and what was recorded of it.
+        For each return number, increasing: the cells of pulses with several returns, whether each return is the one in the grid
+        of `seen`, and what was recorded of it.
     seen : Observation
         The scan's grid.
     """

@@ -30,7 +30,7 @@ _CREASE = float(np.cos(np.radians(45.0)))
 
 @dataclass(frozen=True)
 class SurfacePlaces:
-    """n places on a surface.
+    """n places on the rock's surface, with the shape of the surface around them, on which errors of points may depend.
 
     Attributes
     ----------
@@ -39,9 +39,9 @@ class SurfacePlaces:
     normal : (n, 3) array
         Unit normal, pointing out of the rock.
     roughness : (n,) array
-        Standard deviation of the neighbours from their plane, m.
+        Standard deviation of the neighbouring vertices from their plane, m.
     convexity : (n,) array
-        Height above the centre of the neighbours, m.
+        Height above the centre of the neighbouring vertices, m; positive on convex rock.
     edge_distance : (n,) array
         Distance to the nearest edge of the mesh (its border or a crease), m.
     """
@@ -56,12 +56,16 @@ class SurfacePlaces:
         return len(self.point)
 
     def part(self, rows: Any) -> Self:
-        """Return some of the places."""
+        """Return some of the places. rows: their numbers (k,), a mask (n,) or a slice."""
         return replace(self, **{each.name: getattr(self, each.name)[rows] for each in fields(self)})
 
     @property
     def covariates(self) -> dict[str, FloatArray]:
-        """The properties by name, (n,) each: position (m), slope against the wall's plane (rad), the others in m."""
+        """The quantities on which errors of points may depend, by name, (n,) each.
+
+        They are the position `along`, `up` and `out` (x, y, z in the wall frame, m), `slope` against the wall's plane (rad),
+        and `roughness`, `convexity` and `edge_distance` (m).
+        """
         along, up, out = self.point.T
         return {
             "along": along,
@@ -75,30 +79,39 @@ class SurfacePlaces:
 
 
 class ShapedSurface:
-    """A mesh in the wall frame, with the properties of its vertices' neighbourhoods."""
+    """A mesh in the wall frame, with the shape of the surface around each vertex: its normal, roughness and convexity."""
 
     def __init__(self, mesh: TriangleMesh) -> None:
         self.mesh = mesh
         self._normal, self._roughness, self._convexity = self._planes()
 
     def nearest(self, points: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
-        """Return distance (m) and number, (n,) each, of the vertex nearest to each of the points (n, 3)."""
+        """Find the mesh's vertex nearest to each of n points (n, 3), wall frame, m.
+
+        Returns its distance (n,), m, and its number (n,).
+        """
         distance, number = self._tree.query(points, workers=-1)
         return distance, number.astype(np.int64)
 
     def normals(self, vertices: NDArray[np.int64]) -> FloatArray:
-        """Return unit normals (n, 3), pointing out of the rock, at vertices (n,)."""
+        """Return the surface's unit normals (n, 3), pointing out of the rock, at vertices of the mesh given by number (n,)."""
         return np.asarray(self._normal[vertices])
 
     def at(self, point: FloatArray, vertices: NDArray[np.int64]) -> SurfacePlaces:
-        """Describe places (n, 3), m, by the mean properties of some vertices (n, k) each."""
+        """Describe the surface around n places by the mean properties (normal, roughness and so on) of vertices near each.
+
+        point: (n, 3) places, wall frame, m. vertices: (n, k) numbers of the k vertices of each.
+        """
         normal = self._normal[vertices].mean(axis=1)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
         values = (each[vertices].mean(axis=1) for each in (self._roughness, self._convexity, self._edge_distance))
         return SurfacePlaces(point, normal, *values)
 
     def near(self, point: FloatArray) -> SurfacePlaces:
-        """Describe places (n, 3), m, by the properties of the nearest vertex. A NaN point keeps its NaN position."""
+        """Describe the surface around n places (n, 3), wall frame, m, by the properties of the nearest vertex.
+
+        A NaN point keeps its NaN position.
+        """
         known = np.isfinite(point).all(axis=1, keepdims=True)
         vertices = self.nearest(np.where(known, point, 0.0))[1]
         return self.at(point, vertices[:, None])
@@ -112,7 +125,7 @@ class ShapedSurface:
 
     @property
     def rim(self) -> NDArray[np.int64]:
-        """Numbers of the vertices on the mesh's open borders."""
+        """Numbers (k,) of the vertices on the mesh's open borders."""
         edges, uses = np.unique(self.mesh.edges, return_counts=True)
         return np.unique(np.concatenate(np.divmod(edges[uses == 1], len(self.mesh.vertices))))
 
@@ -149,12 +162,12 @@ class ShapedSurface:
 
 @dataclass(frozen=True)
 class RecordedPoints:
-    """Points on their way into a cloud.
+    """Points of a stereo pair's point cloud while errors are added to them.
 
     Attributes
     ----------
     places : SurfacePlaces
-        Where the points lie on the true surface.
+        Where the n points lie on the true surface.
     above : (n,) array
         How far each is recorded above the surface, along its normal, m.
     """
@@ -163,5 +176,5 @@ class RecordedPoints:
     above: FloatArray
 
     def with_height_error(self, by: FloatArray) -> RecordedPoints:
-        """Return the points with a further error (n,) along the normals, m."""
+        """Return the points with a further error (n,) along the surface's normals, m."""
         return replace(self, above=self.above + by)

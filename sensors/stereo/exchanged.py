@@ -26,12 +26,16 @@ StereoSensor = StereoPair | MatchedStereoPair
 
 
 def pair_of(sensor: StereoSensor) -> StereoPair:
-    """Return the pair (cameras, model and quality) of a stereo sensor."""
+    """Return the cameras of a stereo sensor with their settings, whether its matching is modelled or done on photographs."""
     return sensor.pair if isinstance(sensor, MatchedStereoPair) else sensor
 
 
 def observe_right(sensor: StereoSensor, scene: RayCaster, random: KeyedRandom) -> Observation:
-    """Make the right depth map that belongs to `sensor.observe(scene, random)`; rows and columns are the right image's."""
+    """Make the depth map of the right image, in addition to the one of the left image that `sensor.observe` makes.
+
+    Call it with the same `scene` and `random`: both depth maps then belong to one observation. Rows and columns are those of
+    the right image.
+    """
     pair = pair_of(sensor)
     exchanged = replace(pair, cameras=pair.cameras.exchanged(), model=_ExchangedModel.of(pair))
     turned: StereoSensor = replace(sensor, pair=exchanged) if isinstance(sensor, MatchedStereoPair) else exchanged
@@ -47,7 +51,10 @@ def observe_right(sensor: StereoSensor, scene: RayCaster, random: KeyedRandom) -
 
 
 def depth_cameras(pair: StereoPair) -> tuple[Camera, Camera]:
-    """Return the nominal cameras, wall frame, of the left and right depth maps: their pixels are the cells of the depth maps."""
+    """Return the nominal (calibrated) cameras, wall frame, whose pixels are the cells of the left and right depth maps.
+
+    pair: the stereo pair that makes the depth maps.
+    """
     cameras, step = pair.cameras.in_wall_frame(pair.frame), REDUCTION[pair.quality]
     rows, columns = pair.shape
     rest = float(cameras.right.width - columns * step), float(cameras.right.height - rows * step)

@@ -35,7 +35,10 @@ WHITE_LEVEL = 0.85
 
 
 class ExposureConfig(Config):
-    """How light is converted to grey values."""
+    """How light is converted to grey values.
+
+    It describes the image sensor of the simulated cameras, which take the photographs that are matched.
+    """
 
     samples_per_side: int = Field(2, ge=1, le=8, description="rays per pixel along a row or a column, averaged")
     compensation_ev: float = Field(
@@ -48,7 +51,15 @@ class ExposureConfig(Config):
 
 @dataclass(frozen=True)
 class Photograph:
-    """A photograph: image (rows, columns), uint8, and clipped_share, the share of pixels at full scale."""
+    """A simulated photograph.
+
+    Attributes
+    ----------
+    image : (rows, columns) uint8 array
+        Grey values.
+    clipped_share : float
+        Share of the pixels (0 to 1) that are overexposed, at full scale.
+    """
 
     image: NDArray[np.uint8]
     clipped_share: float
@@ -61,7 +72,7 @@ def _still(v: mi.Float64) -> mi.Float64:
 
 @dataclass(frozen=True)
 class Studio:
-    """What a picture of the rock depends on besides the camera.
+    """The scene of a simulated photograph: what it depends on besides the camera.
 
     Attributes
     ----------
@@ -72,7 +83,7 @@ class Studio:
     texture : RockTexture
         Texture of the rock beyond the mesh's albedo.
     footprint_m : float
-        Size of a picture's pixel on the rock, m.
+        Size of a photograph's pixel on the rock, m.
     """
 
     scene: RayCaster
@@ -81,21 +92,22 @@ class Studio:
     footprint_m: float
 
     def radiance(self, camera: Camera, step: int, samples_per_side: int, displaced: Displacement = _still) -> Radiance:
-        """Render the radiance (rows, columns) times pi, relative to an unshadowed white face that points at the sun.
+        """Render the light that reaches each pixel of a camera (rows, columns): the radiance times pi.
 
-        Pixels without rock show the sky. The positions of the samples are the same in every pixel, because random ones would
-        add noise that differs between the views.
+        It is relative to that of an unshadowed white face that points at the sun. Pixels without rock show the sky. The
+        positions of the samples are the same in every pixel, because random ones would add noise that differs between the
+        views.
 
         Parameters
         ----------
         camera : Camera
-            Wall frame.
+            The camera, wall frame.
         step : int
-            Frame pixels per pixel of the picture.
+            Frame pixels per pixel of the picture, along a row or a column.
         samples_per_side : int
             Rays per pixel along a row or a column.
         displaced : Displacement
-            Sideways displacement of the rows.
+            Function that gives the sideways displacement of image rows; by default there is none.
         """
         rows, columns = camera.height // step, camera.width // step
         index = dr.arange(mi.UInt32, rows * columns)
@@ -120,30 +132,30 @@ class Studio:
 
 
 def full_scale(*pictures: Radiance) -> float:
-    """Return the radiance at which automatic exposure saturates.
+    """Return the radiance at which automatic exposure saturates, for the photographs of both cameras.
 
-    It is one value for all pictures, because both cameras have the same settings.
+    pictures: rendered radiances (rows, columns). It is one value for all of them, because both cameras have the same settings.
     """
     bright = np.percentile(np.concatenate([picture.ravel() for picture in pictures]), WHITE_PERCENTILE)
     return max(float(bright) / WHITE_LEVEL, 1e-6)
 
 
 def expose(radiance: Radiance, white: float, step: int, config: ExposureConfig, random: KeyedRandom) -> Photograph:
-    """Expose a picture.
+    """Convert the rendered light of a picture to a photograph, with the noise of an image sensor.
 
     The number of electrons is N = N_full 2^EV L / white, with the radiance L, the exposure compensation EV
     (`config.compensation_ev`), and N_full = step^2 full wells, since step^2 pixels of the sensor are added. Their noise is
-    Gaussian with variance N + step^2 r^2, where r is the read noise of a pixel in electrons; shot noise is nearly Gaussian above
-    a hundred electrons. Beyond N_full a pixel is clipped.
+    Gaussian with variance N + step^2 r^2, where r is the read noise of a pixel in electrons; shot noise is nearly Gaussian
+    above a hundred electrons. Beyond N_full a pixel is clipped.
 
     Parameters
     ----------
     radiance : (rows, columns) array
         The rendered picture, in any unit that `white` shares.
     white : float
-        Radiance that saturates at 0 EV.
+        Radiance that saturates the sensor without exposure compensation (0 EV).
     step : int
-        Frame pixels per pixel of the picture.
+        Frame pixels per pixel of the picture, along a row or a column.
     config : ExposureConfig
         The camera's sensor.
     random : KeyedRandom

@@ -30,7 +30,11 @@ SPECKLE_STEP_PX = 1.0
 
 
 class MatchingConfig(Config):
-    """The real matcher; its pixels are those of the pictures it matches, that is the depth map's cells."""
+    """The real matcher; its pixels are those of the pictures it matches, that is the depth map's cells.
+
+    It is OpenCV's semi-global matching, which runs on rendered photographs. The matcher's costs, penalties and paths are those
+    of Hirschmueller (2008).
+    """
 
     block_size_px: int = Field(5, ge=1, le=21, description="side of the window whose costs are summed, odd [px]")
     p1: float = Field(8.0, ge=0, description="penalty of a disparity step of one, per pixel of the window")
@@ -63,14 +67,17 @@ class MatchingConfig(Config):
 
 @dataclass(frozen=True)
 class SearchRange:
-    """The disparities that are searched: `count` (a multiple of 16) from `least` on, cells."""
+    """The range of disparities that a matcher searches: `count` values (a multiple of 16) from `least` on, cells."""
 
     least: int
     count: int
 
     @classmethod
     def between(cls, smallest: float, largest: float) -> SearchRange:
-        """Return the range that contains both disparities. Raises InputError if it is too wide to be matched."""
+        """Return the range of disparities to search that contains `smallest` and `largest`, cells of the depth map.
+
+        Raises InputError if it is too wide to be matched.
+        """
         least = int(np.floor(smallest)) - 1
         count = 16 * int(np.ceil((largest + 2 - least) / 16))
         if count > MOST_DISPARITIES:
@@ -84,10 +91,10 @@ class SearchRange:
 
 
 def match(left: Picture, right: Picture, search: SearchRange, config: MatchingConfig) -> Disparity:
-    """Match two pictures.
+    """Match two rectified pictures by semi-global matching: find the disparity of each cell of the left one.
 
-    The left-right check is OpenCV's: from the same costs, the best left cell of every right cell must agree. Tiles run in
-    OpenCV's number of threads; the result does not depend on it.
+    The left-right check is OpenCV's: from the same costs, the best left cell of every right cell must agree. Tiles run in as
+    many threads as OpenCV uses; the result does not depend on their number.
 
     Parameters
     ----------
@@ -101,7 +108,7 @@ def match(left: Picture, right: Picture, search: SearchRange, config: MatchingCo
     Returns
     -------
     (h, w) array
-        Disparities of the left picture's cells in steps of 1/16, NaN without a match.
+        Disparities of the left picture's cells, in cells (steps of 1/16), NaN without a match.
     """
     canvas_left, canvas_right = _aligned(left, right, search)
     raw = np.full(left.shape, -SUBPIXELS, dtype=np.int16)
@@ -116,7 +123,10 @@ def match(left: Picture, right: Picture, search: SearchRange, config: MatchingCo
 
 
 def without_speckles(disparity: Disparity, speckle_px: int) -> Disparity:
-    """Remove connected smooth regions of at most `speckle_px` cells: stray matches, such as those in the sky."""
+    """Remove small isolated regions from a depth map: stray matches, such as those in the sky.
+
+    disparity: (h, w), cells, NaN without a match. Connected smooth regions of at most `speckle_px` cells become NaN.
+    """
     known = ~np.isnan(disparity)
     least = np.float32(np.floor(disparity[known].min())) if known.any() else np.float32(0)
     steps = np.where(known, np.rint((disparity - least) * SUBPIXELS), -SUBPIXELS).astype(np.int16)

@@ -13,21 +13,21 @@ from sensors.signal_chain.surface_places import RecordedPoints, ShapedSurface
 
 
 def active_point_effects(effects: Sequence[Effect]) -> list[Effect]:
-    """Return the effects that move recorded points and are not null."""
+    """Return those effects (errors) that move recorded points and are not off."""
     return [effect for effect in effects if effect.stage == Stage.POINT and not effect.is_null]
 
 
 def point_shifts(mesh: TriangleMesh, effects: Sequence[Effect], points: FloatArray, random: KeyedRandom) -> FloatArray:
-    """Return how far effects move the recorded points, (n, 3), wall frame, m; 0 where a point is NaN.
+    """Return how far errors in the recorded points themselves move them, (n, 3), wall frame, m; 0 where a point is NaN.
 
-    This runs on the host, because the effects depend on each point's neighbourhood on the surface.
+    It is computed with NumPy, because the effects depend on each point's neighbourhood on the surface.
 
     Parameters
     ----------
     mesh : TriangleMesh
         The true surface, wall frame.
     effects : sequence of Effect
-        Effects on recorded points.
+        Errors in the recorded points, such as noise along the surface's normal.
     points : (n, 3) array
         True points on the surface, wall frame, m.
     random : KeyedRandom

@@ -24,7 +24,10 @@ LARGEST_STRETCH = 3
 
 @dataclass(frozen=True)
 class RectifiedGrid:
-    """Grids of cells that cover the rectified images. Cell (i, j) of a grid is at u = step (j + first), v = step (i + top), px.
+    """Grids of cells on the two rectified images, in which the matcher searches along rows.
+
+    Cell (i, j) of a grid, in row i and column j, is at u = step (j + first), v = step (i + top), px, where first is
+    `left_first` or `right_first`.
 
     Attributes
     ----------
@@ -35,9 +38,9 @@ class RectifiedGrid:
     step : int
         Frame px per cell.
     left_first, right_first, top : int
-        Start of the grids, cells.
+        Number of the first column of the left and of the right grid, and of their first row, cells.
     left_width, right_width, height : int
-        Size of the grids, cells.
+        Width of the left and of the right grid, and their common height, cells.
     """
 
     pair: CameraPair
@@ -52,7 +55,9 @@ class RectifiedGrid:
 
     @classmethod
     def cover(cls, pair: CameraPair, geometry: Rectification, step: int) -> RectifiedGrid:
-        """Make the grids that contain the whole width of both frames in the rows that both have.
+        """Make the grids of cells that contain the whole width of both images, in the rows that both have.
+
+        pair: the nominal cameras. geometry: their rectification. step: px of the frame per cell.
 
         Raises InputError if the cameras converge so much that rectification tears the images apart.
         """
@@ -72,24 +77,33 @@ class RectifiedGrid:
 
     @property
     def disparity_offset(self) -> int:
-        """Number of cells to add to a difference of grid columns, left minus right, to get a disparity."""
+        """Number of cells to add to a difference of grid columns, left minus right, to get a disparity.
+
+        The two grids begin at different columns of the rectified images.
+        """
         return self.left_first - self.right_first
 
     def left(self, image: NDArray[np.uint8]) -> Picture:
-        """Resample the left picture to grey values (height, left_width), NaN outside.
+        """Resample the left picture to the left rectified grid: grey values (height, left_width), NaN outside the picture.
 
-        image: one pixel per `step` px of the frame.
+        image: grey values of the camera's picture, with one pixel per `step` px of the frame.
         """
         geometry = self.geometry
         return self._resampled(image, self.pair.left, geometry.left, geometry.u_left, self.left_first, self.left_width)
 
     def right(self, image: NDArray[np.uint8]) -> Picture:
-        """Resample the right picture: grey values (height, right_width), NaN outside."""
+        """Resample the right picture to the right rectified grid: grey values (height, right_width), NaN outside the picture.
+
+        image: grey values of the camera's picture, with one pixel per `step` px of the frame.
+        """
         geometry = self.geometry
         return self._resampled(image, self.pair.right, geometry.right, geometry.u_right, self.right_first, self.right_width)
 
     def cells(self, u: mi.Float64, v: mi.Float64) -> tuple[mi.Float64, mi.Float64]:
-        """Convert rectified left pixels (u, v) to column and row in the left grid."""
+        """Convert rectified left pixels to positions in the left grid, at which to read disparities.
+
+        u, v: (n,) columns and rows of the rectified image, px. Returns fractional columns and rows of the grid, (n,) each.
+        """
         step, first, top = opaque(self.step, self.left_first, self.top)
         return u / step - first, v / step - top
 

@@ -40,7 +40,10 @@ LARGEST_SHIFT_PX = 1.5
 
 
 class RefinementConfig(Config):
-    """Least-squares matching after the semi-global one; pixels are the depth map's cells."""
+    """Least-squares matching after the semi-global one; pixels are the depth map's cells.
+
+    It improves each disparity by fitting a small window of the right picture to that of the left one.
+    """
 
     steps: int = Field(3, ge=1, le=50, description="iterations")
     window_px: int = Field(5, ge=3, le=31, description="side of the window, odd [px]")
@@ -58,12 +61,13 @@ class RefinementConfig(Config):
 def refine(left: Picture, right: Picture, disparity: Disparity, config: RefinementConfig) -> Disparity:
     """Refine disparities by least-squares matching of windows along the row.
 
-    Over the pixels of a window that show the same surface, L(x) = a R(x - d - s . dx) + b is solved for gain a, offset b and
-    disparity d by Gauss-Newton steps (Lucas & Kanade 1981; Gruen 1985). s is the local slope of the disparity, so that windows
-    follow slanted rock. R is interpolated by cubic convolution (Keys 1981). The standard deviation s_d of d follows from the
+    Over the pixels x of a window that show the same surface, L(x) = a R(x - d - s . dx) + b is solved for contrast a,
+    brightness b and disparity d by Gauss-Newton steps (Lucas & Kanade 1981; Gruen 1985). L and R are the left and the right
+    picture, and dx is the distance from the window's centre. s is the local slope of the disparity, so that windows follow
+    slanted rock. R is interpolated by cubic convolution (Keys 1981). The standard deviation s_d of d follows from the
     residuals. The result is the weighted mean (d / s_d^2 + d_0 / s_0^2) / (1 / s_d^2 + 1 / s_0^2) with the matcher's d_0 and
-    its s_0, so that a window without texture leaves d_0 unchanged. Matches are dropped if they end less certain or less
-    similar than the config requires, or more than 1.5 cells from where they started.
+    its s_0, so that a window without texture leaves d_0 unchanged. Matches are dropped if they end less certain or less similar
+    than the config requires, or more than 1.5 cells from where they started.
 
     Parameters
     ----------

@@ -44,20 +44,20 @@ STEP_PX = 1.0
 
 @dataclass(frozen=True)
 class MatchedStereoPair:
-    """A calibrated pair whose photographs are matched.
+    """A calibrated stereo pair whose photographs are rendered and matched, instead of simulating the matcher's errors.
 
     Raises InputError at construction if the model names an effect on the matching.
 
     Attributes
     ----------
     pair : StereoPair
-        Cameras, wall frame, model and quality.
+        Cameras, wall frame, noise and effects, and quality of the depth map.
     texture : RockTexture
         Texture of the rock beyond the mesh's albedo.
     illumination : IlluminationConfig
         Sun and sky.
     exposure : ExposureConfig
-        The cameras' sensors.
+        How the cameras convert light to grey values.
     matching : MatchingConfig
         The matcher.
     """
@@ -79,7 +79,11 @@ class MatchedStereoPair:
             )
 
     def observe(self, scene: RayCaster, random: KeyedRandom) -> Observation:
-        """Make one depth map, like `StereoPair.observe`; `block` and the truth are what the left pixel really sees."""
+        """Take and match photographs of the scene once, and return the depth map of the left image as an observation.
+
+        scene: the wall, wall frame. random: source of random numbers. The labels in `block` and the error-free quantities are
+        those of what the left pixel really sees.
+        """
         effects = self.pair.model.chain(random)
         nominal = self.pair.cameras.in_wall_frame(self.pair.frame)
         real = self.pair.real_pair(effects, random).in_wall_frame(self.pair.frame)
@@ -105,7 +109,19 @@ class MatchedStereoPair:
     def photograph(
         self, scene: RayCaster, real: CameraPair, effects: tuple[Effect, ...], random: KeyedRandom
     ) -> tuple[Photograph, Photograph]:
-        """Take the left and the right photograph with the real cameras (wall frame) and the same exposure."""
+        """Take the left and the right photograph of the wall with the same exposure.
+
+        Parameters
+        ----------
+        scene : RayCaster
+            The wall, wall frame.
+        real : CameraPair
+            The cameras as they really are, wall frame.
+        effects : tuple of Effect
+            Errors of the sensor, of which those that displace image rows act here.
+        random : KeyedRandom
+            Source of random numbers.
+        """
         step = REDUCTION[self.pair.quality]
         distance = np.linalg.norm(scene.mesh.bounds.mean(axis=0) - real.left.position)
         light = self.illumination.in_wall_frame(self.pair.frame)
@@ -127,14 +143,14 @@ class MatchedStereoPair:
     def matched(
         self, photographs: tuple[Photograph, Photograph], grid: RectifiedGrid, depths_m: tuple[float, float]
     ) -> Disparity:
-        """Match the photographs.
+        """Rectify and match the photographs.
 
         Parameters
         ----------
         photographs : (left, right)
             One pixel per cell of the depth map.
         grid : RectifiedGrid
-            The rectified grids.
+            Grids of cells on the rectified images.
         depths_m : (float, float)
             Nearest and farthest depth of the surface, m.
 
@@ -175,9 +191,10 @@ def _range(depth: mi.Float64, valid: mi.Bool) -> tuple[float, float]:
 
 
 def sampled_disparity(disparity: Disparity, column: mi.Float64, row: mi.Float64) -> mi.Float32:
-    """Interpolate disparities (n,) at fractional columns and rows.
+    """Interpolate the disparities of a depth map (h, w), NaN without a match, at n places.
 
-    On one surface the interpolation is bilinear; at a depth step it takes the nearest cell's.
+    On one surface the interpolation is bilinear; at a depth step it takes the nearest cell's. column, row: (n,) fractional
+    positions in the map, cells.
     """
     height, width = disparity.shape
     values = on_device(mi.Float32, disparity)

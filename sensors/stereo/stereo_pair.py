@@ -45,20 +45,20 @@ SHADOW_MARGIN = 3e-5
 
 @dataclass(frozen=True)
 class StereoPair:
-    """A calibrated pair of cameras and its sensor model.
+    """A calibrated pair of cameras with a model of its errors, which simulates depth maps without rendering photographs.
 
     Attributes
     ----------
     cameras : CameraPair
-        Nominal calibration, world frame.
+        The cameras by their nominal calibration, world frame.
     frame : WallFrame
         The wall frame, in which scenes are given.
     model : StereoModel
-        Noise and effects.
+        Noise and other errors.
     quality : str
-        Reduction of the depth map: "high", "medium" or "low".
+        Resolution of the depth map: "high", "medium" or "low" (a cell for 2 x 2, 4 x 4 or 8 x 8 px of the image).
     truth : bool
-        Whether to keep error-free channels.
+        Whether observations keep error-free quantities, such as the true depth.
     """
 
     cameras: CameraPair
@@ -68,7 +68,11 @@ class StereoPair:
     truth: bool = False
 
     def observe(self, scene: RayCaster, random: KeyedRandom) -> Observation:
-        """Make one depth map, reprojected with the nominal calibration; rows and columns are those of the reduced left image."""
+        """Observe the scene once: simulate the depth map of the left image, and compute points with the nominal calibration.
+
+        scene: the wall, wall frame. random: source of random numbers. Rows and columns are those of the left image, reduced to
+        the map's resolution.
+        """
         effects = self.model.chain(random)
         matches, left_u, left_v, point = self.traced(scene, effects, random)
         for stage in (Stage.MATCH, Stage.FILL):
@@ -83,7 +87,16 @@ class StereoPair:
     def traced(
         self, scene: RayCaster, effects: tuple[Effect, ...], random: KeyedRandom
     ) -> tuple[Matches, mi.Float64, mi.Float64, mi.Array3f64]:
-        """Trace what the real pair sees, before the matching effects.
+        """Trace what the real pair of cameras sees, before the errors of the matching.
+
+        Parameters
+        ----------
+        scene : RayCaster
+            The wall, wall frame.
+        effects : tuple of Effect
+            Errors of the sensor, of which those of cameras and image rows act here.
+        random : KeyedRandom
+            Source of random numbers.
 
         Returns
         -------
@@ -105,22 +118,28 @@ class StereoPair:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, columns) of the depth map."""
+        """(rows, columns) of the depth map that the pair records."""
         step = REDUCTION[self.quality]
         return self.cameras.left.height // step, self.cameras.left.width // step
 
     def real_pair(self, effects: tuple[Effect, ...], random: KeyedRandom) -> CameraPair:
-        """Return the pair as it really is, world frame: the calibrated one with the camera effects added."""
+        """Return the pair as it really is, world frame: the calibrated one with the cameras' errors added.
+
+        effects: errors of the sensor, of which those of cameras act here. random: source of random numbers.
+        """
         return apply_stage(effects, Stage.CAMERA, self.cameras, random)
 
     def cells(self) -> tuple[mi.UInt32, mi.Float64, mi.Float64]:
-        """Return number and centre (u, v) of each cell in the left image, px of the full-resolution frame."""
+        """Return number and centre (u, v), px of the full-resolution frame, of each cell of the depth map in the left image."""
         rows, columns = self.shape
         index = dr.arange(mi.UInt32, rows * columns)
         return index, *self.centres(index)
 
     def centres(self, index: mi.UInt32) -> tuple[mi.Float64, mi.Float64]:
-        """Return the centres (u, v), px of the full-resolution frame, of cells by their numbers, which count row by row."""
+        """Return the centres of the depth map's cells in the left image: columns u and rows v, px of the full-resolution frame.
+
+        index: (n,) numbers of the cells, counted row by row.
+        """
         step = REDUCTION[self.quality]
         columns = self.cameras.left.width // step
         row, column = index // columns, index % columns
@@ -132,7 +151,7 @@ class StereoPair:
         Parameters
         ----------
         matches : Matches
-            The matches after all effects.
+            The n matched cells of the depth map after all errors of the matching.
         camera_point : 3 x (n,)
             Recorded points in the nominal left camera's frame, m.
         left : Camera
@@ -173,8 +192,9 @@ class StereoPair:
 def reproject(geometry: Rectification, u: Any, v: Any, disparity: Any) -> mi.Array3f64:
     """Compute points 3 x (n,) in the left camera's frame, m, from rectified left pixels and their disparity, px.
 
-    This is the inverse of OpenCV's Q: Z = f B / (d - d_inf), X = (u - u_left) Z / f, Y = (v - v_0) Z / f, then rotated back
-    from the rectified frame.
+    It computes Z = f B / (d - d_inf), X = (u - u_left) Z / f, Y = (v - v_0) Z / f, and rotates back from the rectified frame.
+    Here d is the disparity, d_inf that of a point at infinity, f the principal distance, B the base, and (u_left, v_0) the
+    principal point. OpenCV's matrix Q does the same.
 
     Parameters
     ----------
@@ -193,12 +213,28 @@ def reproject(geometry: Rectification, u: Any, v: Any, disparity: Any) -> mi.Arr
 def row_displacement(
     effects: tuple[Effect, ...], camera: Literal["left", "right"], v: mi.Float64, random: KeyedRandom
 ) -> mi.Float64:
-    """Return recorded minus ideal column (n,), px, of pixels in rows `v` of one camera."""
+    """Return how far the image rows of one camera are displaced sideways by errors: recorded minus ideal column (n,), px.
+
+    Parameters
+    ----------
+    effects : tuple of Effect
+        Errors of the sensor, of which those that displace image rows act.
+    camera : str
+        "left" or "right".
+    v : (n,)
+        Rows of the pixels, px.
+    random : KeyedRandom
+        Source of random numbers.
+    """
     return apply_stage(effects, Stage.EXPOSE, ImageRows(camera, v, mi.Float64(0.0)), random).du
 
 
 def view(scene: RayCaster, camera: Camera, u: mi.Float64, v: mi.Float64) -> tuple[Hits, mi.Array3f64]:
-    """Trace the pixels (u, v) of a camera. Returns hits, whose distance is the depth along the camera's axis, and points."""
+    """Find what the pixels of a camera see, by ray casting.
+
+    scene: the wall. camera: the camera, in the scene's frame. u, v: (n,) columns and rows, px. Returns the hits, whose distance
+    is the depth along the camera's axis, and the points 3 x (n,), m.
+    """
     x, y = camera.on_device().tangents(u, v)
     origin, direction = vector(camera.position), rotated(camera.rotation, mi.Array3f64(x, y, 1.0))
     hits = scene.intersect(origin, direction, exact=True)
@@ -219,7 +255,7 @@ def _visible(scene: RayCaster, camera: Camera, hits: Hits, point: mi.Array3f64) 
 def rectified_disparity(
     nominal: CameraPair, geometry: Rectification, left: tuple[mi.Float64, mi.Float64], right: tuple[mi.Float64, mi.Float64]
 ) -> tuple[mi.Float64, mi.Float64, mi.Float64]:
-    """Compute rectified left pixels (u, v) and disparities, px, of corresponding pixels.
+    """Compute the disparities of corresponding pixels of two images: returns rectified left pixels u, v and disparities, px.
 
     Parameters
     ----------
@@ -228,7 +264,7 @@ def rectified_disparity(
     geometry : Rectification
         Their rectification.
     left, right : (u, v)
-        Corresponding pixels of both images, px.
+        Columns and rows (n,) of the corresponding pixels in each image, px.
     """
     left_u, left_v = rectified_pixel(nominal.left, geometry.left, *left, geometry.f, geometry.u_left, geometry.v)
     right_u, _ = rectified_pixel(nominal.right, geometry.right, *right, geometry.f, geometry.u_right, geometry.v)
@@ -236,7 +272,10 @@ def rectified_disparity(
 
 
 def row_tangent(geometry: Rectification, v: mi.Float64) -> mi.Float64:
-    """Return the tangent (n,) of the angle between rectified rows `v`, px, and the rectified axis."""
+    """Return the tangent (n,) of the angle between lines of sight in rectified rows and the rectified axis, up or down.
+
+    geometry: the rectification of the cameras. v: (n,) rows, px.
+    """
     scale, centre = opaque(geometry.f, geometry.v)
     return (v - centre) / scale
 
@@ -244,7 +283,7 @@ def row_tangent(geometry: Rectification, v: mi.Float64) -> mi.Float64:
 def rectified_pixel(
     camera: Camera, rotation: FloatArray, u: mi.Float64, v: mi.Float64, f: float, u_0: float, v_0: float
 ) -> tuple[mi.Float64, mi.Float64]:
-    """Convert an image pixel (u, v) to a rectified pixel.
+    """Convert pixels of an image to pixels (column, row) of the rectified image.
 
     Parameters
     ----------
@@ -253,7 +292,7 @@ def rectified_pixel(
     rotation : (3, 3) array
         Camera frame to rectified frame.
     u, v : (n,)
-        Image pixel, px.
+        Columns and rows in the image, px.
     f, u_0, v_0 : float
         Principal distance and principal point of the rectified image, px.
     """
@@ -263,18 +302,23 @@ def rectified_pixel(
 def rectified_tangents(
     x: mi.Float64, y: mi.Float64, rotation: FloatArray, f: float, u_0: float, v_0: float
 ) -> tuple[mi.Float64, mi.Float64]:
-    """Convert ideal image coordinates to pixels of a rectified image.
+    """Convert ideal image coordinates (directions in a camera's frame) to pixels of a rectified image.
 
     Parameters
     ----------
-    x, y : (n,) tangents X/Z and Y/Z in the camera's frame, without distortion.
-    rotation : (3, 3) rotation from the camera's frame to the rectified frame.
-    f : Principal distance of the rectified image, px.
-    u_0, v_0 : Principal point of the rectified image, px.
+    x, y : (n,)
+        Tangents X/Z and Y/Z in the camera's frame, without distortion.
+    rotation : (3, 3) array
+        Rotation from the camera's frame to the rectified frame.
+    f : float
+        Principal distance of the rectified image, px.
+    u_0, v_0 : float
+        Principal point of the rectified image, px.
 
     Returns
     -------
-    (n,) columns and (n,) rows, px.
+    (n,) and (n,)
+        Columns and rows, px.
     """
     ray = rotated(rotation, mi.Array3f64(x, y, 1.0))
     scale, centre_u, centre_v = opaque(f, u_0, v_0)

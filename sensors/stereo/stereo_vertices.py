@@ -33,11 +33,11 @@ from sensors.stereo.stereo_pair import REDUCTION, StereoPair, rectified_disparit
 
 
 def observe_vertices(pair: StereoPair, scene: RayCaster, random: KeyedRandom) -> TriangleMesh:
-    """Return the wall as the pair reconstructs it: triangles and labels, with vertices as recorded.
+    """Return the wall as a stereo pair reconstructs it: a mesh with the true triangles and labels, and vertices with errors.
 
-    Positions are in the wall frame. Vertices outside one of the images or behind a camera are left out. The same `random` draws
-    the same orientation and row displacement as `pair.observe`; matching noise is keyed by the vertex. Raises InputError if
-    nothing is left.
+    `scene` is the wall; positions are in the wall frame. Vertices outside one of the images or behind a camera are left out.
+    The same `random` draws the same orientation and row displacement as `pair.observe`; the matching noise of a vertex depends
+    on its number. Raises InputError if nothing is left.
     """
     mesh = scene.mesh
     effects = pair.model.chain(random)
@@ -124,10 +124,12 @@ class _TracedCells:
 
 @dataclass(frozen=True)
 class VertexMatches(Matches):
-    """Matches of the n vertices of the wall's mesh instead of a depth map's cells; `index` is the vertex, (u, v) its left pixel.
+    """The n vertices of the wall's mesh as matches of a stereo pair, in place of a depth map's cells.
 
-    An effect that depends on neighbouring pixels, such as smoothing, cannot act on vertices. It acts on the ray-traced depth map
-    of the same observation, and each vertex takes over the change of disparity that the effect made at its pixel.
+    `index` is the number of the vertex, and (u, v) its pixel in the left image.
+
+    An effect that depends on neighbouring pixels, such as smoothing, cannot act on vertices. It acts on the ray-traced depth
+    map of the same observation, and each vertex takes over the change of disparity that the effect made at its pixel.
 
     Attributes
     ----------
@@ -141,7 +143,11 @@ class VertexMatches(Matches):
     before: FloatArray | None = None
 
     def raster(self) -> FloatArray:
-        """Return the disparities (rows, columns), px, of the depth map after the effects so far; NaN without a match."""
+        """Return the disparities (rows, columns), px, of the ray-traced depth map after the effects so far.
+
+        They are NaN without a match. Effects that depend on neighbouring pixels act on this map, because the vertices have no
+        neighbours in rows and columns.
+        """
         return self.cells.matches.raster() if self.before is None else self.before
 
     def albedo_raster(self) -> FloatArray | None:
@@ -149,12 +155,12 @@ class VertexMatches(Matches):
         return self.cells.matches.albedo_raster()
 
     def sampled(self, raster: FloatArray) -> mi.Float64:
-        """Return the values (n,) of a raster (rows, columns) over the depth map, each from the cell in which the vertex lies."""
+        """Read a raster (rows, columns) over the depth map at the n vertices, (n,), in the cell in which each lies."""
         columns, rows = (cell_index(place / self.reduction, count) for place, count in self._axes())
         return dr.gather(mi.Float64, on_device(mi.Float64, raster), rows * dr.opaque(mi.UInt32, self.shape[1]) + columns)
 
     def with_raster(self, disparity: FloatArray) -> Matches:
-        """Transfer an effect on the depth map to the vertices: return matches whose disparities contain the effect's change.
+        """Transfer an effect on the depth map to the mesh's vertices: return matches whose disparities contain its change.
 
         The change of a cell is `disparity` minus `raster()`. A vertex takes the bilinear mean of the changes of the four cells
         round its pixel if all four see the vertex's surface, that is if their disparities differ from its own by less than one
