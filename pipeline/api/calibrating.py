@@ -119,10 +119,8 @@ class Calibration:
         """Return a figure of the report by its name.
 
         kind: windows (the last measured map and a simulated one in the compared windows), measured (the last measured map),
-        systematic
-        (the mean of all), distribution (of the differences), statistics (measured over expected) or epochs. Raises InputError
-        for another
-        name.
+        systematic (the mean of all), distribution (of the differences), statistics (measured over expected) or epochs. Raises
+        InputError for another name.
         """
         return Picture(pick({name: png for name, _, png in pictures(self.figures, None)}, kind, "plot"))
 

@@ -222,8 +222,7 @@ class Diagnosis:
         """The result in a word.
 
         One of named (one effect explains the disagreement), several (more than one does), ambiguous (one of some effects that
-        the data
-        cannot tell apart), unknown (no known effect explains it), no_gap (sensor model and measurement agree) and
+        the data cannot tell apart), unknown (no known effect explains it), no_gap (sensor model and measurement agree) and
         insufficient_data.
         """
         return self.found.verdict
@@ -233,8 +232,7 @@ class Diagnosis:
         """Effects that explain why measurement and sensor model disagree.
 
         One row per parameter of each effect, SI units. The columns include the fitted value, its standard deviation (std), the
-        kind of
-        effect, the effects that the data cannot distinguish from it, and the p-value of the effect.
+        kind of effect, the effects that the data cannot distinguish from it, and the p-value of the effect.
         """
         rows = []
         for each in self.found.effects:
@@ -263,8 +261,7 @@ class Diagnosis:
         """The compared points, wall frame, with their residuals: measured minus predicted depth.
 
         The channels are before_m and after_m (without and with the named effects in the prediction) and held_out (whether the
-        point
-        was kept from the fit, for validation).
+        point was kept from the fit, for validation).
         """
         found, cloud = self.found, self.measurement.held.cloud
         depth, index = found.residuals.depth_m, found.residuals.index

@@ -213,8 +213,7 @@ class Epoch:
         """Return the path of one of the epoch's files in the run's folder, such as difference_002.tif.
 
         kind: first part of the file name, such as "difference". suffix: its end, such as ".tif". Raises InputError if there is
-        no
-        such file.
+        no such file.
         """
         path = self.run.folder / f"{kind}_{self.number:03d}{suffix}"
         if not path.is_file():

@@ -105,8 +105,7 @@ def by_kind(data_set: dict[str, Any], rockfalls: int) -> dict[str, Any]:
     """Give the annotations of a time series a category for each kind of change: missing, moved and deposited rock.
 
     data_set: COCO annotations of `coco`. rockfalls: number of rockfalls n in the series. The block labels in `data_set` code
-    both:
-    kind k (from 0) of rockfall e has the label k n + e. In the returned copy, `block` is the rockfall's number e alone.
+    both: kind k (from 0) of rockfall e has the label k n + e. In the returned copy, `block` is the rockfall's number e alone.
     """
     annotations = [
         {**each, "category_id": (each["block"] - 1) // rockfalls + 1, "block": (each["block"] - 1) % rockfalls + 1}

@@ -56,8 +56,7 @@ def raster_grid(bounds: FloatArray, config: DifferenceConfig) -> Grid:
     """Return the grid of pixels for difference maps of a wall: all that lie inside the reference surface's bounding box.
 
     bounds: (2, 3) smallest and largest coordinates of the box, wall frame, m. config: gives the size of a pixel. Raises
-    InputError
-    if a pixel would be larger than the surface, or if the rasters would not fit into the free memory.
+    InputError if a pixel would be larger than the surface, or if the rasters would not fit into the free memory.
     """
     width, height = (float(extent) for extent in (bounds[1] - bounds[0])[:2])
     available = psutil.virtual_memory().available

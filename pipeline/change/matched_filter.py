@@ -112,8 +112,7 @@ def noise_spectrum(noise: NDArray[np.float32], side: int) -> FloatArray | None:
     """Estimate the power spectrum of a map's noise, by Welch's method of overlapping windows.
 
     noise: (h, w) values of the map outside of blocks, m; NaN elsewhere. side: side of a window, px. Returns the mean |N(k)|^2
-    of the
-    windows' discrete Fourier transforms, (side, side), m2; None if no window has enough data.
+    of the windows' discrete Fourier transforms, (side, side), m2; None if no window has enough data.
     """
     from scipy import ndimage
 

@@ -42,8 +42,7 @@ def record_document(report: Path, record: str) -> Callable[[], dict[str, Any]]:
     """Return a function that gives what --json prints of a finished command.
 
     report: path of the report. record: name of the JSON file next to it, such as run.json; its keys config and versions, which
-    only
-    serve to repeat the run, are left out.
+    only serve to repeat the run, are left out.
     """
 
     def document() -> dict[str, Any]:

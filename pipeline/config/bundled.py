@@ -52,9 +52,9 @@ def config_path(kind: str, given: Path) -> Path:
     """Return `given` itself or, if no such file exists, the bundled config that it names.
 
     kind: a subfolder of the bundled configs, such as "sites", in which a name is looked up. given: a path, or the name of a
-    bundled
-    config: a word (`glendale`), or its path in a checkout (`configs/sites/glendale.yaml`), which is elsewhere in an installed
-    wheel. Raises InputError, with the most similar name, if a bare word is neither a file nor a bundled config of `kind`.
+    bundled config: a word (`glendale`), or its path in a checkout (`configs/sites/glendale.yaml`), which is elsewhere in an
+    installed wheel. Raises InputError, with the most similar name, if a bare word is neither a file nor a bundled config of
+    `kind`.
     """
     if given.exists():
         return given

@@ -27,8 +27,7 @@ def read_preset(name: str) -> ScannerPreset:
     """Read a scanner preset: the scan pattern, reach and noise of an instrument on the market.
 
     name: a bundled name such as `riegl_vz400i`, or a YAML file. Raises InputError for an unknown name, with the most similar
-    one,
-    and for mistakes in the file.
+    one, and for mistakes in the file.
     """
     path = Path(name) if is_path(name) else bundled_config("scanners", name)
     return parse(ScannerPreset, load_yaml(path), str(path))
@@ -55,8 +54,7 @@ def without_keys_of_preset(values: dict[str, Any], overrides: Sequence[Override]
     """Remove from a config's values what a scanner preset sets, if the overrides name a preset.
 
     The preset so replaces the keys of `scanner` that it knows, and the model of a laser scanner, in its place. Everything else
-    in
-    the file stays. Keys among the overrides are applied afterwards and win.
+    in the file stays. Keys among the overrides are applied afterwards and win.
 
     Parameters
     ----------

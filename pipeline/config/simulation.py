@@ -270,8 +270,7 @@ class SimulationConfig(Config):
         """Return the nominal stereo pair, world frame.
 
         target: the wall's middle and orientation, in front of which a rig (two equal cameras) is placed; cameras from a file
-        need it
-        not.
+        need it not.
         """
         return self.cameras.place(target) if isinstance(self.cameras, RigConfig) else self.cameras.pair()
 

@@ -52,8 +52,7 @@ def runs(orders: Sequence[EpochOrder], workers: int) -> list[Run]:
     """Divide the epochs of a data set into groups, each of which one worker makes in one go.
 
     The epochs of a group share wall, sensor and reference epoch, so that these are set up once; groups that share them are of
-    about
-    equal length.
+    about equal length.
 
     orders: the epochs, those that share a reference next to each other. workers: number of processes.
     """

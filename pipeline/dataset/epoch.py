@@ -58,8 +58,7 @@ class EpochTile:
     """A tile of an epoch's difference map for a data set.
 
     tile: the pixels. annotations: of its fallen blocks, as COCO's, without ids. truth: the true difference (size, size), m;
-    None
-    unless the config asks for it.
+    None unless the config asks for it.
     """
 
     tile: Tile
@@ -82,9 +81,8 @@ class StageCache:
     """Keeps the set-up of the last simulated epoch (wall, frame, ray-tracing scene and reference epoch) for the next ones.
 
     Epochs of the same wall, sensor, noise and reference share this set-up, called a stage. The cache keeps only one, because a
-    stage
-    takes much of a worker's memory, and plans put the epochs of a stage next to each other. `made` counts the stages set up so
-    far.
+    stage takes much of a worker's memory, and plans put the epochs of a stage next to each other. `made` counts the stages set
+    up so far.
     """
 
     def __init__(self, config: DatasetConfig) -> None:

@@ -130,8 +130,7 @@ def write_dataset_file(
     folder : Folder of the set.
     name : Name of the set.
     sources : Config, versions, command and file name prefix of each set that this one was made of (one, unless it was merged),
-    by
-        fingerprint, a hash of the config.
+        by fingerprint, a hash of the config.
     epochs : Indices of the set's epochs in the plan of each config, by fingerprint.
     complete : Whether all epochs are made.
     """

@@ -27,8 +27,7 @@ class CellStatistics:
     ----------
     tiles, annotations : Their numbers.
     with_ratio, stand_out : Annotations with a known signal-to-noise ratio, and those of them whose ratio is so high that the
-    block
-        stands out from the noise.
+        block stands out from the noise.
     filled : Sum over the annotations of the share of the bounding box that the mask fills.
     noise_m : Standard deviation outside the blocks of each epoch, m.
     sizes : Number of annotations in each bin of block size; the bins' edges are SIZE_EDGES_M, m.

@@ -12,7 +12,10 @@ from scene.common.errors import InputError
 
 
 class ExportedRun(RunFiles):
-    """A run's folder. Raises InputError if it contains no finished epoch."""
+    """A run of `simulate` that is exported to other formats, read from its folder.
+
+    Raises InputError if the folder contains no finished epoch.
+    """
 
     @cached_property
     def record(self) -> dict[str, Any]:
@@ -24,16 +27,19 @@ class ExportedRun(RunFiles):
 
     @property
     def last(self) -> int:
-        """Number of the last epoch."""
+        """Number of the run's last epoch; the reference is 0."""
         return len(self.record["epochs"]) - 1
 
     def limit_m(self, number: int) -> float:
-        """Return the limit of the colour scale of an epoch's map, as in the report, m."""
+        """Return the difference at which the colour scale of an epoch's map ends, m, the same as in the run's report.
+
+        number: of the epoch.
+        """
         statistics = self.record["epochs"][number].get("statistics")
         if not statistics:
             raise InputError(f"has no statistics of epoch {number}", where=str(self.folder / RUN_FILE), remedy=RESUME)
         return float(SCALE_SIGMAS * statistics["sigma_m"])
 
     def blocks(self, number: int) -> list[dict[str, Any]]:
-        """Return the records of the blocks that fell in an epoch, the largest first."""
+        """Return the records of the blocks that fell in an epoch of the run, the largest first. number: of the epoch."""
         return sorted(self.record["epochs"][number]["blocks"], key=lambda block: -block["volume_m3"])

@@ -55,7 +55,10 @@ Simulated difference maps of rock walls with annotated rockfalls, made by scarps
 
 @dataclass(frozen=True)
 class HuggingFaceSet:
-    """Result of an export for Hugging Face: the folder, and the number of images and of blocks by split, with the Hub's names."""
+    """Result of exporting a data set for Hugging Face.
+
+    folder: where it was written. images, blocks: their numbers by split, with the splits' names on Hugging Face's Hub.
+    """
 
     folder: Path
     images: dict[str, int]
@@ -63,10 +66,11 @@ class HuggingFaceSet:
 
 
 def save_huggingface(folder: Path, out: Path, progress: Progress) -> HuggingFaceSet:
-    """Write the splits of a data set: README.md, and data/SPLIT-00000-of-00002.parquet ... with 256 tiles each.
+    """Export a data set for Hugging Face: README.md, and data/SPLIT-00000-of-00002.parquet ... with 256 tiles each.
 
-    The tiles are the data set's own TIFF files, byte for byte. Raises InputError if the folder contains no split, or if
-    `datasets` (the extra `huggingface`) is not installed.
+    The tiles are the data set's own TIFF files, byte for byte. folder: of the data set. out: where to write. progress: receives
+    the progress. Raises InputError if the folder contains no split, or if `datasets` (the extra `huggingface`) is not
+    installed.
     """
     library, sets = _library(), splits_of(folder)
     blocks: dict[str, int] = {}
@@ -154,7 +158,7 @@ def _row(tiles: Tiles, sample: Sample) -> dict[str, Any]:
 
 
 def summary(made: HuggingFaceSet) -> str:
-    """Describe the exported set as lines of text."""
+    """Describe a data set exported for Hugging Face as lines of text: its folder and the numbers of images and blocks."""
     lines = [f"{split}: {images:,} images, {made.blocks[split]:,} blocks" for split, images in made.images.items()]
     return "\n".join([*lines, f"load it with datasets.load_dataset({str(made.folder)!r})"])
 

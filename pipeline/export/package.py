@@ -21,10 +21,10 @@ _MEDIA = {
 
 
 def package(folder: Path) -> dict[str, Any]:
-    """Describe all files in a folder (except hidden ones and the package itself) by path, size and SHA-256.
+    """Describe the files in a results folder as a Data Package: each with path, size and SHA-256 checksum, as JSON types.
 
-    Raises InputError if there is nothing to list, or for a link to a file outside the folder, which would be missing in a
-    copy.
+    Hidden files and the description itself are left out. Raises InputError if there is nothing to list, or for a link to a file
+    outside the folder, which would be missing in a copy.
     """
     if not folder.is_dir():
         raise InputError("there is no such folder", where=str(folder), remedy="give the folder that a command filled")
@@ -45,7 +45,7 @@ def package(folder: Path) -> dict[str, Any]:
 def save_package(folder: Path, path: Path) -> int:
     """Write the description of a results folder as a Data Package (JSON): each file with its size and SHA-256 checksum.
 
-    Returns the number of files that the description lists.
+    folder: the results. path: the JSON file. Returns the number of files that the description lists.
     """
     made = package(folder)
     write_json(path, made)

@@ -38,7 +38,7 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class PerspectiveView:
-    """A camera for pictures.
+    """A perspective view of a wall for pictures: position, direction and size of an imagined camera.
 
     Attributes
     ----------
@@ -60,10 +60,10 @@ class PerspectiveView:
 
     @classmethod
     def on(cls, places: FloatArray, width: int = 1280) -> PerspectiveView:
-        """Place the camera so that all `places` (n, 3), m, are in its picture of `width` px.
+        """Place the camera so that a wall is just in its picture.
 
-        The picture is at most _TALLEST times as high as wide. Raises InputError if the places are one point or lie on one line of
-        sight.
+        places: (n, 3) points that must be in it, wall frame, m. width: of the picture, px; it is at most three times as high as
+        wide. Raises InputError if the places are one point or lie on one line of sight.
         """
         forward = -_FROM / np.linalg.norm(_FROM)
         right = np.cross(forward, [0.0, 1.0, 0.0])
@@ -86,14 +86,20 @@ class PerspectiveView:
         return cls(middle @ axes - distance * forward, axes, width, max(height, 2), focal_px)
 
     def rays(self, times: int) -> FloatArray:
-        """Return directions (h * times * w * times, 3) through `times` x `times` parts of each pixel, row by row."""
+        """Return the directions in which a picture's pixels look, wall frame, to render it by ray casting.
+
+        times: each pixel is divided into times x times parts. Returns (h * times * w * times, 3), row by row.
+        """
         columns, rows = np.meshgrid(*((np.arange(size * times) + 0.5) / times for size in (self.width, self.height)))
         right, down = columns - self.width / 2, rows - self.height / 2
         own = np.stack([right, down, np.full_like(right, self.focal_px)], axis=-1).reshape(-1, 3) / self.focal_px
         return np.asarray(own @ self.axes)
 
     def project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return column and row (n, 2) of points (n, 3), px from the top-left corner, and their depth (n,), m."""
+        """Return where points are in the picture: column and row (n, 2), px from the top-left corner, and their depth (n,), m.
+
+        points: (n, 3), wall frame, m.
+        """
         own = (points - self.position) @ self.axes.T
         ahead = own[:, 2]
         place = own[:, :2] / ahead[:, None] * self.focal_px + np.array([self.width, self.height]) / 2
@@ -134,7 +140,10 @@ def draw_wall(
 
 
 def difference_at(places: FloatArray, difference: NDArray[np.floating], grid: Grid) -> NDArray[np.floating]:
-    """Return the map's value (n,) at places (n, 2 or 3), m; NaN outside the map."""
+    """Look up a difference map at places on the wall; returns (n,) values, m, NaN outside the map.
+
+    places: (n, 2 or 3) x, y (and z), wall frame, m. difference: (h, w) map, m. grid: its pixels.
+    """
     columns, rows = np.floor(grid.columns(places[:, 0])).astype(int), np.floor(grid.rows(places[:, 1])).astype(int)
     inside = (columns >= 0) & (columns < grid.width) & (rows >= 0) & (rows < grid.height)
     values = np.full(len(places), np.nan)
@@ -143,7 +152,10 @@ def difference_at(places: FloatArray, difference: NDArray[np.floating], grid: Gr
 
 
 def colours_of(values: NDArray[np.floating], limit_m: float) -> NDArray[np.uint8]:
-    """Return the RGBA colours (n, 4) of differences, m, as in the reports' maps."""
+    """Return the RGBA colours (n, 4) of differences, as in the reports' maps.
+
+    values: (n,) differences, m. limit_m: difference at which the colour scale ends, m.
+    """
     return np.asarray(COLOURS.with_extremes(bad=NO_DATA)((values / limit_m + 1) / 2, bytes=True))
 
 

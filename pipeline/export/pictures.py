@@ -40,7 +40,10 @@ _NIGHT, _BEAM = 26, np.array([255, 150, 30], dtype=np.uint8)
 
 
 def save_picture(run: ExportedRun, number: int, path: Path, width: int = 1280) -> None:
-    """Write an epoch's wall as PNG, coloured by the difference, with its largest blocks numbered as in the report."""
+    """Draw the wall of a run's epoch in perspective, coloured by the difference, with its largest blocks numbered; write a PNG.
+
+    number: of the epoch. width: of the picture, px. The blocks have their numbers in the report.
+    """
     reference = run.surface(0)
     view = PerspectiveView.on(reference.vertices, width)
     drawn = _reference_picture(reference, view, run.limit_m(1)) if number == 0 else _epoch_picture(run, number, view)
@@ -48,7 +51,10 @@ def save_picture(run: ExportedRun, number: int, path: Path, width: int = 1280) -
 
 
 def save_epochs(run: ExportedRun, path: Path, progress: Progress) -> None:
-    """Write the epochs, the reference first, as an animated GIF with one colour scale."""
+    """Write an animated GIF of a run's wall, epoch by epoch from the reference on, with one colour scale for the differences.
+
+    progress: receives the progress.
+    """
     numbers = range(1, run.last + 1)
     limit = max(run.limit_m(number) for number in numbers)
     with progress.stage("reference"):
@@ -63,10 +69,10 @@ def save_epochs(run: ExportedRun, path: Path, progress: Progress) -> None:
 
 
 def save_scan(run: ExportedRun, number: int, path: Path) -> None:
-    """Write an animated GIF that shows how an epoch's points are recorded, line by line.
+    """Write an animated GIF that shows how a laser scanner records the points of an epoch, line by line.
 
-    Points are coloured by their distance from the wall plane. Raises InputError for a run of a stereo pair, which records all its
-    points at once.
+    number: of the epoch. Points are coloured by their distance from the wall plane. Raises InputError for a run of a stereo
+    pair, which records all its points at once.
     """
     if run.record["sensor"] != "tls":
         raise InputError(

@@ -29,7 +29,7 @@ _SIGMAS = 6.0
 
 @dataclass(frozen=True)
 class YoloSet:
-    """Result of an export for YOLO.
+    """Result of exporting a data set for YOLO, a family of object detectors.
 
     Attributes
     ----------
@@ -104,15 +104,18 @@ def _write(out: Path, split: str, sample: Sample, limit: float) -> int:
 
 
 def grey_values(image: NDArray[np.float32], valid: NDArray[np.bool_], limit_m: float) -> NDArray[np.uint8]:
-    """Convert a difference map (h, w), m, to 8 bits: 128 is no change, 0 no data."""
+    """Convert a difference map to 8 bits, as images for YOLO: 128 is no change, 1 and 255 are the ends, 0 no data.
+
+    image: (h, w) differences, m. valid: (h, w) true where there is data. limit_m: difference at the ends of the scale, m.
+    """
     grey = np.clip(np.round(_ZERO + _STEPS * image / limit_m), 1, 255)
     return np.where(valid, grey, 0).astype(np.uint8)
 
 
 def outline(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the outline (k, 2) of a mask (h, w) as x, y, px from the top-left corner.
+    """Return the outline of a block's mask (h, w) as a polygon, as YOLO's labels need it.
 
-    Separate parts are joined by lines there and back.
+    The outline is (k, 2) x, y, px from the top-left corner. Separate parts are joined by lines there and back.
     """
     fine = np.kron(mask.astype(np.uint8), np.ones((_FINER, _FINER), np.uint8))
     found, _ = cv2.findContours(fine, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
@@ -140,7 +143,7 @@ def _line(points: NDArray[np.float64], shape: tuple[int, ...]) -> str:
 
 
 def summary(made: YoloSet) -> str:
-    """Describe the exported set as lines of text."""
+    """Describe a data set exported for YOLO as lines of text: folder, grey scale, numbers of images and blocks."""
     return "\n".join(_sentences(made))
 
 

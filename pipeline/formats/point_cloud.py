@@ -39,7 +39,7 @@ class PointCloud:
     stated_units: AxisUnits | None = None
 
     def part(self, rows: NDArray[Any]) -> PointCloud:
-        """Return some of the points, by a mask or indices."""
+        """Return a cloud of some of the points. rows: a mask or indices."""
         return replace(
             self,
             points=self.points[rows],
@@ -49,14 +49,14 @@ class PointCloud:
         )
 
     def noted(self, *notes: str) -> PointCloud:
-        """Return the cloud with further notes."""
+        """Return the cloud with further notes on what a reader left out, converted or guessed."""
         return replace(self, notes=(*self.notes, *notes))
 
 
 def joined(clouds: list[PointCloud], counted: str) -> PointCloud:
-    """Join the clouds of several files, with the channels that all have.
+    """Join the point clouds of several files into one, with the channels that all have.
 
-    The channel named `counted` gives the number of the file; a channel of that name in the files is replaced.
+    counted: name of a new channel with the number of the file, from 0; a channel of that name in the files is replaced.
     """
     if len(clouds) == 1:
         return replace(clouds[0], extra={name: values for name, values in clouds[0].extra.items() if name not in _COUNTERS})

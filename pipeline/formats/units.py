@@ -22,7 +22,7 @@ _PROJECT = "project the points to a coordinate system in metres, such as UTM, an
 
 @dataclass(frozen=True)
 class AxisUnits:
-    """Unit of the coordinates, as a file states it.
+    """Unit of the coordinates in a file, as the file states it.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class AxisUnits:
 
     @property
     def name(self) -> str:
-        """The unit in words; if the axes differ, one after the other."""
+        """The unit in words, such as "us-ft (US survey foot)"; if the axes differ, one after the other."""
         names = [unit_name(each) for each in self.metres]
         if len(set(names)) == 1:
             return names[0]
@@ -45,21 +45,24 @@ class AxisUnits:
 
     @property
     def in_metres(self) -> bool:
-        """Whether all axes are in metres."""
+        """Whether x, y and z are all in metres, so that nothing has to be converted."""
         return all(same_unit(each, 1.0) for each in self.metres)
 
     def factors(self) -> FloatArray:
-        """Return the (3,) lengths of one unit, m."""
+        """Return the factors (3,) that convert x, y and z to metres."""
         return np.array(self.metres)
 
 
 def unit_name(metres: float) -> str:
-    """Return the name of a unit of this length, m."""
+    """Return the name of a unit of length, for messages. metres: its length, m."""
     return next((name for known, name in _NAMES.items() if same_unit(metres, known)), f"units of {metres:.12g} m")
 
 
 def same_unit(metres: float, other: float) -> bool:
-    """Whether two units, m, are the same except for the digits in which they are written."""
+    """Whether two units of length are the same, although files may write them with different numbers of digits.
+
+    metres, other: their lengths, m.
+    """
     return math.isclose(metres, other, rel_tol=_ALIKE)
 
 
@@ -69,9 +72,9 @@ def agreed_units(stated: AxisUnits | None, given: str | None, where: str, option
     Parameters
     ----------
     stated : The file's statement; None: it states nothing.
-    given : A key of METRES; None: the user gives nothing.
+    given : Name of the unit that the user gives, a key of METRES; None: the user gives nothing.
     where : Name of the file, for errors.
-    option : Command-line option that gives the unit.
+    option : Command-line option that gives the unit, for errors.
 
     Raises
     ------
@@ -89,9 +92,9 @@ def agreed_units(stated: AxisUnits | None, given: str | None, where: str, option
 
 
 def understood_crs(text: str) -> Any:
-    """Return the coordinate system (a pyproj.CRS) of WKT or a code such as EPSG:2260.
+    """Interpret the name of a coordinate system. text: WKT or a code such as EPSG:2260.
 
-    None if PROJ does not understand the text.
+    Returns a pyproj.CRS, or None if PROJ does not understand the text.
     """
     from pyproj import CRS
     from pyproj.exceptions import CRSError
@@ -103,9 +106,10 @@ def understood_crs(text: str) -> Any:
 
 
 def not_understood(text: str, where: str) -> str:
-    """Return a note on a coordinate system that PROJ does not understand, so that its coordinates are read as metres.
+    """Return a note that a file's coordinate system is not understood, so that its coordinates are read as metres.
 
-    Raises InputError if its text contains the name of another unit.
+    text: the system as the file states it. where: name of the file, for errors. Raises InputError if the text contains the name
+    of another unit.
     """
     problem = f"states a coordinate system that is not understood: '{text:.60}'"
     if word := re.search(r"foot|feet|yard|\bft\b|us-ft", text, re.IGNORECASE):
@@ -198,5 +202,5 @@ _WORDS = {
 
 
 def metres_of_word(word: str) -> float | None:
-    """Return the length of a unit, m, by the word for it; None for an unknown word."""
+    """Return the length of a unit, m, by a word for it in a file, such as "ft"; None for an unknown word."""
     return _WORDS.get(re.sub(r"[\s._-]+", "", word.lower()))

@@ -137,8 +137,7 @@ def bounds_overlap(bounds: NDArray[np.int64], other: tuple[int, int, int, int]) 
     """Find which rectangles overlap another one.
 
     bounds: (n, 4) first row, end row, first column and end column of each, px, ends exclusive. other: the same of the other
-    one.
-    Returns (n,) bool.
+    one. Returns (n,) bool.
     """
     top, bottom, left, right = bounds.T
     return np.asarray((top < other[1]) & (other[0] < bottom) & (left < other[3]) & (other[2] < right))

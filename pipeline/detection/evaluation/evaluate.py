@@ -40,8 +40,7 @@ class Score:
     area_ratio : Mean of predicted over true mask area of the matches; NaN without matches.
     kind : Overlap of masks ("segm") or boxes ("bbox").
     stand_out : Share of the blocks whose niche stands out from the noise for a matched filter, which is about the largest
-    recall that
-        any detector could reach (pipeline/change/matched_filter.py). NaN if the annotations do not say.
+        recall that any detector could reach (pipeline/change/matched_filter.py). NaN if the annotations do not say.
     """
 
     group: str
@@ -194,8 +193,7 @@ def coco_metrics(truth: Mapping[str, Any], predictions: Sequence[Mapping[str, An
     """Compute pycocotools' twelve metrics of detections, by name: average precision and recall by overlap, area and count.
 
     truth, predictions: COCO annotations and detections, as in `evaluate`. kind: overlap of masks ("segm") or boxes ("bbox").
-    Undefined
-    metrics are -1.
+    Undefined metrics are -1.
     """
     names = (
         "AP",

@@ -24,9 +24,8 @@ def feature_pyramid(name: str, image_px: int, channels_in: int, channels: int) -
     Parameters
     ----------
     name : "resnet50" or "resnet101" of He et al. (2016), with bottleneck blocks; "light" with six plain blocks of two
-    convolutions and
-        a quarter of the width; "fine", narrower still and without pooling at its start, so that all its levels have half the
-        stride, as blocks of five pixels need.
+        convolutions and a quarter of the width; "fine", narrower still and without pooling at its start, so that all its levels
+        have half the stride, as blocks of five pixels need.
     image_px : Side of the images, px.
     channels_in : Channels of the images.
     channels : Channels of the levels.

@@ -64,8 +64,7 @@ def share_inside(left: Tensor, right: Tensor) -> Tensor:
     """Return the share of each box that lies in each other one, (..., n, m); 0 for empty boxes.
 
     left, right: boxes (..., n, 4) and (..., m, 4) as top, left, bottom, right, px; the share is of `left`. This is COCO's
-    overlap
-    with a crowd region.
+    overlap with a crowd region.
     """
     left, right = ops.expand_dims(left, -2), ops.expand_dims(right, -3)
     return _common(left, right) / ops.maximum(_area(left), 1e-6)
@@ -84,10 +83,8 @@ def encode(boxes: Tensor, reference: Tensor) -> Tensor:
     """Code boxes relative to reference boxes (anchors or proposals), as the four numbers that the network predicts.
 
     boxes, reference: (..., 4) top, left, bottom, right, px. The code (..., 4) has the shift of the centre in y and x in units
-    of the
-    reference's height and width, then the logarithms of the ratios of heights and widths. All are divided by their usual
-    standard
-    deviations.
+    of the reference's height and width, then the logarithms of the ratios of heights and widths. All are divided by their usual
+    standard deviations.
     """
     centre, size = _centre_size(boxes)
     at, scale = _centre_size(reference)

@@ -182,7 +182,7 @@ def mirrored(labelled: LabelledMap, axis: int) -> LabelledMap:
 
 
 def cut_window(labelled: LabelledMap, size: int, random: np.random.Generator | None) -> LabelledMap:
-    """Cut a square window out of a map; pixels beyond the map have no data.
+    """Cut a square window out of a map and its blocks, to train on; pixels beyond the map have no data.
 
     A block that the window cuts is kept if at least half of it is inside, and is background otherwise.
 

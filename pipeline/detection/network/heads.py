@@ -16,7 +16,9 @@ _RARE = initializers.Constant(-4.0)
 
 
 def proposal_head(channels: int, ratios: int, size_px: int) -> keras.Model:
-    """Build the head that classifies the anchors of one pyramid level and codes their boxes.
+    """Build the part of the network that judges the anchors of one feature pyramid level: block or not, and a better box.
+
+    Anchors are boxes of fixed size around each cell of the level.
 
     Parameters
     ----------
@@ -26,7 +28,7 @@ def proposal_head(channels: int, ratios: int, size_px: int) -> keras.Model:
 
     Returns
     -------
-    Model from (b, h, w, channels) to logits (b, h w ratios, 1) and codes (b, h w ratios, 4).
+    Model from (b, h, w, channels) to logits (b, h w ratios, 1) and box codes (b, h w ratios, 4) relative to the anchors.
     """
     level = keras.Input((None, None, channels))
     x = layers.Conv2D(channels, size_px, padding="same", activation="relu", kernel_initializer="he_normal", name="shared")(level)
@@ -36,10 +38,10 @@ def proposal_head(channels: int, ratios: int, size_px: int) -> keras.Model:
 
 
 def box_head(channels: int, hidden: int) -> keras.Model:
-    """Build the head that classifies and refines a box.
+    """Build the part of the network that decides whether a proposed box holds a block, and refines the box.
 
-    Its input is the box's features (n, POOLED_PX, POOLED_PX, channels); outputs are class logits (n, CLASSES) and a box code (n,
-    4).
+    The model's input is the features of n boxes (n, 7, 7, channels); its outputs are class logits (n, 2), for background and
+    block, and box codes (n, 4) relative to the proposed boxes. hidden: units of each of the two dense layers.
     """
     features = keras.Input((POOLED_PX, POOLED_PX, channels))
     x: Any = layers.Flatten()(features)
@@ -51,9 +53,10 @@ def box_head(channels: int, hidden: int) -> keras.Model:
 
 
 def mask_head(channels: int, size_px: int) -> keras.Model:
-    """Build the head from a box's features (n, MASK_POOLED_PX, MASK_POOLED_PX, channels) to mask logits (n, size_px, size_px).
+    """Build the part of the network that draws the mask of a block inside its box.
 
-    Each doubling of 14 px is a transposed convolution: one for 28 px, two for 56, three for 112.
+    The model takes the features of n boxes (n, 14, 14, channels) to mask logits (n, size_px, size_px). Each doubling of 14 px
+    is a transposed convolution: one for a `size_px` of 28, two for 56, three for 112.
     """
     features = keras.Input((MASK_POOLED_PX, MASK_POOLED_PX, channels))
     x: Any = features

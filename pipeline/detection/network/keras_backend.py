@@ -51,9 +51,9 @@ def check_installed() -> str:
 
 @contextmanager
 def computing_precision(precision: Literal["float32", "bfloat16"]) -> Iterator[None]:
-    """Let functions compiled in this block compute convolutions and products in a precision; variables stay float32.
+    """Within the `with` block, let compiled functions compute convolutions and products in a precision; variables stay float32.
 
-    Raises InputError for bfloat16 on another backend than TensorFlow.
+    precision: bfloat16 is faster on some processors. Raises InputError for it on another backend than TensorFlow.
     """
     if precision == "float32":
         yield

@@ -8,21 +8,28 @@ from pipeline.detection.network.boxes import Tensor
 
 
 def binary_cross_entropy(logits: Tensor, targets: Tensor, weights: Tensor) -> Tensor:
-    """Return the mean of -[t ln s(x) + (1 - t) ln(1 - s(x))] with the logistic function s, computed without overflow."""
+    """Compute the loss of yes-or-no predictions: the weighted mean of -[t ln s(x) + (1 - t) ln(1 - s(x))].
+
+    s is the logistic function; the result cannot overflow. logits: x, before s. targets: t, 0 to 1. weights: of each element.
+    """
     loss = ops.maximum(logits, 0.0) - logits * targets + ops.log1p(ops.exp(-ops.abs(logits)))
     return _mean(loss, weights)
 
 
 def cross_entropy(logits: Tensor, classes: Tensor, weights: Tensor) -> Tensor:
-    """Return the mean of -ln softmax(x)_c for logits (..., k) and integer classes (...)."""
+    """Compute the loss of class predictions: the weighted mean of -ln softmax(x)_c.
+
+    logits: x (..., k) of k classes. classes: true class c (...), an integer. weights: (...) of each prediction.
+    """
     chosen = ops.sum(ops.one_hot(classes, logits.shape[-1]) * ops.log_softmax(logits, axis=-1), axis=-1)
     return _mean(-chosen, weights)
 
 
 def smooth_l1(codes: Tensor, targets: Tensor, weights: Tensor) -> Tensor:
-    """Return the smooth L1 loss of codes (..., 4): x^2 / 2 for |x| < 1 and |x| - 1/2 beyond (Girshick 2015).
+    """Compute the smooth L1 loss of box codes: x^2 / 2 for |x| < 1 and |x| - 1/2 beyond, of x = code - target (Girshick 2015).
 
-    It is the mean over boxes of the sum over the four numbers.
+    codes, targets: (..., 4) the four numbers that code a box. weights: (...) of each box. Returns the weighted mean over boxes
+    of the sum over the four numbers.
     """
     distance = ops.abs(codes - targets)
     loss = ops.where(distance < 1, 0.5 * ops.square(distance), distance - 0.5)

@@ -27,18 +27,22 @@ LOSSES: tuple[Loss, ...] = get_args(Loss)
 
 
 def total_loss(losses: Mapping[str, Any], weights: Mapping[Loss, float]) -> Any:
-    """Return the weighted sum of losses by name, numbers or tensors; weights default to 1."""
+    """Return the weighted sum of the losses that training minimises.
+
+    losses: by name, numbers or tensors. weights: by name, 1 for those not listed.
+    """
     return sum(weights.get(name, 1.0) * losses[name] for name in LOSSES)
 
 
 @dataclass(frozen=True)
 class FirstStage:
-    """What the network computes of images before it looks at single boxes.
+    """What the network computes of b images before it looks at single boxes.
 
     Attributes
     ----------
-    levels : Pyramid levels P2 to P5, from which boxes take their features.
-    logits, codes : (b, a) and (b, a, 4) of the anchors.
+    levels : Feature pyramid levels P2 to P5, from which boxes take their features.
+    logits, codes : Log odds (b, a) that each of the a anchors (boxes of fixed size) holds a block, and codes (b, a, 4) of
+        better boxes.
     """
 
     levels: list[Tensor]
@@ -47,11 +51,12 @@ class FirstStage:
 
 
 class MaskRCNN(keras.Model):
-    """The detector. Called with images only, it detects; called with blocks too, it returns the losses.
+    """The network that detects fallen blocks in difference maps, a Mask R-CNN (He et al. 2017).
 
-    The input is a dictionary. image: (b, h, w, c) float32 as `normalisation.normalised` makes it, with h = w = image_px. For the
-    losses also boxes: (b, g, 4) float32, px; valid: (b, g) 1 for a block, 0 for an empty place, -1 for a block to ignore; labels:
-    (b, h, w) int32, 1 + the index of a pixel's block.
+    Called with images only, it detects; called with blocks too, it returns the losses. The input is a dictionary. image: (b, h,
+    w, c) float32 as `normalisation.normalised` makes it, with h = w = image_px. For the losses also boxes: (b, g, 4) float32,
+    px; valid: (b, g) 1 for a block, 0 for an empty place, -1 for a block to ignore; labels: (b, h, w) int32, 1 + the index of a
+    pixel's block.
 
     Parameters
     ----------
@@ -101,7 +106,10 @@ class MaskRCNN(keras.Model):
         return self._detections(first.levels, proposals)
 
     def first_stage(self, image: Tensor, *, training: bool) -> FirstStage:
-        """Compute pyramid, anchor logits and anchor codes of images (b, h, w, c)."""
+        """Compute features of images, and which anchors (boxes of fixed size) may hold a block.
+
+        image: (b, h, w, c) images, normalised. training: whether layers, such as batch normalisation, are in training mode.
+        """
         levels = self.pyramid(image, training=training)
         found = [self.proposal_head(level, training=training) for level in levels]
         logits = ops.concatenate([logit for logit, _ in found], axis=1)[..., 0]
@@ -110,7 +118,10 @@ class MaskRCNN(keras.Model):
     def compute_loss(
         self, x: Any = None, y: Any = None, y_pred: Any = None, sample_weight: Any = None, training: bool = True
     ) -> Tensor:
-        """Return the weighted sum of the losses, and keep the mean of each one as a metric."""
+        """Return the weighted sum of the losses, as Keras requires in training, and keep the mean of each one as a metric.
+
+        y_pred: the losses by name, which the network returned. The other arguments are Keras's and not used.
+        """
         for name in LOSSES:
             self.means[name].update_state(y_pred[name])
         return total_loss(y_pred, self.term_weights)

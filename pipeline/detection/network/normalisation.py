@@ -14,7 +14,7 @@ LEVEL_OF_DETECTION = 1.96
 
 
 def nmad(difference: Image) -> float:
-    """Return the robust standard deviation (NMAD) of the pixels with data, m; 0 without data."""
+    """Return the robust standard deviation (NMAD) of a difference map (h, w), m, over the pixels with data; 0 without data."""
     values = difference[np.isfinite(difference)]
     return robust.nmad(values) if values.size else 0.0
 
@@ -44,7 +44,10 @@ def normalised(difference: Image, config: NormalisationConfig, noise_m: float | 
 
 
 def denormalised(image: Image, lowest_m: float, highest_m: float) -> Image:
-    """Convert an image (h, w) that `minmax` scaled back to differences, m, given its former minimum and maximum."""
+    """Convert an image that was scaled to 0...1 (method `minmax`) back to differences, m.
+
+    image: (h, w). lowest_m, highest_m: smallest and largest difference before the scaling, m.
+    """
     return np.asarray(lowest_m + image * (highest_m - lowest_m), dtype=np.float32)
 
 

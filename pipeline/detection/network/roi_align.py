@@ -14,16 +14,16 @@ mask head's input samples P2 at its own spacing.
 
 
 def roi_align(features: list[Tensor], boxes: Tensor, strides: tuple[int, ...], size: int, samples: int = 2) -> Tensor:
-    """Sample the features of boxes from the pyramid.
+    """Interpolate the features of boxes from the feature pyramid on a grid of size x size bins per box (He et al. 2017).
 
-    Each of the size x size bins is the mean of samples x samples interpolated values at the centres of its parts. A cell's value
-    is at the cell's centre, so that the feature of a linear ramp is the ramp at the bin's centre; beyond the outermost centres,
-    the nearest value is used.
+    Each bin is the mean of samples x samples interpolated values at the centres of its parts. A cell's value is at the cell's
+    centre, so that the feature of a linear ramp is the ramp at the bin's centre; beyond the outermost centres, the nearest
+    value is used.
 
     Parameters
     ----------
-    features : Levels P2, P3, ..., (b, h, w, c) each.
-    boxes : (b, n, 4) boxes, px of the image.
+    features : Pyramid levels P2, P3, ..., (b, h, w, c) each.
+    boxes : (b, n, 4) boxes, top, left, bottom, right, px of the image.
     strides : Pixels of the image per cell of each level.
     size : Bins along a side.
     samples : Samples along a side of a bin.

@@ -19,11 +19,11 @@ _IGNORED = 0.5
 
 @dataclass(frozen=True)
 class AnchorTargets:
-    """Sampled anchors of each image.
+    """Anchors of b images, drawn for the loss of the region proposal network.
 
     Attributes
     ----------
-    positive, negative : (b, p) and (b, n) indices of the anchors.
+    positive, negative : (b, p) and (b, n) indices of anchors that hold a block, and of background.
     positive_weight, negative_weight : 1 for a sample, 0 for an empty place.
     code : (b, p, 4) target codes of the positives.
     """
@@ -37,11 +37,11 @@ class AnchorTargets:
 
 @dataclass(frozen=True)
 class BoxTargets:
-    """Sampled proposals of each image, positives first.
+    """Proposed boxes of b images, drawn for the losses of the network's heads, positives (that hold a block) first.
 
     Attributes
     ----------
-    boxes : (b, p + n, 4) boxes, px.
+    boxes : (b, p + n, 4) boxes, top, left, bottom, right, px.
     weight : (b, p + n) 1 for a sample, 0 for an empty place.
     code : (b, p, 4) target codes of the positives.
     block : (b, p) index of each positive's block.
@@ -61,14 +61,14 @@ class BoxTargets:
 def anchor_targets(
     anchors: np.ndarray, blocks: Tensor, valid: Tensor, config: ProposalConfig, seed: random.SeedGenerator
 ) -> AnchorTargets:
-    """Sample positive and negative anchors.
+    """Draw positive and negative anchors (boxes of fixed size), on which the region proposal network is trained.
 
     Positive are those with a large overlap with a block, and the nearest one to each block.
 
     Parameters
     ----------
-    anchors : (a, 4) boxes, px.
-    blocks : (b, g, 4) boxes, px.
+    anchors : (a, 4) boxes, top, left, bottom, right, px.
+    blocks : (b, g, 4) boxes of the annotated blocks in b images, px.
     valid : (b, g) 1 for a block, 0 for an empty place, -1 for a block to ignore, in which no anchor is negative.
     config : Thresholds and numbers of samples.
     seed : Source of random numbers.
@@ -91,13 +91,13 @@ def anchor_targets(
 
 
 def box_targets(proposals: Tensor, blocks: Tensor, valid: Tensor, config: HeadConfig, seed: random.SeedGenerator) -> BoxTargets:
-    """Sample positive and negative proposals.
+    """Draw positive and negative proposed boxes, on which the network's heads are trained.
 
     The blocks themselves are added to the proposals, so that there is always a positive.
 
     Parameters
     ----------
-    proposals : (b, n, 4) boxes, px; empty places have no area.
+    proposals : (b, n, 4) boxes, top, left, bottom, right, px; empty places have no area.
     blocks, valid : As in `anchor_targets`.
     config : Threshold and number of samples.
     seed : Source of random numbers.
@@ -129,12 +129,12 @@ def _counted(boxes: Tensor, blocks: Tensor, valid: Tensor) -> tuple[Tensor, Tens
 
 
 def mask_targets(labels: Tensor, boxes: Tensor, block: Tensor, size: int) -> Tensor:
-    """Sample the masks of blocks on their boxes' mask grid.
+    """Sample the annotated masks of blocks on the grid of their boxes, as targets for the mask head.
 
     Parameters
     ----------
     labels : (b, h, w) int32, 1 + the index of the block at a pixel, 0 for none.
-    boxes : (b, p, 4) boxes, px.
+    boxes : (b, p, 4) boxes, top, left, bottom, right, px.
     block : (b, p) index of each box's block.
     size : Cells along a side of the mask.
 

@@ -94,7 +94,7 @@ def event(item: Detection, number: int, image: str, difference: NDArray[np.float
 
 
 def write_events(events: Sequence[Event], path: Path) -> None:
-    """Write events as CSV, one line each, metres with 4 decimals, unknown values empty."""
+    """Write detected rockfalls to a CSV file, one line each, lengths in metres with 4 decimals, unknown values empty."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(Event.__dataclass_fields__)
@@ -135,7 +135,10 @@ def read_events(path: Path) -> list[Event]:
 
 
 def label_raster(found: Sequence[Detection], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return the (h, w) number of the best detection at each pixel, from 1; NaN where there is none."""
+    """Return a raster (h, w) with the number of the best detection at each pixel, from 1; NaN where there is none.
+
+    found: the detections, best first. shape: (h, w) of the map, px.
+    """
     result = np.full(shape, np.nan, np.float32)
     for number, item in reversed(list(enumerate(found, start=1))):
         height, width = item.mask.shape
@@ -145,5 +148,9 @@ def label_raster(found: Sequence[Detection], shape: tuple[int, ...]) -> NDArray[
 
 
 def write_coco(images: Sequence[dict[str, Any]], annotations: Sequence[dict[str, Any]], path: Path) -> None:
-    """Write images and scored annotations as a COCO data set; its `annotations` have the form of COCO results."""
+    """Write detections as a COCO data set, which `scarpsim evaluate` reads.
+
+    images: COCO's entries of the maps. annotations: COCO's entries of the detections, with scores, so that they are COCO
+    results too. path: the JSON file.
+    """
     write_json(path, {"images": images, "annotations": annotations, "categories": [BLOCK_CATEGORY]})

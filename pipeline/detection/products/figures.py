@@ -44,7 +44,10 @@ _MOST_MARKED = 30
 
 
 def write_loss_figure(training: Sequence[Mapping[str, float]], validation: Sequence[Mapping[str, float]], path: Path) -> None:
-    """Draw the total, class, box and mask losses against the epoch; losses of the proposals are added to those of the heads."""
+    """Draw how the losses of a training fall with the epoch: total, class, box and mask; write the figure to `path`.
+
+    training, validation: mean losses by name, for each epoch. Losses of the proposals are added to those of the heads.
+    """
     figure = Figure(figsize=(9.6, 6.4), dpi=110, layout="constrained")
     epochs = np.arange(1, len(training) + 1)
     marker = "o" if len(epochs) <= _MOST_MARKED else ""
@@ -104,9 +107,10 @@ def write_overlay(difference: NDArray[np.float32], grid: Grid, found: Sequence[D
 
 
 def write_reliability(groups: Sequence[Reliability], path: Path) -> None:
-    """Draw the share of blocks among detections against their score, with standard errors.
+    """Draw how reliable a detector's scores are: the share of blocks among its detections against their score, as PNG.
 
-    On the diagonal, scores are probabilities. Of many groups only the first are drawn, which include all images together.
+    groups: results for groups of images, of which only the first are drawn (they include all images together). Bars are
+    standard errors. On the diagonal, scores are probabilities.
     """
     figure = Figure(figsize=(6.4, 5.6), dpi=110, layout="constrained")
     axes = figure.subplots()

@@ -22,7 +22,7 @@ are none.
 
 @dataclass(frozen=True)
 class EventPlaces:
-    """A run's wall frame and the vertices of its reference surface, which place events in the world.
+    """What places the events of a run in the world: its wall frame and the vertices of its reference surface.
 
     The vertices (n, 3), wall frame, m, are sorted by x; they are empty if the run wrote none.
     """
@@ -31,7 +31,10 @@ class EventPlaces:
     vertices: FloatArray
 
     def world(self, x: float, y: float) -> FloatArray:
-        """Return the (3,) place on the rock before it fell at (x, y) of the wall frame, in the world frame, m; NaN if unknown."""
+        """Return where the rock of an event was before it fell, (3,) in the world frame, m; NaN if unknown.
+
+        x, y: position of the event in the wall frame, m.
+        """
         return np.asarray(self.frame.to_world(np.array([x, y, self._height(x, y)])))
 
     def _height(self, x: float, y: float) -> float:
@@ -48,7 +51,10 @@ class EventPlaces:
 
 
 def with_world_coordinates(event: Event, path: Path) -> Event:
-    """Return the event with world coordinates, if its map, at `path`, belongs to a run with a known wall frame."""
+    """Return a detected rockfall with its world coordinates, if its map belongs to a run with a known wall frame.
+
+    event: the rockfall. path: file of the map in which it was detected.
+    """
     run = next((folder for folder in (path.parent, path.parent.parent) if (folder / RUN_FILE).is_file()), None)
     places = _places(run.resolve()) if run is not None else None
     if places is None:

@@ -35,7 +35,10 @@ Detector = Callable[[NDArray[np.float32]], list[Detection]]
 
 @dataclass(frozen=True)
 class InputMap:
-    """A difference map to search. name: as in the outputs; image: its entry in COCO's list, with an id."""
+    """A difference map in which to detect blocks.
+
+    path: its file. name: its name in the outputs. image: its entry in COCO's list of images, with an id.
+    """
 
     path: Path
     name: str
@@ -48,7 +51,11 @@ def detector_folder(model: str) -> Path:
 
 
 def detector(model: str, *, mirrored: bool = False) -> Detector:
-    """Load a detector: `baseline`, or a name as in `detector_folder`; mirrored: with the mirrored views of its config."""
+    """Load a detector.
+
+    model: `baseline` (a threshold), `default` (the weights that come with scarpsim), or a folder made by `scarpsim train`.
+    mirrored: whether it also searches mirror images of the map, as its config says.
+    """
     if model == BASELINE:
         if mirrored:
             raise InputError(f"the option needs a network, not '{BASELINE}'", where="--mirrored", remedy="leave it out")
@@ -63,9 +70,9 @@ def detector(model: str, *, mirrored: bool = False) -> Detector:
 
 
 def sorted_confidences(values: Sequence[float]) -> tuple[float, ...]:
-    """Return the values in rising order without repetition.
+    """Return the confidences (smallest scores) at which detections are written, in rising order without repetition.
 
-    Raises InputError unless they are between the lowest kept score and 1.
+    Raises InputError unless they are between the lowest score that detections keep and 1.
     """
     for value in values:
         if not LOWEST_SCORE <= value <= 1:
@@ -76,9 +83,10 @@ def sorted_confidences(values: Sequence[float]) -> tuple[float, ...]:
 
 
 def find_inputs(places: Sequence[Path]) -> list[InputMap]:
-    """Find the difference maps at some paths: TIFF files, folders with annotations.json, run folders.
+    """Find the difference maps in which to detect blocks.
 
-    Ids are COCO's, or count from 1.
+    places: TIFF files, folders with annotations.json, or run folders. The maps' ids are those of annotations.json, or count
+    from 1.
     """
     result: list[InputMap] = []
     for place in places:

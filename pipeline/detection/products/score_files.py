@@ -29,13 +29,13 @@ _KINDS: dict[Overlap, str] = {"segm": "masks", "bbox": "boxes"}
 
 @dataclass(frozen=True)
 class Assessment:
-    """Scores of detections.
+    """Scores of a detector on annotated images.
 
     Attributes
     ----------
-    scores : Scores of every group, by overlap of masks and of boxes.
+    scores : Scores of every group of images, by overlap of masks and of boxes.
     coco : pycocotools' metrics over all images, by overlap of masks, or of boxes if there are no masks.
-    reliability : Reliability of the scores, by the same overlap.
+    reliability : How well the detector's scores agree with the share of blocks, by the same kind of overlap as `coco`.
     """
 
     scores: list[Score]
@@ -43,7 +43,7 @@ class Assessment:
     reliability: list[Reliability]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content as JSON types."""
+        """Return the scores of the detector as JSON types, for scores.json."""
         scores, reliable = ([each.to_dict() for each in found] for found in (self.scores, self.reliability))
         return {"scores": scores, "coco": self.coco, "reliability": reliable}
 
@@ -106,7 +106,7 @@ def _check_pairs(truth: Sequence[Mapping[str, Any]], found: Sequence[Mapping[str
 
 
 def as_text(assessment: Assessment) -> str:
-    """Return the scores as tables in the thesis's form, one for each group and overlap, and COCO's metrics."""
+    """Return the scores of a detector as text: a table for each group of images and kind of overlap, and COCO's metrics."""
     lines = []
     groups: dict[tuple[str, Overlap], list[Score]] = {}
     for score in assessment.scores:
@@ -142,7 +142,7 @@ def _reliability_table(groups: Sequence[Reliability]) -> Iterator[str]:
 
 
 def write(assessment: Assessment, folder: Path) -> None:
-    """Write scores.json, scores.csv and reliability.png."""
+    """Write the scores of a detector to a folder: scores.json, scores.csv and the figure reliability.png."""
     write_reliability(assessment.reliability, folder / "reliability.png")
     write_json(folder / "scores.json", assessment.to_dict())
     text = io.StringIO()

@@ -32,11 +32,11 @@ Batch = dict[str, Array]
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ResidentSet:
-    """n tiles of s x s pixels with c channels and up to g blocks each, as the network takes them, in the device's memory.
+    """Training tiles in the memory of a graphics card: n tiles of s x s pixels with c channels and up to g blocks each.
 
     Attributes
     ----------
-    images : (n, s, s, c) float16.
+    images : (n, s, s, c) float16, normalised as the network takes them.
     labels : (n, s, s) uint16, 1 + the index of a pixel's block, 0 for none.
     boxes : (n, g, 4) float32 y0, x0, y1, x1 of the blocks, px; places without a block are empty.
     valid : (n, g) 1 for a block, -1 for one left out of the loss, 0 for an empty place.
@@ -61,13 +61,13 @@ class ResidentSet:
 
 
 def load_resident_set(folder: CocoFolder, detector: DetectorConfig, window_px: int) -> ResidentSet:
-    """Load all tiles of a folder to the device; each is normalised as a whole, as in detection.
+    """Load all tiles of a folder to the memory of a graphics card; each is normalised as a whole, as in detection.
 
     Parameters
     ----------
     folder : The tiles.
     detector : Settings of the network's input.
-    window_px : Side of the windows, px.
+    window_px : Side of the windows that will be cut from them, px.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def load_resident_set(folder: CocoFolder, detector: DetectorConfig, window_px: i
 
 
 def cut_on_device(data: ResidentSet, tile: Array, corner: Array, size: int) -> Batch:
-    """Cut a window out of a tile, as `data.cut_window` does, on the device.
+    """Cut a training window out of a tile in the memory of a graphics card, as `data.cut_window` does in main memory.
 
     A block that the window cuts is kept if at least half of it is inside, and is background otherwise.
 
@@ -123,7 +123,7 @@ def cut_on_device(data: ResidentSet, tile: Array, corner: Array, size: int) -> B
 
 
 def mirrored_window(window: Batch, axis: int) -> Batch:
-    """Mirror a window up-down (axis 0) or left-right (axis 1), as `data.mirrored` does, on the device."""
+    """Mirror a training window and its blocks up-down (axis 0) or left-right (axis 1), in the memory of a graphics card."""
     size = window["labels"].shape[0]
     low, high = window["boxes"][:, axis], window["boxes"][:, axis + 2]
     boxes = window["boxes"].at[:, axis].set(size - high).at[:, axis + 2].set(size - low)
@@ -136,7 +136,7 @@ def mirrored_window(window: Batch, axis: int) -> Batch:
 
 
 class ResidentLearner:
-    """Trains and validates a model on data in the device's memory.
+    """Trains and validates a network on tiles in the memory of a graphics card.
 
     Random choices depend on the training's seed and the epoch only; all other state is in the variables of model and optimizer.
 
@@ -156,7 +156,10 @@ class ResidentLearner:
         self._judged: Callable[..., Any] = jax.jit(self._losses_of_middles)
 
     def learn(self, epoch: int, rates: Sequence[float]) -> list[dict[str, float]]:
-        """Make one step for each learning rate, and return the mean losses."""
+        """Train the network for an epoch: one step for each learning rate. Returns the mean losses by name.
+
+        epoch: its number, on which the random windows depend. rates: learning rate of each step.
+        """
         groups = self._variables()
         state = tuple([variable.value for variable in group] for group in groups)
         key = jax.random.fold_in(jax.random.key(self._training.seed), epoch)
@@ -167,7 +170,7 @@ class ResidentLearner:
         return [{name: float(np.mean(np.asarray(values))) for name, values in losses.items()}]
 
     def validate(self) -> list[dict[str, float]]:
-        """Return the losses in the middles of all validation tiles, batch by batch.
+        """Return the network's losses by name on the middle windows of all validation tiles, for each batch.
 
         The last batch is filled with its own first tiles.
         """

@@ -29,7 +29,11 @@ def learning_rate(step: int, steps: int, config: TrainingConfig) -> float:
 
 
 def has_converged(losses: Sequence[float], config: TrainingConfig) -> bool:
-    """Whether the validation loss fell by less than `stop_slope` per epoch, on average over the last `stop_window` epochs."""
+    """Return whether a training should stop, because the validation loss hardly falls any more.
+
+    losses: validation loss of each epoch so far. config: it stops if the loss fell by less than `stop_slope` per epoch, on
+    average over the last `stop_window` epochs.
+    """
     if config.stop_slope <= 0 or len(losses) <= config.stop_window:
         return False
     recent = losses[-config.stop_window - 1 :]

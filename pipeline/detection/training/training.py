@@ -50,22 +50,25 @@ class _TrainingState(Config):
 
 @dataclass
 class History:
-    """Mean losses by name for each epoch; `loss` is their weighted sum."""
+    """Losses of a training so far: for each epoch the mean losses by name, on training and on validation images.
+
+    The loss called `loss` is the weighted sum of the others.
+    """
 
     training: list[dict[str, float]] = field(default_factory=list)
     validation: list[dict[str, float]] = field(default_factory=list)
 
     @property
     def total(self) -> list[float]:
-        """Validation loss of each epoch."""
+        """Total validation loss (weighted sum) of each epoch of the training."""
         return [losses["loss"] for losses in self.validation]
 
 
 def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = False, progress: Progress | None = None) -> History:
-    """Train a detector.
+    """Train a detector of fallen blocks on a data set of difference map tiles.
 
-    The best detector and the last one are written to out/best and out/checkpoint. At the end, the scores of the best one, and of
-    those that `keep_epochs` keeps, are calibrated by `set_operating_point`.
+    The best detector and the last one are written to out/best and out/checkpoint. At the end, the scores of the best one, and
+    of those that `keep_epochs` keeps, are calibrated by `set_operating_point`.
 
     Parameters
     ----------
@@ -75,11 +78,15 @@ def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = Fals
     resume : Whether to continue after the last complete epoch in `out`, with the same losses as without the interruption.
     progress : Receives the progress; None: nothing is shown.
 
+    Returns
+    -------
+    The losses of all epochs.
+
     Raises
     ------
     InputError
-        If the data set lacks these folders, `out` holds another training, or resident data is used without JAX or with tiles that
-        are not squares of one size.
+        If the data set lacks these folders, `out` holds another training, or resident data is used without JAX or with tiles
+        that are not squares of one size.
     """
     progress = progress or Progress()
     folders = CocoFolder(data_set / "train"), CocoFolder(data_set / "val")

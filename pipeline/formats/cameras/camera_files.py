@@ -18,9 +18,9 @@ _COLMAP_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 
 
 def read_oriented(path: Path) -> MetashapeCameras | None:
-    """Read cameras with poses by label, from a file or folder of Metashape or COLMAP.
+    """Read cameras with poses (world frame) by label, from a file or folder of Metashape or COLMAP.
 
-    Read are Metashape's camera XML or project, and COLMAP's text model (its folder or a file of it). Returns None for other kinds
+    path: Metashape's camera XML or project, or COLMAP's text model (its folder or a file of it). Returns None for other kinds
     of file, such as the project's cameras.yaml. Raises InputError for a calibration without poses.
     """
     if path.is_dir() or path.name in _COLMAP_FILES:
@@ -38,7 +38,7 @@ def read_oriented(path: Path) -> MetashapeCameras | None:
 
 
 def oriented_files(path: Path) -> list[Path]:
-    """Return the files that `read_oriented` reads: those of COLMAP's model, of a project, or `path` only."""
+    """Return the files that `read_oriented` reads cameras from: those of COLMAP's model or a Metashape project, or `path`."""
     if path.is_dir() or path.name in _COLMAP_FILES:
         folder = path if path.is_dir() else path.parent
         return [folder / name for name in sorted(_COLMAP_FILES) if (folder / name).exists()]
@@ -46,7 +46,10 @@ def oriented_files(path: Path) -> list[Path]:
 
 
 def read_lens(path: Path) -> Camera:
-    """Read a calibration without a pose: Metashape's calibration XML, OpenCV's FileStorage, or plain numbers (.txt)."""
+    """Read the calibration of a camera without a pose.
+
+    path: Metashape's calibration XML, OpenCV's FileStorage, or plain numbers (.txt).
+    """
     root = _xml_root(path)
     if root == "document":
         raise InputError("is a camera XML, not a calibration", where=str(path), remedy="name it as cameras.file in the config")
@@ -56,9 +59,9 @@ def read_lens(path: Path) -> Camera:
 
 
 def stereo_pair(found: MetashapeCameras, left: str | None, right: str | None, where: str) -> CameraPair:
-    """Select the two cameras of a pair.
+    """Select the two cameras of a stereo pair among those of a file.
 
-    Cameras that are not aligned are left out with a warning.
+    Cameras without an estimated pose (not aligned) are left out with a warning.
 
     Parameters
     ----------

@@ -12,13 +12,13 @@ from sensors.cameras.camera import INTERIOR, CameraConfig, CameraPair
 
 
 class PairConfig(Config):
-    """Content of cameras.yaml."""
+    """Content of cameras.yaml, the file of a stereo pair: calibration and pose of the left and the right camera."""
 
     left: CameraConfig
     right: CameraConfig
 
     def pair(self) -> CameraPair:
-        """Return the cameras, world frame."""
+        """Return the two cameras of the file (calibration and pose), world frame."""
         return CameraPair(self.left.camera(), self.right.camera())
 
 
@@ -42,7 +42,7 @@ def cameras_yaml_files(path: Path) -> list[Path]:
 
 
 def write_cameras_yaml(path: Path, pair: CameraPair) -> None:
-    """Write a pair, world frame, as cameras.yaml."""
+    """Write the calibration and the poses of a stereo pair, world frame, to the file `path`, usually called cameras.yaml."""
     lines = ["# Rotation maps camera (x right, y down, z forward) to world; the camera model is Agisoft Metashape's."]
     for side, camera in (("left", pair.left), ("right", pair.right)):
         interior = {name: float(getattr(camera, name)) for name in INTERIOR}

@@ -39,9 +39,10 @@ _MAP_HEADER = re.compile(rb"(\d+)&(\d+)&(\d+)&")
 
 
 def read_colmap(folder: Path) -> dict[str, Camera]:
-    """Read the cameras of a COLMAP text model by image name, world frame.
+    """Read the cameras (calibration and pose) of a COLMAP text model by image name, world frame.
 
-    Raises InputError if a file is missing or malformed, or our camera model lacks one of its models or parameters.
+    folder: has the model's text files. Raises InputError if a file is missing or malformed, or has a camera model or parameter
+    that scarpsim's cameras lack.
     """
     from scipy.spatial.transform import Rotation
 
@@ -65,13 +66,13 @@ def read_colmap(folder: Path) -> dict[str, Camera]:
 
 
 def write_colmap(folder: Path, cameras: Mapping[str, Camera], points: FloatArray | None = None) -> None:
-    """Write a COLMAP text model.
+    """Write cameras as a COLMAP text model, with which COLMAP can fuse depth maps.
 
     Parameters
     ----------
     folder : Folder to write.
     cameras : Cameras by image name, world frame.
-    points : (n, 3) points seen by every image, m. COLMAP's fusion finds overlapping images by their common points.
+    points : (n, 3) points seen by every image, world frame, m. COLMAP's fusion finds overlapping images by their common points.
 
     Raises
     ------
@@ -96,7 +97,10 @@ def write_colmap(folder: Path, cameras: Mapping[str, Camera], points: FloatArray
 
 
 def write_map(path: Path, values: NDArray[np.floating]) -> None:
-    """Write a depth map (h, w) or a normal map (h, w, 3) as COLMAP does: `w&h&channels&`, then float32, channel by channel."""
+    """Write a depth map (h, w) or a normal map (h, w, 3) in COLMAP's format.
+
+    That is a header `w&h&channels&`, then float32, channel by channel.
+    """
     channels = values[..., None] if values.ndim == 2 else values
     height, width, depth = channels.shape
     planes = np.ascontiguousarray(np.moveaxis(channels, 2, 0), dtype="<f4")
@@ -104,7 +108,7 @@ def write_map(path: Path, values: NDArray[np.floating]) -> None:
 
 
 def read_map(path: Path) -> NDArray[np.float32]:
-    """Read a depth map as (h, w), or a normal map as (h, w, 3); raise InputError for any other file."""
+    """Read a depth map (h, w) or a normal map (h, w, 3) in COLMAP's format; raise InputError for any other file."""
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -6,9 +6,10 @@ from scene.common.errors import InputError
 
 
 def wkt_of(name: str, where: str) -> str:
-    """Return the WKT (version 1, as in LAS) of a projected coordinate system in metres, such as EPSG:28356.
+    """Return the WKT (version 1, as LAS files have it) of a projected coordinate system in metres.
 
-    Raises InputError if it is unknown or not in metres.
+    name: such as EPSG:28356. where: which key of the config has the name, for errors. Raises InputError if it is unknown or not
+    in metres.
     """
     from pyproj import CRS
     from pyproj.exceptions import CRSError

@@ -25,21 +25,27 @@ _REMEDY = "in Metashape convert the chunk's reference to a projected or local co
 
 
 def is_geocentric(position: FloatArray) -> bool:
-    """Whether a position (3,), m, is that of a camera near the Earth's surface, relative to the Earth's centre."""
+    """Return whether a camera's position (3,), m, is near the Earth's surface if it is relative to the Earth's centre.
+
+    If so, its coordinates are geocentric and have to be projected.
+    """
     return bool(_EARTH_M[0] < np.linalg.norm(position) < _EARTH_M[1])
 
 
 @dataclass(frozen=True)
 class Projection:
-    """A projected coordinate system. text: in WKT or as PROJ writes it; where: name of the file, for errors."""
+    """A projected coordinate system, to which geocentric camera poses are converted.
+
+    text: the system in WKT or as PROJ writes it; where: name of the file, for errors.
+    """
 
     text: str
     where: str
 
     def pose(self, matrix: FloatArray) -> FloatArray:
-        """Convert the pose (4, 4) of a camera from geocentric coordinates to easting, northing and height.
+        """Convert the pose of a camera from geocentric coordinates to easting, northing and height in the projected system.
 
-        The height is ellipsoidal; a scale is kept.
+        matrix: (4, 4) from the camera's frame to geocentric coordinates, m. The height is ellipsoidal; a scale is kept.
         """
         position = matrix[:3, 3]
         shifted = position + _STEP_M * np.concatenate([np.eye(3), -np.eye(3)])
@@ -50,7 +56,10 @@ class Projection:
         return result
 
     def project(self, points: FloatArray) -> FloatArray:
-        """Return the (n, 3) easting, northing and ellipsoidal height of geocentric points (n, 3), m."""
+        """Return the projected coordinates of geocentric points (n, 3), m.
+
+        They are easting, northing and ellipsoidal height, (n, 3), m.
+        """
         crs = self._crs
         from pyproj import Proj, Transformer
 

@@ -38,7 +38,11 @@ _LARGEST = 1e12
 
 @dataclass(frozen=True)
 class MetashapeCameras:
-    """Cameras by label, world frame; labels of cameras that are not aligned, and of those whose pose is relative to a rig."""
+    """Cameras with poses that a file of Metashape or COLMAP contains.
+
+    cameras: by label, world frame. unaligned: labels of cameras without an estimated pose. rigged: labels of those whose pose
+    is relative to another camera of a rig.
+    """
 
     cameras: dict[str, Camera]
     unaligned: tuple[str, ...]
@@ -87,7 +91,7 @@ def read_metashape(path: Path) -> MetashapeCameras:
 
 
 def write_metashape(path: Path, cameras: Mapping[str, Camera]) -> None:
-    """Write cameras by label as a camera XML for Metashape (File > Import > Import Cameras), in one metric component."""
+    """Write cameras by label, world frame, as a camera XML that Metashape imports (File > Import > Import Cameras)."""
     document = ElementTree.Element("document", version="2.0.0")
     chunk = ElementTree.SubElement(document, "chunk", label="scarpsim", enabled="true")
     sensors = ElementTree.SubElement(chunk, "sensors", next_id=str(len(cameras)))
@@ -110,7 +114,7 @@ def write_metashape(path: Path, cameras: Mapping[str, Camera]) -> None:
 
 
 def read_calibration(path: Path) -> Camera:
-    """Read a calibration XML; the camera is placed at the origin."""
+    """Read a camera's interior orientation from Metashape's calibration XML; its pose is the origin."""
     root = read_root(path)
     if root.tag != "calibration":
         raise InputError(
@@ -130,7 +134,7 @@ def read_calibration(path: Path) -> Camera:
 
 
 def write_calibration(path: Path, camera: Camera) -> None:
-    """Write the interior orientation of a camera as a calibration XML."""
+    """Write the interior orientation of a camera as a calibration XML, which Metashape imports."""
     root = ElementTree.Element("calibration")
     for tag, text in (("projection", "frame"), ("width", str(camera.width)), ("height", str(camera.height))):
         ElementTree.SubElement(root, tag).text = text

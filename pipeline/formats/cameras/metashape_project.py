@@ -29,20 +29,24 @@ _EXPORT = "save the project in Metashape again, or export the cameras with File 
 
 
 def is_project(path: Path) -> bool:
-    """Whether a file is a project, by its name."""
+    """Return whether a file is a Metashape project, by its name."""
     return path.suffix.lower() == ".psx"
 
 
 def active_chunk(path: Path) -> ElementTree.Element:
-    """Return the chunk that was open when the project was saved, or its only one.
+    """Return the chunk (set of photographs with their cameras) of a Metashape project that was open when it was saved.
 
-    Raises InputError if files of the project are missing or damaged, or it has several chunks of which none is active.
+    If none was, it is the project's only one. Raises InputError if files of the project are missing or damaged, or it has
+    several chunks of which none is active.
     """
     return _document(project_files(path)[-1], "chunk")
 
 
 def project_files(path: Path) -> list[Path]:
-    """Return the project, its archive, and the archive of its active chunk."""
+    """Return the files from which the cameras of a Metashape project are read.
+
+    They are the project file, its archive, and the archive of its active chunk.
+    """
     root = read_root(path)
     if root.tag != "document" or root.get("path") is None:
         raise InputError("is not a Metashape project", where=str(path), remedy=_EXPORT)

@@ -47,9 +47,10 @@ _NAMES = {
 
 @dataclass(frozen=True)
 class OpencvInterior:
-    """Interior orientation in OpenCV's terms, px.
+    """Interior orientation of a camera in OpenCV's terms, px.
 
-    Unlike in OpenCV, cx and cy are relative to the frame's corner, as in COLMAP (OpenCV's plus 0.5).
+    fx and fy are focal lengths, cx and cy the principal point, k1 to k3 radial and p1, p2 tangential distortion. Unlike in
+    OpenCV, cx and cy are relative to the frame's corner, as in COLMAP (OpenCV's plus 0.5).
     """
 
     fx: float
@@ -64,7 +65,10 @@ class OpencvInterior:
 
     @classmethod
     def of(cls, camera: Camera, where: str) -> OpencvInterior:
-        """Convert the interior orientation of `camera`; raise InputError if OpenCV's model lacks one of its parameters."""
+        """Convert the interior orientation of a camera to OpenCV's terms.
+
+        where: name of the file to be written, for errors. Raises InputError if OpenCV's model lacks one of its parameters.
+        """
         for name, meaning in (("b2", "skew"), ("k4", "radial distortion, r^8")):
             if getattr(camera, name) != 0:
                 raise InputError(
@@ -78,7 +82,7 @@ class OpencvInterior:
         return cls(camera.f_px + camera.b1, camera.f_px, *principal, *radial, camera.p2, camera.p1, camera.k3)
 
     def camera(self, width: float, height: float, where: str, pose: Pose | None = None) -> Camera:
-        """Convert to our camera model.
+        """Convert the interior orientation from OpenCV's terms to scarpsim's, and return it as a camera.
 
         Parameters
         ----------
@@ -92,7 +96,10 @@ class OpencvInterior:
 
 
 def shared_distortion(values: dict[str, float], where: str) -> dict[str, float]:
-    """Return the distortion coefficients that our model has too; raise InputError if another one is not zero."""
+    """Return the distortion coefficients that scarpsim's cameras have too.
+
+    values: coefficients by OpenCV's names. where: name of the file, for errors. Raises InputError if another one is not zero.
+    """
     for name, value in values.items():
         if name not in _SHARED and value != 0:
             raise InputError(
@@ -105,9 +112,9 @@ def shared_distortion(values: dict[str, float], where: str) -> dict[str, float]:
 
 
 def read_opencv(path: Path) -> Camera:
-    """Read a calibration written by FileStorage; the camera is placed at the origin.
+    """Read a camera's calibration that OpenCV wrote with FileStorage; its pose is the origin.
 
-    Raises InputError if the file is not OpenCV's, is incomplete, or has a coefficient that our model lacks.
+    Raises InputError if the file is not OpenCV's, is incomplete, or has a distortion coefficient that scarpsim's cameras lack.
     """
     check_file(path, most_bytes=_MOST_BYTES)
     try:
@@ -135,9 +142,10 @@ def read_opencv(path: Path) -> Camera:
 
 
 def write_opencv(path: Path, camera: Camera) -> None:
-    """Write a calibration, without the pose, with FileStorage in the format of the suffix (.xml, .yml, .yaml, .json).
+    """Write a camera's calibration, without the pose, as a file that OpenCV's FileStorage reads.
 
-    Raises InputError if OpenCV's model lacks a parameter that is not zero (b2, k4).
+    path: its suffix gives the format (.xml, .yml, .yaml, .json). Raises InputError if OpenCV's model lacks a parameter that is
+    not zero (b2, k4).
     """
     interior = OpencvInterior.of(camera, str(path))
     matrix = np.array([[interior.fx, 0.0, interior.cx - 0.5], [0.0, interior.fy, interior.cy - 0.5], [0.0, 0.0, 1.0]])

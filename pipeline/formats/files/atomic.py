@@ -36,11 +36,12 @@ _noted: ContextVar[list[Path] | None] = ContextVar("noted", default=None)
 
 @contextmanager
 def writing(path: Path) -> Iterator[Path]:
-    """Provide a temporary path to write to, which becomes `path` if the block succeeds and is removed if it fails.
+    """Provide a temporary path to write to, so that a file is complete or absent.
 
-    Missing folders are created. The temporary file is in the folder of `path` and keeps its suffix, as libraries may choose a
-    format by it. Its name depends on the target only, so that the next run overwrites what a killed process left. The content is
-    on the disk before the name, so that a power failure leaves no empty file.
+    It becomes `path` if the `with` block succeeds and is removed if it fails. Missing folders are created. The temporary file
+    is in the folder of `path` and keeps its suffix, as libraries may choose a format by it. Its name depends on the target
+    only, so that the next run overwrites what a killed process left. The content is on the disk before the name, so that a
+    power failure leaves no empty file.
 
     Raises InputError for a full disk, a folder without write permission, or a path that cannot be a file.
     """
@@ -84,7 +85,7 @@ def _remove_empty(folders: list[Path]) -> None:
 
 @contextmanager
 def explained(path: Path) -> Iterator[None]:
-    """Turn an operating system's error about `path` that the user can solve into an InputError."""
+    """Within the `with` block, turn an operating system's error about `path` that the user can solve into an InputError."""
     try:
         yield
     except OSError as error:
@@ -93,10 +94,10 @@ def explained(path: Path) -> Iterator[None]:
 
 @contextmanager
 def noting() -> Iterator[list[Path]]:
-    """Collect the paths of the files that this thread completes in the block, so that a failed command can remove them.
+    """Within the `with` block, collect the paths of all files that this thread writes, so that a failed command can remove them.
 
-    A file counts when it has its final name (see `writing` and `note`). Blocks may be nested: when the inner one ends, its files
-    are added to the outer list.
+    A file counts when it has its final name (see `writing` and `note`). Blocks may be nested: when the inner one ends, its
+    files are added to the outer list.
     """
     outer, found = _noted.get(), list[Path]()
     token = _noted.set(found)
@@ -116,7 +117,10 @@ def note(path: Path) -> None:
 
 
 def remove_written(out: Path, written: list[Path]) -> None:
-    """Remove files collected by `noting`, and folders in `out` that are then empty; files of others stay."""
+    """Remove the files that a failed command wrote, and folders in `out` that are then empty; files of others stay.
+
+    written: the files, as `noting` collected them.
+    """
     for path in written:
         with suppress(OSError):  # was renamed with its folder
             path.unlink()
@@ -127,7 +131,7 @@ def remove_written(out: Path, written: list[Path]) -> None:
 
 
 def give_name(temporary: Path, path: Path) -> None:
-    """Rename a file or folder to `path`, writing its content to the disk first and its name afterwards."""
+    """Rename a complete temporary file or folder to `path`; its content is forced to the disk first and the name afterwards."""
     to_disk(temporary)
     temporary.replace(path)
     to_disk(path.parent)
@@ -179,9 +183,10 @@ def check_place(out: Path) -> None:
 
 @contextmanager
 def filling(out: Path) -> Iterator[Path]:
-    """Provide a temporary folder whose content moves to `out` if the block succeeds, and is removed if it fails.
+    """Provide a temporary folder to write to, so that the output folder `out` is complete or absent.
 
-    Raises InputError if `out` is in use, and as `writing` does.
+    Its content moves to `out` if the `with` block succeeds, and is removed if it fails. Raises InputError if `out` is in use,
+    and as `writing` does.
     """
     empty_folder(out)
     temporary = out / ".part" if out.exists() else out.absolute().with_name(f".{out.absolute().name}.part")
@@ -200,7 +205,7 @@ def filling(out: Path) -> Iterator[Path]:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write `data`, completely or not at all."""
+    """Write `data` to the file `path`, completely or not at all."""
     with writing(path) as temporary:
         temporary.write_bytes(data)
 

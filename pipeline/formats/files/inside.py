@@ -9,9 +9,10 @@ from scene.common.errors import InputError
 
 
 def inside(folder: Path, name: Any, where: Path | str) -> Path:
-    """Return `folder / name`, for a name that the file `where` contains.
+    """Return the path of a file in `folder` whose name was read from another file, so that it cannot lead elsewhere.
 
-    Raises InputError for a name that leads out of the folder: an absolute path, one with `..`, or a link to elsewhere.
+    name: relative to the folder. where: the file that contains the name, for errors. Raises InputError for a name that leads
+    out of the folder: an absolute path, one with `..`, or a link to elsewhere.
     """
     if not isinstance(name, str) or not name.strip() or not name.isprintable():
         raise InputError(

@@ -18,10 +18,10 @@ LOCK = ".lock"
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of `folder`, creating the folder if needed.
+    """Within the `with` block, hold a lock on `folder`, so that no other process writes to it; create the folder if needed.
 
-    Afterwards the lock file and created folders that are empty are removed. Raises InputError if another process holds the lock,
-    or the folder cannot be created.
+    Afterwards the lock file and created folders that are empty are removed. Raises InputError if another process holds the
+    lock, or the folder cannot be created.
     """
     if folder.exists() and not folder.is_dir():
         raise InputError("is a file", where=f"--out {folder}", remedy="choose a folder")
@@ -42,7 +42,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def is_free(folder: Path) -> bool:
-    """Whether a folder contains nothing but a lock."""
+    """Return whether a folder contains nothing but a lock file, so that it can be written to."""
     return folder.is_dir() and all(path.name == LOCK for path in folder.iterdir())
 
 

@@ -9,7 +9,7 @@ from scene.common.errors import InputError
 
 
 def require_own_folder(path: Path) -> None:
-    """Raise InputError unless `path` is a folder or does not exist.
+    """Check that `path` can be used as a folder to write to: raise InputError unless it is a folder or does not exist.
 
     A file, a pipe (at which `rmtree` waits forever) and a link are refused.
     """

@@ -7,7 +7,7 @@ from typing import Any
 
 
 def without_nan(value: Any) -> Any:
-    """Replace NaN and infinity, which JSON does not have, by null, and NumPy's numbers and arrays by plain ones."""
+    """Return a value as JSON can hold it: NaN and infinity become null, NumPy's numbers and arrays plain ones."""
     if isinstance(value, dict):
         return {str(key): without_nan(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

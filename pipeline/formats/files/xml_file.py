@@ -10,7 +10,10 @@ from scene.common.regular_file import MOST_TEXT_BYTES, check_file
 
 
 def read_root(path: Path) -> ElementTree.Element:
-    """Return the root of an XML file; raise InputError if it is not XML or declares entities."""
+    """Return the root element of an XML file.
+
+    Raises InputError if it is not XML or declares entities, which could fill the memory.
+    """
     check_file(path, most_bytes=MOST_TEXT_BYTES)
     try:
         text = path.read_bytes()
@@ -20,7 +23,7 @@ def read_root(path: Path) -> ElementTree.Element:
 
 
 def parsed(text: bytes, where: str) -> ElementTree.Element:
-    """Return the root of XML text."""
+    """Return the root element of XML text; `where` names its file for errors. Raises InputError as `read_root` does."""
     if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
         raise InputError("declares entities, which could fill the memory", where=where, remedy="export it again without them")
     try:

@@ -58,13 +58,13 @@ _LEAST_SIGMA = {
 
 @dataclass(frozen=True)
 class PointFit:
-    """How a sample of the points fits the reference.
+    """How well measured points fit the reference surface, along the sensor's rays, to find a wrong frame or unit.
 
     Attributes
     ----------
     hits : Share of the points whose rays meet the reference.
     near : Share of these that are near it.
-    off_m : Median distance behind it along the rays, m (negative: in front); NaN without hits.
+    off_m : Median distance of the points behind it along the rays, m (negative: in front); NaN without hits.
     reach : Share of the range within which a point is near.
     """
 
@@ -75,7 +75,10 @@ class PointFit:
 
     @classmethod
     def of(cls, points: FloatArray, origin: FloatArray, reference: RayCaster, sensor: Sensor) -> PointFit:
-        """Compare points (n, 3) with the reference along their rays from the origin (3,), wall frame, m."""
+        """Compare measured points with the reference surface along their rays.
+
+        points: (n, 3), wall frame, m. origin: (3,) of the rays, m. reference: ready for ray casting. sensor: stereo or tls.
+        """
         reach = _NEAR_SHARE[sensor]
         away = points[:: max(len(points) // _SAMPLE, 1)] - origin
         length = np.linalg.norm(away, axis=1)
@@ -92,14 +95,14 @@ class PointFit:
 
     @property
     def good(self) -> bool:
-        """Whether the points belong to this surface."""
+        """Whether so many points are near the reference that they belong to this surface."""
         return self.hits >= _FEWEST_HITS and self.near >= _FEWEST_NEAR
 
 
 def finite(cloud: PointCloud, where: str) -> PointCloud:
-    """Return the points whose coordinates and recorded values are finite.
+    """Return the points of a cloud whose coordinates and recorded values are finite.
 
-    Raises InputError if there are none, or all are at one place or on one line.
+    where: name of the file, for errors. Raises InputError if there are none, or all are at one place or on one line.
     """
     channels = [cloud.intensity, cloud.gps_time, *(cloud.extra.get(name) for name in ("pixel_x", "pixel_y"))]
     keep: NDArray[np.bool_] = np.all(np.isfinite(cloud.points), axis=1)
@@ -126,9 +129,10 @@ def _on_a_line(points: FloatArray) -> bool:
 
 
 def check_frame(here: PointFit, other: PointFit | None, frame: str, where: str) -> None:
-    """Raise InputError if the points do not fit the reference, naming the frame in which they would.
+    """Raise InputError if measured points do not fit the reference in the stated frame; it names the frame in which they would.
 
-    here: fit in the frame that the file states; other: fit in the other frame.
+    here: fit in the frame that measurement.yaml states; other: fit in the other frame, if there is one. frame: name of the
+    stated one. where: name of the file, for errors.
     """
     if here.good:
         return
@@ -147,9 +151,10 @@ def check_frame(here: PointFit, other: PointFit | None, frame: str, where: str) 
 
 
 def check_seen(pair: CameraPair, points: FloatArray, where: str) -> float:
-    """Return the share of the points (n, 3) that both cameras see, all in one frame.
+    """Return the share of points that both cameras of a pair see, to find cameras and points in different frames.
 
-    Raises InputError if it is almost zero, or the pair has no base.
+    points: (n, 3), m, in the pair's frame. where: name of the file, for errors. Raises InputError if the share is almost zero,
+    or the pair has no base.
     """
     if pair.base_m < _SHORTEST_BASE_M:
         raise InputError(
@@ -179,9 +184,9 @@ def check_seen(pair: CameraPair, points: FloatArray, where: str) -> float:
 
 
 def check_pixels(left: Camera, cloud: PointCloud, where: str) -> None:
-    """Raise InputError if the pixels of a cloud's points are not those in which the left camera sees them.
+    """Raise InputError if the pixels stored with a cloud's points are not those in which the left camera sees them.
 
-    A cloud without pixels is accepted.
+    where: name of the file, for errors. A cloud without pixels is accepted.
     """
     if not {"pixel_x", "pixel_y"} <= set(cloud.extra):
         return
@@ -198,7 +203,10 @@ def check_pixels(left: Camera, cloud: PointCloud, where: str) -> None:
 
 
 def check_power(cloud: PointCloud, where: str) -> PointCloud:
-    """Return the cloud if its intensity can be a received power; raise InputError for negative or huge values."""
+    """Return the cloud if its intensity can be a received power; raise InputError for negative or huge values.
+
+    where: name of the file, for errors.
+    """
     power = cloud.intensity
     if power is None or (power.min(initial=0.0) >= 0 and power.max(initial=0.0) <= _LARGEST_POWER):
         return cloud
@@ -210,7 +218,7 @@ def check_power(cloud: PointCloud, where: str) -> PointCloud:
 
 
 def check_different(clouds: Mapping[str, PointCloud]) -> None:
-    """Raise InputError if two epochs, by name, have the same coordinates, which noise never has."""
+    """Raise InputError if two epochs have the same coordinates, which real noise never gives. clouds: points by file name."""
     known: dict[bytes, str] = {}
     for name, cloud in clouds.items():
         digest = hashlib.sha256(cloud.points.tobytes()).digest()
@@ -220,7 +228,10 @@ def check_different(clouds: Mapping[str, PointCloud]) -> None:
 
 
 def check_near_rays(here: PointFit, where: str) -> None:
-    """Raise InputError if most points are far from the reference along their rays."""
+    """Raise InputError if most measured points are far from the reference along their rays, so that it is not this wall.
+
+    here: fit of points and reference. where: name of the file, for errors.
+    """
     if here.good:
         return
     raise InputError(
@@ -232,7 +243,11 @@ def check_near_rays(here: PointFit, where: str) -> None:
 
 
 def check_pulses(azimuth: Sweep, zenith: Sweep, points: int, epochs: int, where: str) -> None:
-    """Raise InputError for a pattern (start, stop, step) with far more pulses than points, or too few for them."""
+    """Raise InputError for a scan pattern that has far more pulses than there are points, or too few for them.
+
+    azimuth, zenith: start, stop and step of each angle, rad. points: their number in all epochs. epochs: number of scans with
+    this pattern. where: name of the file, for errors.
+    """
     pulses = float(np.prod([(stop - start) // step + 1 for start, stop, step in (azimuth, zenith)]))
     most = max(_PULSES_PER_POINT * points, _FEW_PULSES)
     if points > _POINTS_PER_PULSE * pulses * epochs:
@@ -249,7 +264,11 @@ def check_pulses(azimuth: Sweep, zenith: Sweep, points: int, epochs: int, where:
 
 
 def check_inside(points: FloatArray, azimuth: Sweep, zenith: Sweep, where: str) -> None:
-    """Raise InputError if a pattern does not contain the points (n, 3), scanner frame."""
+    """Raise InputError if a scan pattern does not contain the measured points.
+
+    points: (n, 3), scanner frame, m. azimuth, zenith: start, stop and step of each angle, rad. where: name of the file, for
+    errors.
+    """
     _, around, down = polar(points)
     turned = np.mod(around - azimuth[0] + azimuth[2], 2 * np.pi)
     inside = turned <= azimuth[1] - azimuth[0] + 2 * azimuth[2]
@@ -263,7 +282,10 @@ def check_inside(points: FloatArray, azimuth: Sweep, zenith: Sweep, where: str) 
 
 
 def check_noise(of: str, sigma: FloatArray) -> None:
-    """Raise InputError if the model predicts almost no noise (n,), so that standardised residuals would be meaningless."""
+    """Raise InputError if the sensor model predicts almost no noise, so that standardised residuals would be meaningless.
+
+    of: what the noise is of, for the message. sigma: (n,) predicted standard deviations.
+    """
     least, unit, key = _LEAST_SIGMA[of]
     if sigma.min(initial=np.inf) < least:
         raise InputError(

@@ -18,7 +18,7 @@ MOST_EPOCHS = 1000
 
 
 class ScanPattern(Config):
-    """Nominal directions of a scan: start, stop and step of each angle."""
+    """Nominal directions in which a laser scanner sends its pulses: start, stop and step of azimuth and zenith angle."""
 
     azimuth_rad: Sweep = Field(description="start, stop, step [rad]; or azimuth_deg")
     zenith_rad: Sweep = Field(description="start, stop, step [rad]; or zenith_deg")
@@ -63,7 +63,7 @@ class ScanPattern(Config):
 
 
 class MeasurementConfig(Config):
-    """Content of measurement.yaml."""
+    """Content of measurement.yaml, which describes measured points, reference surface and sensor model for `scarpsim gap`."""
 
     sensor: Literal["tls", "stereo"]
     reference: Path = Field(description="reference surface, world frame, m")

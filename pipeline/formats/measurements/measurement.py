@@ -78,18 +78,18 @@ class MeasurementBase(ABC):
 
     @property
     def epochs(self) -> NDArray[np.int64]:
-        """(n,) epoch of each point, from 0."""
+        """(n,) number of the epoch in which each point was measured, from 0."""
         return np.asarray(self.cloud.extra.get("epoch", np.zeros(len(self.cloud.points))), dtype=np.int64)
 
     @property
     def stable(self) -> NDArray[np.bool_]:
-        """(n,) whether each point is in a stable area."""
+        """(n,) whether each point is in an area where the scene is known not to have changed."""
         x, y = self.cloud.points[:, :2].T
         return in_areas(self.stable_areas, x, y) if self.stable_areas else np.ones(len(x), dtype=bool)
 
     @cached_property
     def scene(self) -> RayCaster:
-        """The reference surface, for ray casting."""
+        """The reference surface, wall frame, prepared for casting the sensor's rays on it."""
         return RayCaster(self.reference)
 
     @property
@@ -99,25 +99,25 @@ class MeasurementBase(ABC):
 
     @property
     def fit(self) -> PointFit:
-        """How the points fit the reference."""
+        """How well the measured points fit the reference surface along the sensor's rays."""
         return PointFit.of(self.cloud.points, self.viewpoint, self.scene, self.sensor)
 
     def check_near(self, where: str) -> None:
-        """Raise InputError if most points are so far from the reference that no pose or effect explains it."""
+        """Raise InputError, naming the file `where`, if most points are too far from the reference for any pose or effect."""
         check_near_rays(self.fit, where)
 
     def changed(self, **values: Any) -> Self:
-        """Return a copy with other points, cameras or pose that keeps the ray caster."""
+        """Return a copy of the measurement with other values of its fields (points, cameras, pose); the ray caster is kept."""
         other = replace(self, **values)
         other.__dict__["scene"] = self.scene  # where cached_property keeps it
         return other
 
     def part(self, rows: NDArray[np.int64]) -> Self:
-        """Return a copy with some of the points."""
+        """Return the measurement with only those points whose indices are in `rows`."""
         return self.changed(cloud=self.cloud.part(rows))
 
     def moved(self, pose: FloatArray) -> Self:
-        """Shift (m) and rotate (rad) sensor and points by a pose (6,), wall frame; cameras about the left one."""
+        """Return the measurement shifted (m) and rotated (rad) about its viewpoint by a pose (6,), wall frame."""
         turn, centre = rotation_matrix(pose[3:]), self.viewpoint
         points = (self.cloud.points - centre) @ turn.T + centre + pose[:3]
         return self.changed(cloud=replace(self.cloud, points=points), **self._moved_sensor(turn, pose[:3]))
@@ -160,24 +160,24 @@ class TlsMeasurement(MeasurementBase):
 
     @property
     def scan_of(self) -> NDArray[np.int64]:
-        """(n,) number of each point's scan."""
+        """(n,) number of the laser scan in which each point was measured, from 0."""
         return np.asarray(self.cloud.extra.get(SCAN, np.zeros(len(self.cloud.points))), dtype=np.int64)
 
     def each_scan(self) -> Iterator[tuple[Scanned, NDArray[np.int64], Self]]:
-        """Yield each of several scans with its points' rows and its own measurement."""
+        """Yield, for each scan of several, its pose, the indices of its points, and a measurement of these points alone."""
         for number, scan in enumerate(self.scans):
             rows = np.flatnonzero(self.scan_of == number)
             yield scan, rows, self.part(rows).changed(station=scan.pose, face=scan.face, scans=())
 
     @property
     def fit(self) -> PointFit:
-        """How the points of the scan that fits worst fit the reference."""
+        """How well the points fit the reference along the rays, in the scan for which this is worst."""
         several = self.each_scan()
         fits = [PointFit.of(one.cloud.points, one.viewpoint, self.scene, self.sensor) for _, rows, one in several if len(rows)]
         return min(fits, key=lambda each: (each.good, each.near)) if fits else super().fit
 
     def moved(self, pose: FloatArray) -> Self:
-        """Move each of several scans by the six values of its set-up in the pose (6 k,)."""
+        """Shift (m) and rotate (rad) the scans of each of k set-ups (scanner positions) by its six values in pose (6 k,)."""
         if not self.scans:
             return super().moved(pose)
         points, scans = self.cloud.points.copy(), []
@@ -188,7 +188,7 @@ class TlsMeasurement(MeasurementBase):
         return self.changed(cloud=replace(self.cloud, points=points), scans=tuple(scans), station=scans[0].pose)
 
     def part(self, rows: NDArray[np.int64]) -> Self:
-        """Return a copy with some of the points, with their scan lines and times."""
+        """Return the measurement with only the points whose indices are in `rows`, and their scan lines and times."""
         line, share = (None if values is None else values[rows] for values in self.order or (None, None))
         return super().part(rows).changed(order=self.order and (line, share))
 
@@ -216,7 +216,7 @@ class StereoMeasurement(MeasurementBase):
     surroundings: Surroundings | None = None
 
     def part(self, rows: NDArray[np.int64]) -> Self:
-        """Return a copy with some of the points, with what is known of their neighbourhoods."""
+        """Return the measurement with only the points whose indices are in `rows`, and what the cameras see around them."""
         shaped = None if self.shaped_px is None else self.shaped_px[rows]
         return super().part(rows).changed(shaped_px=shaped, surroundings=self.surroundings and self.surroundings.part(rows))
 
@@ -238,7 +238,7 @@ class StereoMeasurement(MeasurementBase):
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceMeasurement(MeasurementBase):
-    """A surface from photographs with unknown cameras: points with noise in metres, in a datum of shift, rotation and scale."""
+    """A surface from photographs with unknown cameras: points with noise in metres, up to shift, rotation and scale (datum)."""
 
     sensor = "stereo"
     model: StereoModel
@@ -250,38 +250,38 @@ class SurfaceMeasurement(MeasurementBase):
 
     @property
     def viewpoint(self) -> FloatArray:
-        """(3,) a place in front of the wall; nothing was observed from there."""
+        """(3,) a place in front of the wall, m, which only says on which side it is seen; nothing was observed from there."""
         away = 2 * float(np.linalg.norm(np.ptp(self.reference.bounds, axis=0)))
         return np.asarray(self.centre + np.array([0.0, 0.0, away]))
 
     @cached_property
     def shape(self) -> ShapedSurface:
-        """The reference with properties of its vertices' neighbourhoods."""
+        """The reference surface with normal, roughness and convexity at each vertex, on which errors of such points depend."""
         return ShapedSurface(self.reference)
 
     @cached_property
     def datum(self) -> FloatArray:
-        """(7, k) components of the cloud's datum (shift, rotation, scale) that the reference determines."""
+        """(7, k) combinations of shift, rotation and scale of the points that a comparison with the reference can determine."""
         vertices = np.arange(len(self.reference.vertices))
         return told_datum(self.reference.vertices - self.centre, self.shape.normals(vertices))
 
     @property
     def surface_fit(self) -> SurfaceFit:
-        """How the points fit the reference."""
+        """How well the measured points fit the reference surface, by their distance from it."""
         return SurfaceFit.of(self.cloud.points, self.reference)
 
     def check_near(self, where: str) -> None:
-        """Raise InputError if most points are too far from the reference surface."""
+        """Raise InputError, naming the file `where`, if most points are too far from the reference surface."""
         self.surface_fit.check(where)
 
     def changed(self, **values: Any) -> Self:
-        """Return a copy with other points that keeps the ray caster, the surface's shape and the datum."""
+        """Return a copy with other values of its fields, such as the points; what was computed from the reference is kept."""
         other = super().changed(**values)
         other.__dict__["shape"], other.__dict__["datum"] = self.shape, self.datum
         return other
 
     def moved(self, pose: FloatArray) -> Self:
-        """Shift (m), rotate (rad) and scale the points about the reference's centre by components of the datum (k,)."""
+        """Shift (m), rotate (rad) and scale the points about the reference's centre by k amounts of the columns of `datum`."""
         whole = self.datum @ pose
         turn = (1 + whole[6]) * rotation_matrix(whole[3:6])
         points = (self.cloud.points - self.centre) @ turn.T + self.centre + whole[:3]
@@ -315,7 +315,7 @@ class Material:
 
 
 def read_measurement(folder: Path) -> Measurement:
-    """Read a folder with measurement.yaml; raise InputError that names the file and the key."""
+    """Read a measurement from a folder with measurement.yaml; raise InputError that names the file and the wrong key."""
     path = folder / FILE if folder.is_dir() else folder
     if not path.is_file():
         raise InputError(f"there is no {FILE}", where=str(folder), remedy="name the folder of a measurement")
@@ -339,7 +339,7 @@ def _mended(config: MeasurementConfig, values: Any) -> tuple[str, ...]:
 
 
 def assembled(config: MeasurementConfig, material: Material, reference: str, where: str) -> Measurement:
-    """Make a measurement from its parts in memory, ignoring the config's paths.
+    """Make a measurement from its parts in memory (material) and the settings of measurement.yaml, whose paths are ignored.
 
     reference, where: names of mesh and config, for errors. Raises InputError if the parts do not fit together.
     """
@@ -442,7 +442,7 @@ def _cameras(config: MeasurementConfig, base: Path) -> CameraPair | None:
 
 
 def nominal_pair(file: Path) -> CameraPair:
-    """Read the cameras of a file, world frame: cameras.yaml, or another file with two oriented cameras."""
+    """Read a stereo pair (calibration and poses), world frame, from cameras.yaml or another file with two oriented cameras."""
     found = read_oriented(file)
     return read_cameras_yaml(file) if found is None else stereo_pair(found, None, None, str(file))
 

@@ -29,7 +29,10 @@ def read_model(path: Path) -> TlsModel | StereoModel:
 
 
 def sensor_model(values: Any, where: str) -> TlsModel | StereoModel:
-    """Make a sensor model from its keys and values. where: name of the file, for errors."""
+    """Make a sensor model (its noise and errors) from the content of a YAML file.
+
+    values: keys and values. where: name of the file, for errors. Raises InputError, which names the wrong key.
+    """
     if not isinstance(values, dict) or values.get("sensor") not in ("tls", "stereo"):
         raise InputError("names no sensor", where=where, allowed="sensor: tls, sensor: stereo", remedy="add one of these lines")
     return parse(_ModelFile, {"sensor": values}, where).sensor

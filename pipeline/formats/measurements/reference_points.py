@@ -14,11 +14,11 @@ _NOTICED = 0.3
 
 @dataclass(frozen=True)
 class ReferencePoints:
-    """Error of a reference made of points.
+    """Error of a reference surface whose vertices are themselves measured points.
 
     Attributes
     ----------
-    planes : Planes through the vertices to which incidence angles refer; None: triangles.
+    planes : Planes through the vertices, to which incidence angles refer; None: they refer to the triangles.
     error_m : Standard deviation of each vertex along the rays, m.
     words : Notes for the report if these were estimated.
     """
@@ -29,13 +29,13 @@ class ReferencePoints:
 
     @classmethod
     def of(cls, config: MeasurementConfig, vertices: FloatArray, viewpoint: FloatArray, range_sigma_m: float) -> ReferencePoints:
-        """Take what measurement.yaml states, or estimate it from the vertices.
+        """Take the error of the reference from measurement.yaml if it states one, or else estimate it from the vertices.
 
         Parameters
         ----------
         config : Content of measurement.yaml.
         vertices : (n, 3) vertices of the reference, m.
-        viewpoint : (3,) position of the scanner, m.
+        viewpoint : (3,) position of the scanner, m, in the same frame.
         range_sigma_m : Range noise of the scanner, m.
         """
         if config.incidence is not None or config.reference_error_m is not None:

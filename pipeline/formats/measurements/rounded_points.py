@@ -13,7 +13,7 @@ _TOLD = 0.1
 
 
 def check_rounded_points(points: FloatArray, viewpoint: FloatArray, noise_m: float, where: str) -> tuple[str, ...]:
-    """Return a note on the rounding of points, if it matters.
+    """Check whether the rounding of coordinates in a file disturbs the measured noise; return a note if it matters.
 
     Rounding to steps s has an error of s / sqrt(12) along each axis; its component along the line of sight looks like sensor
     noise.

@@ -54,7 +54,7 @@ is one.
 
 @dataclass(frozen=True)
 class AngularGrid:
-    """Equally spaced angles, rad."""
+    """Equally spaced angles of a scan pattern: first angle and step, rad, and their number."""
 
     start: float
     step: float
@@ -62,25 +62,27 @@ class AngularGrid:
 
     @property
     def stop(self) -> float:
-        """Last angle, rad."""
+        """Last of the equally spaced angles, rad."""
         return self.start + self.step * (self.count - 1)
 
     def to_list(self) -> list[float]:
-        """Return [start, stop, step], as in a measurement's `pattern`."""
+        """Return the angles as [start, stop, step], rad, as the `pattern` in measurement.yaml has them."""
         return [self.start, self.stop, self.step]
 
 
 @dataclass(frozen=True)
 class ScanGeometry:
-    """A raw scan in terms of its scanner.
+    """Scan lines, pulses and angular steps of a raw laser scan, recovered from its n points.
 
     Attributes
     ----------
     range_m, azimuth, zenith : (n,) m and rad, about the scan's own axis; azimuth has no jump within the scan.
-    line, pulse : (n,) int32, 0 at the grids' starts; echoes of one pulse share them.
-    lines, pulses : The angular grids.
+    line, pulse : (n,) int32 number of each point's scan line, and of its pulse in the line, from 0; echoes of one pulse share
+        them.
+    lines, pulses : Azimuths of the lines and zenith angles of the pulses.
     rotation : (3, 3) frame of the scan's axis to the scanner's frame (identity for a level scan).
-    line_shape : (3,) d, c, t of the module's equation, rad.
+    line_shape : (3,) how a line departs from a meridian, rad: by the head's turn during it, collimation error and trunnion
+        tilt.
     synchronous : Whether all lines begin on one zenith grid.
     azimuth_rms, zenith_rms : RMS deviation of the far half's angles from the pattern, rad.
     """
@@ -100,27 +102,27 @@ class ScanGeometry:
 
     @property
     def tilt(self) -> float:
-        """Angle between the scan's axis and the scanner's z, rad."""
+        """Angle between the axis about which the scan was made and the scanner's z axis, rad."""
         return float(np.arctan2(np.hypot(*self.rotation[:2, 2]), self.rotation[2, 2]))
 
     @property
     def pattern(self) -> dict[str, list[float]]:
-        """The `pattern` of a measurement.yaml."""
+        """The scan's nominal directions as the key `pattern` of a measurement.yaml."""
         return {"azimuth_rad": self.lines.to_list(), "zenith_rad": self.pulses.to_list()}
 
     @cached_property
     def returned(self) -> NDArray[np.bool_]:
-        """(lines, pulses) whether each direction of the pattern has a return."""
+        """(lines, pulses) whether each direction of the scan pattern has a return, that is, at least one of the points."""
         cells = np.zeros((self.lines.count, self.pulses.count), dtype=bool)
         cells[self.line, self.pulse] = True
         return cells
 
 
 def recover_pattern(points: FloatArray, position: FloatArray | None = None, rotation: FloatArray | None = None) -> ScanGeometry:
-    """Recover the geometry of a raw scan; raise InputError if the points lie on no pattern.
+    """Recover scan lines, pulses and angular steps of a raw laser scan from its points.
 
     points: (n, 3), m; position: (3,) scanner's centre in the points' frame, m; rotation: (3, 3), scanner to the points' frame.
-    Without them, the points are in the scanner's frame.
+    Without these two, the points are in the scanner's frame. Raises InputError if the points lie on no pattern.
     """
     origin = np.zeros(3) if position is None else position
     local = points - origin if rotation is None else np.einsum("ij,ni->nj", rotation, points - origin)

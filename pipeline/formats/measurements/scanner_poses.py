@@ -24,7 +24,7 @@ is kept.
 
 
 class ScannerPose(Config):
-    """Surveyed pose of the scanner."""
+    """Surveyed position and orientation of a laser scanner in measurement.yaml."""
 
     position_m: Vector3 = Field(description="scanner's centre, world frame [m]")
     rotation: Matrix3 = Field(description="scanner to world; scanner z is the vertical axis")
@@ -43,7 +43,10 @@ class ScannerPose(Config):
 
 
 class ScannerScan(ScannerPose):
-    """Pose of the scanner for one file of points; scans with the same pose belong to one set-up, which is registered once."""
+    """Pose of the laser scanner for one file of points in measurement.yaml, and the face in which it scanned.
+
+    Scans with the same pose belong to one set-up, which is registered once.
+    """
 
     face: Face = Field(
         1,
@@ -53,12 +56,12 @@ class ScannerScan(ScannerPose):
 
 @dataclass(frozen=True)
 class Scanned:
-    """Pose and face of one of several scans in a measurement.
+    """Pose and face of one of several laser scans in a measurement.
 
     Attributes
     ----------
     pose : Scanner to wall frame.
-    face : Face of the instrument.
+    face : Face of the instrument: 1, or 2 if the azimuth is turned by pi and the zenith angle reversed.
     set_up : Number of its set-up, from 0; scans between which the scanner was not moved share one.
     """
 
@@ -68,7 +71,7 @@ class Scanned:
 
 
 def set_ups(scans: Sequence[ScannerScan]) -> list[int]:
-    """Return the number of each scan's set-up, the same for the same pose."""
+    """Return the number, from 0, of the set-up in which each scan was made; scans with the same pose share one."""
     known: list[tuple[Vector3, Matrix3]] = []
     numbers = []
     for scan in scans:

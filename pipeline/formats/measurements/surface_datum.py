@@ -18,18 +18,20 @@ or scale moves its ends. Noise of 4 mm at 500 places would leave smaller compone
 
 
 def datum_columns(away: FloatArray, normal: FloatArray) -> FloatArray:
-    """Return the (n, 7) displacement along the normals per shift (m), rotation (rad) and scale.
+    """Return how a shift, rotation or scale of a surface moves its points along the normals, as columns of a Jacobian.
 
-    away: (n, 3) places relative to the centre, m; normal: (n, 3) unit normals.
+    away: (n, 3) points relative to the centre, m; normal: (n, 3) unit normals. Returns (n, 7) displacements, m, per m of shift
+    (3 columns), rad of rotation (3) and unit of scale.
     """
     columns = [normal, np.cross(away, normal), np.einsum("ni,ni->n", away, normal)[:, None]]
     return np.concatenate(columns, axis=1)
 
 
 def told_datum(away: FloatArray, normal: FloatArray) -> FloatArray:
-    """Return the (7, k) components of the datum (shift, rotation, scale) that places and normals (n, 3) of a surface determine.
+    """Return which combinations of shift, rotation and scale can be determined by comparing points with a surface.
 
-    They are unit vectors if it determines all seven values, else combinations of them.
+    On a plane, for example, shifts along it cannot. away: (n, 3) places on the surface relative to the centre, m; normal: (n,
+    3) unit normals there. Returns the k combinations as columns (7, k): unit vectors if all seven values are determined.
     """
     some = slice(None, None, max(len(away) // _SAMPLE, 1))
     reach = np.sqrt(np.mean(np.sum(away[some] ** 2, axis=1)))

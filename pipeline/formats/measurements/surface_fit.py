@@ -21,7 +21,7 @@ NEAR_SHARE = 0.05
 
 @dataclass(frozen=True)
 class SurfaceFit:
-    """How a sample of points fits the reference.
+    """How well a sample of measured points fits the reference surface, by their distances from it.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class SurfaceFit:
 
     @classmethod
     def of(cls, points: FloatArray, reference: TriangleMesh) -> SurfaceFit:
-        """Compare points (n, 3), m, with the reference, in the same frame."""
+        """Compare measured points (n, 3) with the reference surface, in the same frame, m."""
         from scipy.spatial import cKDTree
 
         reach = near_m(reference)
@@ -46,11 +46,14 @@ class SurfaceFit:
 
     @property
     def good(self) -> bool:
-        """Whether the points belong to this surface."""
+        """Whether so many of the measured points are near the reference surface that they belong to it."""
         return self.near >= _FEWEST_NEAR
 
     def check(self, where: str) -> None:
-        """Raise InputError if the points do not belong to this surface."""
+        """Raise InputError if the measured points do not belong to the reference surface.
+
+        where: name of the points' file, for the error.
+        """
         if self.good:
             return
         raise InputError(
@@ -61,14 +64,17 @@ class SurfaceFit:
 
 
 def near_m(reference: TriangleMesh) -> float:
-    """Return the distance from a vertex of the reference up to which a point belongs to its surface, m."""
+    """Return the distance from the nearest vertex of the reference up to which a measured point belongs to its surface, m."""
     extent = float(np.linalg.norm(np.ptp(reference.bounds, axis=0)))
     corners = reference.corners()
     return NEAR_SHARE * extent + float(np.median(np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)))
 
 
 def air_side(mesh: TriangleMesh) -> FloatArray:
-    """Return a (3,) place in front of the middle of a surface, on the side that its triangles face, in its frame, m."""
+    """Return a place in front of the middle of a rock surface, (3,) in its frame, m, to know which side is air.
+
+    It is on the side that the triangles face.
+    """
     local = mesh.vertices - mesh.vertices.mean(axis=0)
     normal = np.linalg.eigh(np.einsum("ni,nj->ij", local, local))[1][:, 0]
     corners = mesh.corners()
@@ -79,7 +85,10 @@ def air_side(mesh: TriangleMesh) -> FloatArray:
 
 
 def check_in_metres(model: StereoModel, where: str) -> None:
-    """Raise InputError if a stereo model has no noise in metres, or has effects of cameras."""
+    """Raise InputError if a stereo model cannot be used for a surface from unknown cameras.
+
+    That is so if it has no noise in metres, or has effects of cameras. where: name of the file, for the error.
+    """
     of_cameras = [effect.name for effect in model.effects if effect.stage != Stage.POINT]
     if of_cameras:
         raise InputError(

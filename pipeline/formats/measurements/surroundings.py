@@ -13,7 +13,9 @@ from scene.geometry.mesh import FloatArray
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What the cameras see of the reference around n pixels.
+    """What a stereo pair sees of the reference surface around n pixels of the left camera.
+
+    Errors at depth edges, such as smoothing, depend on it.
 
     Attributes
     ----------
@@ -29,15 +31,18 @@ class Surroundings:
 
     @classmethod
     def nowhere(cls, count: int) -> Surroundings:
-        """Return the surroundings of pixels that are not known to see anything."""
+        """Return the surroundings of `count` pixels of which it is not known what they see: their places are NaN."""
         return cls(np.full((count, 3), np.nan), np.zeros(count), np.zeros(count, dtype=bool))
 
     def part(self, rows: Any) -> Surroundings:
-        """Return those of some of the pixels, by a mask or indices."""
+        """Return the surroundings of some of the pixels. rows: a mask or indices."""
         return Surroundings(self.point[rows], self.edge_px[rows], self.hidden[rows])
 
     def changed(self, rows: NDArray[np.int64], other: Surroundings) -> Surroundings:
-        """Return a copy with other surroundings at some of the pixels."""
+        """Return a copy in which some of the pixels have other surroundings.
+
+        rows: indices of these pixels. other: their new surroundings.
+        """
         found = Surroundings(self.point.copy(), self.edge_px.copy(), self.hidden.copy())
         found.point[rows], found.edge_px[rows], found.hidden[rows] = other.point, other.edge_px, other.hidden
         return found

@@ -16,7 +16,7 @@ from scene.geometry.mesh import TriangleMesh
 
 @dataclass(frozen=True)
 class GltfPart:
-    """A named mesh with (n, 4) RGBA colours of its vertices."""
+    """A named part of a glTF model: a mesh with RGBA colours (n, 4) of its n vertices."""
 
     name: str
     mesh: TriangleMesh
@@ -24,9 +24,10 @@ class GltfPart:
 
 
 def write_gltf(path: Path, parts: Sequence[GltfPart]) -> None:
-    """Write a .glb file with one named node for each part; the wall frame's axes are glTF's: x right, y up, z towards the viewer.
+    """Write meshes to a .glb file (glTF), for viewers of 3D models, with one named node for each part.
 
-    Positions are float32, as glTF requires: 4 micrometres at 60 m. Raises InputError for another suffix.
+    The wall frame's axes are glTF's: x right, y up, z towards the viewer. Positions are float32, as glTF requires: 4
+    micrometres at 60 m. Raises InputError for another suffix.
     """
     if path.suffix.lower() != ".glb":
         raise InputError(

@@ -29,17 +29,20 @@ _FIELDS = {"Intensity": "intensity", "GpsTime": "gps_time", "Gps_Time": "gps_tim
 
 
 def write_ply(path: Path, mesh: TriangleMesh) -> None:
-    """Write a mesh: vertices as double, albedo as float, blocks as int if the mesh has them."""
+    """Write a mesh as a PLY file.
+
+    Vertices are double and, if the mesh has them, reflectances (albedo) are float and block labels int.
+    """
     vertex = _xyz(mesh.vertices) | _present(albedo=mesh.vertex_albedo, block=mesh.vertex_block)
     face = {"vertex_indices": mesh.faces} | _present(block=mesh.face_block)
     _write(path, {"vertex": vertex, "face": face})
 
 
 def write_ply_points(path: Path, cloud: PointCloud) -> None:
-    """Write a point cloud: x, y, z as double, the other channels in their own type or PLY's nearest (`_storable`).
+    """Write a point cloud as PLY: x, y, z as double, the other channels in their own type or the nearest one that PLY has.
 
-    Channels other than intensity are named `scalar_...` for CloudCompare. Raises InputError for a channel that no type of PLY can
-    hold without loss.
+    Channels other than intensity are named `scalar_...` for CloudCompare. Raises InputError for a channel that no type of PLY
+    can hold without loss.
     """
     channels = _present(intensity=cloud.intensity, gps_time=cloud.gps_time) | cloud.extra
     names = {name: name if name == "intensity" else _SCALAR + name for name in channels}
@@ -48,7 +51,7 @@ def write_ply_points(path: Path, cloud: PointCloud) -> None:
 
 
 def read_ply(path: Path) -> TriangleMesh:
-    """Read a mesh of triangles; properties other than ours are ignored.
+    """Read a mesh of triangles from a PLY file; properties other than `write_ply` writes are ignored.
 
     Raises InputError for a missing or damaged file, faces that are not triangles, or indices of vertices that do not exist.
     """

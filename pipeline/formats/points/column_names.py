@@ -48,11 +48,11 @@ _HOW = "name the columns x, y, z in the file, or with --columns where a command 
 
 @dataclass(frozen=True)
 class Column:
-    """One column of a text file.
+    """What one column of a text file of points contains.
 
     Attributes
     ----------
-    name : Our name of the channel.
+    name : Name of the channel in scarpsim, such as x or intensity.
     unit : Unit as the file states it; "": none.
     factor : Factor that converts values to SI units.
     decibels : Whether values are decibels of a power.
@@ -66,14 +66,20 @@ class Column:
 
 @dataclass(frozen=True)
 class NamedColumns:
-    """The columns that a file names, empty if it names none, and notes on lines that were ignored."""
+    """The columns that a text file of points names, and notes on lines that were ignored.
+
+    `columns` is empty if the file names none.
+    """
 
     columns: tuple[Column, ...] = ()
     notes: tuple[str, ...] = ()
 
 
 def named_columns(layout: TextLayout, where: str) -> NamedColumns:
-    """Interpret the last line above the points that names x, y and z, by these or other words.
+    """Interpret the column names of a text file of points.
+
+    They are in the last line above the points that names x, y and z, by these or other words. layout: what was found out about
+    the file. where: its name, for errors.
 
     Raises
     ------
@@ -101,7 +107,10 @@ def named_columns(layout: TextLayout, where: str) -> NamedColumns:
 
 
 def with_stated_units(columns: Sequence[Column], layout: TextLayout, where: str) -> tuple[Column, ...]:
-    """Return columns that the user names, with the units that a line of names in the file has for them."""
+    """Add the units that a text file states for its columns to the columns that the user names.
+
+    columns: the user's. layout: what was found out about the file. where: its name, for errors.
+    """
     for line, words in reversed(_with_unit_line(layout)):
         if len(words) == len(columns):
             units = [_parts(word)[1] for word in words]
@@ -153,9 +162,10 @@ def _checked(
 
 
 def understood(words: Sequence[str], where: str) -> tuple[Column, ...]:
-    """Interpret column names; a column with one of our names takes precedence over one with a synonym.
+    """Interpret the column names of a text file of points.
 
-    Raises InputError for coordinates in degrees or in an unknown unit.
+    words: a name for each column. A column with one of scarpsim's own names takes precedence over one with a synonym. where:
+    name of the file, for errors. Raises InputError for coordinates in degrees or in an unknown unit.
     """
     parts = [_parts(word) for word in words]
     names: list[str | None] = [name if name in _MEANING.values() else None for name in (part[0] for part in parts)]

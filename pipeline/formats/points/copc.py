@@ -45,14 +45,14 @@ _NODE = np.dtype([("key", "<i4", 4), ("offset", "<u8"), ("bytes", "<i4"), ("poin
 
 @dataclass(frozen=True)
 class Octree:
-    """Points sorted into the nodes of an octree.
+    """Points sorted into the cubes (nodes) of an octree, as COPC files store them.
 
     Attributes
     ----------
     low, side : (3,) corner and side of the root cube, in the coordinates' steps.
     keys : (m, 4) level, x, y, z of the nodes.
     counts : (m,) number of points in each node.
-    order : (n,) points by node, in their given order within a node.
+    order : (n,) indices of the points by node, in their given order within a node.
     """
 
     low: NDArray[np.int64]
@@ -63,10 +63,22 @@ class Octree:
 
 
 def write_copc(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, header: LazHeader = _USUAL) -> None:
-    """Write a point cloud like `write_laz`, in the order of an octree; equal arguments give equal bytes.
+    """Write a point cloud as COPC, a LAZ file that viewers can load part by part; equal arguments give equal bytes.
 
-    Level k has one point for each cell of side / (128 * 2^k), in addition to the levels above. A node with at most 16,384
-    remaining points takes all of them. Raises InputError for an empty cloud, or if the file cannot be written.
+    The points are in the order of an octree. Level k has one point for each cell of side / (128 * 2^k), in addition to the
+    levels above. A node with at most 16,384 remaining points takes all of them.
+
+    Parameters
+    ----------
+    path : File to write.
+    cloud : The points, as for `write_laz`.
+    pulses : Returns and scan angles of the points.
+    header : Header values.
+
+    Raises
+    ------
+    InputError
+        For an empty cloud, or if the file cannot be written.
     """
     if not len(cloud.points):
         raise InputError(
@@ -81,7 +93,7 @@ def write_copc(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, he
 
 
 def octree(steps: NDArray[np.integer]) -> Octree:
-    """Build the octree of points at integer coordinates (n, 3)."""
+    """Sort points into an octree for COPC. steps: (n, 3) integer coordinates, in the steps in which LAZ stores them."""
     low = steps.min(axis=0).astype(np.int64)
     from_low = steps - low
     side = max(int(from_low.max()), 1)

@@ -49,13 +49,13 @@ _GUIDS = uuid.UUID("7f5c9a52-9f0e-4f3c-9c2b-2f1f5e6f7c11")
 
 @dataclass(frozen=True)
 class E57Scan:
-    """One scan of a file.
+    """One laser scan of an E57 file.
 
     Attributes
     ----------
     name : Name of the scan.
     cloud : Points in the scanner's frame, m; extra channels have row and column of the scan's grid.
-    position : (3,) position of the scanner, m.
+    position : (3,) position of the scanner in the file's frame, m.
     rotation : (3, 3) scanner to the file's frame.
     """
 
@@ -66,15 +66,16 @@ class E57Scan:
 
     @property
     def placed(self) -> PointCloud:
-        """The cloud in the file's frame."""
+        """The scan's points transformed from the scanner's to the file's frame, m."""
         points = np.einsum("ij,nj->ni", self.rotation, self.cloud.points) + self.position
         return replace(self.cloud, points=points)
 
 
 def write_e57(path: Path, scans: Sequence[E57Scan]) -> None:
-    """Write scans; extra channels `row` and `column` (integers from 0) become the scan's grid, others are left out.
+    """Write laser scans to an E57 file; equal arguments give equal bytes.
 
-    Equal arguments give equal bytes. Raises InputError if the file cannot be written, ValueError for a scan without points.
+    Extra channels `row` and `column` (integers from 0) become the scan's grid, others are left out. Raises InputError if the
+    file cannot be written, ValueError for a scan without points.
     """
     with writing(path) as temporary:
         image = libe57.ImageFile(str(temporary), "w")
@@ -87,7 +88,7 @@ def write_e57(path: Path, scans: Sequence[E57Scan]) -> None:
 
 
 def read_e57(path: Path) -> list[E57Scan]:
-    """Read all scans without the records that they mark as invalid.
+    """Read all laser scans of an E57 file, without the points that they mark as invalid.
 
     Raises InputError for a missing or damaged file, one without points, or a coordinate system that is not in metres.
     """

@@ -20,7 +20,7 @@ _GOLDEN = 0.6180339887498949
 
 
 def without_fillers(cloud: PointCloud, where: str, *, grid: bool = False) -> PointCloud:
-    """Remove records that stand for a missing return, and add a note on them.
+    """Remove points that stand for a missing return of a laser pulse, and add a note on them to the cloud.
 
     Programs write 0 0 0, or another fixed place, for pulses of a scan's grid without a return. A single record at 0 0 0 is
     removed if it is outside of all other points, and in formats with grids always.

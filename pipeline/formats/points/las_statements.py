@@ -31,9 +31,10 @@ _PROJECT = "project the points to a coordinate system in metres, such as UTM, an
 
 
 def stated_units(header: laspy.LasHeader, where: str) -> tuple[AxisUnits | None, tuple[str, ...]]:
-    """Return the unit of the coordinates by the file's WKT or GeoTIFF keys, or None, and notes.
+    """Return the unit of the coordinates that a LAS or LAZ file states, or None, and notes on it.
 
-    Raises InputError for coordinates in degrees, or if WKT and keys state different units.
+    header: of the file, whose WKT or GeoTIFF keys are read. where: name of the file, for errors. Raises InputError for
+    coordinates in degrees, or if WKT and keys state different units.
     """
     by_wkt, notes = _by_wkt(header, where)
     by_keys = _by_keys(header, where)
@@ -109,9 +110,10 @@ def _agreed(by_system: float | None, unit_code: int | None, what: str, where: st
 
 
 def check_box(header: laspy.LasHeader, points: FloatArray, where: str) -> tuple[str, ...]:
-    """Return a note if the header's bounding box is much larger than the points (n, 3), in the file's unit.
+    """Compare the bounding box in a LAS file's header with its points; return a note if the box is much larger.
 
-    Raises InputError if points are outside of it. A box of zeros, or turned inside out, states nothing.
+    points: (n, 3), in the file's unit. where: name of the file, for errors. Raises InputError if points are outside of the box.
+    A box of zeros, or turned inside out, states nothing.
     """
     low, high = np.array(header.mins), np.array(header.maxs)
     if not len(points) or not np.isfinite([low, high]).all() or (low > high).any() or not (low.any() or high.any()):
@@ -136,7 +138,11 @@ def _place(values: FloatArray) -> str:
 
 
 def check_counts(header: laspy.LasHeader, path: Path) -> None:
-    """Raise InputError if a header states two numbers of points, or an uncompressed file does not have the size for them."""
+    """Check the number of points in a LAS or LAZ file's header.
+
+    path: the file. Raises InputError if the header states two numbers, or an uncompressed file does not have the size for its
+    points.
+    """
     with path.open("rb") as file:
         (older,) = struct.unpack_from("<I", file.read(_OLDER_COUNT_AT + 4), _OLDER_COUNT_AT)
     if older and older != header.point_count:
@@ -159,7 +165,10 @@ def check_counts(header: laspy.LasHeader, path: Path) -> None:
 
 
 def flagged(las: Any) -> tuple[np.ndarray[Any, np.dtype[np.bool_]], tuple[str, ...]]:
-    """Return the (n,) mask of points that the file takes out of use (withheld, synthetic, classified as noise), and notes."""
+    """Return which points a LAS file takes out of use, as a mask (n,), and notes.
+
+    las: content of the file, as laspy reads it. Such points are flagged as withheld or synthetic, or classified as noise.
+    """
     classes = np.asarray(las.classification)
     out = np.zeros(len(classes), dtype=bool)
     notes = []

@@ -54,11 +54,11 @@ variable sizes.
 
 @dataclass(frozen=True)
 class PulseChannels:
-    """Values for which LAS has its own fields, besides intensity and time.
+    """Values of a cloud's points for which LAS has its own fields, besides intensity and time.
 
     Attributes
     ----------
-    return_number, number_of_returns : (n,), 1 to 15; None: 1 of 1.
+    return_number, number_of_returns : (n,) number of the echo and of all echoes of its pulse, 1 to 15; None: 1 of 1.
     scan_angle_rad : (n,) angle of the emitted direction from straight down, rad, as in LAS (for a scanner, pi minus zenith
         angle).
     """
@@ -70,7 +70,7 @@ class PulseChannels:
 
 @dataclass(frozen=True)
 class LazHeader:
-    """Header values.
+    """Values that are written to the header of a LAS or LAZ file.
 
     Attributes
     ----------
@@ -98,13 +98,17 @@ _LEAP_SECONDS, _ADJUSTED_S = 18, 1e9
 
 
 def gps_seconds(time: datetime.datetime) -> float:
-    """Return a time in UTC as LAS stores standard GPS time, s."""
+    """Return a time in UTC as LAS stores standard GPS time: seconds since 1980-01-06 minus 1e9."""
     return (time - _GPS_START).total_seconds() + _LEAP_SECONDS - _ADJUSTED_S
 
 
 @dataclass(frozen=True)
 class StoredCloud:
-    """A cloud as LAS stores it: header with records, points, fields of the points by name, and the power of 65535 counts."""
+    """A point cloud prepared for writing as LAS.
+
+    header: the file's header. cloud: the points. fields: values of the points by LAS's name. full_scale: relative power that is
+    stored as the largest intensity, 65535.
+    """
 
     header: laspy.LasHeader
     cloud: PointCloud
@@ -113,9 +117,10 @@ class StoredCloud:
 
     @classmethod
     def of(cls, cloud: PointCloud, pulses: PulseChannels, header: LazHeader) -> StoredCloud:
-        """Prepare a cloud for writing.
+        """Prepare a point cloud for writing as LAS.
 
-        Raises ValueError for points that are not finite, or return numbers that LAS cannot store.
+        pulses: returns and scan angles. header: values for the file's header. Raises ValueError for points that are not finite,
+        or return numbers that LAS cannot store.
         """
         fields = {"bit_fields": _return_bits(pulses.return_number, pulses.number_of_returns), "gps_time": cloud.gps_time}
         if pulses.scan_angle_rad is not None:
@@ -126,15 +131,18 @@ class StoredCloud:
         return cls(las, cloud, present | dict(cloud.extra), full_scale)
 
     def with_points(self, cloud: PointCloud) -> StoredCloud:
-        """Return other points with the same header and the same extra dimensions, without intensity and time."""
+        """Return other points prepared for writing with the same header and extra dimensions, such as the next part of a file.
+
+        Intensity and time are left out.
+        """
         return replace(self, cloud=cloud, fields={"bit_fields": self.fields["bit_fields"], **cloud.extra})
 
     def steps(self) -> NDArray[np.int64]:
-        """Return the (n, 3) coordinates as stored: in steps of the header's scale from its offset."""
+        """Return the coordinates (n, 3) as LAS stores them: in steps of the header's scale from its offset."""
         return np.rint((self.cloud.points - self.header.offsets) / self.header.scales).astype(np.int64)
 
     def records(self, rows: slice | NDArray[np.integer]) -> laspy.ScaleAwarePointRecord:
-        """Return the points of these rows as LAS records."""
+        """Return some of the points as LAS records, ready to be written. rows: their indices or a slice."""
         places, intensity = self.cloud.points[rows], self.cloud.intensity
         intensity = None if intensity is None else intensity[rows]
         fields = {name: values if values.ndim == 0 else values[rows] for name, values in self.fields.items()}
@@ -162,9 +170,8 @@ def write_laz(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, hea
     Parameters
     ----------
     path : File to write.
-    cloud : Finite points. Its intensity, at least 0, is stored in 16 bits (see `_full_scale`), its extra channels as extra
-        dimensions in
-        their own type.
+    cloud : Finite points. Its intensity, at least 0, is stored in 16 bits relative to the smallest power of two that no point
+        exceeds, its extra channels as extra dimensions in their own type.
     pulses : Returns and scan angles; the latter are stored in steps of 0.006 degrees.
     header : Header values.
     """
@@ -175,7 +182,7 @@ def write_laz(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, hea
 
 
 def read_laz(path: Path) -> PointCloud:
-    """Read a LAS or LAZ file of any version.
+    """Read a point cloud from a LAS or LAZ file of any version.
 
     Intensity is relative received power: in our files on their stored scale, in others counts / 65535. Intensity and GPS time
     that are zero throughout count as not recorded. Extra channels `return_number` and `number_of_returns` exist if pulses have
@@ -218,7 +225,10 @@ def read_laz(path: Path) -> PointCloud:
 
 
 def damaged(path: Path, error: BaseException) -> InputError:
-    """Return the error for a file that laspy or lazrs cannot read, in our own words."""
+    """Return the InputError for a LAS or LAZ file that the libraries cannot read, saying what is wrong with it.
+
+    error: what the library raised.
+    """
     with path.open("rb") as file:
         start = file.read(4)
     if start != b"LASF":
@@ -230,7 +240,10 @@ def damaged(path: Path, error: BaseException) -> InputError:
 
 
 def check_quantisation(header: laspy.LasHeader, path: Path) -> None:
-    """Raise InputError for scales and offsets that cannot give coordinates."""
+    """Raise InputError if scale and offset in a LAS header, which turn stored integers into coordinates, are unusable.
+
+    path: the file, for the error.
+    """
     scales, offsets = np.asarray(header.scales), np.asarray(header.offsets)
     if not (np.isfinite(scales).all() and (scales > 0).all() and np.isfinite(offsets).all()):
         raise InputError(
@@ -256,7 +269,10 @@ def _standard_channels(las: Any) -> dict[str, NDArray[Any]]:
 
 
 def check_extent(path: Path) -> None:
-    """Raise ValueError for a file cut off in its header, or with an absurd LAZ chunk table, at which lazrs would abort."""
+    """Raise ValueError for a LAS or LAZ file at which the reading library would abort the process.
+
+    That is a file cut off in its header, or with an absurd table of LAZ chunks.
+    """
     with path.open("rb") as file:
         _check_records(file.read(_HEADER_BYTES), path.stat().st_size)
         file.seek(0)
@@ -319,7 +335,10 @@ def _header(cloud: PointCloud, given: LazHeader, full_scale: float) -> laspy.Las
 
 
 def writer(file: BinaryIO, header: laspy.LasHeader, compress: bool) -> laspy.LasWriter:
-    """Return a writer; the parallel back end gives the same bytes as the serial one, with any number of threads."""
+    """Return a writer of LAS records to an open file, whose bytes do not depend on the number of threads.
+
+    header: of the file. compress: whether to write LAZ.
+    """
     return laspy.LasWriter(file, header, do_compress=compress, laz_backend=laspy.LazBackend.LazrsParallel, closefd=False)
 
 

@@ -35,7 +35,7 @@ _FIELDS = (
 
 
 def count_points(path: Path) -> int:
-    """Return the number of points that a file's header states, 0 for a file that is not a readable LAS or LAZ file."""
+    """Return the number of points that the header of a LAS or LAZ file states, 0 for a file that is not readable as such."""
     try:
         with laspy.open(path) as reader:
             return int(reader.header.point_count)
@@ -44,14 +44,14 @@ def count_points(path: Path) -> int:
 
 
 def read_chunks(path: Path, unit: str | None = None) -> Iterator[FloatArray]:
-    """Yield the points (n, 3), m, of a LAS or LAZ file, chunk by chunk.
+    """Read a LAS or LAZ file that may be larger than the memory: yield its points (n, 3), m, chunk by chunk.
 
     Points are left out if they are flagged as withheld or synthetic, classified as noise, or at 0 0 0 (no return).
 
     Parameters
     ----------
     path : LAS or LAZ file.
-    unit : Unit of the coordinates, a key of METRES; None: as the file states, or metres.
+    unit : Name of the coordinates' unit, a key of METRES; None: as the file states, or metres.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def read_chunks(path: Path, unit: str | None = None) -> Iterator[FloatArray]:
 def write_chunks(
     path: Path, bounds: FloatArray, chunks: Iterable[tuple[FloatArray, Mapping[str, NDArray[Any]]]], header: LazHeader
 ) -> None:
-    """Write points to a LAZ file chunk by chunk.
+    """Write points that may not fit into the memory to a LAZ file, chunk by chunk.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ _FAR_M = 1e3
 
 
 def write_pcd(path: Path, cloud: PointCloud) -> None:
-    """Write x, y, z, m, then intensity, gps_time and the other channels by name, in their own types.
+    """Write a point cloud as PCD: x, y, z, m, then intensity, gps_time and the other channels by name, in their own types.
 
     Coordinates are float32, as PCL takes them, or float64 (read by Open3D and CloudCompare) if they are large, such as survey
     coordinates. Raises InputError for a channel that is not a number.

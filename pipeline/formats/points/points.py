@@ -31,13 +31,13 @@ _LARGEST_M = 1e8
 
 @dataclass(frozen=True)
 class PlacedScan:
-    """One scan of a file.
+    """One scan of a point cloud file, with the scanner's pose if the file states it.
 
     Attributes
     ----------
     name : Name of the scan.
     cloud : Points in the file's frame.
-    position : (3,) position of the scanner; None if the file does not state it.
+    position : (3,) position of the scanner in the file's frame; None if the file does not state it.
     rotation : (3, 3) scanner to the file's frame; None if the file does not state it.
     """
 
@@ -47,7 +47,7 @@ class PlacedScan:
     rotation: FloatArray | None = None
 
     def in_metres(self, units: AxisUnits) -> PlacedScan:
-        """Return the scan converted to metres from these units."""
+        """Return the scan with its points and position converted to metres. units: those of its coordinates."""
         if units.in_metres:
             return replace(self, cloud=replace(self.cloud, stated_units=None))
         factors = units.factors()
@@ -69,12 +69,12 @@ def read_points(path: Path) -> PointCloud:
 def read_placed_scans(
     path: Path, unit: str | None = None, columns: Sequence[str] = (), option: str = "--unit"
 ) -> list[PlacedScan]:
-    """Read all scans of a file, in metres and without records that stand for a missing return.
+    """Read all laser scans of a point cloud file, in metres and without points that stand for a missing return.
 
     Parameters
     ----------
     path : File of a format in SUFFIXES, or of one that another package reads.
-    unit : Unit of the coordinates, a key of METRES; None: as the file states, or metres.
+    unit : Name of the coordinates' unit, a key of METRES; None: as the file states, or metres.
     columns : Names of a text file's columns, instead of the file's own.
     option : Command-line option that gives the unit, for errors.
 
@@ -96,7 +96,7 @@ def read_placed_scans(
 
 
 def check_reach(points: FloatArray, where: str) -> None:
-    """Raise InputError if coordinates (n, 3) are too large for a survey; NaN and infinity pass."""
+    """Raise InputError if coordinates (n, 3), m, are too large for a survey; NaN and infinity pass. where: name of the file."""
     known = np.where(np.isfinite(points), np.abs(points), 0.0)
     far = np.flatnonzero((known > _LARGEST_M).any(axis=1))
     if len(far):
@@ -178,7 +178,7 @@ def _read_ptx(path: Path) -> list[PlacedScan]:
 
 
 def joined(clouds: list[PointCloud]) -> PointCloud:
-    """Join the scans of one file."""
+    """Join the scans of one file to one cloud, with the number of the scan in the extra channel `scan`."""
     if len(clouds) == 1:
         return clouds[0]
     shared = set.intersection(*(set(cloud.extra) for cloud in clouds))

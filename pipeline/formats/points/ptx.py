@@ -31,12 +31,12 @@ _EXPORT = "copy or export the complete file again"
 
 @dataclass(frozen=True)
 class PtxScan:
-    """One scan.
+    """One laser scan of a PTX file, which stores scans as grids with the scanner's pose.
 
     Attributes
     ----------
     cloud : Points in the scanner's frame, m; extra channels `row` and `column` of the grid.
-    position : (3,) position of the scanner, m.
+    position : (3,) position of the scanner in the world frame, m.
     rotation : (3, 3) scanner to world, orthonormal only to the file's digits.
     """
 
@@ -65,7 +65,7 @@ class _Lines:
 
 
 def read_ptx(path: Path) -> list[PtxScan]:
-    """Read all scans without their missing returns.
+    """Read all laser scans of a PTX file, without the cells of their grids that have no return.
 
     Raises InputError for a missing or truncated file, a grid that the lines do not fill, or a contradictory pose.
     """
@@ -83,9 +83,9 @@ def read_ptx(path: Path) -> list[PtxScan]:
 
 
 def orthonormal(rotation: FloatArray, where: str) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return the nearest rotation to a matrix, with a note if that changes it by more than rounding.
+    """Return the rotation that is nearest to a matrix (3, 3) read from a file, with a note if they differ by more than rounding.
 
-    Raises InputError if it deviates by more than a hundredth, or is a reflection.
+    where: name of the file, for errors. Raises InputError if the matrix deviates by more than a hundredth, or is a reflection.
     """
     off = float(np.abs(rotation @ rotation.T - np.eye(3)).max()) if np.abs(rotation).max() < 2 else np.inf
     if off > 0.02 or np.linalg.det(rotation) < 0:

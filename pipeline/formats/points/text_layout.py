@@ -42,7 +42,10 @@ _ROWS = "one point in each line, x y z and other values, separated by spaces, ta
 
 @dataclass(frozen=True)
 class HeaderLine:
-    """A line before the points. number: from 1; text: without comment marks; comment: whether it had them."""
+    """A line before the points of a text file.
+
+    number: of the line, from 1; text: without comment marks; comment: whether it had them.
+    """
 
     number: int
     text: str
@@ -51,13 +54,13 @@ class HeaderLine:
 
 @dataclass(frozen=True)
 class TextLayout:
-    """How a file is written.
+    """How a text file of points is written.
 
     Attributes
     ----------
-    encoding : A codec of Python.
+    encoding : Name of its character encoding, as Python has it.
     header : Lines before the first point that are neither empty nor a count.
-    form : Form of the rows.
+    form : Separator, decimal mark and number of columns of the rows.
     stated : Number of points that a count in the header states; None without one.
     """
 
@@ -72,9 +75,10 @@ _BINARY_KINDS = {b"LASF": ("a LAS or LAZ file", ".laz"), b"ASTM-E57": ("an E57 f
 
 
 def encoding_of(path: Path) -> str:
-    """Detect the codec of a text: by its byte-order mark, UTF-16 by its null bytes, else UTF-8 or Western European.
+    """Detect the character encoding of a text file of points; return its name in Python.
 
-    Raises InputError for a file with other null bytes, which is not text.
+    It is told by a byte-order mark, UTF-16 by its null bytes, else UTF-8 or Western European. Raises InputError for a file with
+    other null bytes, which is not text.
     """
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
@@ -100,7 +104,7 @@ def encoding_of(path: Path) -> str:
 
 
 def layout_of(path: Path) -> TextLayout:
-    """Detect how a file of points is written, by its first lines.
+    """Detect how a text file of points is written, by its first lines: encoding, header, separator, decimal mark.
 
     Raises InputError if they contain no line of numbers, or thousands separators.
     """
@@ -133,9 +137,10 @@ def _check_kind(lines: Sequence[str], where: str) -> None:
 
 
 def form_of(sample: Sequence[str], first_line: int, where: str) -> RowForm:
-    """Detect how rows are written, from a sample of them.
+    """Detect the separator and decimal mark of a text file's rows of numbers.
 
-    first_line: number of the sample's first line in the file. Raises InputError for thousands separators.
+    sample: some of its rows. first_line: number of the first of them in the file. where: name of the file, for errors. Raises
+    InputError for thousands separators.
     """
     separator, decimal_comma = _separator(sample)
     rows = [split_row(line, separator) for line in sample]

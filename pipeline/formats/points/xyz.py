@@ -31,9 +31,9 @@ _COLOURS = ["red", "green", "blue"]
 
 
 def write_xyz(path: Path, cloud: PointCloud, *, decimals: int = 6) -> None:
-    """Write a line of column names (after `//`, as in CloudCompare) and a line for each point.
+    """Write a point cloud as text: a line of column names (after `//`, as in CloudCompare) and a line for each point.
 
-    Coordinates, m, get `decimals` decimals; other channels get as many digits as their value needs.
+    decimals: number of decimals of coordinates, m; other channels get as many digits as their value needs.
     """
     columns = dict(zip("xyz", cloud.points.T, strict=True))
     columns |= {"intensity": cloud.intensity, "gps_time": cloud.gps_time, **cloud.extra}
@@ -48,11 +48,11 @@ def write_xyz(path: Path, cloud: PointCloud, *, decimals: int = 6) -> None:
 
 
 def read_xyz(path: Path, columns: Sequence[str] = ()) -> PointCloud:
-    """Read the points of a text file.
+    """Read a point cloud from a text file.
 
-    Encoding, separator, decimal mark and column names are detected (`layout_of`, `named_columns`). Without names, a fourth column
-    is the intensity. Of more columns, three with whole numbers from 0 to 255 are colours, and a single remaining one is the
-    intensity; others are `column_4`, `column_5` ...
+    Encoding, separator, decimal mark and column names are detected (`layout_of`, `named_columns`). Without names, the first
+    three columns are x, y and z, and a fourth one is the intensity. Of more columns, three with whole numbers from 0 to 255 are
+    colours, and a single remaining one is the intensity; others are `column_4`, `column_5` ...
 
     Parameters
     ----------
@@ -61,8 +61,8 @@ def read_xyz(path: Path, columns: Sequence[str] = ()) -> PointCloud:
 
     Returns
     -------
-    The points in the file's unit. `stated_units` is set if the column names state it; `notes` say what was guessed, converted and
-    left out.
+    The points in the file's unit. `stated_units` is set if the column names state it; `notes` say what was guessed, converted
+    and left out.
 
     Raises
     ------

@@ -31,11 +31,11 @@ _TIES_AGREE = 0.01
 
 @dataclass(frozen=True)
 class Georeference:
-    """What a file states of its pixels.
+    """Where a GeoTIFF's pixels are, and in which units, as far as the file states it.
 
     Attributes
     ----------
-    grid : In metres; None if the file has no place.
+    grid : Position and size of the pixels, m; None if the file does not state them.
     flipped : Whether the first row of the file is the southernmost.
     linear_m, vertical_m : Length of the stated units of coordinates and heights, m; None if the file states none.
     """
@@ -47,7 +47,7 @@ class Georeference:
 
 
 def georeference(tags: dict[int, Any], shape: tuple[int, int], path: Path) -> Georeference:
-    """Read the georeference from TIFF tags.
+    """Read from the tags of a GeoTIFF where its pixels are.
 
     Parameters
     ----------
@@ -187,7 +187,10 @@ def _unit_of_code(keys: dict[int, int], path: Path) -> float | None:
 
 
 def scale_and_offset(tags: dict[int, Any], path: Path) -> tuple[float, float]:
-    """Return scale and offset of the stored values, from GDAL's metadata."""
+    """Return scale and offset by which the stored values of a GeoTIFF become heights: height = scale * value + offset.
+
+    tags: values of the first page's tags by their code, of which GDAL's metadata are read. path: the file, for errors.
+    """
     found = {"scale": 1.0, "offset": 0.0}
     text = tags.get(GDAL_METADATA)
     if not text or "role=" not in str(text):

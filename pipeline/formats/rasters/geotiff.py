@@ -70,15 +70,15 @@ _USER_DEFINED, _PIXEL_IS_AREA, _METRE = 32767, 1, 9001
 def write_geotiff(
     path: Path, raster: NDArray[np.floating], grid: Grid, *, description: str = "", with_mask: bool = False
 ) -> None:
-    """Write a raster as float32 GeoTIFF in the wall frame.
+    """Write a raster over the wall, such as a difference map, as float32 GeoTIFF.
 
-    The coordinate system is a local one in metres (GeoTIFF 1.1, user-defined model, pixel is area).
+    Its coordinate system is the wall frame, a local one in metres (GeoTIFF 1.1, user-defined model, pixel is area).
 
     Parameters
     ----------
     path : File to write.
     raster : (h, w) values, m; NaN without data.
-    grid : Place and scale of the pixels.
+    grid : Place and scale of the pixels, wall frame.
     description : ASCII text.
     with_mask : Whether to add a second page with a transparency mask, one bit for each pixel with data, as GDAL reads it.
     """
@@ -88,19 +88,19 @@ def write_geotiff(
 
 
 def wall_frame_wkt() -> str:
-    """Return the coordinate system of the GeoTIFFs as GDAL reads it: local, metres."""
+    """Return the wall frame as a coordinate system in WKT, local and in metres, as GDAL reads it from the GeoTIFFs."""
     axes = 'AXIS["Easting",EAST],AXIS["Northing",NORTH]'
     return f'LOCAL_CS["{_CITATION}",UNIT["metre",1,AUTHORITY["EPSG","{_METRE}"]],{axes}]'
 
 
 def write_tiff(path: Path, image: NDArray[np.floating], *, description: str = "") -> None:
-    """Write an image (h, w), such as a depth map, m, as float32 without a place in the world."""
+    """Write an image (h, w), such as a depth map, m, as float32 TIFF, without a place in the world. description: ASCII text."""
     _write(path, image, description, [(_NODATA, _ASCII, 0, "nan", False)])
 
 
 @dataclass(frozen=True)
 class Raster:
-    """A raster as a file contains it.
+    """A raster of one band, such as an elevation model, as a file contains it.
 
     Attributes
     ----------
@@ -115,9 +115,9 @@ class Raster:
 
 
 def read_raster(path: Path) -> Raster:
-    """Read a raster of one band with everything that the file states.
+    """Read a raster of one band, such as an elevation model, with everything that the file states of its pixels and units.
 
-    Raises InputError for a damaged file, one beyond `most_pixels`, or an unusable place or unit.
+    Raises InputError for a damaged file, one with too many pixels (`most_pixels`), or an unusable place or unit.
     """
     values, tags, notes = _measured(path)
     place = georeference(tags, (values.shape[0], values.shape[1]), path)
@@ -283,7 +283,7 @@ def _check_values(raster: NDArray[np.float32], path: Path) -> None:
 
 
 def most_pixels() -> int:
-    """Return the largest number of pixels that an image may have.
+    """Return the largest number of pixels that an image may have, so that a wrong file cannot fill the memory.
 
     It is MOST_PIXELS, or more if the limit in the environment variable READ_LIMIT names allows it, at four bytes a pixel.
     """

@@ -15,7 +15,7 @@ _NO_DATA = "181,181,181,255"
 
 @dataclass(frozen=True)
 class Stop:
-    """A fixed point of a colour scale: a value of the raster, its colour (#rrggbb) and its label in the legend."""
+    """A fixed point of a raster's colour scale: a value, its colour (#rrggbb) and its label in the legend."""
 
     value: float
     colour: str
@@ -23,9 +23,10 @@ class Stop:
 
 
 def write_style(raster: Path, stops: Sequence[Stop]) -> None:
-    """Write the style of a one-band raster beside it.
+    """Write a style file beside a one-band raster, with which QGIS colours it when it opens the raster.
 
-    Colours are interpolated between the stops, which are in rising order; values beyond them have the last colour.
+    raster: path of the raster. stops: fixed points of the colour scale, in rising order. Colours are interpolated between them;
+    values beyond them have the last colour.
     """
     low, high = (f"{stops[place].value:.9g}" for place in (0, -1))
     root = ElementTree.Element("qgis", {"version": "3.28.0", "styleCategories": "Symbology"})

@@ -83,12 +83,12 @@ class Coco:
     categories: list[Entry]
 
     def to_dict(self) -> dict[str, list[Entry]]:
-        """Return the content as pycocotools takes it."""
+        """Return the COCO data set as a dictionary of lists, as pycocotools takes it."""
         return {"images": self.images, "annotations": self.annotations, "categories": self.categories}
 
 
 def read_coco(path: Path, *, masks: bool = True) -> Coco:
-    """Read COCO annotations.
+    """Read and check annotations of blocks in images, a JSON file in COCO's format.
 
     Parameters
     ----------

@@ -22,11 +22,11 @@ _LONGEST_NUMBER = 7
 
 
 def run_lengths(segmentation: Any, height: int, width: int, where: str) -> dict[str, Any]:
-    """Return the mask of an image as {size, counts}, with `counts` as compressed by pycocotools.
+    """Return the mask of a COCO annotation as compressed run lengths, {size, counts}, with `counts` as of pycocotools.
 
     Parameters
     ----------
-    segmentation : Polygons or run lengths.
+    segmentation : The annotation's polygons or run lengths.
     height, width : Size of the image, px.
     where : Name of the annotation, for errors.
 

@@ -41,7 +41,7 @@ def write_geopackage(
     outlines: Sequence[Rings],
     wkt: str = "",
 ) -> None:
-    """Write one table of polygons with heights.
+    """Write polygons with heights and their attributes as a GeoPackage of one table, for a GIS.
 
     Parameters
     ----------
@@ -52,11 +52,11 @@ def write_geopackage(
     columns : mapping of str to type
         Names and types (int, float or str) of the table's columns.
     rows : sequence of mappings
-        A value, or None, for each column.
+        For each polygon, a value or None for each column.
     outlines : sequence of Rings
-        Of each row.
+        The polygon of each row.
     wkt : str
-        The coordinate system; empty where there is none.
+        The coordinate system of the polygons; empty where there is none.
     """
     kinds = {int: "INTEGER", float: "DOUBLE", str: "TEXT"}
     system = _OWN_SYSTEM if wkt else _UNDEFINED_CARTESIAN

@@ -16,7 +16,10 @@ _REMEDY = "make the run again"
 
 
 def read_surface(path: Path) -> TriangleMesh:
-    """Read a surface (PLY); raise InputError as `read_ply` does, and for an empty one or impossible coordinates."""
+    """Read a surface of a run from a PLY file.
+
+    Raises InputError as `read_ply` does, and for an empty one or impossible coordinates.
+    """
     mesh = read_ply(path)
     if not len(mesh.faces):
         raise InputError("has no triangles", where=str(path), remedy=_REMEDY)
@@ -25,7 +28,10 @@ def read_surface(path: Path) -> TriangleMesh:
 
 
 def read_own_points(path: Path) -> PointCloud:
-    """Read points (LAZ); raise InputError as `read_laz` does, and for an empty file or impossible coordinates."""
+    """Read the points of a run from a LAZ file.
+
+    Raises InputError as `read_laz` does, and for no points or impossible coordinates.
+    """
     from pipeline.formats.points.laz import read_laz  # laspy takes a fifth of a second to load
 
     cloud = read_laz(path)

@@ -166,9 +166,10 @@ class _Gap(_Record):
 
 
 def read_run(path: Path, remedy: str) -> dict[str, Any]:
-    """Read the record of a run, finished or not; missing lists of blocks become empty, and null values are left out.
+    """Read and check run.json, the record of a simulation, finished or not.
 
-    Raises InputError, which ends with `remedy`, if the file is not such a record.
+    Missing lists of blocks become empty, and null values are left out. remedy: what the user can do, the end of an error.
+    Raises InputError if the file is not such a record.
     """
     values = read_json(path, remedy=remedy)
     parse(_RunRecord, values, str(path))
@@ -189,7 +190,7 @@ def _without_null(values: dict[str, Any], *names: str) -> dict[str, Any]:
 
 
 def read_gap(path: Path) -> dict[str, Any]:
-    """Read the record of a diagnosis; raise InputError if the file is not one."""
+    """Read gap.json, the record of a diagnosis by `scarpsim gap`; raise InputError if the file is not one."""
     values = read_json(path, remedy="run scarpsim gap again")
     parse(_Gap, values, str(path))
     return dict(values)

@@ -23,33 +23,39 @@ RESUME = "continue it with simulate --resume"
 
 
 def epoch_folder(run: Path, number: int) -> Path:
-    """Return the folder of an epoch's own files in a run's folder."""
+    """Return the folder of an epoch's own files (points, surface) in a run's folder; epoch 0 is the reference."""
     return run / f"epoch_{number:03d}"
 
 
 @dataclass(frozen=True)
 class RunFiles:
-    """A run's folder; files are read and checked on request, with InputError if they are not a run's or were not written."""
+    """Access to the files of a simulation's run in its folder.
+
+    Files are read and checked on request, with InputError if they are not a run's or were not written.
+    """
 
     folder: Path
 
     @cached_property
     def record(self) -> dict[str, Any]:
-        """run.json, as `read_run` gives it."""
+        """Content of run.json, the record of the simulation, as `read_run` checks it."""
         return read_run(self.folder / RUN_FILE, RESUME)
 
     def surface(self, number: int, name: str = "surface") -> TriangleMesh:
-        """Read the measured surface of an epoch, wall frame, or, with the name `truth`, the true wall."""
+        """Read a surface of one of the run's epochs, wall frame, m.
+
+        number: of the epoch. name: "surface" for the measured one, "truth" for the true wall.
+        """
         return read_surface(self._written(number, f"{name}.ply"))
 
     def points(self, number: int) -> PointCloud:
-        """Read the sensor's points of an epoch, wall frame."""
+        """Read the points that the sensor measured in one of the run's epochs, wall frame, m. number: of the epoch."""
         return read_own_points(self._written(number, "points.laz"))
 
     def survey_points(self, number: int) -> tuple[PointCloud, str]:
-        """Read the points of an epoch, and the WKT of their coordinate system, "" if the config names none.
+        """Read the points of one of the run's epochs, and the WKT of their coordinate system, "" if the config names none.
 
-        They are in the wall's own coordinates if the run wrote those, else in the wall frame.
+        number: of the epoch. The points are in the wall's own coordinates if the run wrote those, else in the wall frame; m.
         """
         world = epoch_folder(self.folder, number) / "points_world.laz"
         if not world.is_file():
@@ -58,7 +64,10 @@ class RunFiles:
         return read_own_points(world), wkt_of(crs, "products.crs") if crs else ""
 
     def difference(self, number: int) -> tuple[NDArray[np.float32], Grid]:
-        """Read the (h, w) difference map of an epoch, reference minus epoch, m, and its grid."""
+        """Read the difference map of one of the run's epochs and the grid of its pixels.
+
+        number: of the epoch. The map is (h, w), reference minus epoch, m; NaN without data.
+        """
         return read_geotiff(self.folder / f"difference_{number:03d}.tif")
 
     def _written(self, number: int, name: str) -> Path:
