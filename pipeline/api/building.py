@@ -45,12 +45,12 @@ _FEWEST_FOR_NORMALS = 3
 
 
 def make_wall(seed: int = 1, **keys: Any) -> Mesh:
-    """Make a procedural wall.
+    """Generate an artificial rock wall as a mesh, to simulate on.
 
     Parameters
     ----------
     seed : int
-        Seed of the wall's shape.
+        Seed of the random shape. The same seed gives the same wall.
     **keys
         Keys of a config's `wall` section: style="glendale", width_m, height_m, resolution_m, ...
 
@@ -90,16 +90,17 @@ def stage(
     model: Any = None,
     **overrides: Any,
 ) -> SensorSite:
-    """Place a sensor in front of a wall and transform the wall into the wall frame.
+    """Place a sensor in front of a wall and transform the wall into the wall frame, ready for `observe`.
 
     Parameters
     ----------
     wall : TriangleMesh, optional
         The wall in the world frame, m. Default: the config's wall.
     sensor : "tls" or "stereo", optional
-        The sensor. May be omitted if the config has only one.
+        The sensor: laser scanner or stereo pair. May be omitted if the config has only one.
     config, seed, model, **overrides
-        The config, which also places the sensor; see `configure`.
+        The config (file, name or values), a seed and a sensor model in place of the config's, and changed keys; they are
+        treated as by `configure`. The config also says where the sensor stands.
 
     Returns
     -------
@@ -154,7 +155,7 @@ def make_blocks(
 
 
 def place_blocks(mesh: TriangleMesh, seed: int = 1, **keys: Any) -> solids.Blocks:
-    """Draw blocks at random positions on a wall.
+    """Draw blocks at random positions on a wall, to be removed from it by `carve`.
 
     Parameters
     ----------
@@ -168,19 +169,22 @@ def place_blocks(mesh: TriangleMesh, seed: int = 1, **keys: Any) -> solids.Block
     Returns
     -------
     Blocks
-        The blocks, wall frame.
+        The blocks as closed meshes, wall frame, m.
     """
     config = parse(solids.RockfallConfig, keys, "place_blocks")
     return solids.place_blocks(config, mesh, KeyedRandom(seed).child("blocks"))
 
 
 def carve(mesh: TriangleMesh, blocks: solids.Blocks) -> carving.Carved:
-    """Remove blocks from a wall.
+    """Remove blocks from a wall, as rockfall does, so that each leaves a niche.
+
+    mesh: the wall, m. blocks: closed meshes in the wall's frame, as `make_blocks` or `place_blocks` returns them.
 
     Returns
     -------
     Carved
-        `.mesh`, whose `face_block` labels the faces of each niche, and `.removed_volume_m3` (k,).
+        `.mesh`, whose `face_block` labels the faces of each niche, and `.removed_volume_m3` (k,), the volume that each of the k
+        blocks took from the wall.
     """
     return carving.carve(mesh, blocks)
 

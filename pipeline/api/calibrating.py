@@ -100,7 +100,10 @@ class Calibration:
 
     @property
     def systematic(self) -> xarray.DataArray:
-        """Mean of the measured difference maps, (y, x), m."""
+        """Mean of the measured difference maps, (y, x), m.
+
+        It contains what all epochs share: systematic errors of the sensor, and errors of the reference.
+        """
         return data_array(self.figures.systematic, self.figures.inputs.grid, "systematic", "mean of the measured maps")
 
     @property
@@ -113,11 +116,18 @@ class Calibration:
         return summary(self.figures)
 
     def plot(self, kind: str = "windows") -> Picture:
-        """Return a figure of the report: windows, measured, systematic, distribution, statistics or epochs."""
+        """Return a figure of the report by its name.
+
+        kind: windows (the last measured map and a simulated one in the compared windows), measured (the last measured map),
+        systematic
+        (the mean of all), distribution (of the differences), statistics (measured over expected) or epochs. Raises InputError
+        for another
+        name.
+        """
         return Picture(pick({name: png for name, _, png in pictures(self.figures, None)}, kind, "plot"))
 
     def write(self, out: Path | str) -> Path:
-        """Write the folder that `scarpsim calibrate` writes; return its report.html.
+        """Write the report and files that `scarpsim calibrate` writes to the folder `out`; return the path of its report.html.
 
         Raises InputError if the folder is in use.
         """

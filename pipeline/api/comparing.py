@@ -76,7 +76,7 @@ def compare(
 
 @dataclass(frozen=True, repr=False)
 class Comparison:
-    """Result of `compare`.
+    """Result of `compare`: several sensors, each observing the same wall with the same blocks.
 
     Attributes
     ----------
@@ -125,12 +125,20 @@ class Comparison:
         return summary(self.figures)
 
     def plot(self, kind: str = "maps") -> Picture:
-        """Return a figure of the report: maps, level_of_detection, noise, by_covariate, detection or size_and_depth."""
+        """Return a figure of the report by its name.
+
+        kind: maps (difference maps), level_of_detection, noise, by_covariate (noise over incidence angle, range and the like),
+        detection (share of blocks detected over size and depth, and errors of their volumes) or size_and_depth (that share as a
+        table).
+        """
         drawn = pictures(self.figures)
         return Picture(pick({name.removesuffix(".png"): png for name, png in drawn.items()}, kind, "plot"))
 
     def write(self, out: Path | str) -> Path:
-        """Write the folder that `scarpsim compare` writes; return its report.html. Raises InputError if the folder is in use."""
+        """Write the report and files that `scarpsim compare` writes to the folder `out`; return the path of its report.html.
+
+        Raises InputError if the folder is in use.
+        """
         return write_comparison(Path(out), self.figures)
 
     def __repr__(self) -> str:

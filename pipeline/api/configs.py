@@ -73,7 +73,10 @@ def check_sensor(sensor: str | None) -> None:
 
 
 def one_sensor(config: SimulationConfig, sensor: SensorName | None) -> SensorName:
-    """Return the sensor that was asked for, or the only one that the config has a model of."""
+    """Return the sensor that was asked for or, if that is None, the only one that the config has a model of.
+
+    Raises InputError if none was asked for and the config has both.
+    """
     if sensor is not None:
         return sensor
     names = config.sensor_names()
@@ -85,7 +88,10 @@ def one_sensor(config: SimulationConfig, sensor: SensorName | None) -> SensorNam
 
 
 def keywords(values: Mapping[str, Any]) -> list[Override]:
-    """Return keyword arguments as config overrides; two underscores in a keyword stand for the dot."""
+    """Return keyword arguments as overrides of config keys, for calls from Python.
+
+    values: new values by keyword; two underscores in a keyword stand for the dot, as in rockfall__count=5.
+    """
     return [Override(tuple(name.split("__")), plain(value), f"{name}={value!r:.80}") for name, value in values.items()]
 
 
@@ -103,7 +109,10 @@ def plain(value: Any) -> Any:
 
 
 def paths(values: Any) -> list[Path]:
-    """Return one path or several as a list; an object with a `folder`, such as a run, stands for its folder."""
+    """Return a caller's input as a list of paths.
+
+    values: one path, an object with a `folder` (such as a run, which stands for its folder), or a list of these.
+    """
     several: Sequence[Any] = values if isinstance(values, list | tuple) else [values]
     return [Path(getattr(each, "folder", each)) for each in several]
 

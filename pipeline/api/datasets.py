@@ -73,7 +73,7 @@ def make_dataset(
 
 @dataclass(frozen=True, repr=False)
 class DataSet:
-    """A data set on disk.
+    """A data set of annotated difference map tiles on disk, to train and test detectors with.
 
     Attributes
     ----------
@@ -94,7 +94,11 @@ class DataSet:
         return read_dataset_file(self.folder)
 
     def tiles(self, split: str = "train", **filters: str) -> Tiles:
-        """Return the tiles of a split as arrays, optionally only those of one sensor, wall, noise or size_class."""
+        """Return the tiles of a split, to be read one by one as arrays.
+
+        split: train, val or test. filters: values of sensor, wall, noise or size_class that a tile must have, such as
+        sensor="stereo". Raises InputError for an unknown filter, or if no tile matches.
+        """
         return Tiles(self.folder / pick({name: name for name in self.splits}, split, str(self.folder)), **filters)
 
     @property
@@ -110,7 +114,10 @@ class DataSet:
         return frame(rows)
 
     def plot(self, kind: str | None = None) -> Picture:
-        """Return a figure of the set's data card, by name. Default: the first."""
+        """Return a figure of the set's README.md (its data card), such as its block sizes.
+
+        kind: name of the figure; by default the first. Raises InputError, with the names, if there is no such figure.
+        """
         drawn = {path.stem: path for path in sorted((self.folder / "card").glob("*.png"))}
         return Picture(pick(drawn, kind, str(self.folder)).read_bytes())
 

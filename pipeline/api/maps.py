@@ -66,14 +66,16 @@ def data_array(
 
 
 def dataset(rasters: Mapping[str, xarray.DataArray]) -> xarray.Dataset:
-    """Combine rasters of one grid into a Dataset, by name."""
+    """Combine rasters of one grid into a Dataset. rasters: (y, x) arrays by the name of their variable."""
     return library("xarray").Dataset(dict(rasters))
 
 
 def raster_of(array: Any, where: str) -> tuple[NDArray[np.float32], Grid]:
     """Return the values of a DataArray, (h, w) float32 with row 0 at the largest y, and the grid of its coordinates.
 
-    Raises InputError if it has other dimensions than y and x, or pixels that are not square.
+    array: a map with the dimensions y and x, whose coordinates are pixel centres in the wall frame, m. where: what errors
+    should
+    call it. Raises InputError if it has other dimensions, fewer than 2 x 2 pixels, or pixels that are not square.
     """
     if set(array.dims) != {"y", "x"}:
         raise InputError(

@@ -219,12 +219,23 @@ class Diagnosis:
 
     @property
     def verdict(self) -> str:
-        """One of named, several, ambiguous, unknown, no_gap and insufficient_data."""
+        """The result in a word.
+
+        One of named (one effect explains the disagreement), several (more than one does), ambiguous (one of some effects that
+        the data
+        cannot tell apart), unknown (no known effect explains it), no_gap (sensor model and measurement agree) and
+        insufficient_data.
+        """
         return self.found.verdict
 
     @property
     def effects(self) -> pandas.DataFrame:
-        """One row per parameter of each named effect: value, std, kind, indistinguishable effects, p_value; SI units."""
+        """Effects that explain why measurement and sensor model disagree.
+
+        One row per parameter of each effect, SI units. The columns include the fitted value, its standard deviation (std), the
+        kind of
+        effect, the effects that the data cannot distinguish from it, and the p-value of the effect.
+        """
         rows = []
         for each in self.found.effects:
             held = each.to_dict()
@@ -249,9 +260,11 @@ class Diagnosis:
 
     @property
     def residuals(self) -> Points:
-        """The compared points, wall frame, with their residuals.
+        """The compared points, wall frame, with their residuals: measured minus predicted depth.
 
-        The channels are before_m and after_m (measured minus predicted depth without and with the named effects) and held_out.
+        The channels are before_m and after_m (without and with the named effects in the prediction) and held_out (whether the
+        point
+        was kept from the fit, for validation).
         """
         found, cloud = self.found, self.measurement.held.cloud
         depth, index = found.residuals.depth_m, found.residuals.index
@@ -265,7 +278,11 @@ class Diagnosis:
 
     @property
     def gap(self) -> dict[str, Any] | None:
-        """The gap on validation points: before, after, floor, unit, closed, ... None if it was not measured."""
+        """How much worse the measurement fits the sensor model than it should, on points kept from the fit.
+
+        The keys include before and after (without and with the named effects), floor (what data simulated from the model itself
+        reach), unit, and closed (how much of the gap the effects explain). None if it was not measured.
+        """
         return self.found.gap.to_dict() if self.found.gap else None
 
     def to_dict(self) -> dict[str, Any]:
@@ -301,7 +318,7 @@ class Diagnosis:
         return drawn
 
     def write(self, out: Path | str) -> Path:
-        """Write the folder that `scarpsim gap` writes; return its report.html."""
+        """Write the report and files that `scarpsim gap` writes to the folder `out`; return the path of its report.html."""
         return report.write_report(Path(out), self.found, self.measurement.held)
 
     def __repr__(self) -> str:

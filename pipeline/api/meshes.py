@@ -18,10 +18,12 @@ from scene.geometry.mesh import TriangleMesh
 class Mesh(TriangleMesh):
     """Triangles with shared vertices, counter-clockwise as seen from the sensor's side.
 
+    The vertices are (n, 3) and the faces (m, 3).
+
     Attributes
     ----------
     vertices : (n, 3) float64
-        Coordinates, m.
+        Coordinates, m, in the frame that the function which made the mesh states.
     faces : (m, 3) int32
         Indices of the vertices.
     vertex_albedo : (n,) float32 or None
@@ -32,7 +34,10 @@ class Mesh(TriangleMesh):
 
     @classmethod
     def of(cls, mesh: TriangleMesh) -> Self:
-        """Return another kind of triangle mesh as a `Mesh`, without copying."""
+        """Return any triangle mesh of the simulator as a `Mesh`, which can be saved, plotted and converted.
+
+        The arrays are not copied.
+        """
         return cls(mesh.vertices, mesh.faces, mesh.vertex_albedo, mesh.vertex_block, mesh.face_block)
 
     @classmethod

@@ -51,7 +51,11 @@ class Picture:
 
 
 def pick(pictures: Mapping[str, Any], kind: str | None, where: str) -> Any:
-    """Return the picture called `kind`, or the first if `kind` is None; raise InputError with the available names otherwise."""
+    """Return the picture called `kind`, or the first if `kind` is None.
+
+    pictures: pictures by name. where: what errors should call the call or its result. Raises InputError, with the available
+    names, if there is none.
+    """
     if not pictures:
         raise InputError(
             "the result has no pictures to plot", where=where, remedy="make the result again; its report needs pictures too"
@@ -66,7 +70,10 @@ def pick(pictures: Mapping[str, Any], kind: str | None, where: str) -> Any:
 
 
 def html_table(title: str, rows: Mapping[str, Any], picture: Picture | None = None) -> str:
-    """Return HTML of a heading, a table of two columns and a small picture, for `_repr_html_`."""
+    """Return HTML that a notebook shows for a result (`_repr_html_`).
+
+    title: heading. rows: a table of two columns, values by their label. picture: a figure that is shown small below it.
+    """
     lines = "".join(
         f"<tr><th style='text-align:left'>{_text(name)}</th><td>{_text(value)}</td></tr>" for name, value in rows.items()
     )

@@ -61,7 +61,7 @@ def plan(
 
 @dataclass(frozen=True, repr=False)
 class SensorPlan:
-    """Predicted performance of one sensor.
+    """Predicted performance of one sensor in front of a wall, before anything is measured.
 
     Attributes
     ----------
@@ -99,7 +99,10 @@ class SensorPlan:
         return summary(self.promise)
 
     def plot(self, kind: str = "smallest_block_m") -> Picture:
-        """Return a figure of the map called `kind`."""
+        """Return a figure of one map.
+
+        kind: name of the map, as in `maps`: smallest_block_m, normal_sigma_m, ... Raises InputError for another name.
+        """
         chosen = pick({each.name: each for each in self.promise.maps}, kind, "plot")
         return Picture(map_picture(self.promise, chosen))
 
@@ -112,7 +115,10 @@ class SensorPlan:
 
 @dataclass(frozen=True, repr=False)
 class Plans:
-    """The plans of a config's sensors; with several stations, first the plan of all together, then one of each.
+    """Result of `plan`: the predicted performance of each sensor of a config.
+
+    If a laser scanner has several stations (places where it stands), the first plan is of all together, and one of each
+    follows.
 
     Attributes
     ----------
@@ -139,11 +145,17 @@ class Plans:
         return "\n\n".join(each.summary() for each in self.plans)
 
     def plot(self, kind: str = "smallest_block_m") -> Picture:
-        """Return a figure of the first plan's map called `kind`."""
+        """Return a figure of one map of the first plan.
+
+        kind: name of the map: smallest_block_m, normal_sigma_m, ... Raises InputError for another name.
+        """
         return self[0].plot(kind)
 
     def write(self, out: Path | str) -> Path:
-        """Write the folder that `scarpsim inspect` writes; return its report.html. Raises InputError if the folder is in use."""
+        """Write the report and maps that `scarpsim inspect` writes to the folder `out`; return the path of its report.html.
+
+        Raises InputError if the folder is in use.
+        """
         return write_plans(Path(out), self.config, [each.promise for each in self.plans])
 
     def __repr__(self) -> str:

@@ -210,7 +210,12 @@ class Epoch:
         return epoch_folder(self.run.folder, self.number)
 
     def file(self, kind: str, suffix: str) -> Path:
-        """Return the path of one of the epoch's files in the run's folder; raise InputError if it does not exist."""
+        """Return the path of one of the epoch's files in the run's folder, such as difference_002.tif.
+
+        kind: first part of the file name, such as "difference". suffix: its end, such as ".tif". Raises InputError if there is
+        no
+        such file.
+        """
         path = self.run.folder / f"{kind}_{self.number:03d}{suffix}"
         if not path.is_file():
             kinds = [name for name in PICTURES if (self.run.folder / f"{name}_{self.number:03d}{suffix}").is_file()]
@@ -224,7 +229,7 @@ class Epoch:
 
     @property
     def pictured(self) -> bool:
-        """Whether it has figures: of a series, only the epochs have in which rocks fell."""
+        """Whether the epoch has figures. In a series of many epochs only those have figures in which rocks fell."""
         return (self.run.folder / f"difference_{self.number:03d}.png").is_file()
 
     @property
@@ -240,7 +245,7 @@ class Epoch:
 
     @property
     def m3c2(self) -> xarray.DataArray:
-        """Map of M3C2 distances, (y, x), m, if the run's config asked for them."""
+        """Map of M3C2 distances (changes along the surface's normal), (y, x), m, if the run's config asked for them."""
         values, grid = read_geotiff(self.file("m3c2", ".tif"))
         return data_array(values, grid, "m3c2", "M3C2 distance; missing rock positive", frame=self.run.frame)
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def frame(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> pandas.DataFrame:
-    """Return a DataFrame of rows; `columns` gives their order, also when there are no rows."""
+    """Return a DataFrame of rows. rows: values by column. columns: their order, needed for a table without rows."""
     return library("pandas").DataFrame(list(rows), columns=columns)
 
 
@@ -38,11 +38,18 @@ def boxes(
 
 
 def spread_out(name: str, values: Sequence[float], axes: str = "xyz", unit: str = "_m") -> dict[str, float]:
-    """Return a vector as one column per axis: position_x_m, position_y_m, ..."""
+    """Return a vector as one table column per axis, such as position_x_m, position_y_m and position_z_m.
+
+    name: first part of the columns' names. values: the components, in the order of `axes`. axes: a letter for each component.
+    unit: end of the columns' names.
+    """
     return {f"{name}_{axis}{unit}": value for axis, value in zip(axes, values, strict=True)}
 
 
 def frame_of(columns: Mapping[str, Any], index: Sequence[str], name: str) -> pandas.DataFrame:
-    """Return a DataFrame of columns with an index called `name`."""
+    """Return a DataFrame of columns.
+
+    columns: values by the column's name. index: label of each row. name: name of the index.
+    """
     pandas = library("pandas")
     return pandas.DataFrame(dict(columns), index=pandas.Index(index, name=name))

@@ -29,7 +29,7 @@ KIND_CATEGORIES = [
 
 
 class AnnotationConfig(Config):
-    """Which blocks are annotated."""
+    """Which fallen blocks get an annotation in images of a difference map, and which of them training ignores."""
 
     minimum_area_px: int = Field(4, ge=1, description="blocks that cover fewer pixels of an image are left out")
     ignore_below: float = Field(
@@ -42,14 +42,14 @@ class AnnotationConfig(Config):
 
 @dataclass(frozen=True)
 class LabelledImage:
-    """An image of the data set.
+    """A difference map or a tile of it, with the block at each pixel, to be annotated in COCO's format.
 
     Attributes
     ----------
     file_name : str
         Path relative to the annotations' folder.
     block : (h, w) int32 array
-        Label of each pixel: the block's label in blocks.json, or WALL.
+        Label of each pixel: the block's label in blocks.json, or 0 where there is none.
     grid : Grid
         Position of the image on the wall.
     epoch : int
@@ -67,7 +67,7 @@ class LabelledImage:
 
 
 def coco(images: Iterable[LabelledImage], config: AnnotationConfig, info: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Make the data set in COCO's format, with JSON types only. Ids of images and annotations count from 1.
+    """Make the content of annotations.json in COCO's format, to train and score detectors with.
 
     Beyond COCO's own keys, an image has `epoch`, `row`, `column` and its grid (`x_min_m`, `y_max_m`, `gsd_m`, wall frame), and
     an annotation has the `block` that it shows.
@@ -80,6 +80,11 @@ def coco(images: Iterable[LabelledImage], config: AnnotationConfig, info: dict[s
         Which blocks are annotated.
     info : dict, optional
         Further entries of COCO's `info`.
+
+    Returns
+    -------
+    dict
+        JSON types only. Ids of images and annotations count from 1.
     """
     described: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
@@ -97,7 +102,12 @@ def coco(images: Iterable[LabelledImage], config: AnnotationConfig, info: dict[s
 
 
 def by_kind(data_set: dict[str, Any], rockfalls: int) -> dict[str, Any]:
-    """Turn the block labels of a series into categories: of n rockfalls, kind k (from 0) of rockfall e has the label k n + e."""
+    """Give the annotations of a time series a category for each kind of change: missing, moved and deposited rock.
+
+    data_set: COCO annotations of `coco`. rockfalls: number of rockfalls n in the series. The block labels in `data_set` code
+    both:
+    kind k (from 0) of rockfall e has the label k n + e. In the returned copy, `block` is the rockfall's number e alone.
+    """
     annotations = [
         {**each, "category_id": (each["block"] - 1) // rockfalls + 1, "block": (each["block"] - 1) % rockfalls + 1}
         for each in data_set["annotations"]
@@ -106,7 +116,10 @@ def by_kind(data_set: dict[str, Any], rockfalls: int) -> dict[str, Any]:
 
 
 def merge(data_sets: Iterable[dict[str, Any]], info: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Merge several data sets of `coco` into one, with ids that count from 1 throughout; categories are those of the last."""
+    """Merge several results of `coco` into one, with ids that count from 1 throughout.
+
+    data_sets: the results, of which the last gives the categories. info: further entries of COCO's `info`.
+    """
     result = coco([], AnnotationConfig(), info)
     for data_set in data_sets:
         result["categories"] = data_set["categories"]
@@ -119,7 +132,10 @@ def merge(data_sets: Iterable[dict[str, Any]], info: dict[str, Any] | None = Non
 
 
 def block_annotations(block: IntArray, config: AnnotationConfig) -> Iterator[dict[str, Any]]:
-    """Yield one annotation, without ids, for each block that covers enough pixels of the labels (h, w), in ascending order."""
+    """Yield a COCO annotation, without ids, for each block that covers enough pixels of an image, by ascending label.
+
+    block: (h, w) label of the block at each pixel, 0 for none. config: says how many pixels are enough.
+    """
     from scipy import ndimage
 
     for label, box in enumerate(ndimage.find_objects(block), start=1):

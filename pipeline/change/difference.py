@@ -34,17 +34,17 @@ class DifferenceConfig(Config):
 
 @dataclass(frozen=True)
 class SurfaceRaster:
-    """A surface seen from the sensors' side along the wall's normal.
+    """Heights of a surface seen from the sensors' side along the wall's normal, as a raster.
 
     Attributes
     ----------
     grid : Grid
         Position of the pixels.
     heights : (h, w) float32 array
-        z of the highest surface at each pixel centre, m; NaN where there is none.
+        z of the highest surface at each pixel centre, wall frame, m; NaN where there is none.
     block : (h, w) int32 array
-        Block label of the face seen there (of the nearest vertex, for a surface with labels only at its vertices); WALL where
-        there is none.
+        Label of the fallen block whose niche is seen there (the label of the face or, for a surface with labels only at its
+        vertices, of the nearest vertex); 0 where there is none.
     """
 
     grid: Grid
@@ -53,9 +53,11 @@ class SurfaceRaster:
 
 
 def raster_grid(bounds: FloatArray, config: DifferenceConfig) -> Grid:
-    """Return the grid of all pixels inside the reference surface's bounding box (2, 3), wall frame, m.
+    """Return the grid of pixels for difference maps of a wall: all that lie inside the reference surface's bounding box.
 
-    Raises InputError if a pixel would be larger than the surface, or if the rasters would not fit into the free memory.
+    bounds: (2, 3) smallest and largest coordinates of the box, wall frame, m. config: gives the size of a pixel. Raises
+    InputError
+    if a pixel would be larger than the surface, or if the rasters would not fit into the free memory.
     """
     width, height = (float(extent) for extent in (bounds[1] - bounds[0])[:2])
     available = psutil.virtual_memory().available
@@ -82,9 +84,9 @@ def raster_grid(bounds: FloatArray, config: DifferenceConfig) -> Grid:
 
 
 def surface_raster(mesh: TriangleMesh, grid: Grid) -> SurfaceRaster:
-    """Rasterise `mesh` (wall frame) by looking along -z at every pixel centre of `grid`.
+    """Rasterise a mesh by looking along -z at every pixel centre, to compare it with another epoch.
 
-    Labels are its `face_block`, else `vertex_block`.
+    mesh: wall frame, m; the block labels of its faces, or else of its vertices, are rasterised too. grid: the pixels.
     """
     dr.flush_malloc_cache()  # frees the observation's memory: rasterising the surface is the peak of an epoch
     flat = FlatMesh(mesh, grid)
@@ -101,7 +103,10 @@ def surface_raster(mesh: TriangleMesh, grid: Grid) -> SurfaceRaster:
 
 
 def cast_raster(caster: RayCaster, grid: Grid) -> SurfaceRaster:
-    """Rasterise a mesh (wall frame) that is already prepared for ray casting, as `surface_raster` does."""
+    """Rasterise the heights and block labels of a mesh that is already prepared for ray casting, as `surface_raster` does.
+
+    caster: the mesh in the wall frame, m. grid: the pixels.
+    """
     hits, point = caster.look_down(grid)
     block = hits.block
     if caster.mesh.face_block is None and caster.mesh.vertex_block is not None:
@@ -117,9 +122,9 @@ def _as_raster(grid: Grid, valid: mi.Bool, z: mi.Float64, block: mi.Int32) -> Su
 
 
 def difference(reference: SurfaceRaster, epoch: SurfaceRaster) -> NDArray[np.float32]:
-    """Return reference minus epoch in z, (h, w), m.
+    """Return the difference map of two epochs: reference minus epoch in z, (h, w), wall frame, m.
 
-    It is positive where rock is missing, negative where it was added, and NaN without data.
+    It is positive where rock is missing, negative where it was added, and NaN without data. Both rasters have the same grid.
     """
     if reference.grid != epoch.grid:
         raise InputError(
@@ -132,7 +137,11 @@ def difference(reference: SurfaceRaster, epoch: SurfaceRaster) -> NDArray[np.flo
 
 @dataclass(frozen=True)
 class DifferenceStatistics:
-    """Statistics of `count` differences, m; NaN if there are none. rmse is about zero, nmad = 1.4826 median(|d - median|)."""
+    """Statistics of the differences in a difference map, m; NaN if there are none.
+
+    `count` is the number of differences, `rmse` is about zero, and `nmad` is 1.4826 median(|d - median|), a robust standard
+    deviation.
+    """
 
     count: int
     median: float
@@ -172,14 +181,17 @@ def statistics(values: NDArray[np.floating]) -> DifferenceStatistics:
 
 @dataclass(frozen=True)
 class BlockStatistics:
-    """Statistics of a difference map inside the niches of the blocks and outside of them."""
+    """Statistics of a difference map inside the niches of fallen blocks and outside of them, where only noise is expected."""
 
     inside: DifferenceStatistics
     outside: DifferenceStatistics
 
 
 def block_statistics(values: NDArray[np.floating], block: IntArray) -> BlockStatistics:
-    """Compute the statistics of a difference map (h, w), m, inside and outside the blocks by the epoch's labels (h, w)."""
+    """Compute the statistics of a difference map inside the niches of fallen blocks and outside of them.
+
+    values: (h, w) differences, m; NaN is ignored. block: (h, w) label of the block at each pixel, 0 outside.
+    """
     return BlockStatistics(statistics(values[block != WALL]), statistics(values[block == WALL]))
 
 

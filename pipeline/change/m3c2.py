@@ -34,7 +34,7 @@ _LEAST_POINTS = 2
 
 
 class M3c2Config(Config):
-    """M3C2 by py4dgeo (extra `m3c2`)."""
+    """Settings of M3C2, a comparison of point clouds along local normals (Lague et al. 2013), by py4dgeo (extra `m3c2`)."""
 
     core_step_px: int = Field(5, ge=1, description="distance between core points, in pixels of the difference map")
     normal_radius_m: float = Field(0.25, gt=0, description="radius of the neighbourhood in which normals are fitted")
@@ -49,16 +49,16 @@ class M3c2Config(Config):
 
 @dataclass(frozen=True)
 class M3c2Map:
-    """M3C2 distances at core points, as rasters over the wall's plane.
+    """M3C2 distances (changes between two point clouds along normals) at core points, as rasters over the wall's plane.
 
     Attributes
     ----------
     grid : Grid
-        One pixel per core point.
+        One pixel per core point, the point at which a distance is computed.
     distance, level : (h, w) float32 arrays
         Distance and its level of detection, m; NaN without enough points.
     block : (h, w) array
-        Labels of the difference map at the core points.
+        Labels of the fallen blocks at the core points, 0 for none.
     points : (n, 3) array
         The core points, wall frame, m.
     place : (n,) array
@@ -89,24 +89,29 @@ class M3c2Map:
 
 
 def core_grid(grid: Grid, step: int) -> tuple[Grid, slice]:
-    """Return the grid of core points, and a slice that selects the middle one of every `step` rows or columns of `grid`."""
+    """Return the coarser grid of M3C2's core points, one in the middle of every `step` x `step` pixels of `grid`.
+
+    Also returns the slice that selects these middle rows and, likewise, columns from a raster on `grid`.
+    """
     width, height = (max(size // step, 1) for size in (grid.width, grid.height))
     return replace(grid, gsd=grid.gsd * step, width=width, height=height), slice(step // 2, None, step)
 
 
 def m3c2(reference: FloatArray, epoch: FloatArray, raster: SurfaceRaster, block: IntArray, config: M3c2Config) -> M3c2Map:
-    """Compute distances from the reference's points to the epoch's. The result does not depend on the number of threads.
+    """Compute M3C2 distances from the reference's points to the epoch's.
+
+    The result does not depend on the number of threads.
 
     Parameters
     ----------
     reference, epoch : (n, 3) and (m, 3) arrays
         Registered points, wall frame, m.
     raster : SurfaceRaster
-        Raster of the reference; its pixels give the core points.
+        Raster of the reference; every few of its pixels give a core point, at which a distance is computed.
     block : (h, w) array
-        The epoch's labels at these pixels.
+        Label of the epoch's fallen block at each pixel of `raster`, 0 for none.
     config : M3c2Config
-        Radii and limits.
+        Distance of the core points, radii and limits.
 
     Raises
     ------

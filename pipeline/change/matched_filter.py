@@ -38,20 +38,25 @@ _LEAST_FREE = 0.5
 def signal_to_noise(
     difference: NDArray[np.float32], block: IntArray, change: NDArray[np.float32], count: int
 ) -> NDArray[np.float64]:
-    """Compute the matched filter's signal-to-noise ratio rho (count,) of each block in a difference map.
+    """Compute how well each niche stands out from the noise of a difference map.
 
-    It is NaN if it cannot be determined, and 0 for a block that is not in the map.
+    The measure is the signal-to-noise ratio of a filter that is matched to the niche's true shape.
 
     Parameters
     ----------
     difference : (h, w) array
-        Difference map, m.
+        Difference map, m; NaN without data.
     block : (h, w) array
-        Block labels.
+        Labels of the fallen blocks, from 1; 0 outside.
     change : (h, w) array
         True loss of the wall at each pixel, m.
     count : int
         Number of blocks.
+
+    Returns
+    -------
+    (count,) array
+        The ratio of each block: NaN if it cannot be determined, 0 for a block that is not in the map.
     """
     from scipy import ndimage
 
@@ -104,9 +109,11 @@ class _Spectra:
 
 
 def noise_spectrum(noise: NDArray[np.float32], side: int) -> FloatArray | None:
-    """Estimate the mean |N(k)|^2 (side, side), m2, on windows of `side` px of a map (h, w) of noise, which is NaN elsewhere.
+    """Estimate the power spectrum of a map's noise, by Welch's method of overlapping windows.
 
-    Returns None if no window has enough data.
+    noise: (h, w) values of the map outside of blocks, m; NaN elsewhere. side: side of a window, px. Returns the mean |N(k)|^2
+    of the
+    windows' discrete Fourier transforms, (side, side), m2; None if no window has enough data.
     """
     from scipy import ndimage
 
@@ -127,18 +134,18 @@ def noise_spectrum(noise: NDArray[np.float32], side: int) -> FloatArray | None:
 def true_change(
     wall: RayCaster, carved: RayCaster, block: IntArray, grid: Grid, shift_m: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Return the true loss (h, w) of the wall at the pixels with a label, m; 0 elsewhere, NaN where there is no wall.
+    """Return the true loss of the wall at the pixels of the niches, (h, w), m; 0 outside niches, NaN where there is no wall.
 
     Parameters
     ----------
     wall, carved : RayCaster
-        The wall before and after.
+        The wall before and after the blocks fell, wall frame.
     block : (h, w) array
-        Block labels of the map.
+        Labels of the fallen blocks in the map, 0 outside.
     grid : Grid
-        Its pixels.
+        The map's pixels.
     shift_m : (h, w, 2) array
-        Displacement of the map in x and y, m.
+        By how much the map is displaced from the true wall in x and y at each pixel, m.
     """
     row, column = np.nonzero(block != WALL)
     result = np.zeros(grid.shape, dtype=np.float32)

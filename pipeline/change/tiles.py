@@ -34,7 +34,7 @@ class TileConfig(Config):
 
 @dataclass(frozen=True)
 class Tile:
-    """A square of a raster; pixels beyond the raster's edge are NaN and WALL.
+    """A square cut out of a difference map or another raster; pixels beyond the raster's edge are NaN and have no block.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Tile:
     values : (size, size) float32 array
         Values of the raster.
     block : (size, size) int32 array
-        Block labels.
+        Label of the fallen block at each pixel, 0 for none.
     valid_share : float
         Share of its pixels that have data.
     """
@@ -59,12 +59,15 @@ class Tile:
 
     @property
     def name(self) -> str:
-        """Its position as a word for file names, unique within the raster: r00512_c01024."""
+        """Position of the tile as a word for file names, unique within the raster.
+
+        r00512_c01024 begins at row 512 and column 1024.
+        """
         return f"r{self.row:05d}_c{self.column:05d}"
 
 
 def tiles(values: NDArray[np.float32], block: IntArray, grid: Grid, config: TileConfig) -> Iterator[Tile]:
-    """Cut a raster row by row into tiles, leaving out those with too few data.
+    """Cut a raster row by row into square tiles for a detector, leaving out those with too few data.
 
     Every pixel belongs to a tile. The last row and column of tiles extend beyond the raster and are filled with NaN, so that
     all tiles have the same size and, without overlap, no pixel is in two of them.
@@ -72,16 +75,16 @@ def tiles(values: NDArray[np.float32], block: IntArray, grid: Grid, config: Tile
     Parameters
     ----------
     values, block : (h, w) arrays
-        The raster and its labels.
+        The raster, NaN without data, and the labels of the fallen blocks, 0 for none.
     grid : Grid
-        Its pixels.
+        Position of the raster's pixels.
     config : TileConfig
-        Size and overlap of the tiles.
+        Size and overlap of the tiles, and their smallest share of pixels with data.
 
     Raises
     ------
     InputError
-        If the shapes differ, or for more than MOST_TILES.
+        If the shapes differ, or for more tiles than are allowed.
     """
     if not values.shape == block.shape == grid.shape:
         raise InputError(
@@ -111,5 +114,8 @@ def tiles(values: NDArray[np.float32], block: IntArray, grid: Grid, config: Tile
 
 
 def tile_starts(length: int, config: TileConfig) -> range:
-    """Return the first pixels of the tiles along a side of `length` pixels. No tile lies entirely within the one before it."""
+    """Return the first pixel of each tile along a side of a raster, `length` px long.
+
+    config: size and overlap of the tiles. No tile lies entirely within the one before it.
+    """
     return range(0, max(length - config.overlap_px, 1), config.size_px - config.overlap_px)

@@ -39,7 +39,12 @@ def as_json(document: dict[str, Any]) -> str:
 
 
 def record_document(report: Path, record: str) -> Callable[[], dict[str, Any]]:
-    """Return a function that reads the JSON file `record` next to a report, without the keys in `_OMITTED_KEYS`."""
+    """Return a function that gives what --json prints of a finished command.
+
+    report: path of the report. record: name of the JSON file next to it, such as run.json; its keys config and versions, which
+    only
+    serve to repeat the run, are left out.
+    """
 
     def document() -> dict[str, Any]:
         values = json.loads((report.parent / record).read_text(encoding="utf-8"))

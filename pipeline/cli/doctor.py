@@ -93,7 +93,7 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
 
 
 def examine() -> list[Finding]:
-    """Return all findings; a probe that fails is reported as a finding."""
+    """Examine the installation for `scarpsim doctor` and return all findings; a check that fails is reported as a finding."""
     probes: tuple[Callable[[], Iterator[Finding]], ...] = (_python, _packages, _extras, _libraries, _backend, _machine, _caches)
     return [finding for probe in probes for finding in _run_probe(probe)]
 

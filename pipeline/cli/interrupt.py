@@ -16,7 +16,9 @@ INTERRUPTED = 130
 
 @contextmanager
 def exit_on_second_interrupt(kept: Callable[[], str]) -> Iterator[None]:
-    """Within the block, end the process with status 130 at the second SIGINT and print what `kept` returns.
+    """Within the `with` block, end the process with status 130 when the user presses Ctrl-C (SIGINT) a second time.
+
+    kept: returns the sentence that is then printed, which says what results are kept.
 
     Python handles signals only between two of its own instructions, so native code that waits for memory or a thread cannot be
     interrupted. Here the kernel's signal handler writes each signal's number to a socket, and a separate thread reads it.

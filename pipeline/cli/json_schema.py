@@ -30,7 +30,10 @@ _NUMBER_ALLOWED = ("DrawnParameter", "Constant")
 
 
 def json_schema(kind: str) -> dict[str, Any]:
-    """Return the JSON schema (draft 2020-12) of one kind of file; raise InputError for an unknown kind."""
+    """Return the JSON schema (draft 2020-12) of one kind of config file, with which editors check and complete it.
+
+    kind: simulation, dataset, detector, scanner, model or measurement. Raises InputError for another.
+    """
     if kind not in KINDS:
         raise InputError(f"there is no schema '{kind}'", allowed=", ".join(KINDS), remedy=nearest(kind, KINDS))
     found = KINDS[kind].model_json_schema()
@@ -38,17 +41,23 @@ def json_schema(kind: str) -> dict[str, Any]:
 
 
 def schema_text(kind: str) -> str:
-    """Return the schema of one kind of file as JSON text."""
+    """Return the JSON schema of one kind of config file (simulation, dataset, detector, ...) as text."""
     return json.dumps(json_schema(kind), indent=1) + "\n"
 
 
 def schema_name(kind: str) -> str:
-    """Return the file name of the schema that `scarpsim init` writes next to a config."""
+    """Return the file name of the JSON schema that `scarpsim init` writes next to a config.
+
+    kind: the kind of config: simulation, dataset, detector, scanner, model or measurement.
+    """
     return f"scarpsim.{kind}.schema.json"
 
 
 def schema_line(kind: str) -> str:
-    """Return the YAML comment that tells editors where the schema is."""
+    """Return the first line of a config file, a YAML comment that tells editors where its JSON schema is.
+
+    kind: the kind of config: simulation, dataset, detector, scanner, model or measurement.
+    """
     return f"# yaml-language-server: $schema={schema_name(kind)}\n"
 
 

@@ -58,7 +58,11 @@ _REMEDIES = {
 
 
 class Command(Protocol):
-    """Interface of a command's module: a summary and an example for the help, the arguments, and the action."""
+    """Interface of the module of one `scarpsim` command.
+
+    SUMMARY is a sentence for the help and EXAMPLE a command line in it. `add_arguments` declares the arguments; `run` does the
+    work.
+    """
 
     SUMMARY: str
     EXAMPLE: str
@@ -68,7 +72,10 @@ class Command(Protocol):
         ...
 
     def run(self, arguments: argparse.Namespace) -> CommandOutput:
-        """Run the command and return what it prints. It may set `arguments.kept`, which says what an interrupt leaves usable."""
+        """Run the command with its parsed arguments and return what it prints.
+
+        It may set `arguments.kept` to a sentence that says which results remain usable after an interrupt.
+        """
         ...
 
 
@@ -139,7 +146,10 @@ exit status: 0 done; 2 the input or the config is wrong (one message says what i
 
 
 def command_parser(prog: str, command: Command) -> Parser:
-    """Return the parser of one command. `prog`: how the help calls the command."""
+    """Return the argument parser of one command.
+
+    prog: how the help calls the command, such as "scarpsim gap". command: the command's module.
+    """
     parser = Parser(prog, command.SUMMARY, command.EXAMPLE)
     command.add_arguments(parser)
     parser.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")

@@ -40,7 +40,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_source_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments that describe raw scans; `gap` has the same."""
+    """Declare the arguments that describe raw scans (files, units, columns, instrument) on a command's parser.
+
+    The commands `measurement` and `gap` both take them.
+    """
     parser.add_argument(
         "--reference",
         metavar="FILE|half",
@@ -93,7 +96,17 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
 
 
 def build_measurement_folder(arguments: argparse.Namespace, scans: list[Path], out: Path) -> Interpretation:
-    """Build the measurement folder `out` from raw scans as the arguments say, and return how they were interpreted."""
+    """Build a measurement folder, the input of `scarpsim gap`, from raw scans, and return how they were interpreted.
+
+    Parameters
+    ----------
+    arguments : argparse.Namespace
+        Parsed arguments that describe the scans, as `add_source_arguments` declares them.
+    scans : list of Path
+        Files of the scans.
+    out : Path
+        The folder to write.
+    """
     from pipeline.formats.files.atomic import empty_folder
     from pipeline.measurement.build import build, build_stereo
     from pipeline.measurement.surface import build_surface
@@ -131,12 +144,12 @@ def _request(arguments: argparse.Namespace, scans: list[Path]) -> Request:
 
 
 def comma_separated_words(text: str) -> list[str]:
-    """Convert an argument: words separated by commas, in lower case."""
+    """Convert the text of an argument to a list of words, which it separates by commas; they become lower case."""
     return [word.strip().lower() for word in text.split(",")]
 
 
 def pair(text: str) -> tuple[str, str]:
-    """Convert an argument: the labels of two cameras, separated by a comma."""
+    """Convert the text of an argument to the labels of two cameras, which it separates by a comma."""
     labels = [label.strip() for label in text.split(",")]
     if len(labels) != 2 or not all(labels):
         raise argparse.ArgumentTypeError(f"got '{text}'; allowed: the labels of two cameras, separated by a comma")
@@ -144,7 +157,7 @@ def pair(text: str) -> tuple[str, str]:
 
 
 def comma_separated_numbers(count: int) -> Callable[[str], Any]:
-    """Return an argument's converter: `count` coordinates, separated by commas."""
+    """Return a function that converts the text of an argument to `count` coordinates, which it separates by commas."""
 
     def check(text: str) -> tuple[float, ...]:
         try:

@@ -90,7 +90,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Compare real epochs with the first one and write maps, events and report."""
+    """Compare the measured epochs of a wall with the first one, and write difference maps, events and report."""
     from pipeline.monitoring.follow import follow
     from pipeline.monitoring.report import headline
     from pipeline.monitoring.run import monitor_paths

@@ -33,7 +33,7 @@ class Parser(argparse.ArgumentParser):
         self._negative_number_matcher = _NEGATIVE_NUMBERS
 
     def parse(self, words: list[str]) -> argparse.Namespace:
-        """Parse the words after the command's name. An unknown option is reported before a missing one."""
+        """Parse the words after the command's name. Of several mistakes, an unknown option is reported before a missing one."""
         flags = [flag for action in self._actions for flag in action.option_strings]
         for word in words:
             flag = word.partition("=")[0]
@@ -52,18 +52,21 @@ class Parser(argparse.ArgumentParser):
         return f"see {self.prog} --help"
 
     def error(self, message: str) -> NoReturn:
-        """Raise argparse's message as an InputError."""
+        """Raise a mistake that argparse found as an InputError, so that it is reported like all others.
+
+        message: argparse's description of the mistake.
+        """
         raise InputError(message, where=self.prog, remedy=self._see_help)
 
 
 def add_output_options(parser: argparse.ArgumentParser) -> None:
-    """Add --quiet and --json, which every computing command has."""
+    """Declare --quiet (no progress) and --json (results as JSON), which every computing command has, on its parser."""
     parser.add_argument("--quiet", action="store_true", help="show no progress")
     parser.add_argument("--json", action="store_true", help="print one JSON document on stdout; text goes to stderr")
 
 
 def one_of(*allowed: str) -> Callable[[str], str]:
-    """Return an argument's converter that accepts only the words `allowed`."""
+    """Return a function that converts the text of an argument and accepts only the words `allowed`."""
 
     def check(text: str) -> str:
         if text in allowed:
@@ -76,7 +79,10 @@ def one_of(*allowed: str) -> Callable[[str], str]:
 
 
 def between(low: float, high: float) -> Callable[[str], float]:
-    """Return an argument's converter that accepts numbers from `low` to `high`, both included."""
+    """Return a function that converts the text of an argument to a number and rejects those outside a range.
+
+    low, high: smallest and largest number that is accepted.
+    """
 
     def check(text: str) -> float:
         try:
@@ -91,7 +97,10 @@ def between(low: float, high: float) -> Callable[[str], float]:
 
 
 def at_least(smallest: int, *, at_most: int | None = None) -> Callable[[str], int]:
-    """Return an argument's converter that accepts whole numbers from `smallest` to `at_most`."""
+    """Return a function that converts the text of an argument to a whole number and rejects those outside a range.
+
+    smallest, at_most: smallest and largest number that is accepted; at_most None: no limit.
+    """
     allowed = f"a whole number from {smallest}" + ("" if at_most is None else f" to {at_most}")
 
     def check(text: str) -> int:

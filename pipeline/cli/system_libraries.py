@@ -63,12 +63,18 @@ LIBRARIES = (
 
 
 def missing(extras: Sequence[str] = ()) -> list[SystemLibrary]:
-    """Return the libraries that this machine lacks for the program and the given extras."""
+    """Return the shared libraries that this machine lacks, for `scarpsim doctor`.
+
+    extras: names of the installed extras (optional parts of the program) whose libraries are looked for too.
+    """
     return [library for library in LIBRARIES if library.extra in ("", *extras) and not library.present]
 
 
 def packages(libraries: list[SystemLibrary]) -> list[str]:
-    """Return the Debian packages of `libraries`. LLVM's package name contains its release, so apt is asked which exist."""
+    """Return the names of the Debian packages that contain the libraries.
+
+    LLVM's package name contains its release, so apt is asked which exist.
+    """
     return [_llvm_package() if library.soname == LLVM else library.package for library in libraries]
 
 

@@ -21,7 +21,10 @@ def configs_folder() -> Path:
 
 
 def named_configs(kind: str) -> dict[str, Path]:
-    """Return the config files of a kind by name: those that come with the program and those of other packages (PLUG_INS)."""
+    """Return the config files of a kind by name: those that come with the program, and those that other packages add.
+
+    kind: a subfolder of the bundled configs, such as "sites".
+    """
     own = {path.stem: path for path in sorted((configs_folder() / kind).glob("*.yaml"))}
     if kind not in PLUG_INS:
         return own
@@ -48,9 +51,10 @@ def bundled_config(kind: str, name: str) -> Path:
 def config_path(kind: str, given: Path) -> Path:
     """Return `given` itself or, if no such file exists, the bundled config that it names.
 
-    A bundled config is named by a word (`glendale`), or by its path in a checkout (`configs/sites/glendale.yaml`), which is
-    elsewhere in an installed wheel. Raises InputError, with the most similar name, if a bare word is neither a file nor a
-    bundled config of `kind`.
+    kind: a subfolder of the bundled configs, such as "sites", in which a name is looked up. given: a path, or the name of a
+    bundled
+    config: a word (`glendale`), or its path in a checkout (`configs/sites/glendale.yaml`), which is elsewhere in an installed
+    wheel. Raises InputError, with the most similar name, if a bare word is neither a file nor a bundled config of `kind`.
     """
     if given.exists():
         return given

@@ -15,7 +15,11 @@ from scene.common.yaml_text import parse_yaml
 
 @dataclass(frozen=True)
 class Override:
-    """A value for one key of a config. path: keys, and list indices from 0; text: as it was given."""
+    """A new value for one key of a config, as `--set` gives it.
+
+    path: names of the keys from the outermost on, and list indices from 0. value: the new value. text: the override as the user
+    gave it, for errors.
+    """
 
     path: tuple[str, ...]
     value: Any
@@ -23,7 +27,7 @@ class Override:
 
 
 def read_override(text: str) -> Override:
-    """Parse `key.path=value`.
+    """Parse the text of a `--set` option, `key.path=value`, which changes a key of a config.
 
     The value is read as YAML: a number, true or false, null, a text, or a collection such as [1, 2] or {a: 1}. Raises
     InputError if the text is malformed.

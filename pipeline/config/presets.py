@@ -19,28 +19,30 @@ from sensors.laser.presets import ScannerPreset
 
 
 def is_path(name: str) -> bool:
-    """Return whether a preset or model is named by a file instead of by a bundled name."""
+    """Return whether `name` is a file (of a scanner preset or a sensor model) and not the name of a bundled one."""
     return name.endswith((".yaml", ".yml")) or "/" in name or "\\" in name
 
 
 def read_preset(name: str) -> ScannerPreset:
-    """Read the preset with a bundled name such as `riegl_vz400i`, or from a YAML file.
+    """Read a scanner preset: the scan pattern, reach and noise of an instrument on the market.
 
-    Raises InputError for an unknown name, with the most similar one, and for mistakes in the file.
+    name: a bundled name such as `riegl_vz400i`, or a YAML file. Raises InputError for an unknown name, with the most similar
+    one,
+    and for mistakes in the file.
     """
     path = Path(name) if is_path(name) else bundled_config("scanners", name)
     return parse(ScannerPreset, load_yaml(path), str(path))
 
 
 def model_file(name: str) -> Path:
-    """Return the file of a sensor model: of a bundled name such as `glendale_high`, or a YAML file itself."""
+    """Return the YAML file of a sensor model. name: a bundled name such as `glendale_high`, or the path of the file itself."""
     return Path(name) if is_path(name) else bundled_config("noise", name)
 
 
 def expand_shorthand(overrides: Sequence[str | Override]) -> list[Override]:
-    """Return the overrides with `scanner=NAME` as `scanner.preset=NAME`.
+    """Return config overrides in which `scanner=NAME` is written out as `scanner.preset=NAME`.
 
-    Another instrument so keeps the pattern that is scanned.
+    So the instrument alone is replaced, and what it scans (the other keys of `scanner`) is kept.
     """
     found = [read_override(each) if isinstance(each, str) else each for each in overrides]
     return [
@@ -50,17 +52,23 @@ def expand_shorthand(overrides: Sequence[str | Override]) -> list[Override]:
 
 
 def without_keys_of_preset(values: dict[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
-    """Remove from a file's values what a preset sets, if the overrides name one.
+    """Remove from a config's values what a scanner preset sets, if the overrides name a preset.
 
-    The preset so replaces the keys of `scanner` that it knows, and the model of a laser scanner, in its place. Everything else in
+    The preset so replaces the keys of `scanner` that it knows, and the model of a laser scanner, in its place. Everything else
+    in
     the file stays. Keys among the overrides are applied afterwards and win.
 
     Parameters
     ----------
     values : dict
-        Values of the file.
+        Values of the config file.
     overrides : sequence of Override
-        Overrides, as from `expand_shorthand`.
+        The user's changes, as from `expand_shorthand`.
+
+    Returns
+    -------
+    dict
+        The remaining values.
     """
     values = _with_section(values)
     later = apply_overrides({}, [each for each in overrides if each.path[0] == "scanner"]).get("scanner")
@@ -75,7 +83,7 @@ def without_keys_of_preset(values: dict[str, Any], overrides: Sequence[Override]
 
 
 def with_preset(values: dict[str, Any]) -> dict[str, Any]:
-    """Return a config's values with the preset that its `scanner` names written out.
+    """Return a config's values in which the scanner preset that it names is replaced by the preset's own keys.
 
     `scanner` is a preset's name or file, or a section with the key `preset`, whose other keys replace the preset's. The
     preset's sensor model is added if the config has no laser scanner's model of its own.

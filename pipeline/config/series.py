@@ -23,7 +23,7 @@ _HOUR = timedelta(hours=1)
 
 
 class RegularTimes(Config):
-    """Epochs at equal intervals."""
+    """Times of the epochs of a series, at equal intervals."""
 
     start: datetime = Field(description="time of the reference, ISO 8601, such as 2026-03-01T00:00:00Z")
     every_h: float = Field(1.0, gt=0, le=1e5, description="interval [h]")
@@ -38,7 +38,10 @@ Times = Annotated[
 
 
 class ConditionsConfig(Config):
-    """What changes from epoch to epoch besides the rock. Each is a course: random_walk, drift, cycle or table over time."""
+    """What changes from epoch to epoch besides the rock: pose and errors of the sensor, snow and vegetation.
+
+    Each value is a course over time: a random_walk, a drift, a cycle or a table.
+    """
 
     pose: PoseCourses | None = Field(None, description="real minus surveyed pose of the sensor")
     effects: EffectCourses = Field(
@@ -49,7 +52,10 @@ class ConditionsConfig(Config):
 
 
 class SeriesConfig(Config):
-    """A wall over time: what falls stays fallen, blocks move before they fall, fragments lie below, conditions drift."""
+    """Settings of a wall that changes over a series of epochs.
+
+    What falls stays fallen, blocks move before they fall, fragments lie below, and the conditions of measurement drift.
+    """
 
     times: Times = Field(description="times of the epochs, the reference first: start, every_h, count; or a list")
     cumulative: bool = Field(True, description="what fell stays fallen; false: an epoch has only what fell since the last")
@@ -97,13 +103,13 @@ class SeriesConfig(Config):
         return len(self.times) if isinstance(self.times, tuple) else self.times.count
 
     def when(self, number: int) -> datetime:
-        """Return the time of an epoch in UTC."""
+        """Return the time, in UTC, of the epoch with a number; 0 is the reference."""
         if isinstance(self.times, tuple):
             return utc(self.times[number])
         return utc(self.times.start) + number * self.times.every_h * _HOUR
 
     def hours_of(self, time: datetime) -> float:
-        """Return the hours from the first epoch to a time."""
+        """Return a time as hours after the first epoch."""
         return (utc(time) - self.when(0)) / _HOUR
 
     @property

@@ -47,19 +47,22 @@ SensorName = Literal["stereo", "tls"]
 
 
 class CamerasFile(Config):
-    """A stereo pair from a file: the project's cameras.yaml, Metashape's camera XML or COLMAP's text model."""
+    """Settings of a stereo pair whose cameras are read from a file.
+
+    The file is the project's cameras.yaml, Metashape's camera XML or COLMAP's text model.
+    """
 
     file: Path = Field(description="cameras.yaml, a Metashape camera XML or project (.psx), or the folder of a COLMAP text model")
     left: str | None = Field(None, description="label or image name of the left camera; none: the only pair, sorted by position")
     right: str | None = Field(None, description="label or image name of the right camera")
 
     def pair(self) -> CameraPair:
-        """Read the cameras, world frame."""
+        """Read the pair of cameras (interior orientation and pose) from the configured file, world frame."""
         found = read_oriented(self.file)
         return read_cameras_yaml(self.file) if found is None else stereo_pair(found, self.left, self.right, str(self.file))
 
     def files(self) -> list[Path]:
-        """Return the files that `pair` reads."""
+        """Return the files that `pair` reads the cameras from."""
         return cameras_yaml_files(self.file) if read_oriented(self.file) is None else oriented_files(self.file)
 
 
@@ -92,7 +95,7 @@ SensorModel = Annotated[Annotated[StereoModel, Tag("stereo")] | Annotated[TlsMod
 
 
 class ProductsConfig(Config):
-    """What is written in addition to the raster products."""
+    """What a simulation writes besides its rasters (difference maps and hillshades)."""
 
     truth_channels: bool = Field(True, description="the true range or depth of each point, as extra dimensions of points.laz")
     world: bool | None = Field(None, description="points and surface in world coordinates too; none: only for imported walls")
@@ -264,7 +267,12 @@ class SimulationConfig(Config):
         return (self.station,) if isinstance(self.station, StationConfig) else self.station
 
     def camera_pair(self, target: Target) -> CameraPair:
-        """Return the nominal pair, world frame; a rig is placed in front of `target`."""
+        """Return the nominal stereo pair, world frame.
+
+        target: the wall's middle and orientation, in front of which a rig (two equal cameras) is placed; cameras from a file
+        need it
+        not.
+        """
         return self.cameras.place(target) if isinstance(self.cameras, RigConfig) else self.cameras.pair()
 
 
@@ -303,7 +311,26 @@ def load_config(path: Path, overrides: Sequence[str | Override], sensor: SensorN
 def resolved(
     values: Any, overrides: Sequence[str | Override], sensor: SensorName | None, seed: int | None, path: Path
 ) -> SimulationConfig:
-    """Make a config of values that have already been read, with overrides and the seed; `path` is their file, or names them."""
+    """Make and check a config of values that have already been read.
+
+    Parameters
+    ----------
+    values : mapping
+        Content of a config file.
+    overrides : sequence of str or Override
+        Values to change, `key.path=value`.
+    sensor : str or None
+        The sensor that is used; None for any.
+    seed : int or None
+        Seed that replaces the config's.
+    path : Path
+        File of the values, or what errors should call them; relative paths in the values start from its folder.
+
+    Raises
+    ------
+    InputError
+        If anything is wrong, or if the config only has models of another sensor than `sensor`.
+    """
     own: dict[str, Any] = {}
     values = {} if values is None else values
     if not isinstance(values, dict):

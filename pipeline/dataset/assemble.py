@@ -27,7 +27,7 @@ ANNOTATIONS = "annotations.json"
 
 @dataclass
 class AssembledSet:
-    """Number of images and annotations by split, and warnings about the set."""
+    """What `assemble` found in a data set: number of images and annotations by split (train, val, test), and warnings."""
 
     images: dict[str, int] = field(default_factory=dict)
     annotations: dict[str, int] = field(default_factory=dict)
@@ -35,14 +35,14 @@ class AssembledSet:
 
 
 def assemble(folder: Path, *, complete: bool) -> AssembledSet:
-    """Write annotations.json of each split, the data set card and the checksums.
+    """Finish a data set on disk: write annotations.json of each split, the README with its figures, and the checksums.
 
     Image and annotation ids count from 1 through train, val and test, so that they are unique in the set.
 
     Parameters
     ----------
     folder : Folder of the set.
-    complete : Whether all shards are there; False assembles those of an interrupted job.
+    complete : Whether all epochs have been made; False assembles those of an interrupted job.
     """
     dataset = read_dataset_file(folder)
     statistics = SetStatistics()
@@ -71,7 +71,10 @@ def assemble(folder: Path, *, complete: bool) -> AssembledSet:
 
 
 def shards(folder: Path, dataset: Record) -> Iterator[Record]:
-    """Yield the epochs' records that are there, in the order of the plan."""
+    """Yield the records of the epochs that have been made (each a JSON file in the folder), in the planned order.
+
+    folder: the data set's. dataset: content of its dataset.json.
+    """
     for name in _shard_names(dataset):
         record = read_shard(folder, name)
         if record is not None:
@@ -79,7 +82,10 @@ def shards(folder: Path, dataset: Record) -> Iterator[Record]:
 
 
 def complete_shards(folder: Path, dataset: Record) -> Iterator[Record]:
-    """Yield the records of all epochs; raise InputError if one is missing or damaged."""
+    """Yield the records of all epochs of a data set, in the planned order; raise InputError if one is missing or damaged.
+
+    folder: the data set's. dataset: content of its dataset.json.
+    """
     for name in _shard_names(dataset):
         record = read_shard(folder, name)
         if record is None:
@@ -92,7 +98,7 @@ def complete_shards(folder: Path, dataset: Record) -> Iterator[Record]:
 
 
 def assembled_damage(folder: Path) -> list[Damage]:
-    """Return what is missing or damaged of the files that `assemble` writes, including the list of checksums."""
+    """Return which of a data set's files on all epochs (annotations, README, checksums) are missing or damaged."""
     path = folder / CHECKSUMS
     if not path.is_file():
         return [Damage(Path(CHECKSUMS), "a folder" if path.is_dir() else "missing")]

@@ -63,14 +63,14 @@ _SURFACES = {
 def write_card(
     folder: Path, dataset: dict[str, Any], statistics: SetStatistics, digests: dict[str, str], *, complete: bool
 ) -> list[str]:
-    """Write README.md and its pictures, and return the names of the written files.
+    """Write a data set's README.md (its data card) with figures, and return the names of the written files.
 
     Parameters
     ----------
     folder : Folder of the set.
     dataset : Content of dataset.json.
     statistics : Statistics of the set.
-    digests : Checksums of the other files, by name.
+    digests : SHA-256 checksums of the other files, by name.
     complete : Whether the set is complete.
     """
     from pipeline.dataset.figures import noise_figure, sizes_figure

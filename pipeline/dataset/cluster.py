@@ -49,7 +49,14 @@ _RUNS_EACH = 2
 
 
 def runs(orders: Sequence[EpochOrder], workers: int) -> list[Run]:
-    """Divide epochs into groups of equal length that share wall, sensor and reference, so that a worker sets these up once."""
+    """Divide the epochs of a data set into groups, each of which one worker makes in one go.
+
+    The epochs of a group share wall, sensor and reference epoch, so that these are set up once; groups that share them are of
+    about
+    equal length.
+
+    orders: the epochs, those that share a reference next to each other. workers: number of processes.
+    """
     longest = min(max(len(orders) // (_RUNS_EACH * workers), 1), _LONGEST_RUN)
     found = []
     for _, same in groupby(orders, key=lambda order: (order.source, order.stage)):
@@ -101,7 +108,7 @@ class _LostError(Exception):
 
 
 def make_on_cluster(orders: list[EpochOrder], count: int, scheduler: str) -> Iterator[dict[str, Any]]:
-    """Make and store epochs on a cluster, and yield what each took, in the order in which they finish.
+    """Make and store epochs of a data set on a Dask cluster, and yield what each took, in the order in which they finish.
 
     Local workers share the cores. Workers of a scheduler use the threads that Dask gave them, and must see the folder under the
     same path.
@@ -110,7 +117,11 @@ def make_on_cluster(orders: list[EpochOrder], count: int, scheduler: str) -> Ite
     ----------
     orders : The epochs.
     count : Number of local workers.
-    scheduler : Address of a scheduler; "": local workers.
+    scheduler : Address of a Dask scheduler; "": local workers.
+
+    Yields
+    ------
+    Times, memory and number of tiles of each epoch, as `worker.make_and_store` returns them.
 
     Raises
     ------

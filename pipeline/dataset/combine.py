@@ -24,9 +24,9 @@ KEYS = ("sensor", "noise", "size", "wall", "split")
 
 
 def merge_datasets(folders: Sequence[Path], out: Path) -> DatasetSummary:
-    """Merge finished sets into a new one.
+    """Merge finished data sets into a new one and return its summary.
 
-    Ids are assigned again, and each file name gets the fingerprint of its set as a prefix.
+    Ids are assigned again, and each file name gets the fingerprint (a hash of the config) of its set as a prefix.
 
     Parameters
     ----------
@@ -62,13 +62,17 @@ def merge_datasets(folders: Sequence[Path], out: Path) -> DatasetSummary:
 
 
 def split_dataset(folder: Path, out: Path, keys: Sequence[str]) -> list[DatasetSummary]:
-    """Make one set for each combination of properties in a finished set.
+    """Split a finished data set into new ones by properties of its tiles, such as one for each sensor and noise level.
 
     Parameters
     ----------
     folder : The finished set.
-    out : Folder of the new sets, which are named after their combination.
+    out : Folder of the new sets, which are named after the values of their properties.
     keys : Properties: sensor, noise, size, wall, split.
+
+    Returns
+    -------
+    A summary of each new set.
 
     Raises
     ------

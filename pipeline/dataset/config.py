@@ -69,19 +69,19 @@ class NoiseLevel(Config):
     tls: ScaledModel | None = Field(None, description="model of the laser scanner")
 
     def of(self, sensor: SensorName) -> ScaledModel | None:
-        """Return the model of a sensor and the factor of its noise; None if this level has no model of that sensor."""
+        """Return the model of a sensor with the factor of its noise, at this level of noise; None if there is no such model."""
         return self.stereo if sensor == "stereo" else self.tls
 
 
 class SizeClass(Config):
-    """Blocks of one size class."""
+    """Size and density of the fallen blocks in one size class of a data set."""
 
     blocks_per_m2: float = Field(gt=0, le=1e6, description="blocks per area of the wall; replaces rockfall.count")
     rockfall: RockfallConfig = RockfallConfig()
 
 
 class Part(Config):
-    """A part of the set: all combinations of its walls, noise levels, size classes and sensors.
+    """A part of a data set: epochs of all combinations of the listed walls, noise levels and size classes with all sensors.
 
     Each combination has equally many epochs.
     """
@@ -190,12 +190,13 @@ def load_dataset_config(path: Path, overrides: Sequence[str | Override] = (), se
 
 
 def dataset_config(values: Any, overrides: Sequence[str | Override], seed: int | None, path: Path) -> DatasetConfig:
-    """Resolve a data set's config from values already read.
+    """Make and check a data set's config from values already read; the sites and sensor models that it names are read.
 
     Parameters
     ----------
     values : Content of a config file.
-    overrides, seed : As in `load_dataset_config`.
+    overrides : Values to change, `key.path=value`.
+    seed : Replaces the seed of the config; None: its own.
     path : The file, or how errors should call it.
     """
     if not isinstance(values, dict):

@@ -37,12 +37,12 @@ _DRAWS = 5
 
 @dataclass(frozen=True)
 class EpochStage:
-    """Set-up shared by the epochs of one wall, sensor, noise level and reference.
+    """Set-up shared by the epochs of a data set with the same wall, sensor, noise level and reference epoch.
 
     Attributes
     ----------
     site : Wall and sensor.
-    reference : The reference epoch.
+    reference : The reference epoch, with which the others are compared.
     spacing_m : Spacing of ray-traced samples on the wall, m; None if the surface consists of the wall's own vertices.
     true : Raster of the untouched wall; None unless the config asks for true differences.
     """
@@ -55,7 +55,12 @@ class EpochStage:
 
 @dataclass(frozen=True)
 class EpochTile:
-    """A tile of an epoch, its annotations (as COCO's, without ids), and its true difference (size, size), m, or None."""
+    """A tile of an epoch's difference map for a data set.
+
+    tile: the pixels. annotations: of its fallen blocks, as COCO's, without ids. truth: the true difference (size, size), m;
+    None
+    unless the config asks for it.
+    """
 
     tile: Tile
     annotations: list[dict[str, Any]]
@@ -64,17 +69,22 @@ class EpochTile:
 
 @dataclass(frozen=True)
 class MadeEpoch:
-    """A simulated epoch: its record (JSON types), and the tiles that belong to the set."""
+    """A simulated epoch of a data set, not yet written.
+
+    record: its description (JSON types). tiles: those tiles of its difference map that belong to the set.
+    """
 
     record: dict[str, Any]
     tiles: list[EpochTile]
 
 
 class StageCache:
-    """Keeps the stage that a worker has set up last. A stage is a wall, its frame, its ray-tracing scene and its reference epoch.
+    """Keeps the set-up of the last simulated epoch (wall, frame, ray-tracing scene and reference epoch) for the next ones.
 
-    Epochs of the same wall and sensor share a stage. The cache keeps only one, because a stage takes much of a worker's memory,
-    and plans put the epochs of a stage next to each other. `made` counts the stages set up so far.
+    Epochs of the same wall, sensor, noise and reference share this set-up, called a stage. The cache keeps only one, because a
+    stage
+    takes much of a worker's memory, and plans put the epochs of a stage next to each other. `made` counts the stages set up so
+    far.
     """
 
     def __init__(self, config: DatasetConfig) -> None:
@@ -84,7 +94,10 @@ class StageCache:
         self.made = 0
 
     def of(self, epoch: PlannedEpoch, progress: Progress) -> EpochStage:
-        """Return the stage (wall, scene, reference epoch) of an epoch; set it up unless the last call was for the same stage."""
+        """Return the stage (wall, scene, reference epoch) that an epoch of the data set needs.
+
+        It is set up unless the last call was for the same stage. progress: receives the progress of that.
+        """
         if self._kept is None or self._key != epoch.stage:
             self._kept = None  # free the memory before the new one is made
             self._kept, self._key = _set_up(self._config, epoch, progress), epoch.stage
@@ -106,13 +119,13 @@ def _set_up(config: DatasetConfig, epoch: PlannedEpoch, progress: Progress) -> E
 
 
 def make_epoch(config: DatasetConfig, epoch: PlannedEpoch, stages: StageCache, progress: Progress) -> MadeEpoch:
-    """Simulate an epoch of the plan and cut its tiles.
+    """Simulate a planned epoch of a data set and cut its difference map into tiles.
 
     Parameters
     ----------
     config : Config of the set.
     epoch : The planned epoch.
-    stages : Keeps the set-up between epochs.
+    stages : Keeps the set-up (wall, reference epoch) between epochs.
     progress : Receives the progress.
 
     Raises
@@ -176,12 +189,16 @@ def _observed(
 
 
 def with_count(simulation: SimulationConfig, count: int) -> SimulationConfig:
-    """Return the simulation with another number of blocks."""
+    """Return a simulation's config with `count` as the number of falling blocks."""
     return simulation.model_copy(update={"rockfall": simulation.rockfall.model_copy(update={"count": count})})
 
 
 def true_difference(wall: SurfaceRaster, epoch: LaterEpoch) -> NDArray[np.float32]:
-    """Return the (h, w) true change of the wall, m, without any sensor; NaN where there is no wall."""
+    """Return the true change of the wall in an epoch, as a difference map without the errors of a sensor.
+
+    wall: raster of the wall before the blocks fell. epoch: holds the wall after that. Returns (h, w), m; NaN where there is no
+    wall.
+    """
     return difference(wall, surface_raster(epoch.carved.mesh, wall.grid))
 
 

@@ -21,14 +21,14 @@ _BINS = 40
 
 @dataclass(frozen=True)
 class SampleTile:
-    """A tile to draw.
+    """A tile to draw as an example in a data set's README.
 
     Attributes
     ----------
     title : Title of the panel.
     values : (h, w) differences, m.
     blocks : (h, w) true within annotated masks.
-    sigma_m : Noise of its epoch, m.
+    sigma_m : Noise of its epoch, m; the colour scale ends at six times this.
     """
 
     title: str
@@ -38,7 +38,10 @@ class SampleTile:
 
 
 def sizes_figure(counts: Mapping[str, NDArray[np.integer]], edges: NDArray[np.floating]) -> bytes:
-    """Draw histograms of block sizes by class: counts for each bin between logarithmic `edges`, m."""
+    """Draw histograms of the sizes of a data set's blocks, as PNG.
+
+    counts: number of blocks in each bin, by size class. edges: edges of the bins, m, equally spaced in the logarithm.
+    """
     figure, axes = _axes()
     for number, (name, values) in enumerate(counts.items()):
         axes.stairs(values, edges, fill=True, alpha=0.35, color=FAMILY[number % len(FAMILY)], label=name)
@@ -52,7 +55,10 @@ def sizes_figure(counts: Mapping[str, NDArray[np.integer]], edges: NDArray[np.fl
 
 
 def noise_figure(noise: Mapping[str, Sequence[float]]) -> bytes:
-    """Draw histograms of the epochs' noise, m, by sensor and level."""
+    """Draw histograms of the noise in a data set's epochs, as PNG.
+
+    noise: standard deviation of each epoch outside the blocks, m, by sensor and noise level.
+    """
     figure, axes = _axes()
     values = {name: 1e3 * np.asarray(each) for name, each in noise.items()}
     high = max((float(each.max()) for each in values.values() if each.size), default=1.0)
@@ -67,7 +73,10 @@ def noise_figure(noise: Mapping[str, Sequence[float]]) -> bytes:
 
 
 def samples_figure(rows: Sequence[Sequence[SampleTile]]) -> bytes:
-    """Draw sample tiles with colours to +-6 sigma of their epoch, and the outlines of annotated masks."""
+    """Draw sample tiles of a data set in rows, with the outlines of their annotated blocks, as PNG.
+
+    The colours end at +-6 times the noise of a tile's epoch.
+    """
     columns = max(len(row) for row in rows)
     figure = Figure(figsize=(3.1 * columns, 3.3 * len(rows)), dpi=_DPI, layout="constrained")
     grid = np.atleast_2d(figure.subplots(len(rows), columns, squeeze=False))

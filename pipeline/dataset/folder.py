@@ -33,7 +33,10 @@ STAGING, CHECKSUMS, TRUTH = ".staging", "checksums.sha256", "truth"
 
 
 def fingerprint(config: DatasetConfig) -> str:
-    """Return a hash that identifies a set: of the resolved config, and of the files of its walls and cameras."""
+    """Return a hash that identifies a data set, so that a job continues only the set of its own config.
+
+    It is of the resolved config, and of the files of its walls and cameras.
+    """
     digest = hashlib.sha256(config.model_dump_json().encode())
     for wall in config.walls.values():
         meshes = [*wall.wall.files] if isinstance(wall.wall, ImportedWall) else []
@@ -44,7 +47,10 @@ def fingerprint(config: DatasetConfig) -> str:
 
 
 def tile_files(record: Record) -> Iterator[tuple[str, str]]:
-    """Yield the files of an epoch, relative to the data set's folder, with their checksums."""
+    """Yield the tile files of an epoch, as pairs of path relative to the data set's folder and SHA-256 checksum.
+
+    record: the epoch's record in the data set.
+    """
     split = PurePosixPath(record["epoch"]["split"])
     for tile in record["tiles"]:
         yield str(split / tile["image"]["file_name"]), tile["sha256"]
@@ -66,7 +72,10 @@ class Damage:
 
 
 def epoch_damage(folder: Path, name: str) -> list[Damage]:
-    """Return what is missing or damaged of an epoch, after reading every byte of its tiles."""
+    """Return which files of an epoch in a data set are missing or damaged, after reading every byte of its tiles.
+
+    folder: the data set's. name: file name of the epoch's record.
+    """
     record = read_shard(folder, name)
     if record is None:
         return file_damage(folder, f"{SHARDS}/{name}", "", name)
@@ -97,7 +106,10 @@ def file_damage(folder: Path, file: str, digest: str, where: str) -> list[Damage
 
 
 def require_no_folders(folder: Path, damage: list[Damage]) -> None:
-    """Raise InputError if a folder is in the place of a file that is to be made again."""
+    """Check that damaged files of a data set can be written again; raise InputError if a folder is in the place of one.
+
+    folder: the data set's. damage: its damaged files.
+    """
     for each in damage:
         if (folder / each.file).is_dir():
             raise InputError(
@@ -106,14 +118,18 @@ def require_no_folders(folder: Path, damage: list[Damage]) -> None:
 
 
 def require_own_folders(folder: Path) -> None:
-    """Raise InputError if something else is in the place of a folder of a job; a split may be a link to a folder."""
+    """Check that a job can write to the subfolders of a data set.
+
+    Raises InputError if something else, such as a file, is in the place of one; the folder of a split may be a link to a
+    folder.
+    """
     for name in (STAGING, SHARDS, *SPLITS):
         if name not in SPLITS or not (folder / name).is_dir():
             require_own_folder(folder / name)
 
 
 def discard_unbegun(folder: Path) -> None:
-    """Remove what a job wrote that ended before its first epoch was made; files of others stay."""
+    """Remove what a data set job wrote to `folder`, if it ended before its first epoch was made; all other files stay."""
     if any((folder / SHARDS).glob("*.json")):
         return
     _remove_staging(folder)
@@ -126,7 +142,7 @@ def discard_unbegun(folder: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files of dead jobs."""
+    """Remove temporary files that killed jobs left in a data set's folder."""
     _remove_staging(folder)
     for part in folder.rglob(".*.part*"):
         part.unlink(missing_ok=True)

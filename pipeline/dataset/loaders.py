@@ -109,7 +109,7 @@ class Tiles(Sequence[Sample]):
         )
 
     def path_of(self, record: dict[str, Any]) -> Path:
-        """Return the path of a tile's file."""
+        """Return the path of a tile's TIFF file. record: the image's entry in annotations.json."""
         return self._path(record["file_name"])
 
     def _path(self, name: Any) -> Path:
@@ -120,13 +120,17 @@ class Tiles(Sequence[Sample]):
         return (self[index] for index in range(len(self)))
 
     def shuffled(self, seed: int) -> Iterator[Sample]:
-        """Yield all samples once, in an order that depends on `seed` only; use another seed for each pass."""
+        """Yield all tiles once in random order, for one pass of a training.
+
+        seed: decides the order; use another one for each pass.
+        """
         return (self[int(index)] for index in np.random.default_rng(seed).permutation(len(self)))
 
     def tf_dataset(self) -> tf.data.Dataset:
-        """Return a tf.data.Dataset of dictionaries.
+        """Return the tiles with their annotations as a tf.data.Dataset of dictionaries, to train with TensorFlow.
 
-        Its keys are image (h, w, 1) float32, valid (h, w, 1) bool, boxes (k, 4) float32, masks (k, h, w) bool and image_id int64.
+        The keys are image (h, w, 1) float32, valid (h, w, 1) bool, boxes (k, 4) float32, masks (k, h, w) bool and image_id
+        int64.
         """
         import tensorflow as tf
 
@@ -143,7 +147,7 @@ class Tiles(Sequence[Sample]):
 
 
 def masks_of(annotations: Sequence[dict[str, Any]], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Decode the (k, h, w) masks of COCO annotations."""
+    """Decode the masks of k COCO annotations of one image, (k, h, w). shape: (h, w) of the image, px."""
     if not annotations:
         return np.zeros((0, *shape), dtype=bool)
     decoded = coco_mask.decode([each["segmentation"] for each in annotations])

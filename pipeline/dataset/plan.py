@@ -19,13 +19,13 @@ SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
 @dataclass(frozen=True)
 class PlannedEpoch:
-    """One epoch of a data set.
+    """One epoch that a data set has or will have.
 
     Attributes
     ----------
     index : Index in the plan.
     split : "train", "val" or "test".
-    sensor, wall, noise, size : The combination that it belongs to.
+    sensor, wall, noise, size : The combination of sensor, wall, noise level and size class that it belongs to, by their names.
     number : Number among the epochs of its combination and split, from 1.
     reference : Number of the reference epoch that it is compared with, from 1.
     """
@@ -41,7 +41,7 @@ class PlannedEpoch:
 
     @property
     def name(self) -> str:
-        """A word for file names, unique in the set."""
+        """A word that names the epoch in file names, unique in the data set."""
         return f"{self.wall}_{self.sensor}_{self.noise}_{self.size}_{self.split}{self.number:04d}"
 
     @property
@@ -50,12 +50,12 @@ class PlannedEpoch:
         return self.sensor, self.wall, self.noise, self.reference
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as a dictionary."""
+        """Return the fields of the planned epoch as a dictionary, for its record."""
         return asdict(self)
 
 
 def planned_epochs(config: DatasetConfig) -> list[PlannedEpoch]:
-    """List all epochs of the set, those that share a reference epoch next to each other."""
+    """List all epochs that a data set's config asks for, those that share a reference epoch next to each other."""
     found = [
         PlannedEpoch(0, split, sensor, wall, noise, size, number, (number - 1) % config.references + 1)
         for part in config.parts
@@ -72,7 +72,10 @@ def planned_epochs(config: DatasetConfig) -> list[PlannedEpoch]:
 
 
 def simulation_of(config: DatasetConfig, epoch: PlannedEpoch) -> SimulationConfig:
-    """Return the config that simulates an epoch; the number of its blocks is set later, when the wall's area is known."""
+    """Return the simulation config of a data set's epoch.
+
+    config: of the data set. epoch: which one. The number of its blocks is set later, when the wall's area is known.
+    """
     level = config.noise[epoch.noise].of(epoch.sensor)
     if level is None:  # the config's validation excludes this
         raise InputError(
@@ -114,22 +117,22 @@ def block_count(config: DatasetConfig, size: str, grid: Grid) -> int:
 
 
 def random_of_wall(config: DatasetConfig, wall: str) -> KeyedRandom:
-    """Return the random source of a wall without its own seed, and of its texture.
+    """Return the random source for the shape of a wall whose config gives no seed, and for its texture.
 
-    It is the same for all sensors, noise levels and sizes.
+    config: of the data set. wall: name of the wall. The source is the same for all sensors, noise levels and sizes.
     """
     return KeyedRandom(config.seed).child("dataset", "wall", wall)
 
 
 def random_of_reference(config: DatasetConfig, epoch: PlannedEpoch) -> KeyedRandom:
-    """Return the random source of an epoch's reference epoch."""
+    """Return the random source for simulating the reference epoch with which a data set's epoch is compared."""
     return KeyedRandom(config.seed).child("dataset", "reference", *epoch.stage)
 
 
 def random_of_epoch(config: DatasetConfig, epoch: PlannedEpoch, draw: int) -> KeyedRandom:
-    """Return the random source of an epoch's blocks, noise and registration.
+    """Return the random source for the blocks, the noise and the registration of a data set's epoch.
 
-    draw counts from 1; it differs if blocks find no room and are drawn again.
+    draw: number of the attempt, from 1; blocks that find no room are drawn again from another source.
     """
     path = epoch.wall, epoch.sensor, epoch.noise, epoch.size, epoch.split
     return KeyedRandom(config.seed).child("dataset", "epoch", *path, "draw", draw)
@@ -137,13 +140,13 @@ def random_of_epoch(config: DatasetConfig, epoch: PlannedEpoch, draw: int) -> Ke
 
 @dataclass(frozen=True)
 class TileRegion:
-    """Columns of pixels, [first, end), in which a tile must lie."""
+    """Columns of a difference map, [first, end) px, in which the tiles of a split must lie."""
 
     first: int
     end: float
 
     def holds(self, column: int, size: int) -> bool:
-        """Whether a tile of `size` px that begins at `column` lies in the region."""
+        """Whether a tile of `size` px that begins at `column` lies in the columns of its split."""
         return self.first <= column and column + size <= self.end
 
 
@@ -188,7 +191,7 @@ def check_tiles_filled(split: Split, where: TileRegion, grid: Grid, config: Tile
     Parameters
     ----------
     split : "train", "val" or "test".
-    where : Region of the split.
+    where : Columns of the difference map that the split uses.
     grid : Raster of the difference maps.
     config : Size of the tiles and their smallest share of data.
     """

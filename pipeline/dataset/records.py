@@ -106,7 +106,10 @@ class _Shard(BaseModel):
 
 
 def read_dataset_file(folder: Path) -> Record:
-    """Read dataset.json; raise InputError if the folder is not a data set or the file was changed."""
+    """Read dataset.json, which describes a data set.
+
+    Raises InputError if the folder is not a data set or the file was changed.
+    """
     path = folder / DATASET_FILE
     if not path.exists():
         raise InputError("the folder is not a data set: it has no dataset.json", where=str(folder), remedy="check the path")
@@ -120,14 +123,16 @@ def read_dataset_file(folder: Path) -> Record:
 def write_dataset_file(
     folder: Path, name: str, sources: dict[str, Any], epochs: dict[str, list[int]], *, complete: bool = False
 ) -> None:
-    """Write dataset.json.
+    """Write dataset.json, which describes a data set.
 
     Parameters
     ----------
     folder : Folder of the set.
     name : Name of the set.
-    sources : Config, versions, command and file name prefix, by fingerprint.
-    epochs : Indices of the set's epochs, by fingerprint.
+    sources : Config, versions, command and file name prefix of each set that this one was made of (one, unless it was merged),
+    by
+        fingerprint, a hash of the config.
+    epochs : Indices of the set's epochs in the plan of each config, by fingerprint.
     complete : Whether all epochs are made.
     """
     head = {"schema": SCHEMA, "name": name, "fingerprint": "-".join(sources), "complete": complete}
@@ -136,18 +141,21 @@ def write_dataset_file(
 
 
 def shard_name(source: str, index: int) -> str:
-    """Return the file name of an epoch's shard."""
+    """Return the file name of the record of an epoch in a data set.
+
+    source: fingerprint (hash) of the epoch's config. index: of the epoch in the plan of that config.
+    """
     return f"{source}_{index:06d}.json"
 
 
 def write_shard(folder: Path, name: str, record: Record) -> None:
-    """Write an epoch's record with its own checksum."""
+    """Write the record of a data set's epoch, with a checksum of its content. name: file name, as of `shard_name`."""
     text = _text(record)
     write_text(folder / SHARDS / name, f"{_digest(text)}\n{text}\n")
 
 
 def read_shard(folder: Path, name: str) -> Record | None:
-    """Read an epoch's record; None if it is missing or damaged."""
+    """Read the record of a data set's epoch; None if it is missing or damaged. name: file name, as of `shard_name`."""
     try:
         digest, _, text = read_text(folder / SHARDS / name).partition("\n")
         text = text.removesuffix("\n")

@@ -38,7 +38,10 @@ _MOST_WORKERS = 16
 
 @dataclass(frozen=True)
 class Workers:
-    """Who makes the epochs: `count` local processes, a Dask `scheduler` at an address, or (neither) this process."""
+    """Who makes the epochs of a data set: local processes, a Dask scheduler's workers, or (if neither is given) this process.
+
+    count: number of local processes. scheduler: address of the scheduler, or empty.
+    """
 
     count: int = 0
     scheduler: str = ""
@@ -57,14 +60,14 @@ class Workers:
 
 @dataclass
 class DatasetSummary:
-    """Result of a job.
+    """Result of making, verifying or combining a data set.
 
     Attributes
     ----------
     folder : Folder of the set.
-    made : What each epoch took that was made (see `worker.make_and_store`).
+    made : Times, memory and number of tiles of each epoch that was made (see `worker.make_and_store`).
     images, annotations : Numbers in the whole set, by split.
-    damage : What was missing or damaged before.
+    damage : Files that were missing or damaged before.
     warnings : Warnings about the set.
     """
 
@@ -87,14 +90,14 @@ def make_dataset(
 ) -> DatasetSummary:
     """Make a data set, or complete one that was interrupted.
 
-    On an interrupt, the finished epochs are assembled before KeyboardInterrupt is raised.
+    On an interrupt, annotations and README of the finished epochs are written before KeyboardInterrupt is raised.
 
     Parameters
     ----------
     config : Config of the set.
     out : Folder that is new, empty, or holds a set of the same config.
     workers : Who makes the epochs.
-    command : The command, for the data set card.
+    command : The command, which the set's README states.
     progress : Receives the progress; None: nothing is shown.
 
     Raises

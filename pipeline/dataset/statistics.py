@@ -21,15 +21,17 @@ Cell = tuple[str, str, str, str, str]
 
 @dataclass
 class CellStatistics:
-    """Statistics of one combination.
+    """Statistics of the tiles with one combination of wall, sensor, noise level, size class and split in a data set.
 
     Attributes
     ----------
     tiles, annotations : Their numbers.
-    with_ratio, stand_out : Annotations with a known signal-to-noise ratio, and with one above STANDS_OUT.
+    with_ratio, stand_out : Annotations with a known signal-to-noise ratio, and those of them whose ratio is so high that the
+    block
+        stands out from the noise.
     filled : Sum over the annotations of the share of the bounding box that the mask fills.
-    noise_m : StD outside the blocks of each epoch, m.
-    sizes : Annotations in each bin of SIZE_EDGES_M.
+    noise_m : Standard deviation outside the blocks of each epoch, m.
+    sizes : Number of annotations in each bin of block size; the bins' edges are SIZE_EDGES_M, m.
     """
 
     tiles: int = 0
@@ -43,13 +45,13 @@ class CellStatistics:
 
 @dataclass(frozen=True)
 class ShownTile:
-    """A sample tile for the card.
+    """A tile that a data set's README shows as an example.
 
     Attributes
     ----------
-    cell : Combination of its epoch.
+    cell : Combination (wall, noise level, ...) that its epoch belongs to.
     file : Path relative to the set's folder.
-    tile : Its entry in the shard.
+    tile : Its entry in the record of the epoch.
     noise_m : Noise of its epoch, m.
     """
 
@@ -60,11 +62,11 @@ class ShownTile:
 
 
 class SetStatistics:
-    """Statistics of a set by combination, and a sample tile of each sensor, noise level and size class.
+    """Statistics of a data set for its README, collected epoch by epoch.
 
     Attributes
     ----------
-    cells : Statistics of each combination.
+    cells : Statistics of each combination of its properties (wall, noise level, ...).
     samples : Sample tile by sensor, noise level and size class.
     seeds : Seeds of the epochs.
     spacing_m, smallest_m : Largest spacing of ray-traced samples and smallest edge of a block, m, by sensor and wall.
@@ -78,7 +80,7 @@ class SetStatistics:
         self.smallest_m: dict[tuple[str, str], float] = {}
 
     def add(self, record: dict[str, Any]) -> None:
-        """Add an epoch's record."""
+        """Add an epoch of a data set to the statistics. record: the epoch's record."""
         epoch = record["epoch"]
         key = epoch["split"], epoch["sensor"], epoch["wall"], epoch["noise"], epoch["size"]
         cell = self.cells[key]
@@ -109,7 +111,10 @@ class SetStatistics:
         self.smallest_m[place] = min([*edges, self.smallest_m.get(place, float("inf"))])
 
     def warnings(self) -> list[str]:
-        """Return a warning for each sensor and wall with fewer than two ray-traced samples along the smallest edge of a block."""
+        """Return a warning for each sensor and wall that is sampled too coarsely for its smallest blocks.
+
+        This is so if fewer than two ray-traced samples fall on the smallest edge of a block.
+        """
         return [
             f"{sensor} {wall}: samples are {1e3 * spacing:.0f} mm apart; the smallest block has an edge of {1e3 * edge:.0f} mm. "
             f"Fewer than two samples on it lose depth and rims of small niches; use {_FINER[sensor]}"

@@ -30,14 +30,20 @@ _TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 
 
 def run_with_watchdog(work: Callable[[T], Result], seconds: float, argument: T) -> Result:
-    """Return work(argument); end this process if it uses no processor time for so many seconds, as in a deadlock."""
+    """Return work(argument), but end this process if it hangs, as in a deadlock.
+
+    work: the function to call. seconds: time without any use of the processor after which the process is ended.
+    """
     with exit_if_stalled(seconds):
         return work(argument)
 
 
 @contextmanager
 def exit_if_stalled(seconds: float = STALLED_S) -> Iterator[None]:
-    """End this process if the block, and the threads it starts, use no processor time for so many seconds."""
+    """Within the `with` block, end this process if it hangs, as in a deadlock.
+
+    seconds: time after which it is ended if the block, and the threads that it starts, have not used the processor.
+    """
     own = threading.get_native_id()
     others = {thread.native_id for thread in threading.enumerate()} - {own}
     pulse = _Activity()
@@ -54,7 +60,10 @@ def exit_if_stalled(seconds: float = STALLED_S) -> Iterator[None]:
 
 @contextmanager
 def watch_workers(seconds: float = STALLED_S) -> Iterator[None]:
-    """Kill worker processes that are started in the block and use no processor time for so many seconds."""
+    """Within the `with` block, kill worker processes that hang, as in a deadlock.
+
+    seconds: time after which a process that was started in the block is killed if it has not used the processor.
+    """
     import psutil
 
     before = {child.pid for child in psutil.Process().children()}

@@ -73,12 +73,18 @@ def _source_plan(folder: str, job: str, source: str) -> _SourcePlan:
 
 
 def package_versions() -> dict[str, str]:
-    """Return what the bytes of a set depend on besides its config: versions of the packages, and the ray tracer's backend."""
+    """Return the versions on which the bytes of a data set depend besides its config.
+
+    They are of packages and of the ray tracer's backend, by name.
+    """
     return {**versions(), "backend": VARIANT}
 
 
 def require_same_versions(entry: dict[str, Any], where: str) -> None:
-    """Raise InputError if the versions here differ from those that started the set, which would change its bytes."""
+    """Raise InputError if package versions here differ from those that started a data set, which would change its bytes.
+
+    entry: the source's entry in dataset.json. where: name of the file, for errors.
+    """
     before, here = entry["versions"], package_versions()
     differ = sorted(key for key in before if key != "platform" and here.get(key) != before[key])
     if differ:
@@ -100,7 +106,7 @@ def use_threads(count: int) -> None:
 
 
 def make_and_store_run(orders: Sequence[EpochOrder]) -> list[dict[str, Any]]:
-    """Make epochs of one wall one after the other, so that the loaded wall is used again.
+    """Make epochs of a data set that share wall and reference one after the other, so that these are loaded once.
 
     Returns
     -------
@@ -111,7 +117,7 @@ def make_and_store_run(orders: Sequence[EpochOrder]) -> list[dict[str, Any]]:
 
 
 def make_and_store(order: EpochOrder) -> dict[str, Any]:
-    """Make an epoch and store it.
+    """Simulate an epoch of a data set and store its tiles and its record.
 
     Returns
     -------

@@ -48,7 +48,10 @@ class Detection:
         return int(np.count_nonzero(self.mask[top:bottom, left:right]))
 
     def moved(self, row: int, column: int) -> Detection:
-        """Return the same detection in a larger frame, where pixel (0, 0) of the present frame is (row, column)."""
+        """Return the same detection with its position in a larger image, such as the map from which a tile was cut.
+
+        row, column: position in the larger image of the top-left pixel of the present one.
+        """
         return Detection(self.row + row, self.column + column, self.mask, self.score)
 
     def annotation(self, number: int, image_id: int, shape: tuple[int, ...]) -> dict[str, Any]:
@@ -74,13 +77,13 @@ class Detection:
 
 
 def detection_from_mask(mask: NDArray[np.bool_], row: int, column: int, score: float) -> Detection | None:
-    """Make a detection from the true pixels of a mask.
+    """Make a detection from the pixels of a block, cropped to their bounding box.
 
     Parameters
     ----------
-    mask : (h, w) bool.
+    mask : (h, w) bool, true at the block's pixels.
     row, column : Top-left pixel of `mask` in the map.
-    score : Confidence.
+    score : Confidence, 0 to 1.
 
     Returns
     -------
@@ -104,7 +107,10 @@ def merged(items: Sequence[Detection]) -> Detection:
 
 
 def without_duplicates(found: Iterable[Detection]) -> list[Detection]:
-    """Sort detections, best first, and drop each one that shares most of its pixels, or of the other's, with a better one."""
+    """Return detections without repeated ones, best score first.
+
+    A detection is dropped if it shares most of its pixels with a better one, or contains most of that one's pixels.
+    """
     ranked = sorted(found, key=lambda item: (-item.score, item.row, item.column))
     kept: list[Detection] = []
     bounds = np.empty((len(ranked), 4), np.int64)
@@ -117,7 +123,7 @@ def without_duplicates(found: Iterable[Detection]) -> list[Detection]:
 
 
 def not_covered_by(found: Iterable[Detection], others: Sequence[Detection]) -> list[Detection]:
-    """Return the detections of `found` that share most of their pixels with none of the others."""
+    """Return the detections of `found` of which no detection in `others` covers most of the pixels."""
     bounds = np.array([item.bounds for item in others]).reshape(-1, 4)
 
     def covered(item: Detection) -> bool:
@@ -128,13 +134,18 @@ def not_covered_by(found: Iterable[Detection], others: Sequence[Detection]) -> l
 
 
 def bounds_overlap(bounds: NDArray[np.int64], other: tuple[int, int, int, int]) -> NDArray[np.bool_]:
-    """Return the (n,) mask of those bounds (n, 4), as `Detection.bounds`, that overlap the other bounds."""
+    """Find which rectangles overlap another one.
+
+    bounds: (n, 4) first row, end row, first column and end column of each, px, ends exclusive. other: the same of the other
+    one.
+    Returns (n,) bool.
+    """
     top, bottom, left, right = bounds.T
     return np.asarray((top < other[1]) & (other[0] < bottom) & (left < other[3]) & (other[2] < right))
 
 
 def shared_pixels(one: Detection, other: Detection) -> int:
-    """Count the pixels that are in both masks."""
+    """Count the pixels of a map that are in the masks of both detections."""
     top, bottom = max(one.row, other.row), min(one.bounds[1], other.bounds[1])
     first, last = max(one.column, other.column), min(one.bounds[3], other.bounds[3])
     if top >= bottom or first >= last:

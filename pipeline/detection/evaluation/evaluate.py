@@ -29,19 +29,19 @@ _KEYS = ("image_id", "category_id", "segmentation", "bbox", "area", "iscrowd", "
 
 @dataclass(frozen=True)
 class Score:
-    """Scores of one group of images at one confidence and one overlap: one cell of the thesis's tables.
+    """Scores of a detector for one group of images at one confidence and one overlap.
 
     Attributes
     ----------
     group : Name of the group.
     confidence : Lowest score that counts.
-    iou : Lowest overlap that counts as a match.
+    iou : Lowest overlap (intersection over union) that counts as a match.
     true_positives, false_positives, false_negatives : Their numbers.
     area_ratio : Mean of predicted over true mask area of the matches; NaN without matches.
     kind : Overlap of masks ("segm") or boxes ("bbox").
-    stand_out : Share of the blocks whose niche stands out from the noise for a matched filter
-        (pipeline/change/matched_filter.py):
-        about the largest recall that any detector could reach. NaN if the annotations do not say.
+    stand_out : Share of the blocks whose niche stands out from the noise for a matched filter, which is about the largest
+    recall that
+        any detector could reach (pipeline/change/matched_filter.py). NaN if the annotations do not say.
     """
 
     group: str
@@ -163,7 +163,9 @@ def matched_scores(
     threshold: float,
     kind: Overlap = "segm",
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the scores of detections and whether each is matched with a block; detections on crowd regions are left out.
+    """Return the scores of detections and whether each is matched with a block, to judge how reliable the scores are.
+
+    Detections on crowd regions (`iscrowd`) are left out.
 
     Parameters
     ----------
@@ -189,7 +191,12 @@ def matched_scores(
 
 
 def coco_metrics(truth: Mapping[str, Any], predictions: Sequence[Mapping[str, Any]], kind: Overlap = "segm") -> dict[str, float]:
-    """Return pycocotools' twelve metrics by name: average precision and recall by overlap, area and count; -1 where undefined."""
+    """Compute pycocotools' twelve metrics of detections, by name: average precision and recall by overlap, area and count.
+
+    truth, predictions: COCO annotations and detections, as in `evaluate`. kind: overlap of masks ("segm") or boxes ("bbox").
+    Undefined
+    metrics are -1.
+    """
     names = (
         "AP",
         "AP50",

@@ -21,11 +21,11 @@ OVERLAP = 0.25
 
 @dataclass(frozen=True)
 class ScoreClass:
-    """Detections with scores from `low` to `high`.
+    """Detections with scores between two limits, to compare their mean score with the share of them that are blocks.
 
     Attributes
     ----------
-    low, high : Limits of the class.
+    low, high : Limits of the scores.
     score : Mean score.
     detections : Number of detections.
     right : Number of those that are blocks.
@@ -39,12 +39,15 @@ class ScoreClass:
 
     @property
     def precision(self) -> float:
-        """Share of the detections that are blocks."""
+        """Share of the detections with such scores that are blocks."""
         return self.right / self.detections
 
     @property
     def error(self) -> float:
-        """Standard error of that share, with one block and one false alarm added so that it is never 0 (Agresti & Coull 1998)."""
+        """Standard error of the share of these detections that are blocks.
+
+        One block and one false alarm are added for it, so that it is never 0 (Agresti & Coull 1998).
+        """
         count = self.detections + 2
         share = (self.right + 1) / count
         return float(np.sqrt(share * (1 - share) / count))
@@ -52,7 +55,7 @@ class ScoreClass:
 
 @dataclass(frozen=True)
 class Reliability:
-    """Reliability of the scores in one group of images.
+    """Reliability of a detector's scores in one group of images: whether detections are blocks as often as their scores say.
 
     Attributes
     ----------
@@ -69,7 +72,10 @@ class Reliability:
 
     @property
     def calibration_error(self) -> float:
-        """Mean |precision - score| over the detections (Naeini et al. 2015); NaN without detections."""
+        """Mean difference |precision - score| over the detections, 0 if scores are probabilities; NaN without detections.
+
+        Precision and mean score are compared in classes of the score (Naeini et al. 2015).
+        """
         count = sum(each.detections for each in self.classes)
         off = sum(abs(each.right - each.score * each.detections) for each in self.classes)
         return off / count if count else float("nan")
@@ -87,7 +93,9 @@ def reliability(
     groups: Mapping[str, Iterable[int]],
     kind: Overlap = "segm",
 ) -> list[Reliability]:
-    """Compute the reliability of all scores, at an overlap of OVERLAP.
+    """Compare the scores of detections with how many of them are blocks, for groups of images.
+
+    A detection is a block if their intersection over union is at least OVERLAP (0.25).
 
     Parameters
     ----------

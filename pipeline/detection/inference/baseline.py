@@ -15,7 +15,10 @@ from scene.common.config import Config
 
 
 class BaselineConfig(Config):
-    """Settings of the baseline detector."""
+    """Settings of the baseline detector, which needs no network.
+
+    It thresholds the filtered difference map and takes connected components as blocks.
+    """
 
     median_px: Literal[1, 3, 5] = Field(3, description="side of the median filter before the threshold; 1: none")
     levels: float = Field(
@@ -27,10 +30,10 @@ class BaselineConfig(Config):
 
 
 def detect(difference: NDArray[np.float32], config: BaselineConfig | None = None) -> list[Detection]:
-    """Detect missing rock in a difference map (h, w), m, NaN without data; best first.
+    """Detect missing rock in a difference map without a network, by a threshold; the best detections come first.
 
-    The score of a component is 1 - 2^-r^2, where r is its mean difference over the threshold: 0.5 at the threshold, 0.94 at
-    twice.
+    difference: (h, w), m, NaN without data. config: settings; by default the usual ones. The score of a connected component is
+    1 - 2^-r^2, where r is its mean difference over the threshold: 0.5 at the threshold, 0.94 at twice.
     """
     config = config or BaselineConfig()
     valid = np.isfinite(difference)

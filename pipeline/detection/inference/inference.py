@@ -17,8 +17,8 @@ from pipeline.detection.network.normalisation import nmad, normalised
 def detect(model: Any, difference: NDArray[np.float32], minimum_score: float = 0.5) -> list[Detection]:
     """Detect blocks in a difference map with the network.
 
-    Tiles overlap as `seams.shared_px` says, so that every block up to that size is complete in one of them; `seams` merges
-    blocks that tiles cut. In maps larger than a tile, margins and tiles without data are skipped.
+    The map is searched in overlapping tiles, so that every block up to the overlap's size is complete in one of them; parts of
+    larger blocks are merged. In maps larger than a tile, margins and tiles without data are skipped.
 
     Parameters
     ----------
@@ -66,13 +66,17 @@ def _detect_in_tiles(model: Any, difference: NDArray[np.float32], minimum_score:
 
 
 def tile_places(shape: tuple[int, ...], size: int) -> Iterator[tuple[int, int]]:
-    """Yield (row, column) of tiles of side `size` that overlap by `shared_px` or more and end flush with the map's edge."""
+    """Yield the first row and column of overlapping tiles that cover a map, to search it tile by tile.
+
+    shape: (h, w) of the map, px. size: side of a tile, px. Tiles overlap by `shared_px` or more and end flush with the map's
+    edge.
+    """
     rows, columns = (_starts(length, size) for length in shape)
     return ((row, column) for row in rows for column in columns)
 
 
 def paste(probability: NDArray[np.float32], box: NDArray[np.float32], size: int) -> tuple[int, int, NDArray[np.bool_]]:
-    """Draw a mask that is given on a box into the image's pixels.
+    """Draw a mask that the network predicted on the grid of a box into the image's pixels.
 
     Values are interpolated bilinearly between the centres of the mask's cells.
 

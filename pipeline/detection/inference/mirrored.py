@@ -23,20 +23,30 @@ VIEWS: dict[Mirroring, tuple[Axes, ...]] = {
 
 
 def build_network(config: DetectorConfig, image_px: int | None = None) -> MaskRCNN:
-    """Build the network of a detector's config for detection."""
+    """Build the network for detection from a detector's config, without trained weights.
+
+    image_px: side of the images, px; None: as in the config.
+    """
     return MaskRCNN(config, image_px) if config.head.mirrored == "none" else MirroredMaskRCNN(config, image_px)
 
 
 class MirroredMaskRCNN(MaskRCNN):
-    """A MaskRCNN that averages its outputs over mirrored views; `FirstStage.levels` holds P2 to P5 of each view."""
+    """A MaskRCNN that also looks at mirror images of the map (views) and averages its outputs over them, for better detections.
+
+    The `levels` of its `FirstStage` hold the feature pyramid levels P2 to P5 of each view.
+    """
 
     @property
     def views(self) -> tuple[Axes, ...]:
-        """The mirrored axes of each view, from the config."""
+        """For each view of the map, the axes along which it is mirrored (0: up-down, 1: left-right), as the config says."""
         return VIEWS[self.config.head.mirrored]
 
     def first_stage(self, image: Tensor, *, training: bool) -> FirstStage:
-        """Compute `MaskRCNN.first_stage` of all views, and average it over them for the anchors of the unmirrored map."""
+        """Compute features, anchor scores and anchor boxes in all mirrored views of the images; average scores and boxes.
+
+        image: (b, h, w, c) the images, not mirrored; the averages belong to their anchors. training: whether layers are in
+        training mode.
+        """
         levels, logits, codes = [], [], []
         for axes in self.views:
             own = super().first_stage(ops.flip(image, [axis + 1 for axis in axes]), training=training)

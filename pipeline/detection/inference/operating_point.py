@@ -31,9 +31,14 @@ _TRIED = tuple(float(score) for score in 1 / (1 + np.exp(-np.linspace(-3, 5, 33)
 
 
 def set_operating_point(folder: Path, validation: CocoFolder) -> float:
-    """Calibrate the scores of the detector in `folder` on validation images, and save it.
+    """Calibrate the scores of a trained detector so that the usual threshold gives the largest F1, and save it.
 
     If the detector has mirrored views (`head.mirrored`), scores are calibrated with and without them.
+
+    Parameters
+    ----------
+    folder : Folder of the detector.
+    validation : Validation images.
 
     Returns
     -------
@@ -62,7 +67,7 @@ def _best_head_shifts(model: Any, validation: CocoFolder, prefix: str) -> dict[s
 
 
 def best_shifts(truth: dict[str, Any], found: list[dict[str, Any]]) -> tuple[float, float] | None:
-    """Find the shifts of the log odds with which the threshold CONFIDENCE gives the largest F1.
+    """Find how to shift the log odds of the scores so that the usual threshold CONFIDENCE gives the largest F1.
 
     A detection's size is that of its box.
 

@@ -28,7 +28,7 @@ border.
 
 
 def shared_px(size: int) -> int:
-    """Return by how much neighbouring tiles of side `size` overlap at least, px: a quarter of the side.
+    """Return the least overlap of neighbouring tiles in detection, px: a quarter of their side `size`.
 
     Half of the side would take nearly twice as many tiles for less than half a point of F1 (docs/validation/detector.md).
     """
@@ -37,7 +37,10 @@ def shared_px(size: int) -> int:
 
 @dataclass(frozen=True)
 class MapTile:
-    """A square of a map. row, column: its first pixel in the map; size: its side, px; shape: (h, w) of the map."""
+    """A square of a map in which the network searches for blocks.
+
+    row, column: its first pixel in the map; size: its side, px; shape: (h, w) of the map.
+    """
 
     row: int
     column: int
@@ -46,13 +49,13 @@ class MapTile:
 
     @property
     def bounds(self) -> tuple[int, int, int, int]:
-        """First row, end row, first column and end column in the map, px; the ends are exclusive."""
+        """First row, end row, first column and end column of the tile in the map, px; the ends are exclusive."""
         return self.row, min(self.row + self.size, self.shape[0]), self.column, min(self.column + self.size, self.shape[1])
 
 
 @dataclass(frozen=True)
 class Border:
-    """A side of a tile inside the map.
+    """A side of a tile that is not the map's edge, and so may cut a block in two.
 
     Attributes
     ----------
@@ -66,18 +69,18 @@ class Border:
     step: int
 
     def passed_by(self, item: Detection) -> bool:
-        """Whether a detection, in the map's frame, extends beyond the border."""
+        """Whether a detection extends beyond this border of a tile. item: the detection, in pixels of the whole map."""
         first, last = item.bounds[2 * self.axis : 2 * self.axis + 2]
         return first < self.place if self.step < 0 else last > self.place
 
 
 @dataclass(frozen=True)
 class BlockPart:
-    """A block as one tile shows it.
+    """A block as one tile shows it, perhaps only the part inside the tile.
 
     Attributes
     ----------
-    item : The detection, in the map's frame.
+    item : The detection, in pixels of the whole map.
     tile : The tile.
     cuts : Borders of the tile that may have cut the block.
     """
@@ -88,7 +91,10 @@ class BlockPart:
 
 
 def block_part(item: Detection, tile: MapTile) -> BlockPart:
-    """Find the borders of the tile that may have cut a detection, which is in the map's frame."""
+    """Find which borders of a tile may have cut a block that was detected in it.
+
+    item: the detection, in pixels of the whole map. tile: the tile.
+    """
     margin = tile.size // _MARGIN
     cuts = []
     for axis in (0, 1):

@@ -22,7 +22,10 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 def save(model: Any, folder: Path) -> None:
-    """Write a MaskRCNN to the folder; each file is complete or absent."""
+    """Write a trained MaskRCNN to a folder, from which `load` reads it: its config and its weights.
+
+    Each file is complete or absent.
+    """
     write_text(folder / CONFIG, yaml.safe_dump(model.config.model_dump(mode="json"), sort_keys=False))
     save_weights(model, folder / WEIGHTS)
 
@@ -36,7 +39,7 @@ def save_weights(model: Any, path: Path) -> None:
 
 
 def load_weights(model: Any, path: Path) -> None:
-    """Load Keras's weights; only numbers are taken from the file, and no code in it is run."""
+    """Load Keras's weights from a file into a network; only numbers are taken from the file, and no code in it is run."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Keras warns of each layer that does not fit, then raises
         model.load_weights(path)
@@ -54,7 +57,7 @@ def load_config(folder: Path) -> DetectorConfig:
 
 
 def with_head(config: DetectorConfig, **values: Any) -> DetectorConfig:
-    """Return a copy of the config with other values in `head`."""
+    """Return a copy of a detector's config with other values in its section `head`. values: new values by key."""
     return config.model_copy(update={"head": config.head.model_copy(update=values)})
 
 

@@ -19,12 +19,12 @@ _PLAIN_WIDTHS = {"fine": (16, 32, 64, 128), "light": (32, 64, 128, 192)}
 
 
 def feature_pyramid(name: str, image_px: int, channels_in: int, channels: int) -> keras.Model:
-    """Build a model from images to the pyramid levels P2 to P6.
+    """Build the part of the network that computes features of an image at several resolutions, the pyramid levels P2 to P6.
 
     Parameters
     ----------
     name : "resnet50" or "resnet101" of He et al. (2016), with bottleneck blocks; "light" with six plain blocks of two
-        convolutions and
+    convolutions and
         a quarter of the width; "fine", narrower still and without pooling at its start, so that all its levels have half the
         stride, as blocks of five pixels need.
     image_px : Side of the images, px.

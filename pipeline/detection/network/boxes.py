@@ -24,18 +24,20 @@ _LARGEST_LOG = float(np.log(1000 / 16))
 def anchors(
     height: int, width: int, strides: tuple[int, ...], sizes: tuple[float, ...], ratios: tuple[float, ...]
 ) -> NDArray[np.float32]:
-    """Compute the anchors of all levels, ordered by level, row, column and ratio; each is centred on its cell.
+    """Compute the anchors, the boxes of fixed size and place from which a region proposal network predicts boxes of blocks.
+
+    They are ordered by pyramid level, row, column and ratio; each is centred on a cell of its level.
 
     Parameters
     ----------
     height, width : Size of the image, px.
-    strides : Pixels per cell, one for each level.
+    strides : Pixels per cell, one for each pyramid level.
     sizes : Square root of the anchors' area, px, one for each level.
     ratios : Height over width.
 
     Returns
     -------
-    (a, 4) boxes.
+    (a, 4) boxes, top, left, bottom, right, px.
     """
     root = np.sqrt(np.asarray(ratios))
     levels = []
@@ -49,16 +51,21 @@ def anchors(
 
 
 def intersection_over_union(left: Tensor, right: Tensor) -> Tensor:
-    """Return the (..., n, m) IoU of boxes (..., n, 4) and (..., m, 4); 0 if both are empty."""
+    """Compute the overlap of each box with each other one, as intersection over union (..., n, m); 0 if both are empty.
+
+    left, right: boxes (..., n, 4) and (..., m, 4) as top, left, bottom, right, px.
+    """
     left, right = ops.expand_dims(left, -2), ops.expand_dims(right, -3)
     common = _common(left, right)
     return common / ops.maximum(_area(left) + _area(right) - common, 1e-6)
 
 
 def share_inside(left: Tensor, right: Tensor) -> Tensor:
-    """Return the share (..., n, m) of boxes (..., n, 4) that lies in boxes (..., m, 4); 0 for empty boxes.
+    """Return the share of each box that lies in each other one, (..., n, m); 0 for empty boxes.
 
-    This is COCO's overlap with a crowd.
+    left, right: boxes (..., n, 4) and (..., m, 4) as top, left, bottom, right, px; the share is of `left`. This is COCO's
+    overlap
+    with a crowd region.
     """
     left, right = ops.expand_dims(left, -2), ops.expand_dims(right, -3)
     return _common(left, right) / ops.maximum(_area(left), 1e-6)
@@ -74,10 +81,13 @@ def _common(left: Tensor, right: Tensor) -> Tensor:
 
 
 def encode(boxes: Tensor, reference: Tensor) -> Tensor:
-    """Code boxes (..., 4) relative to reference boxes (..., 4), both as top, left, bottom, right, px.
+    """Code boxes relative to reference boxes (anchors or proposals), as the four numbers that the network predicts.
 
-    The code (..., 4) has the shift of the centre in y and x in units of the reference's height and width, then the logarithms of
-    the ratios of heights and widths. All are divided by their usual standard deviations.
+    boxes, reference: (..., 4) top, left, bottom, right, px. The code (..., 4) has the shift of the centre in y and x in units
+    of the
+    reference's height and width, then the logarithms of the ratios of heights and widths. All are divided by their usual
+    standard
+    deviations.
     """
     centre, size = _centre_size(boxes)
     at, scale = _centre_size(reference)
@@ -86,7 +96,11 @@ def encode(boxes: Tensor, reference: Tensor) -> Tensor:
 
 
 def decode(code: Tensor, reference: Tensor) -> Tensor:
-    """Return the (..., 4) boxes of codes, the inverse of `encode`; sizes are limited to 62 times the reference's."""
+    """Return the boxes (..., 4) that the network's codes mean, the inverse of `encode`.
+
+    code: (..., 4) relative to the boxes `reference` (..., 4), top, left, bottom, right, px. Sizes are limited to 62 times the
+    reference's.
+    """
     at, scale = _centre_size(reference)
     code = code * _DEVIATIONS
     centre = at + code[..., :2] * scale
@@ -95,12 +109,15 @@ def decode(code: Tensor, reference: Tensor) -> Tensor:
 
 
 def widened(boxes: Tensor, margin: float) -> Tensor:
-    """Move all edges of boxes (..., 4) outwards by `margin`, px."""
+    """Move all edges of boxes (..., 4), top, left, bottom, right, outwards by `margin`, px."""
     return boxes + margin * np.array([-1, -1, 1, 1], np.float32)
 
 
 def mirrored(boxes: Tensor, axes: Axes, side: float) -> Tensor:
-    """Return where boxes (..., 4) of an image of this side, px, lie after mirroring; its own inverse."""
+    """Return where boxes lie after their image is mirrored; applying it twice gives the boxes again.
+
+    boxes: (..., 4) top, left, bottom, right, px. axes: mirrored axes, 0 for up-down, 1 for left-right. side: of the image, px.
+    """
     edges = [boxes[..., number] for number in range(4)]
     for axis in axes:
         edges[axis], edges[axis + 2] = side - edges[axis + 2], side - edges[axis]
@@ -108,25 +125,29 @@ def mirrored(boxes: Tensor, axes: Axes, side: float) -> Tensor:
 
 
 def mirrored_codes(codes: Tensor, axes: Axes) -> Tensor:
-    """Return codes (..., 4) after mirroring the image: shifts of the centre change sign, sizes stay; its own inverse."""
+    """Return the codes (see `encode`) of boxes after their image is mirrored; applying it twice gives the codes again.
+
+    codes: (..., 4), of which the shifts of the centre change sign and the sizes stay. axes: mirrored axes, 0 for up-down, 1 for
+    left-right.
+    """
     return codes * np.array([-1 if axis in axes else 1 for axis in range(2)] + [1, 1], np.float32)
 
 
 def doublings(boxes: Tensor) -> Tensor:
-    """Return log2(s / 16 px) (...), the size of boxes in doublings, where s is the root of the box's area, at least 1 px.
+    """Return the size of boxes as a number of doublings of 16 px, by which the detector corrects its scores.
 
-    The detector corrects its scores by size with it. boxes: (..., 4) y0, x0, y1, x1, px.
+    boxes: (..., 4) y0, x0, y1, x1, px. Returns log2(s / 16 px) (...), where s is the root of the box's area, at least 1 px.
     """
     return 0.5 * ops.log2(ops.maximum(_area(boxes), 1.0)) - 4.0
 
 
 def clip(boxes: Tensor, height: int, width: int) -> Tensor:
-    """Clip boxes (..., 4) to the image."""
+    """Clip boxes (..., 4), top, left, bottom, right, px, to an image of the given height and width, px."""
     return ops.clip(boxes, 0.0, np.array([height, width, height, width], np.float32))
 
 
 def non_maximum_suppression(boxes: Tensor, scores: Tensor, threshold: float, count: int) -> tuple[Tensor, Tensor]:
-    """Apply greedy non-maximum suppression.
+    """Drop boxes that overlap a better one (greedy non-maximum suppression), so that each block is found once.
 
     A box stays unless a better box that stays overlaps it by more than `threshold`. The rule has a unique solution. It is found
     by applying the rule to all boxes at once until nothing changes; each pass settles at least one more box, and in practice a
@@ -134,10 +155,10 @@ def non_maximum_suppression(boxes: Tensor, scores: Tensor, threshold: float, cou
 
     Parameters
     ----------
-    boxes : (b, n, 4) boxes.
+    boxes : (b, n, 4) boxes of b images, top, left, bottom, right, px.
     scores : (b, n) scores, 0...1, falling along n.
     threshold : Largest IoU of two boxes that both stay.
-    count : Number of boxes to return.
+    count : Number of boxes to return for each image.
 
     Returns
     -------

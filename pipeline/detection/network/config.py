@@ -36,7 +36,7 @@ class NormalisationConfig(Config):
 
 
 class ProposalConfig(Config):
-    """Settings of the region proposal network (Ren et al. 2015)."""
+    """Settings of the region proposal network, which finds boxes that may contain a block (Ren et al. 2015)."""
 
     anchor_sizes_px: tuple[Annotated[float, Field(gt=0, le=1e4)], ...] = Field(
         (8, 16, 32, 64, 128), min_length=5, max_length=5, description="one per pyramid level"
@@ -56,7 +56,7 @@ class ProposalConfig(Config):
 
 
 class HeadConfig(Config):
-    """Settings of the heads on the proposals (He et al. 2017), and of detection."""
+    """Settings of the network's heads, which classify proposed boxes and draw masks (He et al. 2017), and of detection."""
 
     mask_size_px: Literal[28, 56, 112] = Field(56, description="side of a mask within its box")
     sampled_proposals: int = Field(96, ge=3, le=5000, description="proposals per image in the loss, a third of them positive")
@@ -98,7 +98,10 @@ class HeadConfig(Config):
 
     @property
     def shifts(self) -> tuple[float, float]:
-        """Shift of the log odds of a block of 16 px, and for each doubling of its side, for detection as configured."""
+        """What detection adds to the log odds of a block of 16 px, and for each doubling of its side, to calibrate scores.
+
+        With mirrored views these are the values fitted with them.
+        """
         if self.mirrored == "none":
             return self.score_shift, self.score_per_doubling
         shift, slope = self.mirrored_score_shift, self.mirrored_score_per_doubling
@@ -122,7 +125,10 @@ class DetectorConfig(Config):
 
     @property
     def strides(self) -> tuple[int, ...]:
-        """Pixels of the image per cell of the pyramid levels P2 to P6."""
+        """Pixels of the image per cell of each level of the feature pyramid, P2 to P6.
+
+        Larger blocks are detected in levels with larger cells.
+        """
         finest = 2 if self.backbone == "fine" else 4
         return tuple(finest << level for level in range(5))
 
@@ -189,6 +195,9 @@ class TrainConfig(Config):
 
 
 def load_train_config(path: Path, overrides: Sequence[str] = ()) -> TrainConfig:
-    """Read a YAML file and apply `key.path=value` overrides; raise InputError for any mistake in it."""
+    """Read the config of a detector and its training.
+
+    path: YAML file. overrides: changes of its values, `key.path=value`. Raises InputError for any mistake.
+    """
     values = load_yaml(path) or {}
     return parse(TrainConfig, apply_overrides(values, overrides) if isinstance(values, dict) else values, where=str(path))

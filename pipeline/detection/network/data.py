@@ -26,7 +26,7 @@ MIRRORED: dict[bool | str, tuple[int, ...]] = {True: (1, 0), "left_right": (1,),
 
 @dataclass(frozen=True)
 class LabelledMap:
-    """A difference map and its blocks.
+    """A difference map and its annotated blocks, to train or validate the network with.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class LabelledMap:
 
 
 class CocoFolder:
-    """A folder with `annotations.json` and the TIFF images that it names.
+    """A folder of annotated difference maps for training: `annotations.json` (COCO) and the TIFF images that it names.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class CocoFolder:
     Raises
     ------
     InputError
-        As `read_coco` does.
+        If annotations.json is missing or wrong.
     """
 
     def __init__(self, folder: Path, *, masks: bool = True) -> None:
@@ -75,13 +75,13 @@ class CocoFolder:
         return len(self.images)
 
     def path(self, image: dict[str, Any]) -> Path:
-        """Return the path of an entry of `images`; raise InputError if it is outside the folder."""
+        """Return the path of an image. image: its entry in annotations.json. Raises InputError if it is outside the folder."""
         return inside(self.folder, image.get("file_name"), self.folder / "annotations.json")
 
     def labelled(self, index: int) -> LabelledMap:
-        """Read the image at `index` with those of its blocks that cover at least one pixel.
+        """Read one image with those of its blocks that cover at least one pixel.
 
-        Raises InputError if the file is damaged or not of the annotated size.
+        index: of the image in annotations.json, from 0. Raises InputError if the file is damaged or not of the annotated size.
         """
         difference = self._difference(index)
         labels = np.zeros(difference.shape, np.int32)
@@ -114,7 +114,7 @@ class CocoFolder:
 def batches(
     folder: CocoFolder, detector: DetectorConfig, training: TrainingConfig, epoch: int, *, learning: bool
 ) -> Iterator[Batch]:
-    """Yield all images once, as batches of network inputs.
+    """Yield all images of a folder once, as batches of network inputs for one epoch of training or validation.
 
     What is drawn depends on seed, epoch and image only. An incomplete last batch is filled with its own first images.
 
@@ -123,7 +123,7 @@ def batches(
     folder : The images.
     detector : Settings of the network's input.
     training : Batch size, window size, flips and seed.
-    epoch : Number of the epoch.
+    epoch : Number of the training epoch.
     learning : True: random order, mirroring and windows; False: in order, and the middle of each image.
     """
     order = np.arange(len(folder))
@@ -157,7 +157,8 @@ def batches(
 def network_input(labelled: LabelledMap, config: DetectorConfig) -> Batch:
     """Return one image and its blocks as the network's input, without the batch axis.
 
-    Raises InputError if there are more than `most_blocks` blocks.
+    labelled: the map and its blocks. config: says how values are scaled. Raises InputError if there are more blocks than its
+    `most_blocks`.
     """
     count = len(labelled.boxes)
     if count > config.most_blocks:
@@ -174,7 +175,7 @@ def network_input(labelled: LabelledMap, config: DetectorConfig) -> Batch:
 
 
 def mirrored(labelled: LabelledMap, axis: int) -> LabelledMap:
-    """Mirror a map: up-down (axis 0) or left-right (axis 1)."""
+    """Mirror a map and its blocks, to vary training images. axis: 0 for up-down, 1 for left-right."""
     boxes = labelled.boxes.copy()
     boxes[:, [axis, axis + 2]] = labelled.difference.shape[axis] - labelled.boxes[:, [axis + 2, axis]]
     return replace(labelled, difference=np.flip(labelled.difference, axis), labels=np.flip(labelled.labels, axis), boxes=boxes)
