@@ -51,7 +51,7 @@ class SunPosition:
 
 
 def sun_coordinates(days: float) -> tuple[float, float]:
-    """Compute the sun's right ascension and declination, rad, at a time.
+    """Compute the sun's right ascension and declination, rad, at a time, from which its place in the sky follows.
 
     These are the Astronomical Almanac's low-precision formulas, accurate to 0.01 deg from 1950 to 2050 (Michalsky 1988, eq.
     2-7). `days` is the time in days after J2000 (2000-01-01 12:00 UT).

@@ -132,7 +132,7 @@ class Blocks:
         return TriangleMesh(self.vertices[vertices], faces)
 
     def only(self, index: int) -> Blocks:
-        """Return the same kind of collection with one of the blocks alone. `index` counts the blocks from 0."""
+        """Return a collection that holds one of the blocks alone. `index` counts the blocks from 0."""
         mesh, one = self.mesh(index), slice(index, index + 1)
         vertex_start, face_start = (np.array([0, len(array)], dtype=np.int32) for array in (mesh.vertices, mesh.faces))
         placed = self.shape[one], self.size_m[one], self.position_m[one]

@@ -65,7 +65,7 @@ def faces_under_boxes(mesh: TriangleMesh, boxes: FloatArray, halo_m: float = 0.0
 def integral_image(raster: NDArray[np.generic]) -> IntArray:
     """Return the integral image (h + 1, w + 1) of a raster (h, w), from which sums over rectangles are read quickly.
 
-    Entry (i, j) is the sum over rows below i and columns below j.
+    Entry (i, j) is the sum over the rows 0 to i - 1 and the columns 0 to j - 1.
     """
     sums = np.zeros((raster.shape[0] + 1, raster.shape[1] + 1), dtype=np.int32)
     np.cumsum(raster, axis=0, dtype=np.int32, out=sums[1:, 1:])

@@ -28,14 +28,16 @@ _MOST_TESTS = 16.0
 
 @dataclass(frozen=True)
 class TopFaces:
-    """The highest face at each pixel of a raster of h w pixels, row by row, as device arrays.
+    """The face that a viewer above sees in each pixel of a raster of h x w pixels, looking along -z: the highest one.
+
+    The arrays, on the ray-tracing device, have one entry a pixel, row by row.
 
     Attributes
     ----------
     valid : (h w,) bool
         Whether there is a face; the other entries have no meaning where there is none.
     face : (h w,) uint32
-        Index of the face.
+        Number of the face.
     point : 3 x (h w,) float64
         The place on the face at the pixel's centre, m.
     """
@@ -46,9 +48,10 @@ class TopFaces:
 
 
 class FlatMesh:
-    """A mesh whose triangles are ready to be drawn on a raster, seen along -z.
+    """A mesh whose triangles are ready to be drawn on a raster, seen along -z, to find the highest face in each pixel.
 
-    Raises InputError if the mesh has no triangles or lies too far from the origin.
+    It takes the mesh (wall frame, m) and the raster. Raises InputError if the mesh has no triangles or lies too far from the
+    origin.
     """
 
     def __init__(self, mesh: TriangleMesh, grid: Grid) -> None:
@@ -73,11 +76,11 @@ class FlatMesh:
 
     @property
     def is_quick(self) -> bool:
-        """Whether faces are small enough for drawing to be quicker than casting rays."""
+        """Whether the faces are so small that drawing them on the raster is quicker than casting a ray through each pixel."""
         return float(dr.sum(mi.Float64(self._count))[0]) <= _MOST_TESTS * len(self._mesh.faces)
 
     def top_faces(self) -> TopFaces:
-        """Draw all triangles."""
+        """Draw all triangles on the raster and return the highest face in each pixel."""
         pixels = self._grid.width * self._grid.height
         highest, face = dr.zeros(mi.UInt32, pixels), dr.full(mi.UInt32, _NONE, pixels)
 
@@ -95,7 +98,10 @@ class FlatMesh:
         return TopFaces(valid, face, self._points(face, valid))
 
     def labels(self, top: TopFaces, labels: mi.Int32) -> mi.Int32:
-        """Return the label of the vertex of its face that is nearest to each point; labels: int32, one per vertex."""
+        """Return the block label in each pixel of the raster: that of the face's vertex which is nearest to the pixel's point.
+
+        top: the highest faces, as `top_faces` returns them. labels: (v,) int32, the block labels of the mesh's vertices.
+        """
         return label_of_nearest_vertex(self._vertices, self._face_vertices, top.face, top.valid, top.point, labels)
 
     def _visit(self, keep: Callable[[mi.UInt32, mi.UInt32, mi.Bool], None]) -> None:

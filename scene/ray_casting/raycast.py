@@ -68,7 +68,10 @@ class Hits:
 
 
 def check_castable(mesh: TriangleMesh) -> None:
-    """Raise InputError if a mesh has no triangles, or lies too far from the origin for single precision."""
+    """Check that rays can be cast at a mesh: raise InputError if it has no triangles or lies too far from the origin.
+
+    Far from the origin, single precision is too coarse.
+    """
     if len(mesh.faces) == 0:
         raise InputError("the mesh has no triangles", where="ray casting", remedy="use a mesh with triangles")
     if not np.abs(mesh.bounds).max() < _LARGEST_COORDINATE:
@@ -315,7 +318,7 @@ class RayCaster:
 def label_of_nearest_vertex(
     vertices: mi.Float64, face_vertices: mi.UInt32, face: mi.UInt32, valid: mi.Bool, point: mi.Array3f64, labels: mi.Int32
 ) -> mi.Int32:
-    """Return, for places on faces of a mesh, the label of the face's vertex that is nearest.
+    """Return, for each of n places on faces of a mesh, the block label of the face's vertex that is nearest.
 
     Parameters
     ----------

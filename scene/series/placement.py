@@ -63,7 +63,7 @@ def place_block(
     zone : SafeZone
         Part of the wall in which a random place is drawn, for a block without a given place.
     taken : sequence of (2, 3) arrays
-        Boxes of blocks that it may not touch, m.
+        Bounding boxes (smallest and largest coordinates, wall frame, m) of blocks that it may not touch.
     config : RockfallConfig
         Shapes and placement.
 

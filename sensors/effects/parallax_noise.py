@@ -16,7 +16,7 @@ from sensors.signal_chain.matches import Matches
 
 
 class ParallaxNoise(MatchingNoise):
-    """Disparities have white noise: dd ~ N(0, sigma), independent for each cell of the depth map."""
+    """Disparities have white noise: the error dd ~ N(0, sigma) is independent for each cell of the depth map."""
 
     name: Literal["parallax_noise"] = "parallax_noise"
     means = "Disparities scatter more than the model says, pixel by pixel."

@@ -11,7 +11,7 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 
 class RangeNoise(RangeSpread):
-    """Ranges have white noise: dR ~ N(0, sigma), independent for each pulse. Several sources of noise add in quadrature."""
+    """Ranges have white noise: the error dR ~ N(0, sigma) is independent for each pulse. Sources of noise add in quadrature."""
 
     name: Literal["range_noise"] = "range_noise"
     means = "Ranges scatter more than the model says, everywhere alike."

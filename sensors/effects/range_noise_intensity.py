@@ -11,7 +11,7 @@ from sensors.signal_chain.pulses import PulseGeometry
 
 
 class RangeNoiseIntensity(RangeSpread):
-    """Range noise decreases with the received power I: dR ~ N(0, a I^exponent), independent for each pulse.
+    """Range noise decreases with the received power I: the error dR ~ N(0, a I^exponent) is independent for each pulse.
 
     The exponent is about -0.5 where photon counts dominate (shot noise) and -1 where the receiver's noise dominates (thermal)
     (Wujanz et al. 2017; Schmitz et al. 2019).

@@ -13,8 +13,8 @@ from sensors.signal_chain.pulses import PulseGeometry
 class RangeNoiseProportional(RangeSpread):
     """Range noise grows with the range.
 
-    dR ~ N(0, ppm 1e-6 R) with the range R, independent for each pulse. It is the second figure of data sheets that state "1 mm
-    + 10 ppm".
+    The error dR ~ N(0, ppm 1e-6 R), with the range R, is independent for each pulse. It is the second figure of data sheets
+    that state "1 mm + 10 ppm".
     """
 
     name: Literal["range_noise_proportional"] = "range_noise_proportional"

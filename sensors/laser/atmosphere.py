@@ -11,10 +11,10 @@ def extinction_per_m(visibility_m: float, wavelength_nm: float) -> float:
     """Compute the extinction coefficient of haze and fog, 1/m: sigma = 3.912 / V (wavelength / 550 nm)^-q (Kim et al. 2001).
 
     It tells how haze and fog weaken a scanner's echoes. `visibility_m` is the visibility V in m, `wavelength_nm` that of the
-    laser in nm. The exponent q falls with it, as droplets become larger than the wavelength; with V in km, it is 1.6 above 50
-    km, 1.3 above 6 km, 0.16 V + 0.34 above 1 km, V - 0.5 above 0.5 km, 0 in fog. The published jumps of q at 6 and 50 km are
-    kept. The model does not hold for rain and snow (see the effect `precipitation`), nor where gases absorb, which the bands of
-    laser scanners avoid.
+    laser in nm. The exponent q is smaller at shorter visibility, as droplets become larger than the wavelength: with V in km,
+    it is 1.6 above 50 km, 1.3 above 6 km, 0.16 V + 0.34 above 1 km, V - 0.5 above 0.5 km, 0 in fog. The published jumps of q at
+    6 and 50 km are kept. The model does not hold for rain and snow (see the effect `precipitation`), nor where gases absorb,
+    which the bands of laser scanners avoid.
 
     Kim, McArthur, Korevaar (2001): Comparison of laser beam propagation at 785 nm and 1550 nm in fog and haze, Proc. SPIE 4214.
     """

@@ -32,8 +32,7 @@ SPECKLE_STEP_PX = 1.0
 class MatchingConfig(Config):
     """The real matcher; its pixels are those of the pictures it matches, that is the depth map's cells.
 
-    It is OpenCV's semi-global matching, which runs on rendered photographs. The matcher's costs, penalties and paths are those
-    of Hirschmueller (2008).
+    It is OpenCV's semi-global matching (a variant of Hirschmueller 2008), which runs on rendered photographs.
     """
 
     block_size_px: int = Field(5, ge=1, le=21, description="side of the window whose costs are summed, odd [px]")

@@ -136,7 +136,7 @@ class VertexMatches(Matches):
     cells : _TracedCells
         The ray-traced depth map, computed when an effect first needs it.
     before : (rows, columns) array, optional
-        Disparities of that depth map after the effects so far, px; None before the first.
+        Disparities of that depth map after the effects so far, px; None before the first effect.
     """
 
     cells: _TracedCells
