@@ -185,6 +185,7 @@ def page(record: dict[str, Any]) -> str:
     ]
     failed = sum(each["said"] != "works" for each in record["trials"])
     works = f"{failed} of the ways in the table failed." if failed else "All ways in the table work."
+    machines = ", and at commit ".join(dict.fromkeys(f"{each['commit']} on {each['machine']}" for each in record["trials"]))
     head = f"""# Ways to install
 
 This page is for users who install scarpsim, from its repository or without it. It lists each way that was tried and what came of
@@ -193,11 +194,12 @@ it.
 Each trial started with an empty environment and an empty folder, and with no variable of the shell but the path, the home and the
 package index. A fresh clone carried out the commands of the README with that Python first in the path, and the trial then checked
 that both reports of the demonstration were there. The system libraries were already on the machine. In the other trials the
-program simulated a small wall with the laser scanner, or imported what the extra adds. Times include the installation, mostly from
-a local cache of packages. An *extra* is a named group of optional packages, such as `detect` for the
-detector. {works} "Glibc" in the name of the machine is the version of its C library.
+program simulated a small wall with the laser scanner, or imported what the extra adds. Times include the installation, mostly
+from a local cache of packages. Other programs ran on the machine meanwhile, so that times are upper limits. An *extra* is a named
+group of optional packages, such as `detect` for the detector. {works}
+"Glibc" in the name of a machine is the version of its C library.
 
-Tried on {" and on ".join(dict.fromkeys(each["machine"] for each in record["trials"]))}.
+Tried at commit {machines}.
 
 | what | how | result | time | at commit |
 |---|---|---|---|---|
