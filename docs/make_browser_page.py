@@ -49,6 +49,7 @@ def page(record: dict[str, Any]) -> str:
     table.append(f"| **all {len(rows)}** | {' | '.join(f'**{total[count]}**' for count in COUNTS)} |")
     head = " | ".join(("opened", "files loaded", *COUNTS[1:])).replace("axe runs", "runs of axe-core")
     passed = len(record["tests"]) - record["failed"]
+    pages = sum(not what.endswith(("by mouse", "by keyboard")) for what in rows)
     return f"""# What the browser tests do and find
 
 This page is for users who want to know whether reports, viewer and documentation work in a browser, and for developers who change
@@ -56,7 +57,7 @@ them. The tests in `tests/browser` make small outputs with each command, and ope
 Debian's Chromium {record["chromium"]}. The browser has no access to the network. `make test` runs these tests where Chromium is
 installed.
 
-Of {len(record["tests"])} tests, {passed} passed. They opened {len(rows)} pages and loaded {total["files"]} files. They clicked
+Of {len(record["tests"])} tests, {passed} passed. They opened {pages} different pages and loaded {total["files"]} files. They clicked
 {total["clicks"]} times, pressed {total["keys"]} keys, and saw {total["console errors"]} console errors and
 {total["missing files"]} missing files. In {total["axe runs"]} runs, axe-core found {total["severe violations"]} serious or
 critical violations and {total["lesser violations"]} lesser ones.
@@ -80,7 +81,8 @@ Axe-core runs at both widths, except in the viewer, where it runs at {wide} px.
 ## What was found
 
 Clicks and keys are those of the tests; they do not include a search text that is typed. The severe violations are those that
-axe-core grades serious or critical. The lesser ones are moderate or minor and fail no test.
+axe-core grades serious or critical. The lesser ones are moderate or minor and fail no test. A report without keys has nothing that folds and no link, so
+that there is nothing to reach.
 
 | {head} |
 |{"---|" * (len(COUNTS) + 1)}
