@@ -56,7 +56,9 @@ def parsed_time(text: str, where: str) -> datetime:
     try:
         found = datetime.fromisoformat(text)
     except ValueError:
-        raise InputError(f"got '{text[:60]}'", where=where, allowed=_ISO) from None
+        raise InputError(
+            f"'{text[:60]}' is not a time that can be read", where=where, allowed=_ISO, remedy="write it in this form"
+        ) from None
     return found.replace(tzinfo=UTC) if found.tzinfo is None else found.astimezone(UTC)
 
 
