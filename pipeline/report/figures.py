@@ -301,7 +301,7 @@ def curves_figure(panels: Sequence[CurvePanel], y_label: str, title: str = "") -
 
 
 def histogram_figure(outside: NDArray[np.floating], inside: NDArray[np.floating], title: str = "") -> bytes:
-    """Draw histograms of differences, m: outside the blocks on a linear scale, all on a logarithmic one, as PNG."""
+    """Draw histograms of differences, m, outside and inside blocks: linear near the noise, logarithmic over all."""
     groups = [("outside the blocks", outside, _OUTSIDE), ("inside the blocks", inside, _INSIDE)]
     samples = [(name, values[~np.isnan(values)] * 1e3, colour) for name, values, colour in groups]
     figure = Figure(figsize=(_LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN, 4.6), dpi=DPI, layout="constrained")
