@@ -93,7 +93,11 @@ class Calibration:
 
     @property
     def parameters(self) -> pandas.DataFrame:
-        """One row per noise parameter: value, and low and high end of its confidence interval, in the unit of its name."""
+        """The fitted noise of the sensor, one row per parameter.
+
+        The columns are the value and the low and high end of its confidence interval, in the unit with which the parameter's
+        name ends.
+        """
         found = self.figures.found
         values = {name: np.exp(each) for name, each in (("value", found.x), ("low", found.low), ("high", found.high))}
         return frame_of(values, self.figures.parameters.names, "parameter")
@@ -108,11 +112,11 @@ class Calibration:
 
     @property
     def warnings(self) -> list[str]:
-        """Limitations to know before the values are used, as sentences."""
+        """Limitations of the calibration to know before its values are used, as sentences."""
         return warnings(self.figures)
 
     def summary(self) -> str:
-        """Return the result as a few lines of text."""
+        """Return the fitted noise of the sensor as a few lines of text."""
         return summary(self.figures)
 
     def plot(self, kind: str = "windows") -> Picture:

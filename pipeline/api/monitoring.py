@@ -108,7 +108,7 @@ class Monitoring:
 
     @property
     def folder(self) -> Path:
-        """Folder with the written products."""
+        """Folder with the maps, tables and the report that the monitoring wrote."""
         return self.result.folder
 
     @property
@@ -132,7 +132,10 @@ class Monitoring:
 
     @property
     def events(self) -> geopandas.GeoDataFrame:
-        """One row per event and epoch, with the columns of events.csv. The geometry is the outline in survey coordinates."""
+        """Detected rockfalls and other changes, one row per event and epoch, with the columns of events.csv.
+
+        The geometry of a row is the event's outline in survey coordinates, m.
+        """
         geopandas, shapely = library("geopandas"), library("shapely")
         outlines = [shapely.MultiPolygon([shapely.Polygon(ring) for ring in each]) for each in self.result.outlines()]
         crs = self.result.site.crs or None
@@ -161,7 +164,7 @@ class Monitoring:
         return Picture(path.read_bytes())
 
     def summary(self) -> str:
-        """Return the result as text, one line per epoch."""
+        """Return the result of the monitoring as text, one line per epoch."""
         return "\n".join(headline(self.result))
 
     def __repr__(self) -> str:

@@ -99,7 +99,7 @@ class SeriesConfig(Config):
 
     @property
     def count(self) -> int:
-        """Number of epochs, the reference included."""
+        """Number of epochs in the series, the reference included."""
         return len(self.times) if isinstance(self.times, tuple) else self.times.count
 
     def when(self, number: int) -> datetime:
@@ -114,7 +114,7 @@ class SeriesConfig(Config):
 
     @property
     def hours(self) -> FloatArray:
-        """(count,) times of the epochs, h after the first."""
+        """(count,) times of the epochs of the series, h after the first."""
         return np.array([self.hours_of(self.when(number)) for number in range(self.count)])
 
     def falls_h(self) -> Sequence[float]:

@@ -28,7 +28,10 @@ _Factor = Annotated[float, Field(ge=0)]
 
 
 class ScaledModel(Config):
-    """A sensor model whose noise is multiplied by a factor. In a file, `model` may be a bundled name or a path."""
+    """A sensor model whose noise is multiplied by a factor, for one noise level of a data set.
+
+    In a file, `model` may be a bundled name or a path.
+    """
 
     model: SensorModel
     scale: _Factor | dict[str, _Factor] = Field(1.0, description="factor of every sigma and mean of the noise, one or by wall")
@@ -63,7 +66,7 @@ def _scaled(value: Any, factor: float) -> Any:
 
 
 class NoiseLevel(Config):
-    """The sensor models at one level of noise."""
+    """The sensor models of a data set's epochs at one of its levels of noise."""
 
     stereo: ScaledModel | None = Field(None, description="model of the stereo pair")
     tls: ScaledModel | None = Field(None, description="model of the laser scanner")

@@ -33,7 +33,7 @@ class Detection:
 
     @property
     def area_px(self) -> int:
-        """Number of pixels in the mask."""
+        """Number of pixels in the detected block's mask."""
         return int(np.count_nonzero(self.mask))
 
     @property
@@ -97,7 +97,7 @@ def detection_from_mask(mask: NDArray[np.bool_], row: int, column: int, score: f
 
 
 def merged(items: Sequence[Detection]) -> Detection:
-    """Merge detections into one with all their pixels and the best of their scores."""
+    """Merge detections of the parts of one block into one, with all their pixels and the best of their scores."""
     bounds = np.array([item.bounds for item in items])
     (top, left), (bottom, right) = bounds[:, ::2].min(axis=0), bounds[:, 1::2].max(axis=0)
     mask = np.zeros((bottom - top, right - left), bool)

@@ -69,7 +69,7 @@ class Score:
         return _share(2 * self.true_positives, 2 * self.true_positives + self.false_positives + self.false_negatives)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content as JSON types, with null for NaN."""
+        """Return the scores of a group of images as JSON types, with null for NaN."""
         values = {**asdict(self), "precision": self.precision, "recall": self.recall, "f1": self.f1}
         return {name: None if isinstance(value, float) and np.isnan(value) else value for name, value in values.items()}
 

@@ -31,7 +31,7 @@ class NormalisationConfig(Config):
 
     @property
     def channels(self) -> int:
-        """Number of channels of the network's input."""
+        """Number of channels of the network's input: the difference, and where there is data if that is added."""
         return 2 if self.validity_channel else 1
 
 

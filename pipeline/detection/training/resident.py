@@ -51,7 +51,7 @@ class ResidentSet:
 
     @property
     def tiles(self) -> int:
-        """Number of tiles."""
+        """Number of training tiles in the graphics card's memory."""
         return int(self.images.shape[0])
 
     @property

@@ -245,7 +245,7 @@ class SurfaceMeasurement(MeasurementBase):
 
     @property
     def centre(self) -> FloatArray:
-        """(3,) centre of rotation and scale of the cloud, wall frame, m."""
+        """(3,) middle of the reference surface, about which the measured points are rotated and scaled, wall frame, m."""
         return np.asarray(self.reference.bounds.mean(axis=0))
 
     @property
