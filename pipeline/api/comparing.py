@@ -93,14 +93,15 @@ class Comparison:
 
     @property
     def table(self) -> pandas.DataFrame:
-        """Main results, one row per sensor, indexed by its name: noise, level of detection, smallest block, completeness; SI
-        units.
+        """Main results of the compared sensors, one row per sensor, indexed by name; SI units.
+
+        The columns include noise, level of detection, smallest block that is detected, and completeness.
         """
         return frame(map(_row, self.figures.found)).set_index("name")
 
     @property
     def blocks(self) -> pandas.DataFrame:
-        """One row per block and sensor: size, whether it was in view and seen, true and measured volume; SI units."""
+        """All fallen blocks, one row per block and sensor: size, whether in view and seen, true and measured volume; SI units."""
         found = self.figures.found
         return frame({"sensor": each.name, **block.to_dict()} for each in found for block in each.detection.blocks)
 
