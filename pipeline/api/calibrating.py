@@ -43,15 +43,16 @@ def calibrate(
     measured : path, Run, or a list of them
         A folder with measurement.yaml, a folder with difference maps, difference maps (GeoTIFF), or a run.
     config : optional
-        The site; see `configure`. Default: the config of a run among `measured`, or else the demo.
+        The config of the site (file, name or values); see `configure`. Default: the config of a run among
+        `measured`, or else the demo.
     sensor : "tls" or "stereo", optional
         What measured. Default: as the inputs say.
     greedy : bool
-        Also run the greedy search of the thesis, for comparison.
+        Also run the simple search of the thesis, which lowers one parameter at a time, for comparison.
     out : path, optional
         Folder for the report and files. Default: nothing is written.
     seed, model, **overrides
-        See `configure`.
+        A seed and a sensor model in place of the config's, and changed keys; see `configure`.
     progress : "auto" or bool
         Whether progress is shown; "auto": in notebooks and on terminals.
 

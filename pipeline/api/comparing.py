@@ -101,7 +101,10 @@ class Comparison:
 
     @property
     def blocks(self) -> pandas.DataFrame:
-        """All fallen blocks, one row per block and sensor: size, whether in view and seen, true and measured volume; SI units."""
+        """All fallen blocks, one row per block and sensor; SI units.
+
+        The columns include the size, whether the block was in view and seen, and its true and measured volume.
+        """
         found = self.figures.found
         return frame({"sensor": each.name, **block.to_dict()} for each in found for block in each.detection.blocks)
 

@@ -58,8 +58,10 @@ def monitor(
     progress : "auto" or bool
         Whether progress is shown; "auto": in notebooks and on terminals.
     **options
-        Fields of `MonitorOptions`: position, direction, views, gsd_m, stable, targets, unit, columns, scanner, model,
-        photographs, detector, seed.
+        Fields of `MonitorOptions`: position (of the sensor) and direction (of change), survey coordinates, m; views (their
+        number) and gsd_m (side of a pixel, m) of the maps; stable (areas of stable rock, wall frame, m); targets (file of
+        measured targets, used instead of ICP); unit and columns of the files; scanner, model or photographs (what measured);
+        detector; seed. Default: found from the files.
 
     Returns
     -------

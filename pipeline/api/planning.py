@@ -37,7 +37,8 @@ def plan(
     Parameters
     ----------
     config, seed, model, **overrides
-        The set-up; see `configure`.
+        The set-up's config (file, name or values), a seed and a sensor model in place of the config's, and changed keys; see
+        `configure`.
     sensor : "tls" or "stereo", optional
         The sensor to plan. Default: all sensors of the config.
     out : path, optional

@@ -56,7 +56,8 @@ def simulate(
     Parameters
     ----------
     config, seed, model, **overrides
-        The site; see `configure`.
+        The site's config (file, name or values), a seed and a sensor model in place of the config's, and changed keys; see
+        `configure`.
     sensor : "tls" or "stereo", optional
         The sensor. May be omitted if the config has a model of only one.
     out : path, optional

@@ -39,7 +39,7 @@ class EpochOrder:
     ----------
     folder : Folder of the set.
     job : Identifier of the job, which names its staging folder.
-    source : Fingerprint of the epoch's config.
+    source : Fingerprint (a hash) of the data set's config.
     index : Index of the epoch in the plan of that config.
     stage : Key of its set-up (`PlannedEpoch.stage`).
     threads : Threads to use; 0: all.

@@ -17,7 +17,7 @@ _COVERED = 0.6
 
 @dataclass(frozen=True)
 class Detection:
-    """One detected block.
+    """One detected block, as a mask at its position in a difference map.
 
     Attributes
     ----------
@@ -55,7 +55,9 @@ class Detection:
         return Detection(self.row + row, self.column + column, self.mask, self.score)
 
     def annotation(self, number: int, image_id: int, shape: tuple[int, ...]) -> dict[str, Any]:
-        """Return the detection as a COCO result that also has an id and a box, so that it is an annotation too.
+        """Return the detection in COCO's format, to write it to a file.
+
+        It is a COCO result that also has an id and a box, as COCO's annotations have.
 
         Parameters
         ----------

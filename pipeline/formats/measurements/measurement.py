@@ -129,7 +129,7 @@ class MeasurementBase(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class TlsMeasurement(MeasurementBase):
-    """n points of a laser scan, or of several: in other poses or faces (channel `scan`), or at other times (channel `epoch`).
+    """n points measured by one laser scan, or by several of other poses or faces (channel `scan`) or times (channel `epoch`).
 
     Attributes
     ----------
