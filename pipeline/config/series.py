@@ -123,5 +123,5 @@ class SeriesConfig(Config):
 
 
 def utc(time: datetime) -> datetime:
-    """Return a time in UTC; one without a zone is UTC."""
+    """Return a time converted to UTC, so that times can be compared; one without a zone is taken as UTC."""
     return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)

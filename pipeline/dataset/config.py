@@ -98,7 +98,7 @@ class Part(Config):
 
 
 class DatasetConfig(Config):
-    """Config of a data set of difference map tiles."""
+    """Config of a data set of annotated difference map tiles, on which detectors of rockfall are trained and tested."""
 
     name: str = Field("rockfall", pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name of the data set")
     seed: int = Field(1, ge=0, lt=2**63, description="seed of all random numbers")

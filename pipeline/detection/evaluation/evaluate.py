@@ -55,17 +55,17 @@ class Score:
 
     @property
     def precision(self) -> float:
-        """Share of the detections that are blocks; NaN without detections."""
+        """Share of the detector's detections that are blocks; NaN without detections."""
         return _share(self.true_positives, self.true_positives + self.false_positives)
 
     @property
     def recall(self) -> float:
-        """Share of the blocks that were detected; NaN without blocks."""
+        """Share of the annotated blocks that were detected; NaN without blocks."""
         return _share(self.true_positives, self.true_positives + self.false_negatives)
 
     @property
     def f1(self) -> float:
-        """Harmonic mean of precision and recall; NaN where there is neither a block nor a detection."""
+        """Harmonic mean of precision and recall of the detections; NaN where there is neither a block nor a detection."""
         return _share(2 * self.true_positives, 2 * self.true_positives + self.false_positives + self.false_negatives)
 
     def to_dict(self) -> dict[str, Any]:

@@ -31,7 +31,7 @@ def save(model: Any, folder: Path) -> None:
 
 
 def save_weights(model: Any, path: Path) -> None:
-    """Write Keras's weights to `path`, which must end in .weights.h5, completely or not at all."""
+    """Write the weights of a Keras network to the file `path`, which must end in .weights.h5, completely or not at all."""
     with writing(path) as temporary:
         own = temporary.with_name(f"{temporary.stem}.weights.h5")
         model.save_weights(own)

@@ -56,7 +56,7 @@ class ResidentSet:
 
     @property
     def side_px(self) -> int:
-        """Side of a tile, px."""
+        """Side of the training tiles, px."""
         return int(self.images.shape[1])
 
 

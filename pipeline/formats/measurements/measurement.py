@@ -281,7 +281,7 @@ class SurfaceMeasurement(MeasurementBase):
         return other
 
     def moved(self, pose: FloatArray) -> Self:
-        """Shift (m), rotate (rad) and scale the points about the reference's centre by k amounts of the columns of `datum`."""
+        """Shift (m), rotate (rad) and scale the points about `centre`; pose (k,): amounts of the k columns of `datum`."""
         whole = self.datum @ pose
         turn = (1 + whole[6]) * rotation_matrix(whole[3:6])
         points = (self.cloud.points - self.centre) @ turn.T + self.centre + whole[:3]
