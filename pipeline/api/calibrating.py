@@ -43,15 +43,16 @@ def calibrate(
     measured : path, Run, or a list of them
         A folder with measurement.yaml, a folder with difference maps, difference maps (GeoTIFF), or a run.
     config : optional
-        The site; see `configure`. Default: the config of a run among `measured`, or else the demo.
+        The config of the site (file, name or values); see `configure`. Default: the config of a run among
+        `measured`, or else the demo.
     sensor : "tls" or "stereo", optional
         What measured. Default: as the inputs say.
     greedy : bool
-        Also run the greedy search of the thesis, for comparison.
+        Also run the simple search of the thesis, which lowers one parameter at a time, for comparison.
     out : path, optional
         Folder for the report and files. Default: nothing is written.
     seed, model, **overrides
-        See `configure`.
+        A seed and a sensor model in place of the config's, and changed keys; see `configure`.
     progress : "auto" or bool
         Whether progress is shown; "auto": in notebooks and on terminals.
 
@@ -93,7 +94,11 @@ class Calibration:
 
     @property
     def parameters(self) -> pandas.DataFrame:
-        """One row per noise parameter: value, and low and high end of its confidence interval, in the unit of its name."""
+        """The fitted noise of the sensor, one row per parameter.
+
+        The columns are the value and the low and high end of its confidence interval, in the unit with which the parameter's
+        name ends.
+        """
         found = self.figures.found
         values = {name: np.exp(each) for name, each in (("value", found.x), ("low", found.low), ("high", found.high))}
         return frame_of(values, self.figures.parameters.names, "parameter")
@@ -108,11 +113,11 @@ class Calibration:
 
     @property
     def warnings(self) -> list[str]:
-        """Limitations to know before the values are used, as sentences."""
+        """Limitations of the calibration to know before its values are used, as sentences."""
         return warnings(self.figures)
 
     def summary(self) -> str:
-        """Return the result as a few lines of text."""
+        """Return the fitted noise of the sensor as a few lines of text."""
         return summary(self.figures)
 
     def plot(self, kind: str = "windows") -> Picture:

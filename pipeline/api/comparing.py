@@ -88,22 +88,31 @@ class Comparison:
 
     @property
     def names(self) -> list[str]:
-        """Names of the sensors, in the order in which they were given."""
+        """Names of the compared sensors, in the order in which they were given."""
         return [each.name for each in self.figures.found]
 
     @property
     def table(self) -> pandas.DataFrame:
-        """One row per sensor, indexed by name: noise, level of detection, smallest block, completeness; SI units."""
+        """Main results of the compared sensors, one row per sensor, indexed by name; SI units.
+
+        The columns include noise, level of detection, smallest block that is detected, and completeness.
+        """
         return frame(map(_row, self.figures.found)).set_index("name")
 
     @property
     def blocks(self) -> pandas.DataFrame:
-        """One row per block and sensor: size, whether it was in view and seen, true and measured volume; SI units."""
+        """All fallen blocks, one row per block and sensor; SI units.
+
+        The columns include the size, whether the block was in view and seen, and its true and measured volume.
+        """
         found = self.figures.found
         return frame({"sensor": each.name, **block.to_dict()} for each in found for block in each.detection.blocks)
 
     def differences(self, sensor: str) -> xarray.DataArray:
-        """Return the difference maps of the sensor called `sensor`, (epoch, y, x), m."""
+        """Return the difference maps of one of the sensors, (epoch, y, x), m; NaN without data.
+
+        They are reference minus epoch. sensor: its name, as in `names`.
+        """
         trial = self.figures.trial
         if sensor not in self.names:
             raise InputError(
@@ -114,14 +123,14 @@ class Comparison:
 
     @property
     def level_of_detection(self) -> xarray.Dataset:
-        """Level of detection (95 %) of each pixel, m; one map per sensor."""
+        """Smallest change that is significant (95 %) at each pixel of the wall, m; one map (y, x) per sensor, by its name."""
         grid = self.figures.trial.grid
         return dataset({
             each.name: data_array(each.noise.level, grid, each.name, "95 % level of detection") for each in self.figures.found
         })  # fmt: skip
 
     def summary(self) -> str:
-        """Return the main results as lines of text."""
+        """Return the main results of the comparison of sensors as lines of text."""
         return summary(self.figures)
 
     def plot(self, kind: str = "maps") -> Picture:

@@ -85,7 +85,7 @@ class DataSet:
 
     @property
     def splits(self) -> list[str]:
-        """The splits that the set has, out of train, val and test."""
+        """Names of the splits that the data set has, out of train, val and test."""
         return [name for name in SPLITS if (self.folder / name / "annotations.json").is_file()]
 
     @property
@@ -103,7 +103,7 @@ class DataSet:
 
     @property
     def table(self) -> pandas.DataFrame:
-        """One row per tile: split, file_name, sensor, wall, noise, size_class, blocks, ..."""
+        """Description of all tiles, one row per tile: split, file_name, sensor, wall, noise, size_class, blocks, ..."""
         rows = []
         for split in self.splits:
             content = read_coco(self.folder / split / "annotations.json")

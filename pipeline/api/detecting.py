@@ -108,9 +108,9 @@ class Detections:
 
     @property
     def events(self) -> geopandas.GeoDataFrame:
-        """One row per event: image, number, position, area, depth, volume, score; SI units.
+        """The detected rockfalls, one row per event: image, number, position, area, depth, volume, score; SI units.
 
-        The geometry is its rectangle, wall frame.
+        The geometry of a row is the event's bounding rectangle, wall frame, m.
         """
         bounds = [
             [each.x_m - each.width_m / 2, each.y_m - each.height_m / 2, each.x_m + each.width_m / 2, each.y_m + each.height_m / 2]
@@ -120,16 +120,19 @@ class Detections:
 
     @property
     def volume_m3(self) -> float:
-        """Total volume of all events."""
+        """Total volume of rock that fell in all detected events, m3."""
         return sum(each.volume_m3 for each in self.found)
 
     def plot(self, image: str | None = None) -> Picture:
-        """Return the outlines drawn over a map, chosen by the stem of its file name. Default: the first map."""
+        """Return a difference map with the outlines of the detected rockfalls.
+
+        image: name of the map's file without its suffix; by default the first map.
+        """
         drawn = {path.name.removesuffix("_detections.png"): path for path in sorted(self.folder.glob("*_detections.png"))}
         return Picture(pick(drawn, image, "plot").read_bytes())
 
     def summary(self) -> str:
-        """Return the number of events and their volume as one line of text."""
+        """Return the number of detected rockfalls and their total volume as one line of text."""
         return f"{counted(len(self), 'block')} with a score of {self.confidence:g} or more, {self.volume_m3:.3g} m³"
 
     def __repr__(self) -> str:

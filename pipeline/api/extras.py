@@ -13,7 +13,10 @@ EXTRAS = {"open3d": "poisson"}
 
 
 def library(name: str) -> Any:
-    """Import an optional library; raise InputError that names the extra to install if it does not load."""
+    """Import an optional library, such as pandas, by its name.
+
+    Raises InputError that names the extra (optional part of scarpsim) to install if it does not load.
+    """
     try:
         return import_module(name)
     except ImportError as error:

@@ -137,12 +137,12 @@ class Measurement:
 
     @property
     def model(self) -> Any:
-        """The sensor model to be tested."""
+        """The sensor model (expected noise and errors) that the measurement is to test."""
         return self.held.model
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Remarks of the readers about the files, as sentences."""
+        """Remarks about the measurement's files, such as what was left out or converted when they were read, as sentences."""
         return self.held.notes
 
     @property
@@ -232,7 +232,8 @@ class Diagnosis:
         """Effects that explain why measurement and sensor model disagree.
 
         One row per parameter of each effect, SI units. The columns include the fitted value, its standard deviation (std), the
-        kind of effect, the effects that the data cannot distinguish from it, and the p-value of the effect.
+        kind of effect, the effects that the data cannot distinguish from it (cannot_be_told_from), and the p-value of the
+        effect.
         """
         rows = []
         for each in self.found.effects:
@@ -244,9 +245,10 @@ class Diagnosis:
 
     @property
     def changes(self) -> geopandas.GeoDataFrame:
-        """Regions where the scene itself changed: volume_m3, volume_std_m3, offset_m, position.
+        """Regions where the rock itself changed between reference and measurement, one row each.
 
-        The geometry is the bounding rectangle, wall frame.
+        The columns are volume_m3, volume_std_m3 (its standard deviation), offset_m (median change of range, positive where rock
+        is missing) and the position in the world (world_x_m, ...). The geometry is the bounding rectangle, wall frame, m.
         """
         rows, bounds = [], []
         for each in self.found.changes:
@@ -283,17 +285,18 @@ class Diagnosis:
         return self.found.gap.to_dict() if self.found.gap else None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of gap.json."""
+        """Return all results of the diagnosis as in gap.json, in JSON types."""
         return report.to_dict(self.found, self.measurement.held)
 
     def summary(self) -> str:
-        """Return the verdict as a few lines of text."""
+        """Return the result of the diagnosis, with the named effects, as a few lines of text."""
         return report.summarise(self.found)
 
     def plot(self, kind: str = "maps") -> Picture:
-        """Return a figure of the report, or the residuals over the wall.
+        """Return a figure of the report by its name, or a map of the residuals over the wall.
 
-        kind: maps, profiles, gap or identifiability for a figure of the report; before or after for the residuals.
+        kind: maps, profiles, gap or identifiability for a figure of the report; before or after for the residuals without or
+        with the named effects in the prediction.
         """
         if kind in ("before", "after"):
             points = self.residuals

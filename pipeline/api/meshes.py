@@ -69,26 +69,29 @@ class Mesh(TriangleMesh):
 
     @classmethod
     def read(cls, path: Path | str) -> Self:
-        """Read a PLY file as `save` writes it. Unlike `open_wall` it repairs nothing."""
+        """Read a mesh from a PLY file that `save` wrote. Unlike `open_wall` it repairs nothing."""
         return cls.of(read_ply(Path(path)))
 
     def save(self, path: Path | str) -> Path:
-        """Write a PLY file; return its path."""
+        """Write the mesh to a PLY file; return its path."""
         write_ply(Path(path), self)
         return Path(path)
 
     def to_trimesh(self) -> Any:
-        """Convert to a trimesh.Trimesh."""
+        """Convert the mesh to a trimesh.Trimesh, for the library trimesh."""
         return library("trimesh").Trimesh(self.vertices, self.faces, process=False)
 
     def to_open3d(self) -> Any:
-        """Convert to an open3d.geometry.TriangleMesh."""
+        """Convert the mesh to an open3d.geometry.TriangleMesh, for the library Open3D."""
         open3d = library("open3d")
         vertices = open3d.utility.Vector3dVector(self.vertices)
         return open3d.geometry.TriangleMesh(vertices, open3d.utility.Vector3iVector(self.faces))
 
     def to_pyvista(self) -> Any:
-        """Convert to a pyvista.PolyData, with block labels and albedo if the mesh has them."""
+        """Convert the mesh to a pyvista.PolyData, for the library PyVista.
+
+        Block labels and reflectances (albedo) go with it if it has them.
+        """
         faces = np.concatenate([np.full((len(self.faces), 1), 3, self.faces.dtype), self.faces], axis=1)
         made = library("pyvista").PolyData(self.vertices, faces.ravel())
         if self.vertex_albedo is not None:
@@ -98,7 +101,7 @@ class Mesh(TriangleMesh):
         return made
 
     def plot(self, gsd_m: float | None = None) -> Picture:
-        """Return a hillshade, viewed along the normal of the mean plane.
+        """Return a shaded picture (hillshade) of the mesh, viewed along the normal of its mean plane.
 
         gsd_m: side of a pixel, m; by default the picture has about 100,000 pixels.
         """

@@ -58,8 +58,10 @@ def monitor(
     progress : "auto" or bool
         Whether progress is shown; "auto": in notebooks and on terminals.
     **options
-        Fields of `MonitorOptions`: position, direction, views, gsd_m, stable, targets, unit, columns, scanner, model,
-        photographs, detector, seed.
+        Fields of `MonitorOptions`: position (of the sensor) and direction (of change), survey coordinates, m; views (their
+        number) and gsd_m (side of a pixel, m) of the maps; stable (areas of stable rock, wall frame, m); targets (file of
+        measured targets, used instead of ICP); unit and columns of the files; scanner, model or photographs (what measured);
+        detector; seed. Default: found from the files.
 
     Returns
     -------
@@ -108,7 +110,7 @@ class Monitoring:
 
     @property
     def folder(self) -> Path:
-        """Folder with the written products."""
+        """Folder with the maps, tables and the report that the monitoring wrote."""
         return self.result.folder
 
     @property
@@ -132,7 +134,10 @@ class Monitoring:
 
     @property
     def events(self) -> geopandas.GeoDataFrame:
-        """One row per event and epoch, with the columns of events.csv. The geometry is the outline in survey coordinates."""
+        """Detected rockfalls and other changes, one row per event and epoch, with the columns of events.csv.
+
+        The geometry of a row is the event's outline in survey coordinates, m.
+        """
         geopandas, shapely = library("geopandas"), library("shapely")
         outlines = [shapely.MultiPolygon([shapely.Polygon(ring) for ring in each]) for each in self.result.outlines()]
         crs = self.result.site.crs or None
@@ -161,7 +166,7 @@ class Monitoring:
         return Picture(path.read_bytes())
 
     def summary(self) -> str:
-        """Return the result as text, one line per epoch."""
+        """Return the result of the monitoring as text, one line per epoch."""
         return "\n".join(headline(self.result))
 
     def __repr__(self) -> str:

@@ -29,7 +29,7 @@ class Picture:
     png: bytes
 
     def save(self, path: Path | str) -> Path:
-        """Write the PNG file; return its path."""
+        """Write the picture to a PNG file; return its path."""
         write_bytes(Path(path), self.png)
         return Path(path)
 
@@ -40,7 +40,7 @@ class Picture:
         return self.png
 
     def small(self) -> bytes:
-        """Return a thumbnail as PNG bytes, small enough for a notebook's table."""
+        """Return the picture as a thumbnail, PNG bytes, small enough for a notebook's table."""
         from PIL import Image
 
         with Image.open(io.BytesIO(self.png)) as picture:

@@ -37,7 +37,8 @@ def plan(
     Parameters
     ----------
     config, seed, model, **overrides
-        The set-up; see `configure`.
+        The set-up's config (file, name or values), a seed and a sensor model in place of the config's, and changed keys; see
+        `configure`.
     sensor : "tls" or "stereo", optional
         The sensor to plan. Default: all sensors of the config.
     out : path, optional
@@ -73,9 +74,9 @@ class SensorPlan:
 
     @property
     def maps(self) -> xarray.Dataset:
-        """All maps by name (smallest_block_m, normal_sigma_m, incidence_rad, ...), in SI units.
+        """Maps of the predicted performance over the wall, by name, in SI units.
 
-        They are NaN where the sensor sees nothing.
+        Names are smallest_block_m, normal_sigma_m, incidence_rad and others. Values are NaN where the sensor sees nothing.
         """
         raster = self.promise.raster
         return dataset({
@@ -85,17 +86,17 @@ class SensorPlan:
 
     @property
     def figures(self) -> dict[str, float]:
-        """Single numbers by name: visible share of the wall, pulses, seconds_to_scan, base_m, ...; SI units."""
+        """Single predicted numbers by name: visible share of the wall, pulses, seconds_to_scan, base_m, ...; SI units."""
         return dict(self.promise.figures)
 
     @property
     def table(self) -> pandas.DataFrame:
-        """One row per map: its value in the middle of the wall, median, 5 % and 95 % quantile; SI units."""
+        """Summary of the maps, one row per map: value in the middle of the wall, median, 5 % and 95 % quantile; SI units."""
         middle = self.promise.in_middle
         return frame({"map": each.name, **each.summary(middle)} for each in self.promise.maps).set_index("map")
 
     def summary(self) -> str:
-        """Return the main numbers as lines of text."""
+        """Return the main predicted numbers of the sensor as lines of text."""
         return summary(self.promise)
 
     def plot(self, kind: str = "smallest_block_m") -> Picture:

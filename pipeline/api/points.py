@@ -24,14 +24,14 @@ _AXES = ("x", "y", "z")
 
 
 class Points(np.ndarray[Any, Any]):
-    """Structured array (n,) of points: x, y, z (float64, m), then the recorded or computed channels.
+    """Measured points as a structured array (n,): x, y, z (float64, m), then the recorded or computed values (channels).
 
     `points["x"]` is an array; `points[points["intensity"] > 0.5]` is a `Points` again.
     """
 
     @classmethod
     def of(cls, cloud: PointCloud) -> Self:
-        """Return the points of a cloud, in its frame; its channels keep their types."""
+        """Return the points of a PointCloud as a structured array, in its frame; the recorded values keep their types."""
         channels = {name: cloud.points[:, axis] for axis, name in enumerate(_AXES)}
         optional = {"intensity": cloud.intensity, "gps_time": cloud.gps_time}
         channels |= {name: np.asarray(values) for name, values in (optional | cloud.extra).items() if values is not None}
@@ -46,7 +46,7 @@ class Points(np.ndarray[Any, Any]):
 
     @property
     def xyz(self) -> FloatArray:
-        """Coordinates (n, 3), m."""
+        """Coordinates of the points as an array (n, 3), m."""
         return np.stack([self[name] for name in _AXES], axis=-1)
 
     def cloud(self) -> PointCloud:
@@ -56,7 +56,10 @@ class Points(np.ndarray[Any, Any]):
         return PointCloud(self.xyz, intensity, further.pop("gps_time", None), further)
 
     def save(self, path: Path | str) -> Path:
-        """Write .laz (.copc.laz for COPC), .las, .ply, .pcd or .xyz; return the path. Raises InputError for another suffix."""
+        """Write the points to a file, whose suffix gives the format; return its path.
+
+        Suffixes are .laz (.copc.laz for COPC), .las, .ply, .pcd and .xyz. Raises InputError for another.
+        """
         path, cloud = Path(path), self.cloud()
         if path.suffix in (".laz", ".las"):
             write_cloud(path, cloud)
@@ -76,7 +79,7 @@ class Points(np.ndarray[Any, Any]):
         return path
 
     def to_open3d(self) -> Any:
-        """Convert to an open3d.geometry.PointCloud, grey by intensity if there is one."""
+        """Convert the points to an open3d.geometry.PointCloud, grey by intensity if there is one, for the library Open3D."""
         geometry, utility = library("open3d").geometry, library("open3d").utility
         cloud = geometry.PointCloud(utility.Vector3dVector(self.xyz))
         if "intensity" in (self.dtype.names or ()):
@@ -85,7 +88,7 @@ class Points(np.ndarray[Any, Any]):
         return cloud
 
     def to_pyvista(self) -> Any:
-        """Convert to a pyvista.PolyData with the channels as point data."""
+        """Convert the points to a pyvista.PolyData, with the recorded values as point data, for the library PyVista."""
         cloud = library("pyvista").PolyData(self.xyz)
         for name in self.dtype.names or ():
             if name not in _AXES:
@@ -93,7 +96,10 @@ class Points(np.ndarray[Any, Any]):
         return cloud
 
     def plot(self, channel: str = "z") -> Picture:
-        """Return a plot of the points over x and y, coloured by a channel. At most 100,000 points are drawn."""
+        """Return a plot of the points over x and y. At most 100,000 points are drawn.
+
+        channel: name of the values by which they are coloured, such as z or intensity.
+        """
         if channel not in (self.dtype.names or ()):
             raise InputError(
                 f"there is no channel '{channel}'",

@@ -56,7 +56,8 @@ def simulate(
     Parameters
     ----------
     config, seed, model, **overrides
-        The site; see `configure`.
+        The site's config (file, name or values), a seed and a sensor model in place of the config's, and changed keys; see
+        `configure`.
     sensor : "tls" or "stereo", optional
         The sensor. May be omitted if the config has a model of only one.
     out : path, optional
@@ -112,38 +113,38 @@ class Run:
 
     @property
     def record(self) -> dict[str, Any]:
-        """Content of run.json, checked."""
+        """Content of run.json, which describes the run: its config, versions and results."""
         return self._files.record
 
     @cached_property
     def config(self) -> SimulationConfig:
-        """The resolved config that made the run."""
+        """The complete config with which the run was simulated."""
         return load_config(self.folder / RUN_FILE, [], None, None)
 
     @property
     def sensor(self) -> SensorName:
-        """The kind of sensor: "stereo" or "tls"."""
+        """The kind of sensor that the run simulated: "stereo" or "tls" (laser scanner)."""
         return "stereo" if self.record["sensor"] == "stereo" else "tls"
 
     @property
     def report(self) -> Path:
-        """Path of report.html."""
+        """Path of the run's report.html."""
         return self.folder / "report.html"
 
     @cached_property
     def frame(self) -> WallFrame:
-        """The wall frame, with `to_world(points)` and `to_wall(points)`, (..., 3), m."""
+        """The run's wall frame, which converts points (..., 3), m, with `to_world(points)` and `to_wall(points)`."""
         held = self.record["wall_frame"]
         return WallFrame(np.array(held["rotation"]), np.array(held["origin_m"]))
 
     @property
     def annotations(self) -> dict[str, Any]:
-        """Content of annotations.json, in COCO format."""
+        """The fallen blocks in the run's difference maps, in COCO format: content of annotations.json."""
         return read_annotations(self.folder / "annotations.json")
 
     @property
     def epochs(self) -> list[Epoch]:
-        """The epochs after the reference."""
+        """The epochs of the run after the reference."""
         return [Epoch(self, int(record["epoch"])) for record in self.record["epochs"][1:]]
 
     def __len__(self) -> int:
@@ -157,25 +158,30 @@ class Run:
 
     @property
     def differences(self) -> xarray.DataArray:
-        """Difference maps of all epochs, (epoch, y, x) float32, m; NaN without data."""
+        """Difference maps of all epochs of the run, (epoch, y, x) float32, m: reference minus epoch, NaN without data."""
         maps, grids = zip(*(read_geotiff(each.file("difference", ".tif")) for each in self.epochs), strict=True)
         return data_array(np.stack(maps), grids[0], "difference", DIFFERENCE, frame=self.frame)
 
     @property
     def blocks(self) -> geopandas.GeoDataFrame:
-        """The fallen blocks of all epochs; see `Epoch.blocks`."""
+        """The fallen blocks of all epochs of the run, one row each, with their true and measured sizes; see `Epoch.blocks`."""
         return _blocks(self.epochs)
 
     @property
     def statistics(self) -> pandas.DataFrame:
-        """One row per epoch: statistics of its differences and the RMS of its registration.
+        """Noise of the run, one row per epoch.
 
-        The statistics (count, median_m, nmad_m, ...) are those outside the blocks.
+        The columns are statistics of the difference map outside the fallen blocks (count, median_m, nmad_m, ...) and the RMS of
+        the epoch's registration.
         """
         return frame(each.statistics for each in self.epochs)
 
     def plot(self, kind: str = "difference", epoch: int = 1) -> Picture:
-        """Return a figure of the report of one epoch: difference, blocks, hillshade, histogram, icp or m3c2."""
+        """Return a figure of one epoch of the run, as in the report.
+
+        kind: difference, blocks, hillshade, histogram, icp or m3c2. epoch: its number; 0 is the reference, which has only its
+        hillshade.
+        """
         return self[epoch].plot(kind)
 
     def __repr__(self) -> str:
@@ -206,7 +212,7 @@ class Epoch:
 
     @property
     def folder(self) -> Path:
-        """Folder of the epoch's own files."""
+        """Folder of the epoch's own files (points, surfaces) within the run's folder."""
         return epoch_folder(self.run.folder, self.number)
 
     def file(self, kind: str, suffix: str) -> Path:
@@ -233,12 +239,12 @@ class Epoch:
 
     @property
     def record(self) -> dict[str, Any]:
-        """The epoch's part of run.json."""
+        """The part of run.json that describes this epoch."""
         return dict(self.run.record["epochs"][self.number])
 
     @property
     def difference(self) -> xarray.DataArray:
-        """Difference map, (y, x) float32, m: reference minus epoch, missing rock positive, NaN without data."""
+        """Difference map of the epoch, (y, x) float32, m: reference minus epoch, missing rock positive, NaN without data."""
         values, grid = read_geotiff(self.file("difference", ".tif"))
         return data_array(values, grid, "difference", DIFFERENCE, frame=self.run.frame)
 
@@ -250,27 +256,33 @@ class Epoch:
 
     @property
     def points(self) -> Points:
-        """The points that the sensor measured."""
+        """The points that the sensor measured in this epoch, wall frame, m."""
         return Points.of(self.run._files.points(self.number))
 
     @property
     def surface(self) -> Mesh:
-        """The mesh reconstructed from the points."""
+        """The mesh that was reconstructed from the measured points of this epoch, wall frame, m."""
         return Mesh.of(self.run._files.surface(self.number))
 
     @property
     def truth(self) -> Mesh:
-        """The true mesh of the wall."""
+        """The true mesh of the wall in this epoch, without errors of the sensor, wall frame, m."""
         return Mesh.of(self.run._files.surface(self.number, "truth"))
 
     @property
     def blocks(self) -> geopandas.GeoDataFrame:
-        """One row per fallen block: its true values and what the difference map shows. The geometry is its bounding rectangle."""
+        """The blocks that fell in this epoch, one row each: true values, and what the difference map shows.
+
+        The geometry of a row is the bounding rectangle of the block's niche, wall frame, m.
+        """
         return _blocks([self])
 
     @property
     def statistics(self) -> dict[str, Any]:
-        """Statistics of the differences outside the blocks, SI units, and the RMS of the registration."""
+        """Noise of the epoch, SI units.
+
+        It has the statistics of the difference map outside the blocks, and the RMS of the epoch's registration.
+        """
         outside = self.record.get("statistics", {}).get("outside_blocks")
         if outside is None:
             raise InputError(
@@ -282,23 +294,26 @@ class Epoch:
         return {"epoch": self.number, **outside, "registration_rms_m": registration and registration.get("rms_m")}
 
     def summary(self) -> str:
-        """Return the number of blocks and the noise as one line of text."""
+        """Return the number of blocks that fell in the epoch, and its noise, as one line of text."""
         blocks, found = len(self.record["blocks"]), self.statistics
         return (
             f"{blocks} blocks fell; outside of them NMAD {millimetres(found['nmad_m'])}, median {millimetres(found['median_m'])}"
         )
 
     def plot(self, kind: str = "difference") -> Picture:
-        """Return a figure of the report: difference, blocks, hillshade, histogram, icp or m3c2.
+        """Return a figure of the epoch as in the report.
 
-        The reference has only its hillshade.
+        kind: difference, blocks, hillshade, histogram, icp or m3c2; the reference has only its hillshade.
         """
         if self.number == 0:
             return Picture((self.run.folder / "reference.png").read_bytes())
         return Picture(self.file(pick(dict(zip(PICTURES, PICTURES, strict=True)), kind, "plot"), ".png").read_bytes())
 
     def save_gltf(self, path: Path | str) -> Path:
-        """Write the surface as .glb, coloured by the difference, with each niche as a separate part; return the path."""
+        """Write the measured surface of the epoch as .glb (glTF), for viewers of 3D models; return the path.
+
+        It is coloured by the difference, and each niche is a separate part.
+        """
         from pipeline.export.exported_run import ExportedRun
         from pipeline.export.gltf import save_gltf
 

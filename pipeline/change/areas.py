@@ -31,7 +31,10 @@ Area = Annotated[Box | Annotated[tuple[Vertex, ...], Field(min_length=3)], Befor
 
 
 def in_areas(areas: Iterable[Area], x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
-    """Return whether positions x, y (any shape, wall frame, m) lie in one of the areas."""
+    """Return whether positions lie in one of several areas, such as those that are known to be stable.
+
+    areas: boxes or polygons, wall frame, m. x, y: coordinates, any shape, wall frame, m.
+    """
     found = np.zeros(np.shape(x), dtype=bool)
     for area in areas:
         corners = np.array(area, dtype=np.float64)

@@ -27,7 +27,7 @@ _MOST_PIXELS = 2**32 - 1
 
 
 class DifferenceConfig(Config):
-    """How surfaces are compared."""
+    """How the surfaces of two epochs are compared in a difference map."""
 
     gsd_m: float = Field(0.02, gt=0, description="side of a pixel of the difference map [m]")
 
@@ -150,19 +150,22 @@ class DifferenceStatistics:
     nmad: float
 
     def to_dict(self) -> dict[str, float | int | None]:
-        """Return the values for JSON: keys of lengths end in _m, NaN becomes null."""
+        """Return the statistics of a difference map for JSON: keys of lengths end in _m, NaN becomes null."""
         lengths = {f"{name}_m": value for name, value in dataclasses.asdict(self).items() if name != "count"}
         return {"count": self.count} | {name: None if np.isnan(value) else value for name, value in lengths.items()}
 
     def summary(self) -> str:
-        """Describe the statistics on one line, in millimetres."""
+        """Describe the statistics of a difference map on one line, in millimetres."""
         values = (self.median, self.standard_deviation, self.rmse, self.nmad)
         median, deviation, rmse, nmad = (f"{value * 1e3:.1f} mm" for value in values)
         return f"median {median}, StD {deviation}, RMSE {rmse}, NMAD {nmad} ({self.count:,} pixels)"
 
 
 def statistics(values: NDArray[np.floating]) -> DifferenceStatistics:
-    """Compute the statistics of all values (any shape, m) that are not NaN."""
+    """Compute the statistics (median, standard deviation, NMAD, ...) of a difference map.
+
+    values: any shape, m; NaN is ignored.
+    """
     values = values[~np.isnan(values)]
     if values.size == 0:
         return DifferenceStatistics(0, *[float("nan")] * 5)

@@ -74,12 +74,16 @@ class M3c2Map:
 
     @property
     def significant(self) -> NDArray[np.bool_]:
-        """(h, w) True where the change exceeds its level of detection."""
+        """(h, w) True where the M3C2 distance between the epochs exceeds its level of detection."""
         with np.errstate(invalid="ignore"):
             return np.abs(self.distance) > self.level
 
     def summary(self) -> dict[str, float | int | None]:
-        """Return, for JSON: core points with a distance, how many are significant, and the median level of detection, m."""
+        """Summarise the M3C2 distances for JSON.
+
+        The values are the number of core points with a distance, how many are significant, and the median level of detection,
+        m.
+        """
         known = ~np.isnan(self.level)
         return {
             "core_points": int(np.count_nonzero(~np.isnan(self.distance))),

@@ -10,9 +10,10 @@ _NMAD_FACTOR = 1.4826
 
 
 def nmad(values: NDArray[np.floating], centre: float | np.floating | None = None) -> float:
-    """Compute 1.4826 median(|v - centre|), which equals the standard deviation for normal errors (Hoehle and Hoehle 2009).
+    """Estimate a standard deviation that outliers hardly change: the NMAD, 1.4826 median(|v - centre|).
 
-    values: any shape; NaN is ignored. centre: their median by default. Returns NaN if there are no values.
+    For normal errors it equals the standard deviation (Hoehle and Hoehle 2009). values: any shape; NaN is ignored. centre:
+    their median by default. Returns NaN if there are no values.
     """
     missing = np.isnan(values)
     known = values[~missing] if missing.any() else values

@@ -19,7 +19,7 @@ MOST_TILES = 100_000
 
 
 class TileConfig(Config):
-    """How a raster is cut into tiles."""
+    """How a difference map is cut into square tiles for a detector."""
 
     size_px: int = Field(512, ge=8, le=65_536, description="side of a tile")
     overlap_px: int = Field(0, ge=0, description="pixels that neighbouring tiles share; less than size_px")

@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Make, verify, merge or split a data set."""
+    """Make, verify, merge or split a data set of annotated difference map tiles."""
     if arguments.workers and arguments.scheduler:
         raise InputError("cannot be combined", where="--workers and --scheduler", remedy="give one of them")
     action, *folders = arguments.words

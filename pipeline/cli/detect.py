@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Find fallen blocks in difference maps and write masks, tables and pictures."""
+    """Find fallen blocks in difference maps and write masks, tables and pictures, for the command `scarpsim detect`."""
     from pipeline.cli.train import load_keras
     from pipeline.detection.products.run import BASELINE, CONFIDENCES, detect, sorted_confidences
     from pipeline.formats.files.atomic import check_place, new_folder

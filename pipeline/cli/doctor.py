@@ -58,7 +58,7 @@ _IMPORTS = {
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of examining one thing.
+    """Result of checking one part of the installation, for `scarpsim doctor`.
 
     Attributes
     ----------

@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Score detections against annotations and print the tables."""
+    """Score the detections of fallen blocks against annotations and print the tables."""
     from pipeline.detection.products.run import CONFIDENCES, sorted_confidences
     from pipeline.detection.products.score_files import as_text, assess, write
     from pipeline.formats.files.atomic import check_place

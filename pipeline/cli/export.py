@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Export a run, a data set or a result in the form asked for."""
+    """Export a run, a data set or a result to the format asked for (glTF, YOLO, a picture, ...)."""
     form = arguments.form
     _check_options(arguments)
     if form in _SETS:

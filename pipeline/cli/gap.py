@@ -64,7 +64,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Diagnose a measurement, or with --identifiability only its geometry."""
+    """Diagnose where a measurement and its sensor model disagree, and write the report.
+
+    With --identifiability, predict instead which effects a planned measurement could show.
+    """
     from pipeline.formats.files.atomic import check_place, new_folder
 
     out = arguments.out or new_folder(Path("runs"), "gap")

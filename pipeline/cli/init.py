@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Write a config to start from and its JSON schema."""
+    """Write a commented config to start from, and the JSON schema with which editors check it."""
     out = arguments.out
     if arguments.dataset and (arguments.site or arguments.scanner or arguments.mesh or arguments.cameras):
         raise InputError(

@@ -122,7 +122,10 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def simulate(argv: list[str] | None = None) -> int:
-    """Run `simulate ...`, which is the same as `scarpsim simulate ...`, and return the exit status."""
+    """Run the command `simulate`, short for `scarpsim simulate`, and return the exit status.
+
+    argv: the words after `simulate`; by default those of the process.
+    """
     return _run_command("simulate", simulate_command, sys.argv[1:] if argv is None else argv)
 
 

@@ -90,7 +90,7 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Build the measurement folder and say how the inputs were interpreted."""
+    """Build a measurement folder, the input of `scarpsim gap`, from raw scans and say how they were interpreted."""
     found = build_measurement_folder(arguments, arguments.scans, arguments.out)
     return CommandOutput(f"{found.summary()}\npicture: {found.folder / 'understood.png'}", found.to_dict)
 

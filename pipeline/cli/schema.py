@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Return the JSON schema of one kind of config."""
+    """Return the JSON schema of one kind of config, with which editors check and complete it."""
     from pipeline.cli.json_schema import schema_text
 
     return CommandOutput(schema_text(arguments.kind).rstrip("\n"))

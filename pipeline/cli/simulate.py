@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Run or resume the simulation and write the report."""
+    """Simulate a wall before and after rockfall as a sensor observes it, or continue a simulation, and write the report."""
     if arguments.resume and not arguments.out:
         raise InputError("needs the folder of the run to continue", where="--resume", remedy="add --out DIR")
     if arguments.threads:

@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Make a surface of a point cloud and write it as PLY."""
+    """Reconstruct a surface from a point cloud and write it as a PLY file."""
     out = arguments.out
     if out.suffix.lower() != ".ply":
         raise InputError(f"got '{out.suffix}'", where="--out", allowed=".ply", remedy="choose a file name that ends in .ply")

@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
-    """Train the detector or continue its training."""
+    """Train a detector of fallen blocks on a data set, or continue its training."""
     from pipeline.config.bundled import bundled_config, config_path
     from pipeline.detection.inference.weights import check_detector
     from pipeline.detection.network.config import load_train_config
@@ -90,7 +90,7 @@ def _check_training(out: Path) -> None:
 
 
 def load_keras(*, quiet: bool) -> None:
-    """Import Keras and its backend, after a message that this takes time."""
+    """Import Keras and its backend, after a message that this takes time. quiet: leave out the message."""
     from pipeline.detection.network.keras_backend import check_installed, import_keras
 
     backend = check_installed()

@@ -13,7 +13,10 @@ _PLACES = (Path(__file__).parents[1] / "configs", Path(__file__).parents[2] / "c
 
 
 def configs_folder() -> Path:
-    """Return the folder of the bundled configs. Raises InputError if the installation lacks it."""
+    """Return the folder of the configs that come with scarpsim (sites, scanners, sensor models).
+
+    Raises InputError if the installation lacks it.
+    """
     for place in _PLACES:
         if place.is_dir():
             return place

@@ -99,7 +99,7 @@ class SeriesConfig(Config):
 
     @property
     def count(self) -> int:
-        """Number of epochs, the reference included."""
+        """Number of epochs in the series, the reference included."""
         return len(self.times) if isinstance(self.times, tuple) else self.times.count
 
     def when(self, number: int) -> datetime:
@@ -114,7 +114,7 @@ class SeriesConfig(Config):
 
     @property
     def hours(self) -> FloatArray:
-        """(count,) times of the epochs, h after the first."""
+        """(count,) times of the epochs of the series, h after the first."""
         return np.array([self.hours_of(self.when(number)) for number in range(self.count)])
 
     def falls_h(self) -> Sequence[float]:
@@ -123,5 +123,5 @@ class SeriesConfig(Config):
 
 
 def utc(time: datetime) -> datetime:
-    """Return a time in UTC; one without a zone is UTC."""
+    """Return a time converted to UTC, so that times can be compared; one without a zone is taken as UTC."""
     return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)

@@ -255,15 +255,15 @@ class SimulationConfig(Config):
         return tuple(model.sensor for model in self.sensor) or ("stereo", "tls")
 
     def stereo_model(self) -> StereoModel:
-        """Return the model of the stereo pair."""
+        """Return the config's sensor model (noise and errors) of the stereo pair."""
         return next((model for model in self.sensor if isinstance(model, StereoModel)), StereoModel())
 
     def tls_model(self) -> TlsModel:
-        """Return the model of the laser scanner."""
+        """Return the config's sensor model (noise and errors) of the laser scanner."""
         return next((model for model in self.sensor if isinstance(model, TlsModel)), TlsModel())
 
     def station_configs(self) -> tuple[StationConfig, ...]:
-        """Return the laser scanner's stations, one or several."""
+        """Return the places where the laser scanner stands (its stations), one or several."""
         return (self.station,) if isinstance(self.station, StationConfig) else self.station
 
     def camera_pair(self, target: Target) -> CameraPair:

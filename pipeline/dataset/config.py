@@ -28,7 +28,10 @@ _Factor = Annotated[float, Field(ge=0)]
 
 
 class ScaledModel(Config):
-    """A sensor model whose noise is multiplied by a factor. In a file, `model` may be a bundled name or a path."""
+    """A sensor model whose noise is multiplied by a factor, for one noise level of a data set.
+
+    In a file, `model` may be a bundled name or a path.
+    """
 
     model: SensorModel
     scale: _Factor | dict[str, _Factor] = Field(1.0, description="factor of every sigma and mean of the noise, one or by wall")
@@ -63,7 +66,7 @@ def _scaled(value: Any, factor: float) -> Any:
 
 
 class NoiseLevel(Config):
-    """The sensor models at one level of noise."""
+    """The sensor models of a data set's epochs at one of its levels of noise."""
 
     stereo: ScaledModel | None = Field(None, description="model of the stereo pair")
     tls: ScaledModel | None = Field(None, description="model of the laser scanner")
@@ -95,7 +98,7 @@ class Part(Config):
 
 
 class DatasetConfig(Config):
-    """Config of a data set of difference map tiles."""
+    """Config of a data set of annotated difference map tiles, on which detectors of rockfall are trained and tested."""
 
     name: str = Field("rockfall", pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name of the data set")
     seed: int = Field(1, ge=0, lt=2**63, description="seed of all random numbers")

@@ -67,7 +67,7 @@ class Damage:
 
     @property
     def is_missing_shard(self) -> bool:
-        """Whether this is the record of an epoch that has not been made."""
+        """Whether the file is missing because it is the record of an epoch that has not been made yet."""
         return self.problem == "missing" and self.file.parent.name == SHARDS
 
 

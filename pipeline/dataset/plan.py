@@ -46,7 +46,7 @@ class PlannedEpoch:
 
     @property
     def stage(self) -> tuple[SensorName, str, str, int]:
-        """Key of the set-up that epochs with the same reference epoch share: sensor, wall, noise, number of the reference."""
+        """Key of the set-up that epochs with one reference epoch share: sensor, wall, noise level, number of the reference."""
         return self.sensor, self.wall, self.noise, self.reference
 
     def to_dict(self) -> dict[str, Any]:

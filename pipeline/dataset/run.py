@@ -79,7 +79,7 @@ class DatasetSummary:
     warnings: list[str] = field(default_factory=list)
 
     def summary(self) -> str:
-        """Return the result as lines of text."""
+        """Return the result of making or verifying the data set as lines of text."""
         splits = ", ".join(f"{name} {self.images[name]:,} tiles with {self.annotations[name]:,} blocks" for name in self.images)
         warnings = "".join(f"\nwarning: {each}" for each in self.warnings)
         return f"{len(self.made)} epochs made; {splits}\ncard: {self.folder / 'README.md'}{warnings}"

@@ -39,7 +39,7 @@ class EpochOrder:
     ----------
     folder : Folder of the set.
     job : Identifier of the job, which names its staging folder.
-    source : Fingerprint of the epoch's config.
+    source : Fingerprint (a hash) of the data set's config.
     index : Index of the epoch in the plan of that config.
     stage : Key of its set-up (`PlannedEpoch.stage`).
     threads : Threads to use; 0: all.
@@ -108,6 +108,10 @@ def use_threads(count: int) -> None:
 def make_and_store_run(orders: Sequence[EpochOrder]) -> list[dict[str, Any]]:
     """Make epochs of a data set that share wall and reference one after the other, so that these are loaded once.
 
+    Parameters
+    ----------
+    orders : Which epochs to make, and in which folder.
+
     Returns
     -------
     The times, memory and tiles of each epoch, as `make_and_store` returns them.
@@ -118,6 +122,10 @@ def make_and_store_run(orders: Sequence[EpochOrder]) -> list[dict[str, Any]]:
 
 def make_and_store(order: EpochOrder) -> dict[str, Any]:
     """Simulate an epoch of a data set and store its tiles and its record.
+
+    Parameters
+    ----------
+    order : Which epoch to make, and in which folder.
 
     Returns
     -------

@@ -19,7 +19,7 @@ class ExportedRun(RunFiles):
 
     @cached_property
     def record(self) -> dict[str, Any]:
-        """Contents of run.json."""
+        """Content of run.json, which describes the run."""
         found = super().record
         if len(found["epochs"]) < 2:
             raise InputError("contains no finished epoch", where=str(self.folder), remedy=RESUME)

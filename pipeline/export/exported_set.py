@@ -10,7 +10,7 @@ from scene.common.errors import InputError
 
 
 def splits_of(folder: Path) -> dict[str, Tiles]:
-    """Return the tiles of each split in a data set's folder. Raises InputError if there is none."""
+    """Return the tiles of each split (train, val, test) in a data set's folder. Raises InputError if there is no split."""
     splits = [split for split in SPLITS if (folder / split / "annotations.json").is_file()]
     if not splits:
         raise InputError(

@@ -164,5 +164,5 @@ def summary(made: HuggingFaceSet) -> str:
 
 
 def to_dict(made: HuggingFaceSet) -> dict[str, Any]:
-    """Return folder and numbers of images and blocks as JSON types, for the option --json."""
+    """Return the result of an export for Hugging Face (folder, numbers of images and blocks) as JSON types, for --json."""
     return {"folder": str(made.folder), "images": made.images, "blocks": made.blocks}

@@ -155,5 +155,5 @@ def _sentences(made: YoloSet) -> Iterator[str]:
 
 
 def to_dict(made: YoloSet) -> dict[str, Any]:
-    """Return folder, limit and numbers of images and blocks as JSON types, for the option --json."""
+    """Return the result of an export for YOLO (folder, grey scale, numbers of images and blocks) as JSON types, for --json."""
     return {"folder": str(made.folder), "limit_m": made.limit_m, "images": made.images, "blocks": made.blocks}

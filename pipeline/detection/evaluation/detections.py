@@ -17,7 +17,7 @@ _COVERED = 0.6
 
 @dataclass(frozen=True)
 class Detection:
-    """One detected block.
+    """One detected block, as a mask at its position in a difference map.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class Detection:
 
     @property
     def area_px(self) -> int:
-        """Number of pixels in the mask."""
+        """Number of pixels in the detected block's mask."""
         return int(np.count_nonzero(self.mask))
 
     @property
@@ -55,7 +55,9 @@ class Detection:
         return Detection(self.row + row, self.column + column, self.mask, self.score)
 
     def annotation(self, number: int, image_id: int, shape: tuple[int, ...]) -> dict[str, Any]:
-        """Return the detection as a COCO result that also has an id and a box, so that it is an annotation too.
+        """Return the detection in COCO's format, to write it to a file.
+
+        It is a COCO result that also has an id and a box, as COCO's annotations have.
 
         Parameters
         ----------
@@ -97,7 +99,7 @@ def detection_from_mask(mask: NDArray[np.bool_], row: int, column: int, score: f
 
 
 def merged(items: Sequence[Detection]) -> Detection:
-    """Merge detections into one with all their pixels and the best of their scores."""
+    """Merge detections of the parts of one block into one, with all their pixels and the best of their scores."""
     bounds = np.array([item.bounds for item in items])
     (top, left), (bottom, right) = bounds[:, ::2].min(axis=0), bounds[:, 1::2].max(axis=0)
     mask = np.zeros((bottom - top, right - left), bool)

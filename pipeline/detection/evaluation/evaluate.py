@@ -55,21 +55,21 @@ class Score:
 
     @property
     def precision(self) -> float:
-        """Share of the detections that are blocks; NaN without detections."""
+        """Share of the detector's detections that are blocks; NaN without detections."""
         return _share(self.true_positives, self.true_positives + self.false_positives)
 
     @property
     def recall(self) -> float:
-        """Share of the blocks that were detected; NaN without blocks."""
+        """Share of the annotated blocks that were detected; NaN without blocks."""
         return _share(self.true_positives, self.true_positives + self.false_negatives)
 
     @property
     def f1(self) -> float:
-        """Harmonic mean of precision and recall; NaN where there is neither a block nor a detection."""
+        """Harmonic mean of precision and recall of the detections; NaN where there is neither a block nor a detection."""
         return _share(2 * self.true_positives, 2 * self.true_positives + self.false_positives + self.false_negatives)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content as JSON types, with null for NaN."""
+        """Return the scores of a group of images as JSON types, with null for NaN."""
         values = {**asdict(self), "precision": self.precision, "recall": self.recall, "f1": self.f1}
         return {name: None if isinstance(value, float) and np.isnan(value) else value for name, value in values.items()}
 

@@ -81,7 +81,7 @@ class Reliability:
         return off / count if count else float("nan")
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content as JSON types, with null for NaN."""
+        """Return the reliability of the scores in a group of images as JSON types, with null for NaN."""
         classes = [{**asdict(each), "precision": each.precision, "standard_error": each.error} for each in self.classes]
         error = None if np.isnan(self.calibration_error) else self.calibration_error
         return {"group": self.group, "kind": self.kind, "iou": self.iou, "calibration_error": error, "classes": classes}

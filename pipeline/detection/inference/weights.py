@@ -31,7 +31,7 @@ def save(model: Any, folder: Path) -> None:
 
 
 def save_weights(model: Any, path: Path) -> None:
-    """Write Keras's weights to `path`, which must end in .weights.h5, completely or not at all."""
+    """Write the weights of a Keras network to the file `path`, which must end in .weights.h5, completely or not at all."""
     with writing(path) as temporary:
         own = temporary.with_name(f"{temporary.stem}.weights.h5")
         model.save_weights(own)
@@ -62,9 +62,9 @@ def with_head(config: DetectorConfig, **values: Any) -> DetectorConfig:
 
 
 def check_detector(folder: Path, *, mirrored: bool = False) -> None:
-    """Raise InputError if the folder holds no valid detector, as far as can be checked without loading the network.
+    """Raise InputError if a folder holds no valid detector, as far as can be checked without loading the network.
 
-    With `mirrored`, the detector's config must also state mirrored views.
+    mirrored: whether its config must also state mirrored views, for detection on mirror images of a map.
     """
     if load_config(folder).head.mirrored == "none" and mirrored:
         raise InputError(
@@ -137,7 +137,10 @@ def load(folder: Path, *, image_px: int | None = None, mirrored: bool = False) -
 
 
 def take_weights(model: Any, folder: Path) -> None:
-    """Load the weights of the detector in the folder into a MaskRCNN; raise InputError if they are of another network."""
+    """Load the weights of a trained detector into a MaskRCNN.
+
+    folder: of the detector. Raises InputError if the weights are of another network.
+    """
     path = folder / WEIGHTS
     try:
         load_weights(model, path)

@@ -31,7 +31,7 @@ class NormalisationConfig(Config):
 
     @property
     def channels(self) -> int:
-        """Number of channels of the network's input."""
+        """Number of channels of the network's input: the difference, and where there is data if that is added."""
         return 2 if self.validity_channel else 1
 
 
@@ -134,7 +134,7 @@ class DetectorConfig(Config):
 
 
 class TrainingConfig(Config):
-    """Settings of the training."""
+    """Settings of the training of a detector."""
 
     start: str | None = Field(
         None, min_length=1, description="initial weights: a trained detector's folder, or default (null: random)"
@@ -181,7 +181,7 @@ class TrainingConfig(Config):
 
 
 class TrainConfig(Config):
-    """A detector and its training, as `scarpsim train --config` reads them."""
+    """Settings of a detector and its training, as `scarpsim train --config` reads them."""
 
     detector: DetectorConfig = DetectorConfig()
     training: TrainingConfig = TrainingConfig()

@@ -67,7 +67,7 @@ class CocoFolder:
             self._of[annotation["image_id"]].append(annotation)
 
     def check_images(self) -> None:
-        """Read every image once; raise InputError for the first that is damaged or not of the annotated size."""
+        """Read every image of the folder once; raise InputError for the first that is damaged or not of the annotated size."""
         for index in range(len(self)):
             self._difference(index)
 

@@ -34,7 +34,10 @@ def import_keras() -> None:
 
 
 def check_installed() -> str:
-    """Return the name of Keras's backend; raise InputError if it, or Keras, is not installed."""
+    """Return the name of the library on which Keras computes (its backend), such as tensorflow.
+
+    Raises InputError if it, or Keras, is not installed.
+    """
     backend = os.environ.get("KERAS_BACKEND") or "tensorflow"
     os.environ["KERAS_BACKEND"] = backend
     if backend not in _MODULES:

@@ -54,7 +54,7 @@ class BoxTargets:
 
     @property
     def positives(self) -> int:
-        """Number of places for positive proposals, which belong to a block, in each image."""
+        """Number of places for positive proposals (boxes that hold a block) in each image."""
         return int(self.code.shape[1])
 
 

@@ -111,7 +111,7 @@ def _written(value: Any) -> Any:
 
 
 def read_events(path: Path) -> list[Event]:
-    """Read a table that `write_events` wrote; raise InputError for any other file, naming the line."""
+    """Read a CSV file of detected rockfalls that `write_events` wrote; raise InputError for any other file, naming the line."""
     remedy = "run scarpsim detect again"
     table = csv.DictReader(io.StringIO(read_text(path, remedy=remedy)))
     names = [field.name for field in fields(Event)]

@@ -51,12 +51,12 @@ class ResidentSet:
 
     @property
     def tiles(self) -> int:
-        """Number of tiles."""
+        """Number of training tiles in the graphics card's memory."""
         return int(self.images.shape[0])
 
     @property
     def side_px(self) -> int:
-        """Side of a tile, px."""
+        """Side of the training tiles, px."""
         return int(self.images.shape[1])
 
 

@@ -23,7 +23,7 @@ class PairConfig(Config):
 
 
 def read_cameras_yaml(path: Path) -> CameraPair:
-    """Read cameras.yaml: nominal calibration and pose of `left` and `right`, world frame.
+    """Read the cameras of a stereo pair from cameras.yaml: nominal calibration and pose of `left` and `right`, world frame.
 
     A camera may name a calibration file of Metashape or OpenCV as its `calibration`, relative to cameras.yaml, instead of its
     width, height and interior orientation.

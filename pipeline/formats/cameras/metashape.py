@@ -50,10 +50,10 @@ class MetashapeCameras:
 
 
 def read_metashape(path: Path) -> MetashapeCameras:
-    """Read all frame cameras of a Metashape camera XML, or of a project's active chunk.
+    """Read the calibration and pose, world frame, of all frame cameras in a file of Metashape.
 
-    Raises InputError if the file is no such XML, the sensor of an aligned camera is not a frame camera with a calibration, or two
-    cameras have the same label.
+    path: a camera XML, or a project, of which the active chunk is read. Raises InputError if the file is neither, the sensor of
+    an aligned camera is not a frame camera with a calibration, or two cameras have the same label.
     """
     chunk = _chunk(path)
     sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors//sensor")}

@@ -110,7 +110,7 @@ def noting() -> Iterator[list[Path]]:
 
 
 def note(path: Path) -> None:
-    """Add a file to the list of written files that the surrounding `noting` block collects."""
+    """Add a file to the list that the enclosing `with noting()` block collects, to be removed after a failure."""
     found = _noted.get()
     if found is not None:
         found.append(path)
@@ -138,7 +138,7 @@ def give_name(temporary: Path, path: Path) -> None:
 
 
 def to_disk(path: Path) -> None:
-    """Wait until a file's content, or a folder's entries, are on the disk, as far as the file system can tell."""
+    """Wait until a file's content, or a folder's entries, are on the disk, to survive a power failure."""
     try:
         file = os.open(path, os.O_RDONLY)
     except PermissionError:  # is writable but not readable
@@ -153,14 +153,18 @@ def to_disk(path: Path) -> None:
 
 
 def new_folder(parent: Path, name: str) -> Path:
-    """Return a path under `parent` that does not exist yet, named after `name` and the time."""
+    """Return a path for a new output folder under `parent`, named after `name` and the time, that does not exist yet."""
     stem = f"{name}_{datetime.now():%Y%m%d_%H%M%S}"
     names = (stem if number == 1 else f"{stem}_{number}" for number in range(1, 1000))
     return next(parent / free for free in names if not (parent / free).exists())
 
 
 def empty_folder(out: Path, remedy: str = "choose another --out") -> Path:
-    """Return `out` if it is new or empty; raise InputError, naming --out, if it is in use or cannot be created."""
+    """Check that an output folder can be written to; return it if it is new or empty.
+
+    remedy: what the user can do otherwise, the end of an error. Raises InputError, naming --out, if it is in use or cannot be
+    created.
+    """
     check_place(out)
     if out.exists() and any(out.iterdir()):
         raise InputError("exists and is not an empty folder", where=f"--out {out}", remedy=remedy)

@@ -129,7 +129,7 @@ class MeasurementBase(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class TlsMeasurement(MeasurementBase):
-    """n points of a laser scan, or of several: in other poses or faces (channel `scan`), or at other times (channel `epoch`).
+    """n points measured by one laser scan, or by several of other poses or faces (channel `scan`) or times (channel `epoch`).
 
     Attributes
     ----------
@@ -245,7 +245,7 @@ class SurfaceMeasurement(MeasurementBase):
 
     @property
     def centre(self) -> FloatArray:
-        """(3,) centre of rotation and scale of the cloud, wall frame, m."""
+        """(3,) middle of the reference surface, about which the measured points are rotated and scaled, wall frame, m."""
         return np.asarray(self.reference.bounds.mean(axis=0))
 
     @property
@@ -281,7 +281,7 @@ class SurfaceMeasurement(MeasurementBase):
         return other
 
     def moved(self, pose: FloatArray) -> Self:
-        """Shift (m), rotate (rad) and scale the points about the reference's centre by k amounts of the columns of `datum`."""
+        """Shift (m), rotate (rad) and scale the points about `centre`; pose (k,): amounts of the k columns of `datum`."""
         whole = self.datum @ pose
         turn = (1 + whole[6]) * rotation_matrix(whole[3:6])
         points = (self.cloud.points - self.centre) @ turn.T + self.centre + whole[:3]

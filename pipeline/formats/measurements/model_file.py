@@ -24,7 +24,7 @@ class _ModelFile(Config):
 
 
 def read_model(path: Path) -> TlsModel | StereoModel:
-    """Read a sensor model from a YAML file. Raises InputError, which names the wrong key."""
+    """Read a sensor model (its noise and errors) from a YAML file. Raises InputError, which names the wrong key."""
     return sensor_model(load_yaml(path), str(path))
 
 

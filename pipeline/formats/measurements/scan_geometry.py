@@ -62,7 +62,7 @@ class AngularGrid:
 
     @property
     def stop(self) -> float:
-        """Last of the equally spaced angles, rad."""
+        """Last of the equally spaced angles of a scan pattern, rad."""
         return self.start + self.step * (self.count - 1)
 
     def to_list(self) -> list[float]:

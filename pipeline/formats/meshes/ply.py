@@ -81,7 +81,7 @@ def read_ply(path: Path) -> TriangleMesh:
 
 
 def read_ply_points(path: Path) -> PointCloud:
-    """Read the vertices of any PLY file with all scalar properties, by their names without `scalar_`.
+    """Read a point cloud from a PLY file: its vertices with all scalar properties, by their names without `scalar_`.
 
     Raises InputError for a missing or damaged file.
     """

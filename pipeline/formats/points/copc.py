@@ -93,7 +93,10 @@ def write_copc(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, he
 
 
 def octree(steps: NDArray[np.integer]) -> Octree:
-    """Sort points into an octree for COPC. steps: (n, 3) integer coordinates, in the steps in which LAZ stores them."""
+    """Sort points into an octree, as COPC files store them.
+
+    steps: (n, 3) integer coordinates, in the steps in which LAZ stores them.
+    """
     low = steps.min(axis=0).astype(np.int64)
     from_low = steps - low
     side = max(int(from_low.max()), 1)

@@ -133,7 +133,7 @@ class StoredCloud:
     def with_points(self, cloud: PointCloud) -> StoredCloud:
         """Return other points prepared for writing with the same header and extra dimensions, such as the next part of a file.
 
-        Intensity and time are left out.
+        cloud: the other points; their intensity and time are left out.
         """
         return replace(self, cloud=cloud, fields={"bit_fields": self.fields["bit_fields"], **cloud.extra})
 

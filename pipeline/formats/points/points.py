@@ -58,10 +58,11 @@ class PlacedScan:
 
 
 def read_points(path: Path) -> PointCloud:
-    """Read a point cloud; points of E57 and PTX files are converted to the file's frame by their poses.
+    """Read a point cloud from a file of any known format, in the file's frame, m.
 
-    Several scans give one cloud, with the number of the scan in the extra channel `scan`. Points may be NaN or infinite, as some
-    programs write missing returns. Raises InputError as `read_placed_scans` does.
+    Several scans in a file (E57, PTX) are converted to its frame by their poses and give one cloud, with the number of the scan
+    in the extra channel `scan`. Points may be NaN or infinite, as some programs write missing returns. Raises InputError as
+    `read_placed_scans` does.
     """
     return joined([scan.cloud for scan in read_placed_scans(path)])
 

@@ -125,9 +125,10 @@ def read_raster(path: Path) -> Raster:
 
 
 def read_geotiff(path: Path) -> tuple[NDArray[np.float32], Grid]:
-    """Read a raster of one band, (h, w) float32, m, NaN without data, and the grid of its pixels, m.
+    """Read a raster of one band, such as a difference map, from a GeoTIFF, in metres.
 
-    Stated units are converted. Raises InputError as `read_raster` does, and for a file without a place.
+    Returns the values (h, w) float32, NaN without data, and the grid of the pixels. Stated units are converted. Raises
+    InputError as `read_raster` does, and for a file that does not state where its pixels are.
     """
     raster = read_raster(path)
     if raster.place.grid is None:
@@ -137,9 +138,9 @@ def read_geotiff(path: Path) -> tuple[NDArray[np.float32], Grid]:
 
 
 def read_tiff(path: Path) -> NDArray[np.float32]:
-    """Read an image of one band, (h, w) float32, NaN without data, with rows as in the file.
+    """Read an image of one band, such as a depth map, (h, w) float32, NaN without data, with rows as in the file.
 
-    The place of the pixels is not read: TensorFlow reads images in its own threads, where PROJ, which knows the coordinate
+    Where the pixels are is not read: TensorFlow reads images in its own threads, where PROJ, which knows the coordinate
     systems, crashes. Raises InputError for a damaged or too large file.
     """
     return _measured(path)[0]

@@ -76,7 +76,10 @@ EntryT = TypeVar("EntryT", bound=_Entry)
 
 @dataclass(frozen=True)
 class Coco:
-    """A checked COCO data set, in the order of the file."""
+    """Annotations of blocks in images in COCO's format, checked, in the order of the file.
+
+    images, annotations and categories are COCO's entries.
+    """
 
     images: list[Entry]
     annotations: list[Entry]

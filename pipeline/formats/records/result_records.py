@@ -178,7 +178,10 @@ def read_run(path: Path, remedy: str) -> dict[str, Any]:
 
 
 def read_annotations(path: Path) -> dict[str, Any]:
-    """Read annotations.json of a run, whose images have an epoch and annotations a block; raise InputError for other files."""
+    """Read annotations.json of a run: the fallen blocks in its difference maps, in COCO's format.
+
+    Its images have an epoch and its annotations a block; InputError is raised for other files.
+    """
     values = read_json(path, remedy="make the run again")
     parse(_RunAnnotations, values, str(path))
     return dict(values)
