@@ -57,8 +57,8 @@ them. The tests in `tests/browser` make small outputs with each command, and ope
 Debian's Chromium {record["chromium"]}. The browser has no access to the network. `make test` runs these tests where Chromium is
 installed.
 
-Of {len(record["tests"])} tests, {passed} passed. They opened {pages} different pages and loaded {total["files"]} files. They clicked
-{total["clicks"]} times, pressed {total["keys"]} keys, and saw {total["console errors"]} console errors and
+Of {len(record["tests"])} tests, {passed} passed. They opened {pages} different pages and loaded {total["files"]} files. They
+clicked {total["clicks"]} times, pressed {total["keys"]} keys, and saw {total["console errors"]} console errors and
 {total["missing files"]} missing files. In {total["axe runs"]} runs, axe-core found {total["severe violations"]} serious or
 critical violations and {total["lesser violations"]} lesser ones.
 
@@ -81,8 +81,8 @@ Axe-core runs at both widths, except in the viewer, where it runs at {wide} px.
 ## What was found
 
 Clicks and keys are those of the tests; they do not include a search text that is typed. The severe violations are those that
-axe-core grades serious or critical. The lesser ones are moderate or minor and fail no test. A report without keys has nothing that folds and no link, so
-that there is nothing to reach.
+axe-core grades serious or critical. The lesser ones are moderate or minor and fail no test. A report
+without keys has no wide table, no link and nothing that folds, so that Tab has nothing to reach.
 
 | {head} |
 |{"---|" * (len(COUNTS) + 1)}
