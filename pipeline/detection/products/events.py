@@ -112,7 +112,7 @@ def _written(value: Any) -> Any:
 
 def read_events(path: Path) -> list[Event]:
     """Read a CSV file of detected rockfalls that `write_events` wrote; raise InputError for any other file, naming the line."""
-    remedy = "run scarpsim detect again"
+    remedy = "run scarpsim detect again on the same maps to write the table anew"
     table = csv.DictReader(io.StringIO(read_text(path, remedy=remedy)))
     names = [field.name for field in fields(Event)]
     found: list[Event] = []

@@ -26,7 +26,9 @@ def inside(folder: Path, name: Any, where: Path | str) -> Path:
         leads_out = pure.is_absolute() or ".." in pure.parts or not path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError) as error:  # too long, a loop of links
         raise InputError(
-            f"names the file '{name:.80}', which is impossible ({error})", where=str(where), remedy="correct the name"
+            f"names the file '{name:.80}', which is impossible ({error})",
+            where=str(where),
+            remedy="correct this name in the file",
         ) from None
     if leads_out:
         raise InputError(

@@ -110,7 +110,11 @@ def finite(cloud: PointCloud, where: str) -> PointCloud:
         if channel is not None:
             keep = keep & np.isfinite(channel)
     if not keep.any():
-        problem = f"has no point with finite values ({len(keep):,} are NaN or infinite)" if len(keep) else "has no points"
+        problem = (
+            f"the cloud has no point with finite values ({len(keep):,} are NaN or infinite)"
+            if len(keep)
+            else "the cloud has no points"
+        )
         raise InputError(problem, where=where, remedy="export the points again")
     if keep.sum() > 1 and np.ptp(cloud.points[keep], axis=0).max() < _ONE_PLACE_M:
         raise InputError(f"all {keep.sum():,} points are at the same place", where=where, remedy="export the points again")
