@@ -119,10 +119,12 @@ def read_events(path: Path) -> list[Event]:
     try:
         for row in table:
             if list(row) not in (names, [name for name in names if name not in _PLACE]):
-                raise InputError("not a table of events", where=str(path), allowed=f"columns {', '.join(names)}", remedy=remedy)
+                raise InputError(
+                    "the file is not a table of events", where=str(path), allowed=f"columns {', '.join(names)}", remedy=remedy
+                )
             found.append(_ROW.validate_python({name: value for name, value in row.items() if value or name not in _PLACE}))
     except csv.Error as error:
-        raise InputError(f"not a table of events ({error})", where=str(path), remedy=remedy) from None
+        raise InputError(f"the file is not a table of events ({error})", where=str(path), remedy=remedy) from None
     except ValidationError as error:
         wrong = error.errors()[0]
         raise InputError(

@@ -74,7 +74,9 @@ def read_ptx(path: Path) -> list[PtxScan]:
         with path.open(encoding=encoding_of(path), errors="replace") as file:
             scans = list(_scans(_Lines(file, where)))
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=where, remedy="check the path") from None
+        raise InputError(
+            f"cannot be read ({error.strerror})", where=where, remedy="give the path of an existing PTX file that you may read"
+        ) from None
     if not scans:
         raise InputError("has no scans", where=where, remedy="export it again, with its points")
     if not any(len(scan.cloud.points) for scan in scans):
@@ -92,7 +94,7 @@ def orthonormal(rotation: FloatArray, where: str) -> tuple[FloatArray, tuple[str
         raise InputError(
             "the rotation is not a rotation matrix",
             where=where,
-            remedy="rows must be orthonormal, determinant +1; give more digits",
+            remedy="give the matrix with more digits; its rows must be orthonormal, and its determinant +1",
         )
     left, _, right = np.linalg.svd(rotation)
     words = (f"the rotation deviated from orthonormal by {off:.1g} and was corrected",) if off > 1e-6 else ()
@@ -147,7 +149,7 @@ def _check_pose(stated: FloatArray, matrix: FloatArray, where: str) -> None:
             f"states two poses of the scanner: its position is {there} in lines 3 to 6 of the header but {here} in the matrix",
             where=where,
             allowed="the same pose in both",
-            remedy="export it again, registered",
+            remedy="register the scans in the scanner's software, and export them again as PTX",
         )
 
 

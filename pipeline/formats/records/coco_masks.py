@@ -76,7 +76,9 @@ def _checked(segmentation: Mapping[str, Any], height: int, width: int, where: st
     lengths = _decompressed(counts) if isinstance(counts, str) else _plain(counts)
     if lengths is None or (lengths < 0).any() or lengths.sum() != height * width:
         allowed = f"run lengths, plain or as pycocotools compresses them, of {height * width} pixels in all"
-        raise InputError("its run lengths cannot be decoded", where=where, allowed=allowed, remedy="encode the mask again")
+        raise InputError(
+            "its run lengths cannot be decoded", where=where, allowed=allowed, remedy="encode the mask again with pycocotools"
+        )
     plain = {"size": [height, width], "counts": lengths.tolist()}
     counts = counts if isinstance(counts, str) else coco_mask.frPyObjects(plain, height, width)["counts"].decode("ascii")
     return {"size": [height, width], "counts": counts}

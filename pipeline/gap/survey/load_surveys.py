@@ -31,7 +31,7 @@ def load_surveys(path: Path, overrides: Sequence[str] = (), sensor: SensorName |
             raise InputError(
                 "a measurement takes neither --set nor another --sensor",
                 where=str(path),
-                remedy="leave them out, or give a config",
+                remedy="leave these options out, or give a config instead of the measurement",
             )
         return [measured_survey(measurement)]
     config = load_config(path, overrides, sensor, None)
