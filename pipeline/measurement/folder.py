@@ -143,5 +143,8 @@ def _check_readable(folder: Path, out: Path) -> None:
     except InputError as error:
         where = error.where.replace(str(folder), str(out))
         raise InputError(
-            f"the measurement cannot be used: {error.what}", where=where, allowed=error.allowed, remedy=error.remedy
+            f"the measurement cannot be used: {error.what}",
+            where=where,
+            allowed=error.allowed,
+            remedy=error.remedy or "correct the file that is named",
         ) from None

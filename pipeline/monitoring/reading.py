@@ -306,7 +306,9 @@ def _epochs_of_run(folder: Path) -> list[EpochSource]:
         )
     epochs = sorted(each for each in folder.glob("epoch_*") if (each / "points.laz").is_file())
     if not epochs:
-        raise InputError("is a run without a finished epoch", where=str(folder), remedy="finish the run, or make it again")
+        raise InputError(
+            "is a run without a finished epoch", where=str(folder), remedy="finish the run with scarpsim simulate --resume"
+        )
     return [EpochSource(each, (each / "points.laz",), EpochTime(None, ""), record) for each in epochs]
 
 

@@ -80,7 +80,10 @@ def read_elements(path: Path, only: str = "") -> dict[str, Columns]:
         ) from None
     except InputError as error:  # raised by read_rows, which does not know the path
         raise InputError(
-            f"the values cannot be read: {error.what}", where=f"{path}, {error.where}", allowed=error.allowed, remedy=error.remedy
+            f"the values cannot be read: {error.what}",
+            where=f"{path}, {error.where}",
+            allowed=error.allowed,
+            remedy=f"in the PLY file, {error.remedy}",
         ) from None
     except (ValueError, IndexError, KeyError, OverflowError) as error:
         raise InputError(

@@ -221,7 +221,7 @@ def _read(path: Path, unit: str) -> TriangleMesh:
         raise InputError(
             f"a triangle refers to vertex {faces.max()}, but there are {len(vertices)} vertices, counted from 0",
             where=where,
-            remedy="export it anew",
+            remedy="copy the complete file again, or export the mesh again",
         )
     return TriangleMesh(vertices, faces.astype(np.int32), _albedo(mesh))
 

@@ -240,7 +240,7 @@ def _camera(calibration: ElementTree.Element, size: tuple[int, int], pose: Float
             "the calibration has no frame size or no focal length f",
             where=where,
             allowed="width, height and f greater than 0",
-            remedy="align the cameras, and export the file again",
+            remedy="align the cameras in Metashape, and export them again",
         )
     left, scales, right = np.linalg.svd(pose[:3, :3])  # the nearest rotation, without the similarity's scale
     if np.linalg.det(left @ right) < 0 or np.ptp(scales) > 1e-6 * scales[0]:

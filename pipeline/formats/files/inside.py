@@ -19,7 +19,7 @@ def inside(folder: Path, name: Any, where: Path | str) -> Path:
             f"contains {name!r:.80} where the name of a file is expected",
             where=str(where),
             allowed="a file name",
-            remedy="restore the file from a copy, or make it again",
+            remedy="restore the file from a copy, or run the command again that wrote it",
         )
     pure, path = PurePosixPath(name), folder / name
     try:

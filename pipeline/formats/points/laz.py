@@ -39,7 +39,7 @@ _SCAN_ANGLE_STEP = math.radians(0.006)
 """Step of stored scan angles, rad."""
 _FURTHER = ("classification", "user_data", "point_source_id", "scanner_channel", "red", "green", "blue", "nir")
 """Fields of LAS that become channels if any point has a value above zero."""
-_COPY = "copy the complete file again, or export it again"
+_COPY = "copy the complete file again, or export the points again as LAS or LAZ"
 EXACT_INTENSITY = "intensity_relative"
 """Extra dimension that is read as the intensity, instead of the 16-bit field."""
 

@@ -26,7 +26,7 @@ _LONGEST_LINE = 4096
 _CHANNELS = ("red", "green", "blue")
 _ALIKE_M, _ALIKE = 0.01, 1e-3
 """Positions (m) and axes up to this difference are one pose with few digits."""
-_EXPORT = "copy or export the complete file again"
+_EXPORT = "copy the complete file again, or export the scans again as PTX"
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,9 @@ def _scans(lines: _Lines) -> Iterator[PtxScan]:
         count += 1
         columns, rows = _grid_size(first, lines, count), _grid_size(lines.next(), lines, count)
         if columns < 1 or rows < 1:
-            raise InputError(f"has a grid of {columns} x {rows}", where=lines.here, allowed="1 x 1 or more", remedy=_EXPORT)
+            raise InputError(
+                f"the scan has a grid of {columns} x {rows} points", where=lines.here, allowed="1 x 1 or more", remedy=_EXPORT
+            )
         stated = np.array([_row(lines, 3) for _ in range(4)])
         matrix = np.array([_row(lines, 4) for _ in range(4)])
         _check_pose(stated, matrix, f"{lines.where}, scan {count}")
@@ -171,7 +173,8 @@ def _table(lines: _Lines, columns: int, rows: int, count: int) -> FloatArray:
     if len(table) < cells:
         raise InputError(
             f"scan {count} states {columns:,} x {rows:,} = {cells:,} cells but has {len(table):,} lines", where=lines.where,
-            remedy="the file was cut off, or its numbers of columns and rows are wrong: copy or export it again",
+            remedy="the file was cut off, or its numbers of columns and rows are wrong: copy the complete "
+            "file again, or export the scans again as PTX",
         )  # fmt: skip
     if table.shape[1] < 4:
         raise InputError(

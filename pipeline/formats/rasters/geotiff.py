@@ -249,7 +249,11 @@ def _unreadable(path: Path, problem: str) -> InputError:
             allowed="no compression, deflate, LZW, PackBits, LZMA, Zstandard, LERC, JPEG",
             remedy="save the raster with deflate or without compression",
         )
-    return InputError(f"is not a complete TIFF file ({problem})", where=str(path), remedy="export it again")
+    return InputError(
+        f"is not a complete TIFF file ({problem})",
+        where=str(path),
+        remedy="copy the complete file again, or export the raster again",
+    )
 
 
 def _unstated_nodata(values: NDArray[np.float32], absent: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
@@ -275,7 +279,10 @@ def _nodata(tags: dict[int, Any], path: Path) -> np.float32:
         return np.float32(text)
     except ValueError:
         raise InputError(
-            f"states '{text[:40]}' for missing data", where=str(path), allowed="a number", remedy="export it again"
+            f"states '{text[:40]}' for missing data",
+            where=str(path),
+            allowed="a number",
+            remedy="set the tag GDAL_NODATA to a number, for example with gdal_edit.py -a_nodata -9999",
         ) from None
 
 

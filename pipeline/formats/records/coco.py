@@ -240,7 +240,7 @@ def _parsed(model: type[EntryT], entries: Sequence[Any], kind: str, path: Path) 
         where = f"{path}: {kind} {own}" if isinstance(own, int) and own < 2**63 else f"{path}: {kind} {number} of the list"
         if not isinstance(entry, Mapping):
             raise InputError(
-                f"is of the type {type(entry).__name__}",
+                f"the entry is of the type {type(entry).__name__}",
                 where=where,
                 allowed=f"a mapping with {', '.join(name for name, field in model.model_fields.items() if field.is_required())}",
                 remedy="export the annotations as COCO again",

@@ -38,7 +38,12 @@ def run_lengths(segmentation: Any, height: int, width: int, where: str) -> dict[
     if isinstance(segmentation, Mapping):
         return _checked(segmentation, height, width, where)
     if not isinstance(segmentation, Sequence) or isinstance(segmentation, str):
-        raise InputError(f"its segmentation is {_kind(segmentation)}", where=where, allowed=FORMS, remedy="draw the mask again")
+        raise InputError(
+            f"its segmentation is {_kind(segmentation)}",
+            where=where,
+            allowed=FORMS,
+            remedy="write the mask in one of these forms",
+        )
     return _of_polygons(segmentation, height, width, where)
 
 
