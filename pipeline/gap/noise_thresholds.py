@@ -8,7 +8,13 @@ from pipeline.gap.threshold_field import DEVELOPMENT, JUDGEMENT, ThresholdGroup,
 
 
 class VarianceThresholds(ThresholdGroup):
-    """Thresholds of the variance model (heteroscedastic noise terms)."""
+    """Thresholds by which `gap` accepts noise terms: effects that change the variance of the residuals (variance model).
+
+    A gain is a log-likelihood ratio of the models with and without a term; the score is the gain minus a penalty for the
+    parameters. Wall blocks are parts of the wall, which count as independent. Their agreement is the sum of their gains over
+    the root of the sum of the squares of these. An empirical term is a variance that is fitted freely in bins of a covariate,
+    such as the range.
+    """
 
     significance: PositiveFloat = threshold_field(
         0.004,
@@ -24,14 +30,14 @@ class VarianceThresholds(ThresholdGroup):
     least_excess: PositiveFloat = threshold_field(
         0.04,
         "share of the predicted variance",
-        "Less additional variance than this is attributed to small errors of the reference.",
+        "Less additional variance than this is attributed to small errors of the reference, and no noise term is named.",
         DEVELOPMENT,
     )
     least_unshared_share: PositiveFloat = threshold_field(
         0.75,
         "share of the added variance",
-        "At least this share must differ between neighbouring points. An error of the reference, correlated over metres, moves "
-        "both alike.",
+        "A noise term of a laser scan is named only if at least this share differs between neighbouring points. An error "
+        "of the reference, correlated over metres, moves both alike.",
         DEVELOPMENT,
         le=1,
     )
@@ -86,7 +92,7 @@ class VarianceThresholds(ThresholdGroup):
     second_gain: PositiveFloat = threshold_field(
         3.0,
         "log-likelihood",
-        "A second noise term must score this much more where the first alone leaves a misfit.",
+        "A second noise term must raise the score by this if the first alone does not explain the residuals.",
         JUDGEMENT,
     )
     block_sigmas: PositiveFloat = threshold_field(
@@ -123,7 +129,10 @@ class VarianceThresholds(ThresholdGroup):
 
 
 class GridNoiseThresholds(ThresholdGroup):
-    """Thresholds that separate white from grid-correlated noise of disparities, and noise from errors of the reference."""
+    """Thresholds that separate white from grid-correlated noise of disparities, and noise from errors of the reference.
+
+    Grid-correlated noise is noise that a stereo matcher interpolates between widely spaced pixels (nodes of a grid).
+    """
 
     margin: PositiveFloat = threshold_field(
         6.0, "chi^2", "White or grid-correlated noise is named alone if its semivariogram fits better by this.", JUDGEMENT
@@ -168,7 +177,11 @@ class GridNoiseThresholds(ThresholdGroup):
 
 
 class LockingThresholds(ThresholdGroup):
-    """Thresholds of pixel locking: measured disparities that crowd around whole pixels."""
+    """Thresholds of the test for pixel locking: measured disparities that crowd around whole pixels.
+
+    The resultant length measures how strongly fractions of a pixel crowd: 0 not at all, 1 all alike. The chi^2 of a trial
+    amplitude compares four resultant lengths (fractions of 1, 1/2, 1/3 and 1/4 pixel) with those that it predicts.
+    """
 
     fewest_cycles: PositiveFloat = threshold_field(
         6.0, "pixels of disparity", "The disparities must span at least this for pixel locking to be tested.", JUDGEMENT
@@ -176,7 +189,8 @@ class LockingThresholds(ThresholdGroup):
     crowding_ratio: PositiveFloat = threshold_field(
         1.5,
         "ratio of resultant lengths",
-        "Measured disparities must crowd this many times as strongly as those of the reference, whose shape may crowd too.",
+        "The resultant length of measured disparities must be this many times that of the reference, whose shape may "
+        "make them crowd too.",
         DEVELOPMENT,
     )
     most_noise: PositiveFloat = threshold_field(
@@ -194,13 +208,17 @@ class LockingThresholds(ThresholdGroup):
     good_fit: PositiveFloat = threshold_field(
         20.0,
         "chi^2 of four values",
-        "If no amplitude fits better than this, the best small amplitude is taken, below the one that folds disparities over.",
+        "If no amplitude fits better than this, the best small amplitude is taken: one that keeps the order of the disparities.",
         DEVELOPMENT,
     )
 
 
 class QuantizationThresholds(ThresholdGroup):
-    """Threshold of the test whether ranges were rounded to a step."""
+    """Threshold of the test whether a scanner rounded its ranges to a step, such as 1 mm.
+
+    A phase is the remainder of a range after division by the step, as an angle. The mean resultant length is 1 if all are
+    alike.
+    """
 
     least_resultant: PositiveFloat = threshold_field(
         0.2,
@@ -211,7 +229,12 @@ class QuantizationThresholds(ThresholdGroup):
 
 
 class EdgeThresholds(ThresholdGroup):
-    """Thresholds of edge effects: edge fattening, smoothing, filled occlusions and the beam footprint."""
+    """Thresholds of effects at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint.
+
+    A gain is a log-likelihood ratio of the models with and without an effect. Wall blocks are parts of the wall, which count as
+    independent. Their agreement is the sum of their gains over the root of the sum of the squares of these. A cell is a pixel
+    of the disparity raster. A selection pass is one search for all effects, with or without edge effects in the model.
+    """
 
     least_gain: PositiveFloat = threshold_field(
         30.0, "log-likelihood", "An edge effect needs at least this log-likelihood ratio.", DEVELOPMENT
@@ -257,25 +280,36 @@ class EdgeThresholds(ThresholdGroup):
     clear_step: PositiveFloat = threshold_field(
         1.3,
         "ratio of depth steps",
-        "A point is used to test edge fattening if the step is this many times the smallest one; matchers disagree on smaller "
-        "ones.",
+        "A point is used to test edge fattening if the depth step is this many times the smallest that counts as a "
+        "step; matchers disagree on smaller ones.",
         JUDGEMENT,
     )
-    fewest_filled: PositiveInt = threshold_field(8, "cells", "Filled occlusions need at least this many filled cells.", JUDGEMENT)
+    fewest_filled: PositiveInt = threshold_field(
+        8,
+        "cells",
+        "Filled occlusions need at least this many cells that hold a point though only one camera sees them.",
+        JUDGEMENT,
+    )
     least_filled_gain: PositiveFloat = threshold_field(
         10.0, "log-likelihood", "Filled occlusions need at least this log-likelihood ratio.", JUDGEMENT
     )
     least_filled_share: PositiveFloat = threshold_field(
         0.6,
         "share of the half-occluded cells",
-        "At least this share of the cells in strips up to the estimated width must hold a point.",
+        "In strips beside depth steps that only one camera sees, at least this share of the cells up to the estimated "
+        "width must hold a point.",
         JUDGEMENT,
         le=1,
     )
 
 
 class MissingReturnsThresholds(ThresholdGroup):
-    """Thresholds of the effects that explain missing returns."""
+    """Thresholds of the effects that explain why laser pulses did not return: a detection limit, precipitation or a direction.
+
+    A score is a log-likelihood ratio minus a penalty for the parameters. "Free by direction" means that the probability of loss
+    is fitted freely in bins of the azimuth or the zenith angle. Drops are rain or snow, which return some pulses from in front
+    of the wall.
+    """
 
     least_gain: PositiveFloat = threshold_field(
         9.0, "log-likelihood", "An effect on the returns needs at least this penalised log-likelihood ratio.", JUDGEMENT
@@ -303,8 +337,8 @@ class MissingReturnsThresholds(ThresholdGroup):
     strip_agreement: PositiveFloat = threshold_field(
         0.85,
         "ratio; 1: every strip gains equally",
-        "Strips across a sector must agree this well on its losses. The highest of 35 cases without losses by direction is 0.73, "
-        "the lowest of 3 sectors 0.96.",
+        "A sector without returns is divided into strips across it; their gains must agree this well. The highest of 35 "
+        "cases without losses by direction is 0.73, the lowest of 3 sectors 0.96.",
         DEVELOPMENT,
     )
     early_sigmas: PositiveFloat = threshold_field(

@@ -27,7 +27,10 @@ from scene.common.config import parse
 
 
 class PointThresholds(ThresholdGroup):
-    """Thresholds on the number of points, and on which points are used."""
+    """Thresholds on the number of points that `gap` needs, and on which points it uses for a diagnosis.
+
+    Residuals are measured minus predicted ranges (laser scanner) or disparities (stereo pair).
+    """
 
     fewest: PositiveInt = threshold_field(
         800, "points", "With fewer points on smooth, stable rock the verdict is insufficient_data.", JUDGEMENT
@@ -66,7 +69,13 @@ class PointThresholds(ThresholdGroup):
 
 
 class MeanThresholds(ThresholdGroup):
-    """Thresholds of the systematic effects (mean model)."""
+    """Thresholds by which `gap` accepts systematic effects of a sensor (mean model).
+
+    A log-likelihood ratio compares models with and without an effect; the score is this ratio minus a penalty for the
+    parameters. The equivalence class holds effects that explain the residuals as well as the best one. A signature is the
+    change of the observations by an effect. A typical size is the value of an effect's parameter in the catalogue that
+    instruments commonly have. A non-parametric term is a spline of a covariate, such as the range.
+    """
 
     significance: PositiveFloat = threshold_field(
         0.004,
@@ -196,7 +205,10 @@ class MeanThresholds(ThresholdGroup):
 
 
 class ChangesThresholds(ThresholdGroup):
-    """Thresholds of scene changes: regions where the rock itself moved."""
+    """Thresholds by which `gap` finds scene changes: regions where the rock itself moved since the reference was measured.
+
+    Points in such regions are not used to find sensor effects.
+    """
 
     false_changes: PositiveFloat = threshold_field(
         0.01,
@@ -258,7 +270,10 @@ class ChangesThresholds(ThresholdGroup):
 
 
 class ValidationThresholds(ThresholdGroup):
-    """Thresholds of validation: what an effect must gain on wall blocks that no fit used."""
+    """Thresholds of validation: what an effect must gain on wall blocks (parts of the wall) that were not used for fitting.
+
+    The gain is a difference of log scores (log-likelihoods): model with the effect minus model without it.
+    """
 
     clip_sigmas: PositiveFloat = threshold_field(
         5.0, "standard deviations", "Deviations in validation blocks are clipped at this, which limits outliers.", JUDGEMENT
@@ -299,7 +314,11 @@ class ValidationThresholds(ThresholdGroup):
 
 
 class VerdictThresholds(ThresholdGroup):
-    """Thresholds of the verdict: when the model is rejected, and how much named effects must explain."""
+    """Thresholds of the verdict of `gap`: when the model is rejected, and how much named effects must explain.
+
+    The gap is the distance between model and measurement, as a score on validation points. "Before" and "after" are the scores
+    of the model without and with the named effects; the noise floor is the score that noise alone gives.
+    """
 
     rejection_p: PositiveFloat = threshold_field(
         0.01,
@@ -323,12 +342,12 @@ class VerdictThresholds(ThresholdGroup):
         gt=1,
     )
     gap_sigmas: PositiveFloat = threshold_field(
-        2.0, "standard errors", "The gap before and after differ if their difference exceeds this.", JUDGEMENT
+        2.0, "standard errors", "The scores before and after differ if their difference exceeds this.", JUDGEMENT
     )
     floor_sigmas: PositiveFloat = threshold_field(
         2.6,
         "standard errors",
-        "A score lies above the floor if the difference exceeds this: 0.5 % exceed it by chance.",
+        "A score lies above the noise floor if the difference exceeds this: 0.5 % exceed it by chance.",
         JUDGEMENT,
     )
 

@@ -68,7 +68,7 @@ class LossData:
     ----------
     lost : (m,) whether each pulse was lost.
     fit : (m,) true for pulses that are used for fitting.
-    log_likelihood : log-likelihood of these pulses with one probability of loss for all.
+    log_likelihood : log-likelihood of these pulses with one probability of loss for all; the reference for other models.
     """
 
     lost: BoolArray

@@ -28,7 +28,8 @@ def detectable_noise(
 ) -> list[DetectableSize]:
     """Compute from which size on noise terms would have been found in a measurement with a probability of 95 %.
 
-    Noise that neighbouring points share is left out, because it hardly shows in the deviations that are used.
+    Noise that neighbouring points share is left out, because it hardly shows in deviations within small cells of the wall,
+    which are used.
 
     Parameters
     ----------
@@ -40,7 +41,7 @@ def detectable_noise(
 
     Returns
     -------
-    list : for each noise effect of the catalogue its main parameter and the detectable value of that.
+    list : for each noise effect of the catalogue, the name of its main parameter and the detectable value of this parameter.
     """
     candidates = variance_candidates(residuals)
     if not candidates:

@@ -186,7 +186,7 @@ def identifiability(survey: Survey, reference_error_m: float | None = None) -> I
 
     Parameters
     ----------
-    survey : The planned or measured survey.
+    survey : The planned or measured survey: what each station or stereo pair sees of the wall.
     reference_error_m : Standard deviation of the reference's correlated error, m; None: 1 mm for a laser scanner and 5 mm for a
         stereo pair.
     """

@@ -36,10 +36,9 @@ def view_signatures(view: SurveyView) -> list[Candidate]:
 def group_by_effect(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
     """Group candidates by effect, and keep a few variants of each to analyse which effects can be distinguished.
 
-    A variant is the effect with one choice of the values that are not fitted, such as the camera or a period.
-
-    The first variant represents the effect in tables. The others, such as other cameras, are alternatives that another effect
-    may be confused with. A wave of unknown period is represented by the middle one of the trial periods.
+    A variant is the effect with one choice of the values that are not fitted, such as the camera or a period. The first variant
+    represents the effect in tables. The others, such as other cameras, are alternatives that another effect may be confused
+    with. A wave of unknown period is represented by the middle one of the trial periods.
 
     Parameters
     ----------
