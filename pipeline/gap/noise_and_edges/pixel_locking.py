@@ -73,7 +73,7 @@ class NoiseBounds:
 
     Attributes
     ----------
-    predicted : standard deviation of the noise in the model, px.
+    predicted : standard deviation of the noise in the sensor model, px.
     measured : standard deviation of the residuals, which contain noise and locking together, px.
     """
 
@@ -85,7 +85,9 @@ class NoiseBounds:
         return NoiseBounds(self.predicted * frequency, self.measured * frequency)
 
     def noise_range(self, amplitude: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the lowest and the highest plausible standard deviation of the noise for given amplitudes of the locking.
+        """Return the lowest and highest plausible standard deviation of the matching noise beside given pixel locking.
+
+        The measured variance contains both, so a larger amplitude of the locking leaves less for the noise.
 
         Parameters
         ----------
@@ -110,7 +112,8 @@ def find_locking(
 ) -> Locking | None:
     """Find pixel locking: measured disparities crowd around certain fractions of a pixel. None if not significant.
 
-    Test statistic is the mean phasor R of the fractions. Without locking, n |R|^2 is exponentially distributed (Rayleigh test).
+    Test statistic is R, the mean of exp(i phase) over n points, where a whole pixel is a phase of 2 pi. Without locking, n
+    |R|^2 is exponentially distributed (Rayleigh test).
 
     Parameters
     ----------

@@ -94,14 +94,14 @@ class SurveyDesign:
     Attributes
     ----------
     projected : (n, k) signatures after the pose of each station is projected out, with a column for each of k coefficients.
-    signatures : (n, k) signatures before that.
+    signatures : (n, k) signatures before the pose is projected out.
     pose_basis : (n, p) orthonormal basis of the changes of the observations by the p pose parameters.
     spans : For each effect, the slice of the k columns of each of its variants, such as other cameras or periods.
     scales : For each effect, the value of its main parameter per unit of each coefficient.
     cells : Cells of the wall, between which the reference's error is correlated.
     sigma : (n,) standard deviations, m or px, reduced so that a subsample has the weight of all points.
     unit_m : Median metres of range or depth per unit of the observations (m or px).
-    wall_rows : Number of rows that are points on the wall; rows of known points follow.
+    wall_rows : Number of the n observations that are points on the wall; those of points with known positions follow.
     """
 
     projected: FloatArray
@@ -118,14 +118,14 @@ class SurveyDesign:
     def of(
         cls, views: tuple[SurveyView, ...], families: dict[str, list[Candidate]], points: KnownPoints | None = None
     ) -> SurveyDesign:
-        """Compute the signatures of all effects in all views, and project out the pose of each station.
+        """Compute how all effects would change the observations (their signatures), and project out the stations' poses.
 
         Parameters
         ----------
-        views : What each station or pair sees.
+        views : What each station or stereo pair sees of the wall.
         families : For the name of each effect, its variants, as `group_by_effect` gives them. A variant is the effect with one
             choice of the values that are not fitted, such as the camera or a period.
-        points : Observations of known points; None if the survey has none.
+        points : Additional observations of points with known positions, such as targets; None if the survey has none.
         """
         wanted = [variant for variants in families.values() for variant in variants]
         columns = np.concatenate([signature_columns(view, wanted) for view in views])

@@ -152,7 +152,7 @@ class TlsSurvey:
         ----------
         scale : New distance from the wall's centre, relative to the present one.
         turn_rad : Rotation of the station about the vertical through the wall's centre, rad.
-        number : Number of the new pose.
+        number : Number of the new pose, which tells it from those of the other stations.
 
         Raises
         ------
@@ -208,7 +208,7 @@ class StereoSurvey:
         ----------
         scale : New distance from the wall's centre, relative to the present one.
         turn_rad : Rotation of the pair about the vertical through the wall's centre, rad.
-        number : Number of the new pose.
+        number : Number of the new pose, which tells it from those of the other pairs.
 
         Raises
         ------
@@ -231,7 +231,7 @@ class StereoSurvey:
 
         Parameters
         ----------
-        number : Number of the new pose.
+        number : Number of the new pose, which tells it from those of the other pairs.
 
         Returns
         -------
