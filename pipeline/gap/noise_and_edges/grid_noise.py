@@ -176,7 +176,7 @@ def separate_white_and_grid_noise(
     """Decide whether noise that was taken for white is independent from point to point or correlated between grid nodes.
 
     The semivariogram of the residuals decides. If it does not, both kinds are reported as indistinguishable. Grid nodes are the
-    widely spaced pixels at which a stereo matcher draws noise, which it interpolates in between. Grid-correlated noise also
+    widely spaced pixels between which a stereo matcher interpolates disparities and their noise. Grid-correlated noise also
     replaces an empirical noise term (a variance fitted freely to a covariate such as the depth): so few nodes share one value
     of the covariate that the noise seems to vary with it.
 
@@ -189,7 +189,7 @@ def separate_white_and_grid_noise(
 
     Returns
     -------
-    list : the noise terms of the kind that the semivariogram supports.
+    list : the noise terms, white or grid-correlated, that the semivariogram supports.
     """
     named = [_name_noise(replace(each, name=each.effect, empirical=False), part, value, model) for each in found]
     return [old if old.empirical and new.name == old.effect else new for old, new in zip(found, named, strict=True)]
@@ -212,7 +212,7 @@ def find_grid_noise(
 
     Returns
     -------
-    tuple : the noise term, or None; and a note if the reference surface may be the cause, else "".
+    tuple : the grid-correlated noise term, or None if there is none; and a note if the reference surface may be the cause, else "".
     """
     variogram = _variogram(part, value, model)
     best = None if variogram is None else variogram.best_grid()
