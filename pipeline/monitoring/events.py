@@ -29,7 +29,9 @@ _GROWS = 0.5
 """Share of the level of detection that pixels at a region's rim exceed."""
 LEAST_PIXELS = 16
 SIGNIFICANT = 7.0
-"""Standard deviations by which the mean over a whole region must differ from zero, with and without its deepest pixels."""
+"""Standard deviations by which the mean over a whole region must differ from zero."""
+_SIGNIFICANT_BESIDE = 5.0
+"""The same without the 3 x 3 pixels about the deepest one."""
 INSIGNIFICANT = "insignificant"
 """The mark of a detection that noise or an edge may explain wholly."""
 _STEEP = 4.0
@@ -233,8 +235,8 @@ def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change
     rows, columns = np.nonzero(inner)
     volume = float(depth[whole].sum()) * gsd**2
     volume_std = float(np.sqrt((noise(mask) * pixels) ** 2 + rough[0] ** 2 + rough[1] ** 2)) * gsd**2
-    least = min(significance(mask), significance(_without_deepest(mask, depth)))
-    insignificant = (INSIGNIFICANT,) if least < SIGNIFICANT or volume < volume_std else ()
+    doubtful = significance(_without_deepest(mask, depth)) < _SIGNIFICANT_BESIDE or volume < volume_std
+    insignificant = (INSIGNIFICANT,) if doubtful or significance(mask) < SIGNIFICANT else ()
     return ChangedRegion(
         kind=kind,
         row=row,
