@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -33,15 +34,46 @@ calibration: {windows: 6, window_px: 16, simulations: 60}
 
 
 class WatchedPage:
-    """A page of Chromium, with what its console, network and scripts complained of in `complaints`."""
+    """A page of Chromium, with what its console, network and scripts complained of in `complaints`.
+
+    `tally` counts what was done with the page and what came of it, for docs/validation/browser.md.
+    """
 
     def __init__(self, browser: Any) -> None:
         self.page = browser.new_context(viewport={"width": WIDE, "height": 900}, reduced_motion="reduce").new_page()
         self.complaints: list[str] = []
-        self.page.on("console", lambda said: said.type == "error" and self.complaints.append(said.text))
-        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
-        self.page.on("requestfailed", lambda asked: self.complaints.append(f"{asked.url}: {asked.failure}"))
-        self.page.on("response", lambda answer: answer.status >= 400 and self.complaints.append(f"{answer.url}: {answer.status}"))
+        self.tally: Counter[str] = Counter()
+        self.axe = ""
+        self._count_actions()
+        self.page.on("request", lambda _: self._count("files"))
+        self.page.on("console", lambda said: said.type == "error" and self._complain("console errors", said.text))
+        self.page.on("pageerror", lambda error: self._complain("console errors", str(error)))
+        self.page.on("requestfailed", lambda asked: self._complain("missing files", f"{asked.url}: {asked.failure}"))
+        self.page.on(
+            "response",
+            lambda answer: answer.status >= 400 and self._complain("missing files", f"{answer.url}: {answer.status}"),
+        )
+
+    def _count(self, what: str, number: int = 1) -> None:
+        self.tally[what] += number
+
+    def _complain(self, kind: str, text: str) -> None:
+        self._count(kind)
+        self.complaints.append(text)
+
+    def _count_actions(self) -> None:
+        """Let clicks and pressed keys be counted."""
+        click, press = self.page.click, self.page.keyboard.press
+
+        def counted_click(*words: Any, **options: Any) -> None:
+            self._count("clicks")
+            click(*words, **options)
+
+        def counted_press(*words: Any, **options: Any) -> None:
+            self._count("keys")
+            press(*words, **options)
+
+        self.page.click, self.page.keyboard.press = counted_click, counted_press
 
     def open(self, address: str, width: int = WIDE) -> Any:
         """Open an address in a window of a width, px; return Playwright's page."""
@@ -53,7 +85,14 @@ class WatchedPage:
         """Return the serious barriers that axe-core finds for people who see little or use no mouse."""
         from axe_playwright_python.sync_playwright import Axe
 
-        found = Axe().run(self.page, options=_RULES).response["violations"]
+        response = Axe().run(self.page, options=_RULES).response
+        found = response["violations"]
+        self.axe = response["testEngine"]["version"]
+        self._count("axe runs")
+        for rule in ("color-contrast", "image-alt"):
+            self._count(f"{rule} runs", any(each["id"] == rule for kind in ("passes", "violations") for each in response[kind]))
+        self._count("severe violations", sum(each["impact"] in SEVERE for each in found))
+        self._count("lesser violations", sum(each["impact"] not in SEVERE for each in found))
         return [f"{each['id']}: {each['nodes'][0]['html'][:200]}" for each in found if each["impact"] in SEVERE]
 
     def overflow_px(self) -> int:

@@ -280,7 +280,7 @@ def test_more_pairs_than_memory_has_room_for_are_named(tmp_path: Path) -> None:
     entries = [{**block, "id": number} for number in range(1, 6000)]
     content = {"images": [image], "annotations": entries, "categories": [{"id": 1}]}
     (tmp_path / "a.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match="image 1 has 5,999 detections, and 5,999 blocks in the truth"):
+    with pytest.raises(InputError, match="image 1 has 5,999 detections and 5,999 true blocks"):
         assess(tmp_path / "a.json", tmp_path / "a.json", kinds=("bbox",))
 
 

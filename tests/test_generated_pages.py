@@ -51,6 +51,14 @@ def test_the_page_of_long_tests_is_that_of_their_list() -> None:
     assert OF_TESTS.read_text(encoding="utf-8") == page_of_tests()
 
 
+def test_the_page_of_browser_tests_is_that_of_their_record() -> None:
+    from make_browser_page import PAGE as OF_BROWSER
+    from make_browser_page import RECORD
+    from make_browser_page import page as page_of_browser
+
+    assert OF_BROWSER.read_text(encoding="utf-8") == page_of_browser(json.loads(RECORD.read_text(encoding="utf-8")))
+
+
 def test_the_pages_of_scripts_run_by_hand_are_those_of_their_records(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "tools"))
     for name in ("try_install", "mutation"):

@@ -155,7 +155,8 @@ def _maps(paths: Sequence[Path], config: SimulationConfig, random: KeyedRandom) 
             raise InputError(
                 "the file is not a difference map",
                 where=str(path),
-                allowed="one folder of results or measurements, or GeoTIFFs that share a grid",
+                allowed="one folder of results or measurements, or GeoTIFFs (.tif) that share a grid",
+                remedy="give the folder alone, or only maps in GeoTIFF",
             )
     rasters, grids = zip(*map(read_geotiff, paths), strict=True)
     for path, grid in zip(paths, grids, strict=True):

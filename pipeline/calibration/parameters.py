@@ -136,9 +136,9 @@ def _bounds(base: Model, name: str) -> tuple[float, float]:
     if name in _BOUNDS:
         if name == ORIENTATION and not _has_orientation_noise(base):
             raise InputError(
-                "the model has no orientation noise to scale",
+                "the model has no orientation noise to scale: the sigmas of all angles and positions of the cameras are 0",
                 where="calibration.fit",
-                remedy="set its sigmas, for example with --set sensor=glendale_high",
+                remedy="take it out of calibration.fit, or use a model with such noise, for example --set sensor=glendale_high",
             )
         return _BOUNDS[name]
     sigma = getattr(base.noise.orientation, name.removeprefix(f"{ORIENTATION}.")).sigma

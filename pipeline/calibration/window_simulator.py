@@ -263,14 +263,22 @@ def _sensor_for_cells(sensor: StereoPair | LaserScanner, model: Model, cells: ND
 def _supported_sensor(config: SimulationConfig, site: SensorSite) -> StereoPair | LaserScanner:
     """Return the sensor, or raise InputError if it cannot be simulated cell by cell."""
     if not isinstance(site.sensor, StereoPair | LaserScanner):
-        raise InputError("the noise of a real matcher cannot be fitted", where="matcher", allowed="simulated")
+        raise InputError(
+            "the noise of a real image matcher cannot be fitted",
+            where="matcher",
+            allowed="simulated",
+            remedy="set matcher: simulated",
+        )
     if site.further_stations:
-        raise InputError("cannot calibrate with several stations", where="station", remedy="keep only the station of the maps")
+        raise InputError(
+            "cannot calibrate with several scanner stations", where="station", remedy="keep only the one that measured the maps"
+        )
     if config.reconstruction != "direct" or config.surface.method != "grid" or config.surface.holes != "keep":
         raise InputError(
             "a calibration needs a surface that is made directly from the sensor's own grid",
             where="reconstruction, surface",
             allowed="reconstruction: direct, surface: {method: grid, holes: keep}",
+            remedy="set these keys in the config",
         )
     if names := effects_needing_neighbours(site.sensor.model):
         raise InputError(

@@ -143,6 +143,7 @@ def choose_windows(stable: BoolArray, grid: Grid, settings: CalibrationConfig) -
             f"a window of {side} pixels does not fit the maps of {grid.height} x {grid.width} pixels",
             where="calibration.window_px",
             allowed=f"up to {min(grid.shape)}",
+            remedy="lower calibration.window_px, or give larger maps",
         )
     total = np.pad(stable.astype(np.int64).cumsum(0).cumsum(1), ((1, 0), (1, 0)))
     row, column = (

@@ -35,7 +35,9 @@ def json_schema(kind: str) -> dict[str, Any]:
     kind: simulation, dataset, detector, scanner, model or measurement. Raises InputError for another.
     """
     if kind not in KINDS:
-        raise InputError(f"there is no schema '{kind}'", allowed=", ".join(KINDS), remedy=nearest(kind, KINDS))
+        raise InputError(
+            f"there is no schema '{kind}'", where="scarpsim schema", allowed=", ".join(KINDS), remedy=nearest(kind, KINDS)
+        )
     found = KINDS[kind].model_json_schema()
     return {"$schema": _DRAFT, **_with_short_forms(found), "title": f"scarpsim: {kind}"}
 

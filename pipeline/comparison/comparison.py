@@ -69,9 +69,10 @@ def compare_sensors(
     """
     if sizes_m is not None and not 0 < sizes_m[0] <= sizes_m[1]:
         raise InputError(
-            f"the block sizes {sizes_m[0]:g} and {sizes_m[1]:g} m are not a range",
+            f"the block sizes {sizes_m[0]:g} and {sizes_m[1]:g} m are not a smallest and a largest size",
             where="--sizes-m",
             allowed="0 < smallest <= largest",
+            remedy="give the smallest size first, both in metres",
         )
     progress = progress or Progress()
     progress.plan({"figures": _FIGURES_S * len(sensors)})

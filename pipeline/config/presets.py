@@ -92,7 +92,8 @@ def with_preset(values: dict[str, Any]) -> dict[str, Any]:
         return values
     if not isinstance(own["preset"], str):
         raise InputError(
-            f"'scanner.preset': expected a name or a file, got {own['preset']!r:.80}",
+            f"expected the name or the file of a scanner preset, got {own['preset']!r:.80}",
+            where="scanner.preset",
             remedy="write for example preset: riegl_vz400i",
         )
     preset = read_preset(own["preset"])

@@ -139,7 +139,7 @@ def make_epoch(config: DatasetConfig, epoch: PlannedEpoch, stages: StageCache, p
         simulation = with_count(simulation_of(config, epoch), block_count(config, epoch.size, grid))
         found, draw = _observed(config, simulation, epoch, stage, progress)
     except InputError as error:
-        raise InputError(str(error), where=epoch.name) from None
+        raise InputError(f"this epoch of the data set could not be simulated: {error}", where=epoch.name) from None
     with progress.stage("tiles"):
         truth = None if stage.true is None else true_difference(stage.true, found)
         cut = [tile for tile in _cut(config, found, grid, truth) if where.holds(tile.tile.column, config.tiles.size_px)]

@@ -27,7 +27,7 @@ _LEAST_KEPT = 5e-4
 
 
 def write_icp_study(out: Path, study: IcpStudy) -> Path:
-    """Write report, tables and pictures of the study; return the path of the report.
+    """Write report, tables and pictures of an ICP study into the folder `out`; return the path of the report.
 
     The folder appears when everything has been written.
     """
@@ -50,7 +50,7 @@ def _write(out: Path, study: IcpStudy) -> None:
 
 
 def recommendation_sentence(found: Recommendation) -> str:
-    """State a recommendation as a sentence."""
+    """State the recommended value of an ICP setting, and the error that remains with it, as a sentence for the report."""
     low, high = found.good
     error = f"{millimetres(found.normal_error_m, 2)} of error along the surface's normal remains"
     if found.parameter == "subsample_ratio":
@@ -61,7 +61,7 @@ def recommendation_sentence(found: Recommendation) -> str:
 
 
 def summary(study: IcpStudy) -> str:
-    """State the main results, as lines of text."""
+    """State the main results of an ICP study as lines of text for the terminal."""
     lines = [recommendation_sentence(each) for each in study.recommended]
     for number, error in study.applied.items():
         if error is not None:
@@ -73,7 +73,7 @@ def summary(study: IcpStudy) -> str:
 
 
 def study_figure(study: IcpStudy, parameter: Parameter) -> bytes:
-    """Draw RMS of the fit, error of the pose and share of inliers against a parameter.
+    """Draw RMS of the fit, error of the pose and share of inliers against one ICP setting (`parameter`), as PNG.
 
     Lines are medians, dots single registrations.
     """

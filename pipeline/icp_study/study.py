@@ -78,7 +78,7 @@ class StudyEpoch:
 
 @dataclass(frozen=True)
 class PoseError:
-    """Error of a transform over the reference's points.
+    """Error of an estimated rigid transform against the true one, evaluated at the reference's points.
 
     Attributes
     ----------
@@ -141,7 +141,11 @@ class StudyRow:
 
 @dataclass(frozen=True)
 class Recommendation:
-    """A recommended setting, the range of values that are as good, and the remaining error, m."""
+    """A recommended value of an ICP setting, for the report of a study.
+
+    parameter: the setting. good: lowest and highest of the values that are as good. normal_error_m: remaining RMS error along the
+    normals, m.
+    """
 
     parameter: Parameter
     value: float
@@ -155,7 +159,7 @@ class Recommendation:
 
 @dataclass(frozen=True)
 class IcpStudy:
-    """The result of a study.
+    """The result of an ICP study: how the error of the registration depends on the settings of ICP.
 
     Attributes
     ----------
@@ -172,7 +176,7 @@ class IcpStudy:
     recommended : list of Recommendation
         The recommended settings.
     applied : dict
-        Error of the run's own transform of each epoch; None without ICP.
+        Error of the transform that the run itself applied, by number of the epoch; None without ICP.
     """
 
     sensor: str
@@ -331,7 +335,9 @@ def true_pose(surface: EpochSurfaces, random: KeyedRandom) -> RigidTransform:
 
 
 def recommend(rows: Iterable[StudyRow], parameter: Parameter) -> Recommendation | None:
-    """Recommend a setting by the largest error over epochs and repetitions; None if all registrations failed.
+    """Recommend a value of an ICP setting from registrations (`rows`) with several values; None if all of them failed.
+
+    Values are compared by their largest error over epochs and repetitions.
 
     The subsample ratio is the share of points that are left out: the recommendation is the largest one up to which all errors are
     as small as with all points. The recommended outlier threshold is the geometric middle of the range of thresholds around

@@ -27,14 +27,17 @@ INTERPRETATION_FILE = "understood.json"
 
 @dataclass(frozen=True)
 class Interpretation:
-    """How raw files were interpreted: lines of text by subject, in a folder that the next command uses."""
+    """How raw files were interpreted when a measurement folder was made, for the user to check.
+
+    folder: the measurement folder, which the next command uses. about: lines of text by subject.
+    """
 
     folder: Path
     about: dict[str, tuple[str, ...]]
 
     @property
     def next_command(self) -> str:
-        """The command that analyses the folder."""
+        """The command line with which the user analyses the measurement folder next."""
         return f"scarpsim gap {self.folder} --out {self.folder}_gap"
 
     def summary(self) -> str:

@@ -56,7 +56,10 @@ class Origin:
 
 
 def pattern_from(points: FloatArray, position: FloatArray, rotation: FloatArray) -> ScanGeometry | None:
-    """Return the scan pattern of points (n, 3) seen from a position; None if they lie on no pattern."""
+    """Find the scan lines and angular steps of points (n, 3), m, seen from a position (3,); None if they lie on no pattern.
+
+    rotation: (3, 3) scanner to the points' frame.
+    """
     try:
         found = recover_pattern(points, position, rotation)
     except InputError:
@@ -66,7 +69,7 @@ def pattern_from(points: FloatArray, position: FloatArray, rotation: FloatArray)
 
 
 def refine_origin(points: FloatArray, position: FloatArray, rotation: FloatArray, geometry: ScanGeometry) -> Origin:
-    """Improve an origin by least squares.
+    """Improve the origin of a scan, where its scanner stood, by least squares: from there the points lie on a regular pattern.
 
     Parameters
     ----------
@@ -202,7 +205,7 @@ def origin_from_point_order(points: FloatArray) -> Origin | None:
 
 
 def origin_near(points: FloatArray, position: FloatArray, rotation: FloatArray) -> Origin | None:
-    """Find the origin of points near a position.
+    """Find the origin of a scan, where its scanner stood, near an approximate position.
 
     Parameters
     ----------

@@ -45,7 +45,10 @@ def viewing_rotation(camera: Camera) -> FloatArray:
 
 
 def describe_view(pair: CameraPair, points: FloatArray, where: str) -> tuple[str, ...]:
-    """Describe how much of a cloud (n, 3), m, the pair sees; raise InputError if it sees almost nothing."""
+    """Describe how much of a cloud (n, 3), m, the stereo pair sees, as lines for the user.
+
+    where: name of the file in errors. Raises InputError if the pair sees almost nothing of the cloud.
+    """
     both = check_seen(pair, points, where)
     left = pair.left
     middle = float(np.median((points - left.position) @ left.rotation[:, 2]))

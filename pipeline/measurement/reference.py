@@ -67,7 +67,7 @@ def is_cloud(path: Path) -> bool:
 def reference_from_file(
     path: Path, unit: str | None, position: FloatArray, rotation: FloatArray, seen_from: str = "from the scanner"
 ) -> Reference:
-    """Read a reference from a file.
+    """Read the reference surface, to which measured points are compared, from a file.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def reference_from_file(
 
 
 def reference_from_dem(path: Path, unit: str | None = None, option: str = "--unit") -> Reference:
-    """Make a surface of an elevation model.
+    """Make the reference surface of a measurement from an elevation model.
 
     It has a vertex at the centre of each pixel, and two triangles between four pixels with data.
 
@@ -152,7 +152,10 @@ def reference_from_dem(path: Path, unit: str | None = None, option: str = "--uni
 
 
 def reference_from_half(scan: RawScan, station: Station) -> Reference:
-    """Mesh every second line of a scan (or pulse, if these are much denser) as the reference for its other half."""
+    """Mesh every second line of a scan (or pulse, if these are much denser) as the reference for its other half.
+
+    station: position and scan pattern of the scanner, which tell the lines.
+    """
     even, what = _halves(scan, station)
     surface = triangulate_seen_points(scan.cloud.points[even], station.position, station.rotation, scan.name)
     said = f"half of the scan itself ({what}): {int(even.sum()):,} points, {len(surface.mesh.faces):,} triangles"

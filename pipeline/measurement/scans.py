@@ -44,7 +44,7 @@ class RawScan:
     words: tuple[str, ...] = ()
 
     def part(self, rows: NDArray[Any]) -> RawScan:
-        """Return the scan with some of its points."""
+        """Return the scan with some of its points only; rows: their indices, or a mask."""
         return replace(self, cloud=part_of(self.cloud, rows))
 
 

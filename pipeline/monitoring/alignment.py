@@ -79,7 +79,10 @@ class RasterPair:
         return self.reference.height - self.epoch.height
 
     def design(self, centre: FloatArray) -> NDArray[np.float32]:
-        """(6, h, w) derivatives of the epoch's heights by shift, m, and rotation, rad, about `centre` (3,); NaN without data."""
+        """(6, h, w) derivatives of the epoch's heights by shift, m, and rotation, rad, about `centre` (3,), m; NaN without data.
+
+        They are the design matrix of the least-squares registration. `centre` is in the wall frame.
+        """
         found = _design(self.epoch, self.from_wall.apply(centre))
         if self.from_wall is SAME:
             return found

@@ -35,7 +35,11 @@ def regions_of_detector(detector: str, difference: Path, change: Change) -> list
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             lines = done.stderr.strip().splitlines()
-            message = lines[-1].removeprefix("error: ") if lines else "the detector ended without a word"
+            message = (
+                lines[-1].removeprefix("error: ")
+                if lines
+                else "the detector's process ended without a message; run `scarpsim detect` on a difference map to see more"
+            )
             raise InputError(message) if done.returncode == _WRONG_INPUT else OutsideError(message)
         found = json.loads((Path(folder) / "found" / f"detections_{CONFIDENCE:g}.json").read_text(encoding="utf-8"))
     regions = []

@@ -63,7 +63,11 @@ def follow(
     if not folder.is_dir():
         raise InputError("is not a folder", where=f"--follow {folder}", remedy="name the folder in which new scans come")
     if times:
-        raise InputError("cannot be combined with --follow, which reads the time of each epoch from its file", where="--times")
+        raise InputError(
+            "cannot be combined with --follow, which reads the time of each epoch from its file",
+            where="--times",
+            remedy="leave --times out",
+        )
     keys: dict[str, Any] = {"workers": workers, "progress": Progress()}
     resume = resume or (out / "monitor.json").exists()
     result = monitor_paths(paths, out, options, resume=resume, **keys) if len(paths) > 1 else None
@@ -82,5 +86,9 @@ def follow(
         before = now
         time.sleep(every_s)
     if result is None:
-        raise InputError("no complete epoch has arrived in it yet", where=f"--follow {folder}")
+        raise InputError(
+            "no epoch that could be used arrived in the folder before the command ended",
+            where=f"--follow {folder}",
+            remedy="check that scans are copied into this folder, and let the command run longer",
+        )
     return result

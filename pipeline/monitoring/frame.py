@@ -75,7 +75,7 @@ def raster_of(points: FloatArray, gsd_m: float | None, count: int | None = None)
             f"a pixel of {gsd:g} m is too {'large' if gsd > coarsest else 'small'} for a wall of {width:.1f} x {height:.1f} m",
             where="--gsd",
             allowed=f"{finest:.2g} to {coarsest:.3g} m",
-            remedy="" if gsd > coarsest else "choose a larger pixel, or cut the epochs to the wall",
+            remedy="choose a smaller pixel" if gsd > coarsest else "choose a larger pixel, or cut the epochs to the wall",
         )
     return Grid.over(bounds, gsd)
 

@@ -102,7 +102,7 @@ def gridded(points: FloatArray | Iterable[FloatArray], grid: Grid) -> HeightRast
 
 @dataclass(frozen=True)
 class PointSums:
-    """Sums over the points of each pixel, (10, h w), from which the planes follow; points can be added in chunks."""
+    """Sums over the points of each pixel, (10, h w), from which planes are fitted; points can be added in chunks."""
 
     grid: Grid
     sums: FloatArray
@@ -118,7 +118,7 @@ class PointSums:
             _add_moments(self.sums, points[start : start + _CHUNK], self.grid)
 
     def heights(self) -> HeightRaster:
-        """Return the heights of planes fitted to all points that were added."""
+        """Fit a plane to the points round each pixel, of all that were added, and return the heights of the planes."""
         return _fitted(self.sums.reshape(10, self.grid.height, self.grid.width), self.grid)
 
 

@@ -26,7 +26,7 @@ class PowerLaw:
 
 
 def fit_power_law(volumes_m3: Sequence[float]) -> PowerLaw | None:
-    """Fit the law to volumes, from the smallest volume on for which it fits best; None for fewer than eight events.
+    """Fit a power law N(> V) = n (V / smallest)^-b to rockfall volumes V, m3; None for fewer than eight events.
 
     The exponent is the maximum-likelihood estimate n / sum(log(V / smallest)). Its interval follows from 2 n b / estimate, which
     has a chi-square distribution with 2 n degrees of freedom. The smallest volume is the one with the least Kolmogorov-Smirnov

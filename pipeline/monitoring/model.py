@@ -22,7 +22,12 @@ def scanner_model(options: MonitorOptions) -> TlsModel | None:
     if options.model is not None:
         model = read_model(options.model)
         if not isinstance(model, TlsModel):
-            raise InputError("is the model of a stereo pair", where=str(options.model), allowed="sensor: tls")
+            raise InputError(
+                "is the model of a stereo pair, but `monitor` needs the model of a laser scanner",
+                where=str(options.model),
+                allowed="sensor: tls",
+                remedy="give the model of a laser scanner, or leave --model out",
+            )
         return model
     return None if options.scanner is None else read_preset(options.scanner).model()
 

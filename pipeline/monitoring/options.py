@@ -87,6 +87,7 @@ def read_areas(path: Path) -> tuple[Area, ...]:
             f"is not a list of areas ({wrong})",
             where=str(path),
             allowed="a list of boxes [x0, y0, x1, y1] or polygons [[x, y], ...]",
+            remedy="write the stable areas in this form, in metres in the wall frame",
         ) from None
     if not found:
         raise InputError("contains no area", where=str(path), remedy="leave --stable out, or draw an area")

@@ -43,7 +43,11 @@ _SCALE_M = 1e-4
 
 @dataclass(frozen=True)
 class Followed:
-    """The result of one epoch after its events were numbered. regions: those of the record, with the numbers of their events."""
+    """The result of one epoch of `monitor` after its events were numbered over all epochs.
+
+    source: the epoch's files and time. record: its result before the numbering. regions: the regions of the record, with the
+    numbers of their events.
+    """
 
     source: EpochSource
     record: EpochRecord
@@ -100,7 +104,10 @@ class Result:
 
 
 def write_points(epoch: Followed, data: EpochData, site: ReferenceSite, out: Path) -> None:
-    """Write an epoch's registered points, survey coordinates, with difference, level of detection and event at each point."""
+    """Write an epoch's registered points, survey coordinates, with difference, level of detection and event at each point.
+
+    data: its points as they were read. site: the reference. out: folder of the results.
+    """
     maps = [_maps_of(epoch, view, out) for view in site.views]
     partition = site.reference.partition
 

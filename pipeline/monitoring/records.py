@@ -22,7 +22,7 @@ KEPT = ".monitor"
 
 @dataclass(frozen=True)
 class EpochRecord:
-    """The result of one epoch.
+    """The result of comparing one epoch with the reference, as it is kept in the folder of the results.
 
     Attributes
     ----------
@@ -82,7 +82,9 @@ class EpochRecord:
 
 
 def kept(folder: Path, number: int, inputs: Mapping[str, str], fingerprint: str) -> EpochRecord | None:
-    """Read the record of an epoch; None if there is none, or if it was made from other files, options or another reference.
+    """Read the record that an earlier call wrote of an epoch, which then need not be computed again.
+
+    Returns None if there is none, or if it was made from other files, options or another reference.
 
     Parameters
     ----------

@@ -263,7 +263,9 @@ def _check_same_site(data: EpochData, site: ReferenceSite, source: EpochSource) 
         )
     if data.crs and site.crs and data.crs != site.crs and not _same_system(data.crs, site.crs):
         raise InputError(
-            "is in another coordinate system than the reference", where=source.name, remedy="transform one of the two"
+            "is in another coordinate system than the reference",
+            where=source.name,
+            remedy="transform one of the two into the coordinate system of the other",
         )
     if data.count < _TENTH * site.points:
         return [f"has {data.count:,} points where the reference has {site.points:,}: small changes do not show"]

@@ -115,7 +115,9 @@ def _frames(data: EpochData, towards: FloatArray, options: MonitorOptions) -> tu
     single = wall_frame(data.points, towards, options.direction)
     count = options.views or (None if options.direction is None else 1)
     if count is not None and not 1 <= count <= MOST_VIEWS:
-        raise InputError(f"got {count}", where="--views", allowed=f"1 to {MOST_VIEWS}")
+        raise InputError(
+            f"got {count} views", where="--views", allowed=f"1 to {MOST_VIEWS}", remedy="choose a number in this range"
+        )
     found = divided(data.points - single.origin, towards - single.origin, single.rotation[2], count)
     if found is None:
         return [single], None

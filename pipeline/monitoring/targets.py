@@ -51,7 +51,10 @@ def read_targets(path: Path) -> Targets:
     table = csv.DictReader(io.StringIO(read_text(path)))
     if not set(_COLUMNS) <= set(table.fieldnames or ()):
         raise InputError(
-            f"has the columns {', '.join(table.fieldnames or ()) or 'none'}", where=str(path), allowed=", ".join(_COLUMNS)
+            f"has the columns {', '.join(table.fieldnames or ()) or 'none'}",
+            where=str(path),
+            allowed=", ".join(_COLUMNS),
+            remedy="name all of these columns in the first line, separated by commas",
         )
     found: dict[str, dict[str, FloatArray]] = {}
     for line, row in enumerate(table, start=2):
@@ -95,7 +98,7 @@ def fit_targets(targets: Targets, reference: str, epoch: str, frame: WallFrame) 
     centre_to, centre = to.mean(axis=0), moved.mean(axis=0)
     extent = np.linalg.svd(to - centre_to, compute_uv=False)
     if extent[1] < _LINE * extent[0]:
-        raise InputError("the targets lie on one line", where="--targets", remedy="add a target beside it")
+        raise InputError("the targets lie on one line", where="--targets", remedy="add a target that does not lie on this line")
     left, _, right = np.linalg.svd((moved - centre).T @ (to - centre_to))
     flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(right.T @ left.T))])
     rotation = right.T @ flip @ left.T

@@ -52,16 +52,21 @@ def time_of(path: Path, given: str | None = None) -> EpochTime:
 
 
 def parsed_time(text: str, where: str) -> datetime:
-    """Read a time in ISO 8601; without a zone it is UTC. Raises InputError for anything else."""
+    """Read a time in ISO 8601; without a zone it is UTC.
+
+    where: option or file that states it, for the error. Raises InputError for anything else.
+    """
     try:
         found = datetime.fromisoformat(text)
     except ValueError:
-        raise InputError(f"got '{text[:60]}'", where=where, allowed=_ISO) from None
+        raise InputError(
+            f"'{text[:60]}' is not a time that can be read", where=where, allowed=_ISO, remedy="write it in this form"
+        ) from None
     return found.replace(tzinfo=UTC) if found.tzinfo is None else found.astimezone(UTC)
 
 
 def check_order(times: Sequence[EpochTime], names: Sequence[str]) -> None:
-    """Raise InputError where an epoch is earlier than the one before it."""
+    """Raise InputError where an epoch is earlier than the one before it; names: the epochs' names, for the error."""
     known = [(time.when, name) for time, name in zip(times, names, strict=True) if time.when is not None]
     for (before, first), (after, second) in itertools.pairwise(known):
         if after < before:

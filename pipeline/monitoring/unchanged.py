@@ -55,7 +55,10 @@ def unchanged_pixels(standard: NDArray[np.floating], candidates: NDArray[np.bool
 
 
 def quieter_scatter(values: NDArray[np.floating]) -> float:
-    """Return the standard deviation of noise about zero from the values of the sign that scatters less, long tails included."""
+    """Estimate the standard deviation of noise about zero from the values of the sign that scatters less.
+
+    values: differences, any shape. Long tails are included.
+    """
     sides = [side for side in (values[values > 0], -values[values < 0]) if len(side) >= _FEWEST]
     if not sides:
         return float(np.sqrt(np.mean(values**2))) if len(values) else np.inf

@@ -23,7 +23,7 @@ _HEAD = """# The site of {name}, as `scarpsim monitor` saw it: simulate it with
 
 
 def write_site(result: Result, path: Path) -> None:
-    """Write the config, and the wall's mesh beside it, from the reference epoch.
+    """Write a config for `scarpsim simulate` to `path`, and the wall's mesh beside it, from the reference epoch of `monitor`.
 
     Raises InputError if the reference has no surface, or if a file of that name exists.
     """

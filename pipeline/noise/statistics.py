@@ -221,6 +221,6 @@ def histogram(values: NDArray[np.floating], bins: int = 100, half_width_nmads: f
 
 
 def without_outliers(values: NDArray[np.floating], nmads: float = 5.0) -> NDArray[np.floating]:
-    """Return the values with NaN in place of those farther than `nmads` NMADs from the median."""
+    """Return differences (any shape) with NaN in place of those farther than `nmads` NMADs from their median."""
     size = statistics(values)
     return np.where(np.abs(values - size.median) <= nmads * size.nmad, values, np.nan)

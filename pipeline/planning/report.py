@@ -151,7 +151,7 @@ def _values(found: PlanMap, figures: Mapping[str, float | None]) -> list[str]:
 
 
 def map_picture(plan: Plan, found: PlanMap) -> bytes:
-    """Draw a map of a plan as PNG, in the unit in which reports show it."""
+    """Draw a map (`found`) of a plan as PNG, in the unit in which reports show it."""
     return map_figure(plan.raster.image(found.values * found.factor), plan.raster.grid, found.unit or "ratio", found.title)
 
 

@@ -95,6 +95,7 @@ def wall_raster(caster: RayCaster, gsd_m: float | None = None) -> WallRaster:
             f"a pixel of {gsd:g} m is too large or too small for a wall of {extent[0]:.1f} x {extent[1]:.1f} m",
             where="planning.gsd_m",
             allowed=f"{finest:.2g} to {coarsest:.3g} m",
+            remedy="choose a pixel size in this range",
         )
     grid = Grid.over(bounds, gsd)
     hits, point = caster.look_down(grid)

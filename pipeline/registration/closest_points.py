@@ -175,7 +175,7 @@ def checked_cloud(points: FloatArray, name: str) -> FloatArray:
     """
     points = np.ascontiguousarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"expected shape (n, 3), got {points.shape}", where=name)
+        raise InputError(f"expected shape (n, 3), got {points.shape}", where=name, remedy="give one row x, y, z for each point")
     if len(points) < LEAST_POINTS:
         raise InputError(f"{len(points)} points are too few", where=name, allowed=f"at least {LEAST_POINTS}", remedy=_SEES)
     finite = np.isfinite(points)
@@ -201,7 +201,11 @@ def _on_a_line(points: FloatArray) -> bool:
 def _unit(normals: FloatArray, count: int) -> FloatArray:
     """Normalise the normals. Raises InputError if their number or length is wrong."""
     if np.shape(normals) != (count, 3):
-        raise InputError(f"expected shape ({count}, 3), got {np.shape(normals)}", where="reference normals")
+        raise InputError(
+            f"expected shape ({count}, 3), got {np.shape(normals)}",
+            where="reference normals",
+            remedy="give one normal x, y, z for each reference point",
+        )
     length = np.sqrt(np.einsum("ni,ni->n", normals, normals))
     good = np.isfinite(length) & (length > 0)
     if not good.all():

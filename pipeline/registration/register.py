@@ -387,6 +387,7 @@ class _Alignment:
                 f"the subsample would leave only {used} of {total:,} points",
                 where="icp.subsample_ratio",
                 allowed=f"at most {1 - LEAST_POINTS / total:.6g}",
+                remedy="lower it, the share of points that is left out",
             )
         draw = random.generator().random(total)
         sizes = [size for size in _LEVELS if 4 * size <= used] + [used]

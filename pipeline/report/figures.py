@@ -75,7 +75,7 @@ _CROWDED = 0.15
 
 
 class Iteration(Protocol):
-    """What a convergence picture shows of an iteration of the registration."""
+    """One iteration of ICP as `convergence_figure` draws it: any object with these attributes."""
 
     @property
     def rms_m(self) -> float:
@@ -95,7 +95,10 @@ class Iteration(Protocol):
 
 @dataclass(frozen=True)
 class CurvePanel:
-    """One family of curves: shares in 0 to 1 (k,) by name, at positions x (k,); `at` is the position of the present set-up."""
+    """One panel of `curves_figure`: curves of shares, 0 to 1, against one quantity (logarithmic: its axis is).
+
+    label, x, at: the quantity with its unit, its values (k,), and its value in the present set-up. curves: shares (k,) by name.
+    """
 
     label: str
     x: NDArray[np.floating]
@@ -298,10 +301,7 @@ def curves_figure(panels: Sequence[CurvePanel], y_label: str, title: str = "") -
 
 
 def histogram_figure(outside: NDArray[np.floating], inside: NDArray[np.floating], title: str = "") -> bytes:
-    """Draw histograms of differences, m, outside and inside the blocks.
-
-    The noise has a linear scale, and everything a logarithmic one.
-    """
+    """Draw histograms of differences, m, outside and inside blocks: linear near the noise, logarithmic over all."""
     groups = [("outside the blocks", outside, _OUTSIDE), ("inside the blocks", inside, _INSIDE)]
     samples = [(name, values[~np.isnan(values)] * 1e3, colour) for name, values, colour in groups]
     figure = Figure(figsize=(_LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN, 4.6), dpi=DPI, layout="constrained")
@@ -407,14 +407,14 @@ def _shortened(axis: Axis, low: float) -> float:
 
 
 def colour_bar_position(height_in: float) -> tuple[dict[str, Any], float]:
-    """Return where the colour bar of maps stands, and the height that it takes, in: beside maps, or beneath low ones."""
+    """Return Matplotlib's arguments that place a map's colour bar, and the height that it takes below the map, inches."""
     if height_in < _LOW_IN:
         return {"location": "bottom", "shrink": 0.6, "aspect": 45}, _BENEATH_IN
     return {"location": "right", "shrink": 0.8}, 0.0
 
 
 def label_axes(axes: Axes, x_label: str, y_label: str) -> None:
-    """Label the axes in the size that all pictures share."""
+    """Label the axes of a picture in the font size that all pictures of the reports share."""
     axes.set_xlabel(x_label, fontsize=9)
     axes.set_ylabel(y_label, fontsize=9)
     axes.tick_params(labelsize=8)

@@ -13,7 +13,7 @@ _BAR = '<progress value="{share:.3f}" max="1" style="width: 20em"></progress> {p
 
 
 class NotebookProgress(Progress):
-    """An HTML bar, redrawn whenever a stage begins or advances, which vanishes at the end."""
+    """Shows progress in a notebook as an HTML bar, which is redrawn when a stage begins or advances, and vanishes at the end."""
 
     def __init__(self, display: Any) -> None:
         """Make a bar. display: IPython's function, or one with the same arguments."""

@@ -13,7 +13,7 @@ from pipeline.report.progress import Progress
 
 
 class BarProgress(Progress):
-    """A bar that is redrawn several times a second and vanishes at the end."""
+    """Shows progress on a terminal as a bar that is redrawn several times a second and vanishes at the end."""
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__()

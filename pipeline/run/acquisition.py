@@ -34,7 +34,7 @@ class Acquisition:
     observation : Observation
         The sensor's observation; with several stations that of the first.
     depth_maps : DepthMaps, optional
-        If another program or COLMAP needs them.
+        Depth maps of a stereo pair; None unless another program or COLMAP needs them.
     joined : JoinedStations, optional
         All stations of a laser scanner that has several.
     vertices : TriangleMesh, optional

@@ -21,7 +21,11 @@ _HEADER = LazHeader()
 def write_formats(
     stem: Path, formats: Sequence[str], cloud: PointCloud, scans: Callable[[], list[E57Scan]], header: LazHeader
 ) -> None:
-    """Write points in the formats besides LAZ, all with the same stem."""
+    """Write points in the formats that a config asks for besides LAZ.
+
+    stem: path without ending. formats: names of the formats. scans: makes the E57 scans, called only if they are needed.
+    header: coordinate system and time for COPC.
+    """
     if "copc" in formats:
         write_cloud(stem.with_suffix(COPC), cloud, header)
     if "ply" in formats:

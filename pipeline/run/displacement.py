@@ -25,7 +25,9 @@ _OUTLIER = 6.0
 
 
 def displacement(observations: tuple[Observation, ...], registration: Registration | None, grid: Grid) -> NDArray[np.float32]:
-    """Estimate x and y of the map minus the truth at the pixels of `grid`, (h, w, 2), m; 0 if the samples do not tell.
+    """Estimate how far a map is displaced sideways at the pixels of `grid`: x and y of the map minus the truth, m.
+
+    Returns (h, w, 2) displacements, 0 where the samples do not tell.
 
     Parameters
     ----------

@@ -153,7 +153,7 @@ def observe_reference(config: SimulationConfig, site: SensorSite, random: KeyedR
 def observe_epoch(
     config: SimulationConfig, site: SensorSite, reference: ReferenceEpoch, number: int, random: KeyedRandom, progress: Progress
 ) -> LaterEpoch:
-    """Carve blocks from the untouched wall, observe it and compare it with the reference.
+    """Simulate a later epoch: carve blocks from the untouched wall, observe it and compare it with the reference.
 
     The result is a pure function of config, site and (seed, number); it does not depend on other epochs.
 
@@ -274,6 +274,6 @@ def measure_blocks(change: NDArray[np.float32], raster: SurfaceRaster, ratio: Fl
 
 
 def to_world(site: SensorSite, position: list[float]) -> list[float]:
-    """Convert a position from the wall frame to world coordinates, m."""
+    """Convert a position (3,), m, from the wall frame of `site` to world coordinates."""
     world: FloatArray = site.frame.to_world(np.array(position))
     return world.tolist()

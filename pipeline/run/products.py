@@ -50,7 +50,7 @@ CHANGE_ANNOTATIONS = "annotations_change"
 
 
 def is_whole(out: Path, checksums: Checksums, where: Path) -> bool:
-    """Return whether all files exist with the given checksums.
+    """Return whether all files of the run folder `out` exist with the given checksums (by name).
 
     Raises InputError if a name in the file `where` leads out of the folder.
     """

@@ -190,7 +190,11 @@ class Series:
         path = self.series.surfaces[number]
         wall = self.config.wall
         if not isinstance(wall, ImportedWall):
-            raise InputError("need an imported wall", where="series.surfaces", remedy="leave `wall` out")
+            raise InputError(
+                "surfaces of epochs need a wall that is imported from a mesh",
+                where="series.surfaces",
+                remedy="leave `wall` out, or give it a mesh",
+            )
         mesh, _ = wall.model_copy(update={"mesh": path}).load()
         mesh = mesh.with_vertices(self.site.frame.to_wall(mesh.vertices))
         mesh, _ = orient_to_sensors(mesh, list(self.site.viewpoints.values()), str(path), cleaned=True)

@@ -150,8 +150,7 @@ def _pycolmap() -> Any:
     try:
         import pycolmap  # an extra, and needed here only
     except ImportError:
-        problem, where = "needs the package pycolmap", "reconstruction: colmap"
-        raise InputError(problem, where=where, remedy=how_to_install("colmap")) from None
+        raise InputError("needs the package pycolmap", where="reconstruction: colmap", remedy=how_to_install("colmap")) from None
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     return pycolmap
 

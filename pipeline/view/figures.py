@@ -209,7 +209,7 @@ def _scale(colour: NDArray[np.floating], layer: Layer) -> dict[str, Any]:
 
 
 def hillshade(patch: Patch) -> NDArray[np.floating]:
-    """Shade the patch as lit from the upper left, like the reports' hillshades."""
+    """Compute a hillshade of the patch (a part of the wall), lit from the upper left like those of the reports."""
     if min(patch.height.shape) < 2:
         return np.ones_like(patch.height)
     down, right = np.gradient(patch.height, -patch.y, patch.x)

@@ -190,7 +190,7 @@ def pictures(
     window: ViewWindow | None,
     second: tuple[Pair, str, float] | None = None,
 ) -> tuple[Any, Any, str]:
-    """Make both pictures of a window and a note about them.
+    """Draw the wall inside a window in 3D and as a map, and make a note about both for the page.
 
     Parameters
     ----------
@@ -237,14 +237,20 @@ def following(steps: list[str], step: str) -> str:
 
 
 def clicked(data: Any) -> int | None:
-    """Return the number of the item that was clicked; None for a click on the wall itself."""
+    """Return the number of the item (such as a block) that was clicked; None for a click on the wall itself.
+
+    data: what Plotly reports of the click.
+    """
     point = (data or {}).get("points", [{}])[0]
     known = point.get("customdata")
     return int(known[0]) if isinstance(known, list) and len(known) == 1 and "text" in point else None
 
 
 def zoom(change: Any, now: Any) -> Any:
-    """Return the window after the map was zoomed or moved; None for the whole wall."""
+    """Return the window after the user zoomed or moved the map; None for the whole wall.
+
+    change: what Plotly reports of the map's axes. now: the present window [x0, x1, y0, y1], m.
+    """
     change = change or {}
     if change.get("xaxis.autorange") or change.get("yaxis.autorange"):
         return None

@@ -217,7 +217,7 @@ def centres(grid: Grid, rows: slice, columns: slice, factor: int) -> tuple[Float
 
 
 def inside(points: FloatArray, window: ViewWindow | None) -> NDArray[np.bool_]:
-    """Return which of the points (n, 3) lie in the window."""
+    """Return which of the points (n, 3), wall frame, m, lie in the window, as a mask (n,); None: all."""
     if window is None:
         return np.ones(len(points), bool)
     x, y = points[:, 0], points[:, 1]

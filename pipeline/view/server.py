@@ -46,7 +46,10 @@ Plotly sets styles from scripts and saves pictures through data and blob address
 
 
 def open_results(folder: Path, detections: Path | None = None) -> Results:
-    """Open a folder by the files in it. Raises InputError if it is none of the kinds that can be shown."""
+    """Open a folder of results for `scarpsim view`; its files tell which kind it is.
+
+    detections: folder of `scarpsim detect`, to show with a run. Raises InputError if the folder cannot be shown.
+    """
     if not folder.is_dir():
         raise InputError("there is no such folder", where=str(folder), remedy="give the folder that a command filled")
     if (folder / "run.json").exists():
@@ -71,7 +74,10 @@ def open_results(folder: Path, detections: Path | None = None) -> Results:
 
 
 def make_app(results: Results, token: str, other: Results | None = None) -> dash.Dash:
-    """Make the page for `results`, accessible with the token; other: a second run of the same wall."""
+    """Make the web page that shows `results`.
+
+    token: secret that grants access. other: a second run of the same wall, shown beside; None: none.
+    """
     app = dash.Dash(
         __name__,
         serve_locally=True,

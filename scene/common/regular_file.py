@@ -93,7 +93,7 @@ def read_text(path: Path, *, most_bytes: int | None = None, remedy: str = "check
         ) from None
 
 
-def read_json(path: Path, *, remedy: str = "make it again") -> Any:
+def read_json(path: Path, *, remedy: str = "check the path, or make the file again with the command that wrote it") -> Any:
     """Read a JSON file; `remedy` is what the error message advises.
 
     Raises InputError if the file cannot be read or is not JSON. It also does, before reading, if the contents might take more
@@ -106,7 +106,7 @@ def read_json(path: Path, *, remedy: str = "make it again") -> Any:
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy=remedy) from None
     if needed > most:
-        problem = f"holds so much that it may take {needed:.1f} GB of memory"
+        problem = f"is so large that reading it may take {needed:.1f} GB of memory"
         raise InputError(
             problem,
             where=str(path),

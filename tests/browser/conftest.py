@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from browser_pages import WatchedPage, make_outputs
+from browser_record import RECORD
 from shared_outputs import build_site, made_once
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -24,16 +26,19 @@ def browser() -> Iterator[object]:
 
     with sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS, OFFLINE])
+        RECORD.chromium = chromium.version
         yield chromium
         chromium.close()
 
 
 @pytest.fixture
-def page(browser: object) -> Iterator[WatchedPage]:
+def page(browser: object, request: pytest.FixtureRequest) -> Iterator[WatchedPage]:
     """Return an empty page; whatever its console, its network or its scripts complained of fails the test at the end."""
     watched = WatchedPage(browser)
     yield watched
     watched.close()
+    RECORD.add(request.node.name, watched.tally)
+    RECORD.axe = watched.axe or RECORD.axe
     assert not watched.complaints
 
 
@@ -47,3 +52,9 @@ def outputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The built documentation."""
     return made_once(tmp_path_factory, "site", build_site)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Write the record of what was done and found, where BROWSER_RECORD names a file for it."""
+    if (path := os.environ.get("BROWSER_RECORD")) and RECORD.tallies:
+        RECORD.write(Path(path), session.testsfailed)

@@ -100,9 +100,12 @@ def _check_pairs(truth: Sequence[Mapping[str, Any]], found: Sequence[Mapping[str
     annotated, detected = (Counter(each["image_id"] for each in entries) for entries in (truth, found))
     for image, count in detected.items():
         if count * annotated[image] > _MOST_PAIRS:
-            problem = f"image {image} has {count:,} detections, and {annotated[image]:,} blocks in the truth"
-            allowed, remedy = f"{_MOST_PAIRS:,} pairs", "cut the image into tiles, or leave out the lowest scores"
-            raise InputError(problem, where=where, allowed=allowed, remedy=remedy)
+            raise InputError(
+                f"image {image} has {count:,} detections and {annotated[image]:,} true blocks, too many to compare each pair",
+                where=where,
+                allowed=f"{_MOST_PAIRS:,} pairs of a detection and a block",
+                remedy="cut the image into tiles, or leave out the detections with the lowest scores",
+            )
 
 
 def as_text(assessment: Assessment) -> str:

@@ -164,9 +164,11 @@ def _learner(model: MaskRCNN, folders: tuple[CocoFolder, CocoFolder], config: Tr
         return _Streamed(model, folders, config, progress)
     backend = keras.backend.backend()
     if backend != "jax":
-        where, remedy = "training.data", "set KERAS_BACKEND=jax, or training.data=streamed"
         raise InputError(
-            f"resident needs jax, not KERAS_BACKEND={backend}", where=where, allowed="resident on jax", remedy=remedy
+            f"the value resident needs jax, not KERAS_BACKEND={backend}",
+            where="training.data",
+            allowed="resident on jax, streamed on every backend",
+            remedy="set KERAS_BACKEND=jax, or training.data=streamed",
         )
     from pipeline.detection.training.resident import ResidentLearner, load_resident_set
 

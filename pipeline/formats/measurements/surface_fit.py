@@ -98,6 +98,6 @@ def check_in_metres(model: StereoModel, where: str) -> None:
     if not model.noise.of_points.sigma_m and not model.noise.of_points.shared_sigma_m:
         raise InputError(
             "a stereo measurement needs `cameras`, or a model whose noise is in metres", where=where,
-            remedy="add `cameras` (cameras.yaml or a Metashape XML), or set noise: point_sigma_m in the model; "
-            "scarpsim measurement --photographs estimates it",
+            remedy="add `cameras` (cameras.yaml or a Metashape XML) to the measurement, or set noise: point_sigma_m in the "
+            "model; `scarpsim measurement --photographs` estimates that value",
         )  # fmt: skip

@@ -223,8 +223,12 @@ def _points(columns: dict[str, NDArray[Any]], where: str) -> FloatArray:
     if all(name in columns for name in _CARTESIAN):
         return np.stack([columns[name] for name in _CARTESIAN], axis=1)
     if not all(name in columns for name in _SPHERICAL):
-        problem, allowed = "has points without coordinates", "cartesianX, Y, Z or sphericalRange, Azimuth, Elevation"
-        raise InputError(problem, where=where, allowed=allowed, remedy="export it again, with its coordinates")
+        raise InputError(
+            "has points without coordinates",
+            where=where,
+            allowed="cartesianX, Y, Z or sphericalRange, Azimuth, Elevation",
+            remedy="export it again, with its coordinates",
+        )
     distance, azimuth, elevation = (columns[name] for name in _SPHERICAL)
     level = distance * np.cos(elevation)
     return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)], axis=1)

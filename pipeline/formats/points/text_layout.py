@@ -84,8 +84,9 @@ def encoding_of(path: Path) -> str:
         head = file.read(_HEAD_BYTES)
     for start, (kind, suffix) in _BINARY_KINDS.items():
         if head.startswith(start):
-            problem, remedy = f"is {kind} by its first bytes, not text", f"give it the suffix {suffix}"
-            raise InputError(problem, where=str(path), allowed=_ROWS, remedy=remedy)
+            raise InputError(
+                f"is {kind} by its first bytes, not text", where=str(path), allowed=_ROWS, remedy=f"give it the suffix {suffix}"
+            )
     for mark, name in _BYTE_ORDER_MARKS:
         if head.startswith(mark):
             return name

@@ -117,7 +117,7 @@ def _check_end(path: Path, layout: TextLayout) -> None:
     if len(others) > _FEWEST_ALIKE and len(set(others)) == 1 and end < others[0]:
         raise InputError(
             f"ends within a number: '{last[-1][0]}', while all numbers above have {others[0]} decimals", where=str(path),
-            remedy="the file was cut off: copy or export it again; or end its last line",
+            remedy="the file was probably cut off: copy or export it again; if it is complete, add a line break at its end",
         )  # fmt: skip
 
 
@@ -165,9 +165,11 @@ def _without_words(
     found, said = list(columns), list(notes)
     for index in layout.form.words:
         if found[index].name in _AXES:
-            problem, allowed = f"column {index + 1}, called {found[index].name}, contains words", "numbers"
             raise InputError(
-                problem, where=where, allowed=allowed, remedy="name the columns as they are, in the file or with --columns"
+                f"column {index + 1}, called {found[index].name}, contains words",
+                where=where,
+                allowed="numbers in the columns x, y and z",
+                remedy="correct the names of the columns in the file, or give the right ones with --columns",
             )
         if found[index].name != SKIPPED:
             said.append(f"column {index + 1} ({found[index].name}) contains words and is left out")
@@ -182,7 +184,7 @@ def _check_present(values: FloatArray, columns: Sequence[Column], where: str) ->
         raise InputError(
             f"column {empty[0] + 1}, read as {columns[empty[0]].name}, is empty in all {len(values):,} rows",
             where=where,
-            remedy="export it again, or name the columns with --columns as they are",
+            remedy="export it again, or give the right names of the columns with --columns",
         )
 
 

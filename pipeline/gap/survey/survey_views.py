@@ -82,9 +82,9 @@ class SurveyView:
         smooth = np.flatnonzero(found.usable)
         if len(smooth) < _FEWEST_POINTS:
             raise InputError(
-                f"{len(smooth)} of {len(found)} points lie on smooth parts of the wall, {_FEWEST_POINTS} are needed",
+                f"only {len(smooth)} of {len(found)} points lie on smooth parts of the wall, {_FEWEST_POINTS} are needed",
                 where="station" if found.sensor == "tls" else "cameras",
-                remedy="aim at the wall, or scan with a finer step",
+                remedy="turn the sensor towards the wall or move it closer; for a scanner, choose smaller angular steps",
             )
         return cls(found.part(smooth), int(whole * len(smooth) / len(found)), number, measurement)
 
@@ -297,7 +297,9 @@ def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Surve
         return StereoSurvey((pair,), centre, _pair_observer("medium"))
     if isinstance(measurement, SurfaceMeasurement):
         raise InputError(
-            "the measurement has no cameras, so no effect can be analysed", where="--identifiability", remedy="add `cameras`"
+            "the measurement has no cameras, so no effect can be analysed",
+            where="--identifiability",
+            remedy="add `cameras` (cameras.yaml or a Metashape XML) to measurement.yaml",
         )
     measurement = measurement.changed(order=None)
     set_ups = [(scan.set_up, one) for scan, rows, one in measurement.each_scan() if len(rows)]
