@@ -111,7 +111,7 @@ def test_a_run_takes_a_scanner_and_a_style_of_another_package(package: dict[str,
     [
         ("known = os:sep", "the name 'known' is already in use; choose another name"),
         ("other = os:nonesuch", r"does not load \(AttributeError"),
-        ("other = os:sep", "is a str; allowed: a number"),
+        ("other = os:sep", "an object of the type str; allowed: a number"),
     ],
 )
 def test_wrong_entry_points_are_said_in_one_line(

@@ -150,7 +150,9 @@ def make_blocks(
     size = _table(np.repeat(size[:, None], 3, axis=1) if size.ndim == 1 else size, "sizes", len(place))
     turn = np.zeros_like(place) if rotations_rad is None else _table(rotations_rad, "rotations_rad", len(place))
     if not (size > 0).all():
-        raise InputError(f"got {size.min():g} m", where="sizes", allowed="above 0", remedy="give sizes in metres, above 0")
+        raise InputError(
+            f"a block has the size {size.min():g} m", where="sizes", allowed="above 0", remedy="give sizes in metres, above 0"
+        )
     return solids.make_regular_blocks(place, size, turn, shape, subdivisions)
 
 

@@ -116,7 +116,10 @@ class Comparison:
         trial = self.figures.trial
         if sensor not in self.names:
             raise InputError(
-                f"there is no '{sensor}'", where="compare", allowed=", ".join(self.names), remedy=nearest(sensor, self.names)
+                f"the comparison has no sensor '{sensor}'",
+                where="compare",
+                allowed=", ".join(self.names),
+                remedy=nearest(sensor, self.names) or "choose one of these names",
             )
         changes = trial.seen[self.names.index(sensor)].changes
         return data_array(changes, trial.grid, "difference", DIFFERENCE)
@@ -163,7 +166,7 @@ def _given(sensors: Sequence[Any], seed: int | None, overrides: Mapping[str, Any
     They become names of files and presets, or pairs of a name and a config.
     """
     if not sensors:
-        raise InputError("got no sensor", where="compare", remedy='write for example compare("glendale", "riegl_vz400i")')
+        raise InputError("no sensor is given", where="compare", remedy='write for example compare("glendale", "riegl_vz400i")')
     only = sensors[0]
     if len(sensors) == 1 and isinstance(only, Mapping) and not set(only) & set(SimulationConfig.model_fields):
         named = [(str(name), each) for name, each in only.items()]

@@ -69,7 +69,9 @@ def configure(
 def check_sensor(sensor: str | None) -> None:
     """Raise InputError if `sensor` is neither None nor the name of a kind of sensor."""
     if sensor not in (None, "stereo", "tls"):
-        raise InputError(f"got {sensor!r:.80}", where="sensor", allowed="'stereo', 'tls'", remedy="give one of them")
+        raise InputError(
+            f"the sensor is {sensor!r:.80}", where="sensor", allowed="'stereo', 'tls'", remedy="give 'stereo' or 'tls'"
+        )
 
 
 def one_sensor(config: SimulationConfig, sensor: SensorName | None) -> SensorName:

@@ -176,7 +176,7 @@ def _in_another_process(model: str, places: Sequence[Path], out: Path, confidenc
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         message = (
-            done.stderr.strip().splitlines()[-1].removeprefix("error: ")
+            f"scarpsim detect failed: {done.stderr.strip().splitlines()[-1].removeprefix('error: ')}"
             if done.stderr.strip()
             else "the detector's process ended without a message; run `scarpsim detect` in a terminal to see more"
         )

@@ -22,7 +22,7 @@ def library(name: str) -> Any:
     except ImportError as error:
         extra = EXTRAS.get(name, "notebook")
         raise InputError(
-            f"needs {name}, which does not load ({error})",
+            f"this function needs the package {name}, which does not load ({error})",
             where="Python interface",
             remedy=how_to_install(extra),
         ) from None

@@ -94,7 +94,7 @@ def raster_of(array: Any, where: str) -> tuple[NDArray[np.float32], Grid]:
             f"has pixels of {steps.min():g} to {steps.max():g} m",
             where=where,
             allowed="square pixels of one size",
-            remedy="resample it with array.interp",
+            remedy="resample the map with xarray's array.interp to equal steps in x and y",
         )
     grid = Grid(float(x[0] - gsd / 2), float(y[0] + gsd / 2), gsd, len(x), len(y))
     return np.asarray(array.values, dtype=np.float32), grid

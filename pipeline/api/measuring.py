@@ -334,7 +334,9 @@ def _of_run(run: Run, model: Any) -> Measurement:
     site = prepare_site(run.config, run.sensor, KeyedRandom(run.config.seed))
     if site.further_stations:
         raise InputError(
-            "the run has several stations", where=str(run.folder), remedy="give reference, points and scanner of one station"
+            "the run has several scanner stations, but a measurement has one",
+            where=str(run.folder),
+            remedy="give reference, points and scanner of one station",
         )
     world = site.mesh.with_vertices(site.frame.to_world(site.mesh.vertices))
     cloud = run[0].points.cloud()
@@ -351,7 +353,7 @@ def _clouds(points: Any) -> dict[str, PointCloud]:
     """Return the point clouds, keyed by the name that error messages use."""
     several = points if isinstance(points, list | tuple) else [points]
     if not several:
-        raise InputError("got no points", where="measure", remedy="give an array, Points or a file")
+        raise InputError("no points are given", where="measure", remedy="give an array, Points or a file")
     found = {}
     for number, each in enumerate(several, start=1):
         if isinstance(each, str | os.PathLike):

@@ -58,13 +58,18 @@ def pick(pictures: Mapping[str, Any], kind: str | None, where: str) -> Any:
     """
     if not pictures:
         raise InputError(
-            "the result has no pictures to plot", where=where, remedy="make the result again; its report needs pictures too"
+            "the result has no pictures to plot",
+            where=where,
+            remedy="run the command of this result again, in an environment that can draw its report",
         )
     if kind is None:
         return next(iter(pictures.values()))
     if kind not in pictures:
         raise InputError(
-            f"there is no picture '{kind}'", where=where, allowed=", ".join(pictures), remedy=nearest(kind, pictures)
+            f"there is no picture '{kind}'",
+            where=where,
+            allowed=", ".join(pictures),
+            remedy=nearest(kind, pictures) or "choose one of these pictures",
         )
     return pictures[kind]
 

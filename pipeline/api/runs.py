@@ -108,7 +108,11 @@ class Run:
     @cached_property
     def _files(self) -> RunFiles:
         if not (self.folder / RUN_FILE).exists():
-            raise InputError(f"contains no {RUN_FILE}", where=str(self.folder), remedy="give the folder of a run")
+            raise InputError(
+                f"is not the folder of a run, because it contains no {RUN_FILE}",
+                where=str(self.folder),
+                remedy="give the folder that scarpsim simulate wrote",
+            )
         return RunFiles(self.folder)
 
     @property

@@ -94,7 +94,9 @@ def sensor_of(paths: Sequence[Path], config: SimulationConfig, wanted: SensorNam
     """
     for path in paths:
         if not path.exists():
-            raise InputError("there is no such folder or file", where=str(path), remedy="check the path")
+            raise InputError(
+                "there is no such folder or file", where=str(path), remedy="give the path of an existing folder or file"
+            )
         if (path / FILE).is_file():
             return _matching_sensor(read_measurement(path).sensor, wanted, path)
         if (path / RUN_FILE).is_file():
@@ -200,7 +202,11 @@ def _measured_site(measurement: Measurement, config: SimulationConfig) -> Sensor
     if isinstance(measurement, StereoMeasurement):
         name, sensor = "cameras", StereoPair(measurement.cameras, measurement.frame, measurement.model, config.depth_map)
     elif isinstance(measurement, SurfaceMeasurement):
-        raise InputError("the measurement names no cameras to simulate", where=FILE, remedy="add `cameras`, or use scarpsim gap")
+        raise InputError(
+            "the measurement names no cameras, and a calibration must simulate their pictures",
+            where=FILE,
+            remedy="add the key `cameras` (cameras.yaml or a Metashape XML), or use scarpsim gap instead of a calibration",
+        )
     else:
         name, sensor = "scanner", _scanner(measurement, config)
     eyes = {name: measurement.viewpoint}
@@ -242,6 +248,6 @@ def _angular_spacing(measurement: TlsMeasurement) -> float:
         raise InputError(
             f"more than {count} points lie in one direction from the scanner, so its angular steps are unknown",
             where=FILE,
-            remedy="add `pattern`, or remove repeated points",
+            remedy="add the key `pattern` with the scanner's limits and steps in rad, or remove repeated points",
         )
     return step

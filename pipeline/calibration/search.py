@@ -351,7 +351,11 @@ class NoiseSearch:
             self.maps += epochs
             self.progress.advance((number + 1) / len(points))
         if len(found) < len(points) / 2:
-            raise InputError("most simulations failed", where="calibration", remedy="run simulate on the site to see why")
+            raise InputError(
+                f"{len(points) - len(found)} of {len(points)} simulations failed",
+                where="calibration",
+                remedy="run scarpsim simulate with the same config to see the error",
+            )
         return Simulations(np.array(used), np.array(found))
 
     def _with_interval_and_fit(

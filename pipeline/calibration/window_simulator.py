@@ -217,7 +217,7 @@ class WindowSimulator:
                 raise InputError(
                     "the simulated sensor does not see a part of the wall that the measured maps show",
                     where="cameras, station",
-                    remedy="give it the position and direction of the measurement",
+                    remedy="set position_m and rotation of the sensor to those of the measurement",
                 )
             span = [
                 slice(max(int(place[0]) - _MARGIN_CELLS, 0), min(int(place[-1]) + _MARGIN_CELLS + 1, size))
@@ -264,7 +264,7 @@ def _supported_sensor(config: SimulationConfig, site: SensorSite) -> StereoPair 
     """Return the sensor, or raise InputError if it cannot be simulated cell by cell."""
     if not isinstance(site.sensor, StereoPair | LaserScanner):
         raise InputError(
-            "the noise of a real image matcher cannot be fitted",
+            "a calibration cannot fit the noise of a real image matcher",
             where="matcher",
             allowed="simulated",
             remedy="set matcher: simulated",

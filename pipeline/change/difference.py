@@ -73,7 +73,8 @@ def raster_grid(bounds: FloatArray, config: DifferenceConfig) -> Grid:
     pixels = width * height / config.gsd_m**2
     if pixels > most:
         raise InputError(
-            f"{config.gsd_m:g} m would take {pixels:.3g} pixels and {pixels * _BYTES_PER_PIXEL / 1e9:,.0f} GB of memory, "
+            f"pixels of {config.gsd_m:g} m would take {pixels:.3g} pixels and "
+            f"{pixels * _BYTES_PER_PIXEL / 1e9:,.0f} GB of memory, "
             f"{available / 1e9:.1f} GB are free",
             where="difference.gsd_m",
             allowed=allowed,
@@ -127,7 +128,7 @@ def difference(reference: SurfaceRaster, epoch: SurfaceRaster) -> NDArray[np.flo
     """
     if reference.grid != epoch.grid:
         raise InputError(
-            f"{epoch.grid} is not the reference's {reference.grid}",
+            f"the epoch's raster has the grid {epoch.grid}, the reference's has {reference.grid}",
             where="difference",
             remedy="make both rasters on the same grid",
         )

@@ -126,9 +126,9 @@ def m3c2(reference: FloatArray, epoch: FloatArray, raster: SurfaceRaster, block:
     heights, labels = (full[every, every][: grid.height, : grid.width] for full in (raster.heights, block))
     if heights.shape != grid.shape:
         raise InputError(
-            "is so large that no core point (place where M3C2 is computed) lies in the difference map",
+            f"the step of {config.core_step_px} px is so large that no core point (place where M3C2 is computed) lies in the map",
             where="m3c2.core_step_px",
-            remedy="lower it",
+            remedy="lower m3c2.core_step_px",
         )
     place = np.flatnonzero(np.isfinite(heights))
     row, column = np.divmod(place, grid.width)
@@ -169,6 +169,10 @@ def _py4dgeo() -> Any:
     try:
         import py4dgeo
     except ImportError as error:
-        raise InputError(f"needs py4dgeo, which does not load ({error})", where="m3c2", remedy=how_to_install("m3c2")) from None
+        raise InputError(
+            f"the method M3C2 needs the package py4dgeo, which does not load ({error})",
+            where="m3c2",
+            remedy=how_to_install("m3c2"),
+        ) from None
     logging.getLogger("py4dgeo").setLevel(logging.WARNING)
     return py4dgeo

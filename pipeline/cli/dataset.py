@@ -71,7 +71,11 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
     if action == "split":
         return _split(arguments, _single_folder(folders, "split"))
     if folders:
-        raise InputError(f"unexpected argument '{folders[0]}'", where="scarpsim dataset", remedy="see scarpsim dataset --help")
+        raise InputError(
+            f"unexpected argument '{folders[0]}'",
+            where="scarpsim dataset",
+            remedy="remove the argument; scarpsim dataset --help lists those that are known",
+        )
     return _make(arguments, Path(action))
 
 

@@ -32,7 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "form",
         type=one_of(*FORMS),
         metavar="FORM",
-        help="picture: the wall in 3D (PNG); gltf: wall and niches coloured by the difference (.glb); epochs, scan: animated GIF "
+        help="picture: the wall in 3D (PNG); gltf: wall and niches coloured by the difference (.glb); "
+        "epochs, scan: animated GIF "
         "of the epochs, or of a laser scan in progress; copc: points as cloud-optimised LAZ (QGIS, web); yolo: data set for "
         "YOLO; huggingface: data set as Parquet files for load_dataset and the Hub; package: datapackage.json with checksums",
     )
@@ -74,7 +75,9 @@ def _check_options(arguments: argparse.Namespace) -> None:
     allowed = {"epoch": ("picture", "gltf", "scan", "copc"), "width": ("picture",), "limit_m": ("yolo",)}
     for option, forms in allowed.items():
         if getattr(arguments, option) is not None and arguments.form not in forms:
-            raise InputError(f"works only with {', '.join(forms)}", where=f"--{option.replace('_', '-')}", remedy="leave it out")
+            raise InputError(
+                f"the option works only with {', '.join(forms)}", where=f"--{option.replace('_', '-')}", remedy="leave it out"
+            )
     suffix = _SUFFIXES.get(arguments.form)
     if suffix and arguments.out is not None and not arguments.out.name.lower().endswith(suffix):
         raise InputError(

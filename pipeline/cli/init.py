@@ -58,7 +58,9 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
     except FileExistsError:
         raise InputError("exists already", where=str(out), remedy="choose another name with --out") from None
     except (FileNotFoundError, NotADirectoryError):
-        raise InputError("there is no such folder", where=str(out.parent), remedy="create it first") from None
+        raise InputError(
+            "there is no such folder", where=str(out.parent), remedy="create this folder first, or choose another one with --out"
+        ) from None
     write_text(schema, schema_text(kind))
     command = f"scarpsim dataset {out} --out my_set" if arguments.dataset else f"simulate --sensor tls --config {out}"
     told = f"wrote {out} and, for editors, {schema}; run it with: {command}"
@@ -68,7 +70,7 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
 def _relative_to_config(out: Path, path: Path) -> str:
     """Return the path of an input relative to the folder of the config `out`. Raises InputError if the file does not exist."""
     if not path.exists():
-        raise InputError("there is no such file", where=str(path), remedy="check the path")
+        raise InputError("there is no such file", where=str(path), remedy="give the path of an existing file")
     return os.path.relpath(path.resolve(), out.parent.resolve())
 
 

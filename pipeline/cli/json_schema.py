@@ -36,7 +36,10 @@ def json_schema(kind: str) -> dict[str, Any]:
     """
     if kind not in KINDS:
         raise InputError(
-            f"there is no schema '{kind}'", where="scarpsim schema", allowed=", ".join(KINDS), remedy=nearest(kind, KINDS)
+            f"there is no schema '{kind}'",
+            where="scarpsim schema",
+            allowed=", ".join(KINDS),
+            remedy=nearest(kind, KINDS) or "choose one of these names",
         )
     found = KINDS[kind].model_json_schema()
     return {"$schema": _DRAFT, **_with_short_forms(found), "title": f"scarpsim: {kind}"}

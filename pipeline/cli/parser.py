@@ -41,7 +41,7 @@ class Parser(argparse.ArgumentParser):
                 raise InputError(f"unknown option '{flag}'", where=self.prog, remedy=nearest(flag, flags) or self._see_help)
             if word == "" or (flag.startswith("--") and word == f"{flag}="):
                 problem = f"{flag} is empty" if flag else "an argument is empty"
-                raise InputError(problem, where=self.prog, remedy="check the shell variable that should contain it")
+                raise InputError(problem, where=self.prog, remedy="give the argument a value; a shell variable may be empty")
         arguments, unknown = self.parse_known_args(words)
         if unknown:
             raise InputError(f"unexpected argument '{unknown[0]}'", where=self.prog, remedy=self._see_help)
@@ -56,7 +56,7 @@ class Parser(argparse.ArgumentParser):
 
         message: argparse's description of the mistake.
         """
-        raise InputError(message, where=self.prog, remedy=self._see_help)
+        raise InputError(f"the command line is wrong: {message}", where=self.prog, remedy=self._see_help)
 
 
 def add_output_options(parser: argparse.ArgumentParser) -> None:

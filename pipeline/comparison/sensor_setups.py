@@ -131,7 +131,12 @@ def _kind(name: str) -> str:
     if kind is None:
         known = sorted(each for found in named.values() for each in found)
         hint = nearest(name, known)
-        raise InputError(f"no file or preset is called '{name}'", where="CONFIG", allowed=", ".join(known), remedy=hint)
+        raise InputError(
+            f"no file or preset is called '{name}'",
+            where="CONFIG",
+            allowed=", ".join(known),
+            remedy=hint or "give the path of an existing config, or one of these names",
+        )
     return kind
 
 

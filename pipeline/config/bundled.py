@@ -20,7 +20,11 @@ def configs_folder() -> Path:
     for place in _PLACES:
         if place.is_dir():
             return place
-    raise InputError("the bundled configs are missing", where=str(_PLACES[0]), remedy="install scarpsim again")
+    raise InputError(
+        "the bundled configs are missing",
+        where=str(_PLACES[0]),
+        remedy="run `make setup` in the checkout, or install scarpsim again",
+    )
 
 
 def named_configs(kind: str) -> dict[str, Path]:
@@ -47,7 +51,10 @@ def bundled_config(kind: str, name: str) -> Path:
         return named[name]
     known = sorted(named)
     raise InputError(
-        f"there is no '{name}'", where=f"configs/{kind}".rstrip("/"), allowed=", ".join(known), remedy=nearest(name, known)
+        f"there is no bundled config '{name}'",
+        where=f"configs/{kind}".rstrip("/"),
+        allowed=", ".join(known),
+        remedy=nearest(name, known) or "choose one of these names",
     )
 
 
@@ -70,5 +77,8 @@ def config_path(kind: str, given: Path) -> Path:
         return bundled_config(kind, given.name)
     except InputError as error:
         raise InputError(
-            "is no file, and no bundled config has that name", where=str(given), allowed=error.allowed, remedy=error.remedy
+            "is no file, and no bundled config has that name",
+            where=str(given),
+            allowed=error.allowed,
+            remedy=error.remedy or "give the path of an existing config",
         ) from None

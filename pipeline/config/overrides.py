@@ -34,18 +34,22 @@ def read_override(text: str) -> Override:
     """
     key, equals, value = text.partition("=")
     path = tuple(part.strip() for part in key.split("."))
-    where, remedy = f"--set {text}", "write --set section.key=value"
+    where = f"--set {text}"
     if not equals:
-        raise InputError("has no '='", where=where, remedy=remedy)
+        raise InputError("the override has no '='", where=where, remedy="write --set section.key=value")
     if not all(path):
-        raise InputError("a part of the key is empty", where=where, remedy=remedy)
+        raise InputError("a part of the key is empty", where=where, remedy="write --set section.key=value")
     if not value.strip():
-        raise InputError("has no value", where=where, remedy=f"write {key}=null for none, {key}='\"\"' for an empty text")
+        raise InputError("the key has no value", where=where, remedy=f"write {key}=null for none, {key}='\"\"' for an empty text")
     try:
         return Override(path, parse_yaml(value), text)
     except yaml.YAMLError as error:
         problem = getattr(error, "problem", None) or error
-        raise InputError(f"the value is not valid YAML ({problem})", where=where, remedy="put a text in quotes") from None
+        raise InputError(
+            f"the value is not valid YAML ({problem})",
+            where=where,
+            remedy="correct the value, and put a text with special characters in quotes",
+        ) from None
 
 
 def apply_overrides(values: dict[str, Any], overrides: Sequence[str | Override]) -> dict[str, Any]:
@@ -80,7 +84,7 @@ def _place(container: Any, part: str, name: str, where: str) -> str | int:
         raise InputError(
             f"'{name}' is {container!r} and has no '{part}' in it",
             where=where,
-            remedy="remove the part after it, or set the whole key",
+            remedy=f"remove '{part}' from the key, or set '{name}' as a whole",
         )
     if not (part.isdecimal() and int(part) < len(container)):
         allowed = f"0 to {len(container) - 1}" if container else f"none, the list is empty; set it as a whole: {name}=[...]"

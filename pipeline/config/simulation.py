@@ -302,7 +302,9 @@ def load_config(path: Path, overrides: Sequence[str | Override], sensor: SensorN
     values = load_yaml(path)
     if values is None:
         raise InputError(
-            "contains no key", where=str(path), remedy="write at least one, or begin with what `scarpsim init` writes"
+            "the config contains no key",
+            where=str(path),
+            remedy="write at least one key, or begin with what `scarpsim init` writes",
         )
     return resolved(values, overrides, sensor, seed, path)
 
@@ -333,7 +335,9 @@ def resolved(
     own: dict[str, Any] = {}
     values = {} if values is None else values
     if not isinstance(values, dict):
-        raise InputError("is not a mapping of keys", where=str(path), remedy="write `key: value` lines; see `scarpsim init`")
+        raise InputError(
+            "the config is not a mapping of keys", where=str(path), remedy="write `key: value` lines; see `scarpsim init`"
+        )
     if isinstance(values.get("config"), dict) and "schema" in values:
         values = values["config"]
     if isinstance(values.get("sensor"), str) and values["sensor"] in ("stereo", "tls"):

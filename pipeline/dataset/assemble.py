@@ -92,7 +92,7 @@ def complete_shards(folder: Path, dataset: Record) -> Iterator[Record]:
             raise InputError(
                 "the file is missing or damaged",
                 where=str(folder / SHARDS / name),
-                remedy="run scarpsim dataset verify on its set",
+                remedy="run scarpsim dataset verify on the folder of the data set, which lists all damaged files",
             )
         yield record
 

@@ -151,7 +151,9 @@ def _require_distributed(where: str) -> None:
         import distributed  # noqa: F401
     except ImportError as error:
         raise InputError(
-            f"needs Dask's distributed and cryptography ({error})", where=where, remedy=how_to_install("dataset")
+            f"the option needs the packages distributed (of Dask) and cryptography ({error})",
+            where=where,
+            remedy=how_to_install("dataset"),
         ) from None
 
 
@@ -330,7 +332,8 @@ def _remote(stack: ExitStack, address: str) -> Client:
         raise InputError(
             f"no scheduler answers at '{address}' ({error})",
             where="--scheduler",
-            remedy="use the address that it printed; tls:// also needs certificates (docs/reference/data_sets.md)",
+            remedy="use the address that the Dask scheduler printed when it started; tls:// also needs "
+            "certificates (docs/reference/data_sets.md)",
         ) from None
     stack.callback(_closed, client)
     return client

@@ -81,7 +81,12 @@ def split_dataset(folder: Path, out: Path, keys: Sequence[str]) -> list[DatasetS
     """
     for key in keys:
         if key not in KEYS:
-            raise InputError(f"unknown key '{key}'", where="--by", allowed=", ".join(KEYS), remedy=nearest(key, KEYS))
+            raise InputError(
+                f"unknown key '{key}'",
+                where="--by",
+                allowed=", ".join(KEYS),
+                remedy=nearest(key, KEYS) or "choose one of these keys",
+            )
     dataset = _finished(folder)
     found: dict[str, dict[str, list[int]]] = defaultdict(lambda: defaultdict(list))
     for record in complete_shards(folder, dataset):
@@ -120,7 +125,11 @@ def _finished(folder: Path) -> Record:
     """Read dataset.json, and raise InputError if the set is not finished."""
     dataset = read_dataset_file(folder)
     if not dataset["complete"]:
-        raise InputError("the set is not finished", where=str(folder), remedy="run the command that makes it once more")
+        raise InputError(
+            "the set is not finished",
+            where=str(folder),
+            remedy="run the scarpsim dataset command that makes this set once more; it continues where it stopped",
+        )
     return dataset
 
 
@@ -146,7 +155,11 @@ def _copy(folder: Path, out: Path, record: Record, before: str, after: str) -> N
         target.parent.mkdir(parents=True, exist_ok=True)
         note(target)
         if not source.is_file() or sha256(shutil.copyfile(source, target)) != digest:
-            raise InputError("the file is missing or damaged", where=str(source), remedy="run scarpsim dataset verify on its set")
+            raise InputError(
+                "the file is missing or damaged",
+                where=str(source),
+                remedy="run scarpsim dataset verify on the folder of the data set, which lists all damaged files",
+            )
     write_shard(out, shard, record)
 
 

@@ -113,7 +113,9 @@ def require_no_folders(folder: Path, damage: list[Damage]) -> None:
     for each in damage:
         if (folder / each.file).is_dir():
             raise InputError(
-                "a folder is in the place of a file of the set", where=str(folder / each.file), remedy="move it away"
+                "a folder is in the place of a file of the set",
+                where=str(folder / each.file),
+                remedy="move this folder out of the data set",
             )
 
 

@@ -69,7 +69,10 @@ class Tiles(Sequence[Sample]):
         for key in filters:
             if key not in FILTERS:
                 raise InputError(
-                    f"unknown filter '{key}'", where="Tiles", allowed=", ".join(FILTERS), remedy=nearest(key, FILTERS)
+                    f"unknown filter '{key}'",
+                    where="Tiles",
+                    allowed=", ".join(FILTERS),
+                    remedy=nearest(key, FILTERS) or "choose one of these filters",
                 )
         content = read_coco(self.folder / "annotations.json")
         self.records = [image for image in content.images if all(image.get(key) == value for key, value in filters.items())]

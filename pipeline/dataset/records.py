@@ -112,7 +112,11 @@ def read_dataset_file(folder: Path) -> Record:
     """
     path = folder / DATASET_FILE
     if not path.exists():
-        raise InputError("the folder is not a data set: it has no dataset.json", where=str(folder), remedy="check the path")
+        raise InputError(
+            "the folder is not a data set: it has no dataset.json",
+            where=str(folder),
+            remedy="give the folder that scarpsim dataset made",
+        )
     values = read_json(path, remedy=_REMEDY)
     parse(_DatasetFile, values, str(path))
     if values.pop("sha256", "") != _digest(_text(values)):

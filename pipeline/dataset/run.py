@@ -226,7 +226,7 @@ def _stages(known: dict[str, Any], source: str, folder: Path) -> list[tuple[str,
         raise InputError(
             f"the config of {source} was changed after its epochs were made",
             where=where,
-            remedy="restore dataset.json and the files that it names",
+            remedy="restore dataset.json and the files that it names from a copy, or make the set again in another folder",
         )
     return [epoch.stage for epoch in planned_epochs(config)]
 

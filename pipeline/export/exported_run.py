@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import Any
 
 from pipeline.formats.records.result_records import RUN_FILE
-from pipeline.formats.records.run_files import RESUME, RunFiles
+from pipeline.formats.records.run_files import RunFiles
 from pipeline.report.figures import SCALE_SIGMAS
 from scene.common.errors import InputError
 
@@ -22,7 +22,9 @@ class ExportedRun(RunFiles):
         """Content of run.json, which describes the run."""
         found = super().record
         if len(found["epochs"]) < 2:
-            raise InputError("contains no finished epoch", where=str(self.folder), remedy=RESUME)
+            raise InputError(
+                "contains no finished epoch", where=str(self.folder), remedy="continue the run with scarpsim simulate --resume"
+            )
         return found
 
     @property
@@ -37,7 +39,11 @@ class ExportedRun(RunFiles):
         """
         statistics = self.record["epochs"][number].get("statistics")
         if not statistics:
-            raise InputError(f"has no statistics of epoch {number}", where=str(self.folder / RUN_FILE), remedy=RESUME)
+            raise InputError(
+                f"has no statistics of epoch {number}",
+                where=str(self.folder / RUN_FILE),
+                remedy="continue the run with scarpsim simulate --resume",
+            )
         return float(SCALE_SIGMAS * statistics["sigma_m"])
 
     def blocks(self, number: int) -> list[dict[str, Any]]:

@@ -27,7 +27,7 @@ def package(folder: Path) -> dict[str, Any]:
     outside the folder, which would be missing in a copy.
     """
     if not folder.is_dir():
-        raise InputError("there is no such folder", where=str(folder), remedy="give the folder that a command filled")
+        raise InputError("there is no such folder", where=str(folder), remedy="give a folder with results of a scarpsim command")
     found = [path for path in sorted(folder.rglob("*")) if _is_listed(path.relative_to(folder))]
     for path in found:
         if path.is_symlink() and not path.resolve().is_relative_to(folder.resolve()):
@@ -38,7 +38,7 @@ def package(folder: Path) -> dict[str, Any]:
             )
     files = [path for path in found if path.is_file()]
     if not files:
-        raise InputError("contains no file", where=str(folder), remedy="give the folder that a command filled")
+        raise InputError("contains no file", where=str(folder), remedy="give a folder with results of a scarpsim command")
     return {"$schema": _PROFILE, "name": _slug(folder.resolve().name), "resources": [_resource(folder, path) for path in files]}
 
 

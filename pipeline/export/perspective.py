@@ -78,7 +78,7 @@ class PerspectiveView:
             raise InputError(
                 "all points of the surface lie on one line of sight, so no picture of the wall can be drawn",
                 where="export",
-                remedy="check the run's surface in a viewer; if its file is damaged, make the run again",
+                remedy="make the run again with scarpsim simulate, in another folder: the file of its surface is damaged",
             )
         distance = float((np.maximum(needed, _LEAST_SHARE * needed.max()) - ahead).max())
         focal_px = width / 2 / _HALF_VIEW

@@ -177,7 +177,7 @@ def _metres(axis: Any, name: str, where: str) -> float:
         factor = metres_of_word(axis.unit_name)
     if not factor or "degree" in axis.unit_name:
         raise InputError(
-            f"states the unit '{axis.unit_name}' in the coordinate system '{name}'",
+            f"the file states the unit '{axis.unit_name}' in the coordinate system '{name}'",
             where=where,
             allowed="a unit of length",
             remedy=_PROJECT,

@@ -11,7 +11,7 @@ DEVELOPMENT, JUDGEMENT = "development cases", "judgement"
 
 
 class ThresholdGroup(BaseModel):
-    """Base class of a group of thresholds of `gap`: values are frozen, and unknown keys, infinities and NaN are errors."""
+    """Base class of a group of thresholds of `gap`: values cannot change; unknown keys, infinities and NaN are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -24,7 +24,11 @@ def threshold_field(default: float, unit: str, decides: str, source: str, **boun
     default : default value.
     unit : unit of the value, in words.
     decides : what the threshold decides, in whole sentences.
-    source : where the value comes from.
-    bounds : limits on the value, as keyword arguments of `pydantic.Field`.
+    source : where the value comes from, in words, such as "judgement".
+    bounds : limits on the value, as keyword arguments of `pydantic.Field`, such as `lt=1`.
+
+    Returns
+    -------
+    The pydantic field, as the default value of a class attribute.
     """
     return Field(default, description=decides, json_schema_extra={"unit": unit, "source": source}, **bounds)

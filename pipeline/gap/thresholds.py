@@ -334,7 +334,7 @@ class VerdictThresholds(ThresholdGroup):
 
 
 class Thresholds(ThresholdGroup):
-    """All thresholds of a diagnosis with `gap`, in groups."""
+    """All thresholds by which `gap` decides when it diagnoses a measurement, in groups: one attribute for each test."""
 
     points: PointThresholds = PointThresholds()
     mean: MeanThresholds = MeanThresholds()
@@ -358,7 +358,7 @@ def read_thresholds(overrides: Sequence[str]) -> Thresholds:
 
     Parameters
     ----------
-    overrides : replacements, each as `group.key=value`.
+    overrides : replacements, each as `group.key=value`, such as `mean.class_margin=4`.
 
     Raises
     ------
@@ -368,13 +368,13 @@ def read_thresholds(overrides: Sequence[str]) -> Thresholds:
 
 
 def thresholds() -> Thresholds:
-    """Return the thresholds of the diagnosis that is running; the defaults outside of one."""
+    """Return the thresholds of the diagnosis by `gap` that is running; the defaults if none is running."""
     return _IN_USE.get()
 
 
 @contextmanager
 def use_thresholds(chosen: Thresholds) -> Iterator[None]:
-    """Make `thresholds()` return the given thresholds inside a `with` block."""
+    """Make `thresholds()` return the chosen thresholds inside a `with` block, for one diagnosis by `gap`."""
     token = _IN_USE.set(chosen)
     try:
         yield

@@ -222,11 +222,17 @@ def surfaces_of_run(folder: Path, epochs: int) -> tuple[SimulationConfig, str, l
     """Read config, sensor, reference and the first `epochs` epochs of a run. Raises InputError if it has fewer epochs."""
     path = folder / RUN_FILE
     if not path.exists():
-        raise InputError(f"contains no {RUN_FILE}", where=str(folder), remedy="name a run's folder or a config file")
+        raise InputError(
+            f"is not the folder of a run, because it contains no {RUN_FILE}",
+            where=str(folder),
+            remedy="name a run's folder or a config file",
+        )
     run = read_run(path, "run it again with simulate")
     sensor, records = run["sensor"], [(record["epoch"], _applied(record)) for record in run.get("epochs", [])]
     if len(records) < 2:
-        raise InputError("has no epoch after the reference", where=str(folder), remedy="finish it with simulate --resume")
+        raise InputError(
+            "has no epoch after the reference", where=str(folder), remedy="finish the run with scarpsim simulate --resume"
+        )
     if epochs >= len(records):
         raise InputError(
             f"got {epochs}",

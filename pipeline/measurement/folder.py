@@ -142,4 +142,9 @@ def _check_readable(folder: Path, out: Path) -> None:
         read_measurement(folder).check_near(FILE)
     except InputError as error:
         where = error.where.replace(str(folder), str(out))
-        raise InputError(error.what, where=where, allowed=error.allowed, remedy=error.remedy) from None
+        raise InputError(
+            f"the measurement cannot be used: {error.what}",
+            where=where,
+            allowed=error.allowed,
+            remedy=error.remedy or "correct the file that is named",
+        ) from None

@@ -24,7 +24,7 @@ def read_pair(path: Path, labels: tuple[str, str] | None) -> CameraPair:
             "there is no such file",
             where=str(path),
             allowed="cameras.yaml, Metashape XML or .psx, a COLMAP folder",
-            remedy="check the path",
+            remedy="give the path of an existing camera file or folder",
         )
     found = read_oriented(path)
     if found is None:

@@ -87,7 +87,7 @@ def reference_from_file(
             "there is no such file",
             where=str(path),
             allowed=f"a mesh, a cloud, a DEM, or the word {HALF}",
-            remedy="check the path",
+            remedy="give the path of an existing file, or the word half",
         )
     if path.suffix.lower() in DEMS:
         return reference_from_dem(path, unit, "--reference-unit")
@@ -127,7 +127,11 @@ def reference_from_dem(path: Path, unit: str | None = None, option: str = "--uni
     raster = read_raster(path)
     heights, place = raster.values, raster.place
     if place.grid is None:
-        raise InputError("the raster has no pixel scale and tie point", where=str(path), remedy="export a GeoTIFF")
+        raise InputError(
+            "the raster has no pixel scale and tie point",
+            where=str(path),
+            remedy="export the raster as a GeoTIFF, with its coordinates",
+        )
     level, upright = place.linear_m, place.vertical_m
     stated = None if level is None else AxisUnits((level, level, upright or level), "its GeoTIFF keys")
     units, notes = agreed_units(stated, unit, str(path), option), list(raster.notes)
@@ -138,10 +142,16 @@ def reference_from_dem(path: Path, unit: str | None = None, option: str = "--uni
     grid = place.grid
     known = np.isfinite(heights)
     if not known.any() or min(heights.shape) < 2:
-        raise InputError("the raster has no heights", where=str(path), remedy="export the elevation model again")
+        raise InputError(
+            "the raster has no heights", where=str(path), remedy="export the elevation model again, with heights in its pixels"
+        )
     mesh = mesh_of_raster(heights.astype(np.float64), grid)
     if not len(mesh.faces):
-        raise InputError("no four neighbouring pixels have heights", where=str(path), remedy="export a whole elevation model")
+        raise InputError(
+            "no four neighbouring pixels have heights",
+            where=str(path),
+            remedy="export an elevation model without gaps between its pixels",
+        )
     mesh = mesh.with_vertices(mesh.vertices * np.array([metres, metres, up]))
     words = f"elevation model {path.name}: {int(known.sum()):,} heights every {grid.gsd * metres:.3g} m, taken as exact"
     limit = (

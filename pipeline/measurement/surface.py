@@ -73,7 +73,11 @@ def _check(request: Request) -> None:
             remedy="name a mesh, a cloud or a DEM",
         )
     if request.scanner is not None:
-        raise InputError("the option needs laser scans", where="--scanner", remedy="leave out --scanner or --photographs")
+        raise InputError(
+            "the option needs laser scans, but --photographs is given",
+            where="--scanner",
+            remedy="leave out --scanner or --photographs",
+        )
     if len(set(request.scans)) < len(request.scans):
         raise InputError("a file is given twice", where="SCAN", remedy="give one file for each epoch")
 
@@ -81,7 +85,9 @@ def _check(request: Request) -> None:
 def _read(path: Path, request: Request) -> RawScan:
     """Read the points of a cloud, the vertices of a mesh, or the pixels of an elevation model."""
     if not path.is_file():
-        raise InputError("there is no such file", where=str(path), allowed="a cloud, a mesh, a DEM", remedy="check the path")
+        raise InputError(
+            "there is no such file", where=str(path), allowed="a cloud, a mesh, a DEM", remedy="give the path of an existing file"
+        )
     if path.suffix.lower() in DEMS:
         dem = reference_from_dem(path, request.unit)
         words = ("the heights of an elevation model", *dem.words[1:])

@@ -51,7 +51,9 @@ def check_same_unit(points: FloatArray, surface: FloatArray, where: str, unit: s
     sizes = [float(np.linalg.norm(each[1] - each[0])) for each in ends]
     if min(sizes) == 0:
         which = "points" if sizes[0] == 0 else "vertices of the reference"
-        raise InputError(f"all {which} are at the same place", where=where, remedy="export it again")
+        raise InputError(
+            f"all {which} are at the same place", where=where, remedy="export the coordinates again with all their decimals"
+        )
     apart = bool((np.minimum(ends[0][1], ends[1][1]) < np.maximum(ends[0][0], ends[1][0])).any())
     for flag, other, ratio, named in (
         ("--unit", unit, sizes[1] / sizes[0], "points"),
@@ -62,12 +64,14 @@ def check_same_unit(points: FloatArray, surface: FloatArray, where: str, unit: s
             if (factor < 0.1 or (apart and factor < 1)) and 1 / _ALIKE < ratio / factor < _ALIKE:
                 raise InputError(
                     f"the points span {sizes[0]:.4g} m and the reference {sizes[1]:.4g} m, as if the {named} were in {name}",
-                    where=where, remedy=f"add {flag} {_choices(name)} if so",
+                    where=where, remedy=f"if so, add {flag} {_choices(name)}",
                 )  # fmt: skip
     away = float(np.linalg.norm(ends[0].mean(axis=0) - ends[1].mean(axis=0)))
     if apart and away > 3 * sum(sizes):
         raise InputError(
-            f"the points lie {away:,.0f} m from the reference", where=where, remedy="export both in one coordinate system (m)"
+            f"the points lie {away:,.0f} m from the reference",
+            where=where,
+            remedy="export points and reference in one coordinate system in metres",
         )
 
 

@@ -238,7 +238,7 @@ def _check_enough(count: int, given: bool) -> None:
     if count >= _LEAST_PIXELS:
         return
     place = "in the stable areas" if given else "of the epoch on the reference"
-    remedy = "give larger stable areas" if given else "check that both epochs show the same wall, or give a larger --gsd"
+    remedy = "give larger stable areas" if given else "give epochs of the same wall, or a larger --gsd"
     raise InputError(
         f"only {count:,} pixels {place} have data in both epochs",
         where="registration",

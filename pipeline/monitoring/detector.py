@@ -36,7 +36,7 @@ def regions_of_detector(detector: str, difference: Path, change: Change) -> list
         if done.returncode:
             lines = done.stderr.strip().splitlines()
             message = (
-                lines[-1].removeprefix("error: ")
+                f"scarpsim detect failed: {lines[-1].removeprefix('error: ')}"
                 if lines
                 else "the detector's process ended without a message; run `scarpsim detect` on a difference map to see more"
             )

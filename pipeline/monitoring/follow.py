@@ -89,6 +89,6 @@ def follow(
         raise InputError(
             "no epoch that could be used arrived in the folder before the command ended",
             where=f"--follow {folder}",
-            remedy="check that scans are copied into this folder, and let the command run longer",
+            remedy="copy scans into this folder, and let the command run longer",
         )
     return result

@@ -209,11 +209,11 @@ def find_epochs(paths: Sequence[Path], times: Sequence[str] = ()) -> list[EpochS
             f"only {len(found)} epoch is given",
             where="EPOCH",
             allowed="two and more",
-            remedy="name one before and one after",
+            remedy="give at least two epochs, the reference first",
         )
     if times and len(times) != len(found):
         raise InputError(
-            f"contains {len(times)} times for {len(found)} epochs", where="--times", remedy="give one for each epoch"
+            f"contains {len(times)} times for {len(found)} epochs", where="--times", remedy="give one time for each epoch"
         )
     seen: dict[Path, str] = {}
     for source in found:
@@ -243,6 +243,7 @@ def read_epoch(source: EpochSource, options: MonitorOptions) -> EpochData:
             "contains a mesh or an elevation model beside scans, which cannot be joined",
             where=str(source.path),
             allowed="scans only, or one mesh",
+            remedy="move the mesh or the elevation model to a folder of its own",
         )
     notes = tuple(dict.fromkeys(note for part in parts for note in part.notes))
     positions = [part.position for part in parts if part.position is not None]
@@ -281,24 +282,33 @@ def epoch_files(folder: Path) -> list[Path]:
 def _sources(path: Path) -> list[EpochSource]:
     unknown = EpochTime(None, "")
     if not path.exists():
-        raise InputError("there is no such file or folder", where=str(path), remedy="check the path")
+        raise InputError("there is no such file or folder", where=str(path), remedy="give the path of an existing file or folder")
     if path.is_file():
         return [EpochSource(path, (path,), unknown)]
     if (path / RUN_FILE).is_file():
         return _epochs_of_run(path)
     files = tuple(epoch_files(path))
     if not files:
-        raise InputError("contains no scan", where=str(path), allowed=f"files of scans ({', '.join(_ANY)}), or a run of simulate")
+        raise InputError(
+            "contains no scan",
+            where=str(path),
+            allowed=f"files of scans ({', '.join(_ANY)}), or a run of simulate",
+            remedy="copy the scans into this folder, or name another one",
+        )
     return [EpochSource(path, files, unknown)]
 
 
 def _epochs_of_run(folder: Path) -> list[EpochSource]:
-    record = read_run(folder / RUN_FILE, "make the run again")
+    record = read_run(folder / RUN_FILE, "make the run again with scarpsim simulate")
     if not record.get("wall_frame"):
-        raise InputError("does not state its wall frame", where=str(folder / RUN_FILE), remedy="make the run again")
+        raise InputError(
+            "does not state its wall frame", where=str(folder / RUN_FILE), remedy="make the run again with scarpsim simulate"
+        )
     epochs = sorted(each for each in folder.glob("epoch_*") if (each / "points.laz").is_file())
     if not epochs:
-        raise InputError("is a run without a finished epoch", where=str(folder), remedy="finish the run, or make it again")
+        raise InputError(
+            "is a run without a finished epoch", where=str(folder), remedy="finish the run with scarpsim simulate --resume"
+        )
     return [EpochSource(each, (each / "points.laz",), EpochTime(None, ""), record) for each in epochs]
 
 

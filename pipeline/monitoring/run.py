@@ -259,7 +259,7 @@ def _check_same_site(data: EpochData, site: ReferenceSite, source: EpochSource) 
             f"{np.linalg.norm(np.median(wall, axis=0)):,.0f} m from the wall's corner; the coordinates differ{unit}",
             where=source.name,
             allowed="epochs of one coordinate system",
-            remedy="put them into one system, or give --unit",
+            remedy="export all epochs in one coordinate system, or give the unit of their coordinates with --unit",
         )
     if data.crs and site.crs and data.crs != site.crs and not _same_system(data.crs, site.crs):
         raise InputError(

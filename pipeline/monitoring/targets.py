@@ -63,7 +63,9 @@ def read_targets(path: Path) -> Targets:
         except (TypeError, ValueError):
             place = np.full(3, np.nan)
         if not np.isfinite(place).all():
-            raise InputError("coordinates are no numbers", where=f"{path}, line {line}", remedy="give x, y and z in metres")
+            raise InputError(
+                "the coordinates of the target are no numbers", where=f"{path}, line {line}", remedy="give x, y and z in metres"
+            )
         found.setdefault(row["epoch"], {})[row["target"]] = place
     return found
 

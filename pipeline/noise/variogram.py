@@ -95,7 +95,9 @@ def variogram(
     rasters = values[None] if values.ndim == 2 else values
     if np.isfinite(rasters).sum(axis=(1, 2)).max(initial=0) < 2:
         raise InputError(
-            "fewer than two pixels have data, which determines no variogram", where="variogram", remedy="give maps with data"
+            "fewer than two pixels have data, which determines no variogram",
+            where="variogram",
+            remedy="give difference maps in which more pixels have data",
         )
     size = rasters.shape[1:]
     reach = largest_lag_m or gsd_m * max(size) / 2

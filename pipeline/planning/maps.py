@@ -321,7 +321,11 @@ def _ignored(names: Any) -> list[str]:
 def _require_seen(seen: BoolArray, problem: str, where: str) -> None:
     """Raise InputError if nothing is seen."""
     if not seen.any():
-        raise InputError(problem, where=where, remedy="check positions, rotations and window, and which side faces the wall")
+        raise InputError(
+            problem,
+            where=where,
+            remedy="correct position_m and rotation of both cameras so that they look at the front of the wall",
+        )
 
 
 def _map(name: str, title: str, values: FloatArray, seen: BoolArray, unit: str = "", factor: float = 1.0) -> PlanMap:

@@ -106,7 +106,7 @@ def wall_raster(caster: RayCaster, gsd_m: float | None = None) -> WallRaster:
         raise InputError(
             "no part of the wall is visible along the normal of its mean plane",
             where="wall",
-            remedy="check that the mesh is one surface whose triangles face the sensor",
+            remedy="give a mesh that is one surface, with triangles that face the sensor",
         )
     points, normals = (np.array(array, dtype=np.float64).T[found] for array in (point, normal))
     places = Places(points, normals, np.array(albedo, dtype=np.float64)[found])

@@ -19,7 +19,7 @@ from scene.geometry.mesh import FloatArray
 
 LEAST_POINTS = 6
 """Fewest points of a cloud that is registered: one per unknown."""
-_SEES = "check that the sensor sees the wall: its place, its direction, its range, for cameras their overlap"
+_SEES = "correct the sensor's position, direction or range, for cameras also their overlap, so that it sees the wall"
 """Advice when there are too few points."""
 _BLOCK = 2**14
 """Number of points per block of the sums; its arrays fit a core's cache."""

@@ -320,7 +320,7 @@ def _normals(surface: ReferenceSurface, config: IcpConfig) -> FloatArray | None:
         return None
     if surface.normals is None:
         raise InputError(
-            "point_to_plane needs the reference's normals", where="icp.method", remedy="give them or use point_to_point"
+            "point_to_plane needs the reference's normals", where="icp.method", remedy="give them, or set it to point_to_point"
         )
     return surface.normals
 
@@ -387,7 +387,7 @@ class _Alignment:
                 f"the subsample would leave only {used} of {total:,} points",
                 where="icp.subsample_ratio",
                 allowed=f"at most {1 - LEAST_POINTS / total:.6g}",
-                remedy="lower it, the share of points that is left out",
+                remedy="lower icp.subsample_ratio, the share of points that is left out",
             )
         draw = random.generator().random(total)
         sizes = [size for size in _LEVELS if 4 * size <= used] + [used]
@@ -449,7 +449,7 @@ class _Alignment:
             f"only {inliers} of {sum(map(len, blocks)):,} points lie within {gate:g} m of the reference, "
             f"the median distance is {np.median(distance):.3g} m",
             where="icp.outlier_distance_threshold",
-            remedy="raise it, or raise icp.outlier_threshold_decay_iteration to begin with a wider one",
+            remedy=f"raise it above {np.median(distance):.3g} m, or raise icp.outlier_threshold_decay_iteration to begin wider",
         )
 
     def _in_full_coordinates(self, pose: RigidTransform) -> RigidTransform:
@@ -469,7 +469,7 @@ def _point_step(moments: FloatArray) -> _Step:
     u, singular, vt = np.linalg.svd(spread + cross)
     if not singular[1] > ON_A_LINE * singular[0]:
         raise InputError(
-            "the points within the outlier threshold lie on one line", where="icp.outlier_distance_threshold", remedy="raise it"
+            "all points within this distance lie on one line", where="icp.outlier_distance_threshold", remedy="use a larger one"
         )
     rotation = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
     turn = rotation - np.eye(3)

@@ -77,9 +77,9 @@ def surface_of_cloud(cloud: PointCloud, viewpoint: FloatArray, config: CloudConf
     extent = float(np.ptp(points, axis=0).max())
     if away > _FARTHEST * max(extent, 1.0):
         raise InputError(
-            f"lies {away:,.0f} m from the points, which extend over {extent:,.0f} m",
+            f"the place lies {away:,.0f} m from the points, which extend over {extent:,.0f} m",
             where="--seen-from",
-            remedy="give it in the coordinate system of the points",
+            remedy="give the place in the coordinate system of the points",
         )
     rounded = rounded_axes(points)
     notes = check_steps(rounded, median_spacing(points - origin), where, "the points' spacing is") if rounded else ()

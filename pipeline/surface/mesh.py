@@ -75,7 +75,7 @@ def mesh_observation(observation: Observation, config: SurfaceConfig) -> Triangl
         raise InputError(
             f"no triangle between the {int(observation.valid.sum()):,} points of the {observation.sensor} observation",
             where="surface",
-            remedy="enlarge surface.depth_step_m, take a smaller sampling step or check that the sensor sees the wall",
+            remedy="enlarge surface.depth_step_m, choose a smaller sampling step, or turn the sensor towards the wall",
         )
     vertices = points[used]
     faces = _oriented(cells.faces(used), vertices, observation.viewpoint)
@@ -170,7 +170,11 @@ def median_spacing(points: FloatArray) -> float:
 
     spacing = float(np.median(cKDTree(points).query(points, k=2, workers=-1)[0][:, 1]))
     if not spacing > 0:
-        raise InputError("most points of the cloud lie twice in the same place", where="surface", remedy="remove duplicates")
+        raise InputError(
+            "most points of the cloud lie twice in the same place",
+            where="surface",
+            remedy="remove the duplicate points, for example in CloudCompare",
+        )
     return spacing
 
 
@@ -319,8 +323,12 @@ def _poisson(points: FloatArray, viewpoint: FloatArray, depth: int) -> tuple[Flo
     try:
         import open3d  # slow to load, and only needed here
     except ImportError as error:
-        remedy = how_to_install("poisson")
-        raise InputError(f"poisson needs Open3D, which does not load ({error})", where="surface.method", remedy=remedy) from None
+        how = how_to_install("poisson")
+        raise InputError(
+            f"the method poisson needs the package Open3D, which does not load ({error})",
+            where="surface.method",
+            remedy=f"install it: {how}",
+        ) from None
 
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
     cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))

@@ -150,7 +150,9 @@ def _pycolmap() -> Any:
     try:
         import pycolmap  # an extra, and needed here only
     except ImportError:
-        raise InputError("needs the package pycolmap", where="reconstruction: colmap", remedy=how_to_install("colmap")) from None
+        raise InputError(
+            "the reconstruction needs the package pycolmap", where="reconstruction: colmap", remedy=how_to_install("colmap")
+        ) from None
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     return pycolmap
 

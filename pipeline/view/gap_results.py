@@ -148,15 +148,27 @@ def _in_words(step: str, names: list[str]) -> str:
 
 def _cloud(path: Path) -> PointCloud:
     """Read a file of a diagnosis. Raises InputError if it is another point cloud."""
-    cloud, remedy = read_laz(path), "run scarpsim gap again"
+    cloud = read_laz(path)
     missing = [name for name in _CHANNELS if name not in cloud.extra]
     if missing:
-        raise InputError(f"has no channel {missing[0]}", where=str(path), allowed="a file of scarpsim gap", remedy=remedy)
+        raise InputError(
+            f"has no channel {missing[0]}",
+            where=str(path),
+            allowed="a file of scarpsim gap",
+            remedy="run scarpsim gap again on the measurement",
+        )
     if not all(np.isfinite(cloud.extra[name]).all() and cloud.extra[name].ndim == 1 for name in _CHANNELS):
-        raise InputError(f"has values in {' or '.join(_CHANNELS)} that are not finite", where=str(path), remedy=remedy)
+        raise InputError(
+            f"has values in {' or '.join(_CHANNELS)} that are not finite",
+            where=str(path),
+            remedy="run scarpsim gap again on the measurement",
+        )
     if len(cloud.points) < _FEWEST:
         raise InputError(
-            f"contains only {len(cloud.points)} points", where=str(path), allowed=f"at least {_FEWEST}", remedy=remedy
+            f"contains only {len(cloud.points)} points",
+            where=str(path),
+            allowed=f"at least {_FEWEST}",
+            remedy="run scarpsim gap again on the measurement",
         )
     check_reach(cloud.points, str(path))
     return cloud

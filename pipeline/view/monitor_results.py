@@ -21,7 +21,7 @@ from scene.geometry.frame import WallFrame
 
 MONITOR_FILE, REFERENCE_FILE = "monitor.json", "reference.tif"
 _MM, _NORMAL_95 = 1e3, 1.96
-_REMEDY = "run scarpsim monitor again"
+_REMEDY = "run scarpsim monitor again with another --out"
 
 
 class MonitorResults:

@@ -40,10 +40,12 @@ class RunResults:
         Raises InputError if run.json is damaged, no epoch is finished, or the detections belong to other maps.
         """
         self.folder = folder
-        record = read_run(folder / RUN_FILE, "continue it with simulate --resume")
+        record = read_run(folder / RUN_FILE, "continue the run with scarpsim simulate --resume")
         self._epochs = {str(each["epoch"]): each for each in record.get("epochs", []) if each["epoch"] > 0}
         if not self._epochs or "wall" not in record or any("statistics" not in each for each in self._epochs.values()):
-            raise InputError("contains no finished epoch", where=str(folder), remedy="continue it with simulate --resume")
+            raise InputError(
+                "contains no finished epoch", where=str(folder), remedy="continue the run with scarpsim simulate --resume"
+            )
         self.world_to_wall = np.array(record["wall_frame"]["matrix_world_to_wall"]) if "wall_frame" in record else np.eye(4)
         self.title = f"{folder.name}: {INSTRUMENTS[record['sensor']]}, {record['wall']['name']}"
         self.steps = {key: _step_name(each) for key, each in self._epochs.items()}

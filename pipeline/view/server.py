@@ -51,7 +51,7 @@ def open_results(folder: Path, detections: Path | None = None) -> Results:
     detections: folder of `scarpsim detect`, to show with a run. Raises InputError if the folder cannot be shown.
     """
     if not folder.is_dir():
-        raise InputError("there is no such folder", where=str(folder), remedy="give the folder that a command filled")
+        raise InputError("there is no such folder", where=str(folder), remedy="give a folder with results of a scarpsim command")
     if (folder / "run.json").exists():
         return RunResults(folder, detections)
     if detections:
@@ -119,7 +119,7 @@ def make_page_server(results: Results, port: int, token: str, other: Results | N
             return make_server(HOST, port, make_app(results, token, other).server, threaded=True, request_handler=_Silent)
     except (OSError, SystemExit, OverflowError):
         raise InputError(
-            f"port {port} cannot be used", where="--port", remedy="choose another, or 0 for any that is free"
+            f"port {port} cannot be used", where="--port", remedy="choose another port, or 0 for any port that is free"
         ) from None
 
 

@@ -140,9 +140,10 @@ class IlluminationConfig(Config):
         sun = sun_position(self.time_utc, np.radians(self.latitude_deg), np.radians(self.longitude_deg))
         if sun.elevation_rad <= 0:
             raise InputError(
-                f"the sun stands {np.degrees(-sun.elevation_rad):.1f} deg below the horizon",
+                f"the sun stands {np.degrees(-sun.elevation_rad):.1f} deg below the horizon at this "
+                "time and place, so it does not light the wall",
                 where="illumination.time_utc",
-                remedy="give the time in UTC and the longitude east positive",
+                remedy="set illumination.time_utc to a time of day, in UTC, and give the longitude positive towards east",
             )
         return sun
 

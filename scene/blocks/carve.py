@@ -240,7 +240,7 @@ def _removed_volumes(removed: Piece, blocks: Blocks) -> FloatArray:
         raise InputError(
             f"{len(nothing)} of {len(blocks)} blocks remove no rock, the first of them at ({x:.2f}, {y:.2f}, {z:.2f}) m",
             where="carving",
-            remedy="place the blocks on the surface; its faces must look towards the sensors (+z)",
+            remedy="place the blocks on the surface of the wall, whose triangles must face the sensors (+z)",
         )
     return volumes
 

@@ -92,7 +92,7 @@ def solid_of(vertices: FloatArray, faces: IntArray, name: str) -> Solid:
             f"the triangles make no solid ({status})",
             where=name,
             allowed="finite vertices; each edge in one triangle or in two of opposite direction; no triangles without area",
-            remedy="weld and clean the mesh",
+            remedy="in a mesh editor such as MeshLab, merge duplicate vertices and remove triangles without area",
         )
     return Solid(manifold, identity)
 

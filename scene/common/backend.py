@@ -31,7 +31,7 @@ def _choose() -> str:
     if wanted:
         if wanted not in (CUDA, LLVM):
             raise InputError(
-                f"got '{wanted}'",
+                f"the variable is '{wanted}'",
                 where=_VARIANT_VARIABLE,
                 allowed=f"{CUDA}, {LLVM}",
                 remedy="set the variable to one of them, or unset it",
@@ -48,7 +48,9 @@ def _activate() -> str:
         raise InputError(
             "no CUDA device was found" if variant == CUDA else "the system library libLLVM is missing",
             where=f"Mitsuba variant {variant}",
-            remedy="run `scarpsim doctor`" if variant == CUDA else "install it (Debian, Ubuntu: apt-get install libllvm15)",
+            remedy="run `scarpsim doctor` to see why, or unset SCARPSIM_VARIANT to compute on the CPU"
+            if variant == CUDA
+            else "install libLLVM (Debian, Ubuntu: apt-get install libllvm15)",
         )
     mi.set_variant(variant)
     return variant

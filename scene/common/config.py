@@ -64,7 +64,9 @@ def parse(model: type[ConfigT], values: Any, where: str) -> ConfigT:
     try:
         return model.model_validate(dict(values))
     except pydantic.ValidationError as error:
-        raise InputError(_listed([_describe(model, item) for item in error.errors()]), where=where) from None
+        raise InputError(
+            f"keys or values are wrong: {_listed([_describe(model, item) for item in error.errors()])}", where=where
+        ) from None
 
 
 _MOST_YAML_BYTES = 4_000_000
@@ -79,14 +81,13 @@ def load_yaml(path: Path) -> Any:
     if path.suffix == ".json":
         return read_json(path)
     try:
-        remedy = "check the path and the permissions"
-        return parse_yaml(read_text(path, most_bytes=_MOST_YAML_BYTES, remedy=remedy, smaller="give it as .json, which is fast"))
+        return parse_yaml(read_text(path, most_bytes=_MOST_YAML_BYTES, smaller="give it as .json, which is fast"))
     except yaml.YAMLError as error:
         problem = " ".join(str(error).split())
         raise InputError(
             f"is not valid YAML: {problem}",
             where=str(path),
-            remedy="correct the line that is named",
+            remedy="correct the syntax in the line that is named",
         ) from None
 
 

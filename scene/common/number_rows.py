@@ -198,6 +198,7 @@ def _wrong_width(text: str, width: int, number: int, form: RowForm, where: str) 
     """Make the error for a row with too many or too few values."""
     values = "value" if width == 1 else "values"
     return InputError(
-        f"has {width} {values} ('{text:.60}')", where=f"{where}, line {number:,}", allowed=f"{form.columns}, as the rows before",
+        f"has {width} {values} ('{text:.60}')", where=f"{where}, line {number:,}",
+        allowed=f"{form.columns}, as the rows before",
         remedy="correct or remove the line; where it is the last one, the file was cut off: copy or export it again",
     )  # fmt: skip

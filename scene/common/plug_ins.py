@@ -44,14 +44,16 @@ def load_plug_ins(group: str, needs: str, is_one: Callable[[Any], bool], taken: 
             value = entry.load()
         except Exception as error:  # the code of another package fails in any way
             raise InputError(
-                f"does not load ({type(error).__name__}: {error})", where=where, remedy="repair or uninstall that package"
+                f"the plug-in does not load ({type(error).__name__}: {error})",
+                where=where,
+                remedy="repair or uninstall the package that provides this plug-in",
             ) from error
         if not is_one(value):
             raise InputError(
-                f"is a {type(value).__name__}",
+                f"the plug-in is an object of the type {type(value).__name__}",
                 where=where,
                 allowed=needs,
-                remedy="change the entry point in the package that it comes from",
+                remedy="correct the entry point in the package that provides the plug-in",
             )
         found[entry.name] = value
     return found

@@ -20,9 +20,7 @@ READ_LIMIT = "SCARPSIM_READ_GB"
 """Environment variable that raises both limits, in GB."""
 
 
-def check_file(
-    path: Path, *, most_bytes: int | None = None, remedy: str = "check the path", smaller: str = "give a smaller one"
-) -> Path:
+def check_file(path: Path, *, most_bytes: int | None = None, remedy: str = "", smaller: str = "give a smaller file") -> Path:
     """Check that a path is a regular file that can be read, before it is opened; return the path.
 
     Parameters
@@ -32,7 +30,7 @@ def check_file(
     most_bytes : int, optional
         Size limit; none by default.
     remedy : str
-        What the message advises if the file cannot be used.
+        What the message advises if the file cannot be used, after the advice to give a readable file.
     smaller : str
         What the message advises if the file is too large.
 
@@ -43,24 +41,37 @@ def check_file(
         large.
     """
     where = str(path)
+    advice = f"; {remedy}" if remedy else ""
     try:
         state = path.stat()
     except (OSError, ValueError) as error:  # ValueError: a null character
         problem = getattr(error, "strerror", None) or "a null character in its name"
-        raise InputError(f"cannot be read ({problem})", where=where, remedy=remedy) from None
+        raise InputError(
+            f"cannot be read ({problem})", where=where, remedy=f"give the path of an existing file that you may read{advice}"
+        ) from None
     if stat.S_ISDIR(state.st_mode):
-        raise InputError("cannot be read (Is a directory)", where=where, allowed="a file", remedy=remedy)
+        raise InputError(
+            "cannot be read (Is a directory)",
+            where=where,
+            allowed="a file",
+            remedy=f"give the path of a file, not of a folder{advice}",
+        )
     if not stat.S_ISREG(state.st_mode):
         raise InputError(
-            "is a pipe, a device or a socket", where=where, allowed="a file", remedy="copy what it gives into a file"
+            "is a pipe, a device or a socket",
+            where=where,
+            allowed="a file",
+            remedy="write its output into a regular file, and give that file",
         )
     if most_bytes is not None and state.st_size > most_bytes:
         problem = f"has {state.st_size / 1e6:,.0f} MB"
-        raise InputError(problem, where=where, allowed=f"up to {most_bytes / 1e6:,.0f} MB", remedy=smaller)
+        raise InputError(
+            problem, where=where, allowed=f"up to {most_bytes / 1e6:,.0f} MB", remedy=f"the file is too large: {smaller}"
+        )
     return path
 
 
-def read_text(path: Path, *, most_bytes: int | None = None, remedy: str = "check the path", smaller: str | None = None) -> str:
+def read_text(path: Path, *, most_bytes: int | None = None, remedy: str = "", smaller: str | None = None) -> str:
     """Read a UTF-8 text file.
 
     Parameters
@@ -70,7 +81,7 @@ def read_text(path: Path, *, most_bytes: int | None = None, remedy: str = "check
     most_bytes : int, optional
         Size limit, bytes. By default 512 MB, or what the environment variable SCARPSIM_READ_GB allows if that is more.
     remedy : str
-        What the message advises if the file cannot be used.
+        What the message advises if the file cannot be used, after the advice to give a readable file.
     smaller : str, optional
         What the message advises if the file is too large; by default to give a smaller one or to raise the limit.
 
@@ -80,20 +91,22 @@ def read_text(path: Path, *, most_bytes: int | None = None, remedy: str = "check
         If the file is missing, not a regular file, too large or not UTF-8.
     """
     most = max(MOST_TEXT_BYTES, int(read_limit_gb() * 1e9)) if most_bytes is None else most_bytes
-    check_file(path, most_bytes=most, remedy=remedy, smaller=smaller or f"give a smaller one, or set the variable {READ_LIMIT}")
+    check_file(path, most_bytes=most, remedy=remedy, smaller=smaller or f"give a smaller file, or set the variable {READ_LIMIT}")
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy=remedy) from None
+        raise InputError(
+            f"cannot be read ({error.strerror})", where=str(path), remedy="give the path of an existing file that you may read"
+        ) from None
     except UnicodeDecodeError as error:
         raise InputError(
             f"is no text in UTF-8 (byte {error.start:,}: {error.reason})",
             where=str(path),
-            remedy="save it in UTF-8, or give the file that is meant",
+            remedy="save the file as UTF-8 in a text editor, or give another file if this is no text file",
         ) from None
 
 
-def read_json(path: Path, *, remedy: str = "check the path, or make the file again with the command that wrote it") -> Any:
+def read_json(path: Path, *, remedy: str = "make the file again with the command that wrote it") -> Any:
     """Read a JSON file; `remedy` is what the error message advises.
 
     Raises InputError if the file cannot be read or is not JSON. It also does, before reading, if the contents might take more
@@ -104,21 +117,25 @@ def read_json(path: Path, *, remedy: str = "check the path, or make the file aga
     try:
         needed = _json_gb(path, size, most)
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy=remedy) from None
+        raise InputError(
+            f"cannot be read ({error.strerror})", where=str(path), remedy="give the path of an existing file that you may read"
+        ) from None
     if needed > most:
         problem = f"is so large that reading it may take {needed:.1f} GB of memory"
         raise InputError(
             problem,
             where=str(path),
             allowed=f"up to {most:g} GB",
-            remedy=f"cut it into parts, or set the variable {READ_LIMIT}={math.ceil(1.1 * needed)}",
+            remedy=f"cut the file into parts, or set the variable {READ_LIMIT}={math.ceil(1.1 * needed)}",
         )
     text = read_text(path, most_bytes=int(most * 1e9), remedy=remedy)
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         problem = " ".join(str(error).split()) or "nested too deeply"
-        raise InputError(f"is not JSON ({problem})", where=str(path), remedy=remedy) from None
+        raise InputError(
+            f"is not JSON ({problem})", where=str(path), remedy=f"correct the file, or give another: {remedy}"
+        ) from None
 
 
 def read_limit_gb() -> float:

@@ -31,7 +31,8 @@ class FrameConfig(Config):
     normal: Literal["mean_plane", "sensor"] | tuple[float, float, float] = Field(
         "mean_plane",
         description="z axis of the wall frame: the normal of the mean plane of all vertices (mean_plane), the line from the "
-        "middle of the mesh to the sensor (sensor; for terrain that no plane fits), or a direction x, y, z in world coordinates",
+        "middle of the mesh to the sensor (sensor; for terrain that no plane fits), or a direction "
+        "x, y, z in world coordinates",
     )
 
     def fit(self, vertices: FloatArray, towards: FloatArray) -> WallFrame:
@@ -55,10 +56,10 @@ class FrameConfig(Config):
         normal = towards - middle if self.normal == "sensor" else np.array(self.normal, dtype=np.float64)
         if not 0 < np.linalg.norm(normal) < np.inf:
             raise InputError(
-                f"got {self.normal}",
+                f"the normal of the wall is {self.normal}",
                 where="frame.normal",
                 allowed="a direction x, y, z that is not zero",
-                remedy="write for example [0, -1, 0], or leave it out",
+                remedy="write for example normal: [0, -1, 0], or leave the key out",
             )
         if np.dot(towards - middle, normal) < 0:
             raise InputError(
@@ -111,7 +112,9 @@ class WallFrame:
         axes, variances, _ = np.linalg.svd(covariance)
         if not variances[1] > 1e-12 * max(variances[0], 1e-300):
             raise InputError(
-                "the vertices lie on one line, so there is no mean plane", where="wall mesh", remedy="use a mesh of a surface"
+                "the vertices lie on one line, so there is no mean plane",
+                where="wall mesh",
+                remedy="give a mesh of a wall, whose vertices spread in two directions",
             )
         normal = axes[:, 2]
         return cls.along(normal if np.dot(np.asarray(towards) - centre, normal) >= 0 else -normal, vertices)

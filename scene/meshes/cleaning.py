@@ -63,7 +63,9 @@ def clean(mesh: TriangleMesh, where: str, origin: FloatArray | None = None) -> t
         repairs.append(words)
         if not len(mesh.faces):
             raise InputError(
-                "no triangle has an area: all vertices lie on lines or points", where=where, remedy="export the surface anew"
+                "no triangle has an area: all vertices lie on lines or points",
+                where=where,
+                remedy="export the mesh again from the program that made it, with triangles that have an area",
             )
     mesh, words = unify_winding(mesh, where)
     repairs.append(words)
@@ -141,7 +143,7 @@ def inconsistent_faces(mesh: TriangleMesh, where: str) -> NDArray[np.bool_]:
         raise InputError(
             "the surface has only one side (a Moebius strip), so it has no outside",
             where=where,
-            remedy="cut the surface, or export it anew",
+            remedy="cut the surface open in a mesh editor such as MeshLab, so that it has two sides",
         )
     size = np.bincount(label[:count], minlength=label.max() + 1)
     minor = size[label[:count]] < size[label[count:]]

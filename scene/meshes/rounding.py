@@ -140,7 +140,7 @@ def check_steps(rounded: Sequence[RoundedAxis], spacing_m: float, where: str, sp
             f"the coordinates were rounded, {', '.join(map(str, harmful))}; {spacing} {spacing_m:.3g} m (median)",
             where=where,
             allowed=f"steps of up to {limits[harmful[0].axis]:.2g} m",
-            remedy="export it anew in double precision, or subtract an offset from the coordinates before the export",
+            remedy="export the mesh again in double precision, or subtract an offset from the coordinates before the export",
         )
     return tuple(f"the coordinates are rounded, {each}" for each in rounded if each.step_m > _HARMFUL_M)
 

@@ -111,7 +111,7 @@ def _pieces_seen_from_behind(
             "the sensor stands inside a closed solid of the surface",
             where=where,
             allowed="a place from which the outside of each closed solid is seen",
-            remedy="check the sensor's position, or cut the surface open",
+            remedy="move the sensor's position out of the solid, or cut the surface open in a mesh editor",
         )
     return backs[piece]
 

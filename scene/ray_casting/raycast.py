@@ -73,13 +73,15 @@ def check_castable(mesh: TriangleMesh) -> None:
     Far from the origin, single precision is too coarse.
     """
     if len(mesh.faces) == 0:
-        raise InputError("the mesh has no triangles", where="ray casting", remedy="use a mesh with triangles")
+        raise InputError(
+            "the mesh has no triangles", where="ray casting", remedy="give a mesh that contains triangles, not points alone"
+        )
     if not np.abs(mesh.bounds).max() < _LARGEST_COORDINATE:
         raise InputError(
             f"coordinates reach {np.abs(mesh.bounds).max():.0f} m, too far from the origin for single precision",
             where="ray casting",
             allowed=f"less than {_LARGEST_COORDINATE:.0f} m",
-            remedy="check the mesh's unit, or subtract its centre from the coordinates of mesh and sensor",
+            remedy="export the mesh in metres, or subtract its centre from the coordinates of mesh and sensor",
         )
 
 

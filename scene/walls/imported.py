@@ -102,7 +102,11 @@ class ImportedWall(Config):
         extent = _extent(mesh)
         if not _SMALLEST_M <= extent <= _LARGEST_M:
             likely = [unit for unit, metres in METRES.items() if 2 <= extent / METRES[self.unit] * metres <= 1000]
-            remedy = f"set `unit` to {' or '.join(likely)} if that is the file's unit" if likely else "check the file"
+            remedy = (
+                f"set `unit` to {' or '.join(likely)} if that is the file's unit"
+                if likely
+                else "cut the mesh to the wall in a mesh editor, or export it with the unit in `unit`"
+            )
             raise InputError(
                 f"the wall is {extent:.4g} m in size with `unit: {self.unit}`",
                 where=where,
@@ -140,7 +144,7 @@ def read_reference(path: Path) -> tuple[TriangleMesh, tuple[str, ...]]:
             f"the surface is {extent:.4g} m in size",
             where=str(path),
             allowed=f"up to {_LARGEST_M:.0f} m",
-            remedy="give it in metres, cut to the scene",
+            remedy="export the surface in metres, and cut it to the wall and what is near it",
         )
     mesh, words = drop_unused(mesh)
     return mesh, (*notes, *([words] if words else []))
@@ -173,7 +177,7 @@ def _read(path: Path, unit: str) -> TriangleMesh:
     """
     where, kind = str(path), _format(path)
     if not path.exists():
-        raise InputError("there is no such file", where=where, remedy="check the path")
+        raise InputError("there is no such file", where=where, remedy="give the path of an existing mesh")
     check_file(path)
     if kind == "ply" and (plain := _plain_ply(path)) is not None:
         return plain
@@ -190,10 +194,16 @@ def _read(path: Path, unit: str) -> TriangleMesh:
     except InputError:
         raise
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror or error})", where=where, remedy="check the permissions") from None
+        raise InputError(
+            f"cannot be read ({error.strerror or error})", where=where, remedy="give yourself the permission to read the file"
+        ) from None
     except Exception as error:  # trimesh's readers may raise any exception on malformed data
         problem = " ".join(str(error).split())[:200] or type(error).__name__
-        raise InputError(f"is not a valid {kind} file: {problem}", where=where, remedy="export it anew") from None
+        raise InputError(
+            f"is not a valid {kind} file: {problem}",
+            where=where,
+            remedy="copy the complete file again, or export it again from the program that made it",
+        ) from None
     faces = np.asarray(getattr(mesh, "faces", np.empty((0, 3))))
     if not len(faces):
         raise InputError(
@@ -206,12 +216,12 @@ def _read(path: Path, unit: str) -> TriangleMesh:
         vertices = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], axis=1)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
         problem = f"has vertices of {vertices.shape[-1]} coordinates and faces of {faces.shape[-1]} corners"
-        raise InputError(problem, where=where, allowed="3 and 3", remedy="export it anew, as triangles")
+        raise InputError(problem, where=where, allowed="3 and 3", remedy="export the mesh again as triangles with x, y and z")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(
             f"a triangle refers to vertex {faces.max()}, but there are {len(vertices)} vertices, counted from 0",
             where=where,
-            remedy="export it anew",
+            remedy="copy the complete file again, or export the mesh again",
         )
     return TriangleMesh(vertices, faces.astype(np.int32), _albedo(mesh))
 
@@ -225,7 +235,7 @@ def _obj_text(path: Path, unit: str) -> bytes:
     stated = obj.unit_in_comments(text)
     if stated is not None and stated[0] != unit:
         raise InputError(
-            f"says in a comment that its unit is {stated[0]} ('{stated[1][:80]}'), and is to be read in {unit}",
+            f"says in a comment that its unit is {stated[0]} ('{stated[1][:80]}'), but `unit` says {unit}",
             where=str(path),
             remedy=f"set `unit` to {stated[0]}, or remove the comment if it is wrong",
         )
@@ -287,7 +297,7 @@ def _format(path: Path) -> str:
             f"'{path.suffix}' is not a mesh format that can be read",
             where=str(path),
             allowed=", ".join(known),
-            remedy=nearest(kind, known),
+            remedy=nearest(kind, known) or "convert the mesh to one of these formats",
         )
     return kind
 

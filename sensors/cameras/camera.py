@@ -255,9 +255,9 @@ class Camera:
             error = np.hypot(back_u - u, back_v - v)
         if not (np.isfinite(error).all() and error.max() < 1e-6 and (folded[0] * folded[2] > folded[1] ** 2).all()):
             raise InputError(
-                "the lens distortion folds the image and has no inverse over the frame",
+                "the lens distortion folds the image: two directions fall on one pixel, so it cannot be inverted",
                 where="camera calibration",
-                remedy="check k1..k4 and p1, p2 (Metashape's units: tangents, not pixels)",
+                remedy="correct k1 to k4, p1 and p2; as in Metashape they apply to tangents of angles, not to pixels",
             )
 
 

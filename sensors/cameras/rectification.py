@@ -76,7 +76,11 @@ def rectify(pair: CameraPair) -> Rectification:
         )
     base_m = -p_right[0, 3] / p_left[0, 0]
     if base_m < 0:
-        raise InputError("the left camera stands to the right of the right one", where="cameras", remedy="swap left and right")
+        raise InputError(
+            "the left camera stands to the right of the right one",
+            where="cameras",
+            remedy="exchange the cameras left and right in the config",
+        )
     return Rectification(r_left, r_right, p_left[0, 0], p_left[0, 2], p_right[0, 2], p_left[1, 2], base_m)
 
 

@@ -55,7 +55,9 @@ class TextureNoise(Effect):
         albedo = state.albedo_raster()
         if albedo is None:
             raise InputError(
-                "the wall has no albedo, so there is no texture", where=f"effect {self.name}", remedy="give the wall an albedo"
+                "the wall has no albedo (share of light that it reflects), so its pictures have no texture",
+                where=f"effect {self.name}",
+                remedy="give the wall an albedo, or leave this effect out",
             )
         information = texture(WHITE * albedo, state.reduction)
         with np.errstate(divide="ignore"):

@@ -126,7 +126,7 @@ class Pattern:
                 f"{lines:,} lines of {pulses:,} pulses would take {lines * pulses * _BYTES_PER_PULSE / 1e9:,.0f} GB of memory",
                 where="scanner.azimuth_step_rad, scanner.zenith_step_rad",
                 allowed=f"up to {most:,} pulses in the free memory",
-                remedy="choose coarser steps or a smaller window",
+                remedy="choose larger steps, or a smaller window of azimuth and zenith",
             )
         return cls(azimuth[0], config.azimuth_step_rad, lines, zenith[0], config.zenith_step_rad, pulses)
 
@@ -223,7 +223,7 @@ class LaserScanner:
             raise InputError(
                 "the wall lies outside the scanner's field of view",
                 where="scanner.zenith_limits_rad",
-                remedy="move the station or tilt it",
+                remedy="move the station (position_m), tilt it (rotation), or widen scanner.zenith_limits_rad",
             )
         return cls(position, rotation, Pattern.over(azimuth, (low, high), config), config, model, truth, pose_sigma)
 
@@ -388,7 +388,10 @@ class LaserScanner:
         found = self._recorded(pulses, real)
         if np.isnan(found.depth).all():
             raise InputError(
-                "no pulse returned", where="station, scanner", remedy="check position, rotation, window, range limits and effects"
+                "no pulse of the scanner returned from the wall",
+                where="station, scanner",
+                remedy="turn the station towards the wall, widen the scanner's window or range limits, or "
+                "remove effects that lose returns",
             )
         return Observation(
             sensor="tls",

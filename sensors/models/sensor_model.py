@@ -143,9 +143,9 @@ class OrientationNoise(Config):
         except ValidationError as error:
             problem = "; ".join(f"{item['loc'][-1]} {item['input']:.4g}: {item['msg'].lower()}" for item in error.errors())
             raise InputError(
-                f"a drawn value is out of bounds: {problem}",
+                f"an orientation error, drawn at random, puts a camera parameter out of its bounds: {problem}",
                 where="noise.orientation",
-                remedy="lower its sigma; angles are in radians",
+                remedy="lower the sigma of this parameter in noise.orientation; angles are in radians",
             ) from None
 
     def _effects(self, side: Side, value: dict[str, float]) -> tuple[Effect, ...]:

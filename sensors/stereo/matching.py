@@ -84,7 +84,7 @@ class SearchRange:
                 f"the surface spans {count} disparities",
                 where="matching",
                 allowed=f"at most {MOST_DISPARITIES}",
-                remedy="take a coarser depth_map or a smaller depth_margin_m",
+                remedy="choose a depth_map with larger pixels, or a smaller depth_margin_m",
             )
         return cls(least, count)
 

@@ -71,7 +71,7 @@ class RectifiedGrid:
             raise InputError(
                 "the cameras look into such different directions that their images cannot be rectified",
                 where="cameras",
-                remedy="check the rotations, or take matcher: simulated",
+                remedy="correct `rotation` of the cameras so that both look at the wall, or set matcher: simulated",
             )
         return cls(pair, geometry, step, left[0], right[0], int(np.ceil(top)), left_width, right_width, rows)
 
@@ -137,5 +137,9 @@ def _outline(camera: Camera, rotation: FloatArray, geometry: Rectification, u_0:
     v = np.concatenate([zero, one, along, along]) * camera.height
     ray = rotation @ np.stack([*camera.tangents(u, v), np.ones_like(u)])
     if not (ray[2] > 0.05).all():
-        raise InputError("a camera looks along the base", where="cameras", remedy="check the rotations (camera to world)")
+        raise InputError(
+            "a camera looks along the base, the line between the two cameras",
+            where="cameras",
+            remedy="correct `rotation` (camera to world) so that both cameras look at the wall",
+        )
     return geometry.f * ray[0] / ray[2] + u_0, geometry.f * ray[1] / ray[2] + geometry.v

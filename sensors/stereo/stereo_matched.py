@@ -73,9 +73,9 @@ class MatchedStereoPair:
         named = [effect.name for effect in self.pair.model.effects if effect.stage == Stage.MATCH and not effect.is_null]
         if named:
             raise InputError(
-                f"acts on simulated matching, and the matcher is real: {', '.join(named)}",
+                f"these effects act on simulated matching, but `matcher` is a real image matcher: {', '.join(named)}",
                 where="sensor.effects",
-                remedy="leave it out, or take matcher: simulated",
+                remedy="remove them, or set matcher: simulated",
             )
 
     def observe(self, scene: RayCaster, random: KeyedRandom) -> Observation:
@@ -185,7 +185,7 @@ def _range(depth: mi.Float64, valid: mi.Bool) -> tuple[float, float]:
         raise InputError(
             "no part of the wall is seen by the left camera",
             where="cameras",
-            remedy="check positions and rotations (camera to world; x right, y down, z forward)",
+            remedy="correct position_m and rotation of the left camera (camera to world; x right, y down, z forward)",
         )
     return float(values.min()), float(values.max())
 

@@ -93,7 +93,8 @@ def _kept(mesh: TriangleMesh, kept: np.ndarray) -> TriangleMesh:
         raise InputError(
             "no part of the wall is seen by both cameras",
             where="cameras",
-            remedy="check positions, rotations (camera to world; x right, y down, z forward) and which side faces the wall",
+            remedy="correct position_m and rotation of both cameras (camera to world; x right, y down, z "
+            "forward) so that they look at the front of the wall",
         )
     if chosen.all() and kept.all():
         return mesh

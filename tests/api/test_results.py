@@ -109,7 +109,7 @@ def test_meshes_go_to_others(run: Run, tmp_path: Path) -> None:
         assert np.allclose(other, truth.vertices, atol=1e-5)
     assert np.array_equal(truth.to_pyvista().cell_data["block"], truth.face_block)
     assert np.array_equal(Mesh.read(truth.save(tmp_path / "mesh.ply")).faces, truth.faces)
-    with pytest.raises(InputError, match="not all vertex indices"):
+    with pytest.raises(InputError, match="not all indices of vertices"):
         Mesh.from_arrays([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 3]])
 
 
@@ -156,7 +156,13 @@ def test_an_opened_run_is_the_same(run: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "keys", "value", "problem", "use"),
     [
-        ("run.json", ["sensor"], "sonar", r"run\.json: 'sensor': .* got 'sonar'", lambda run: run.sensor),
+        (
+            "run.json",
+            ["sensor"],
+            "sonar",
+            r"run\.json: keys or values are wrong: 'sensor': .* got 'sonar'",
+            lambda run: run.sensor,
+        ),
         ("run.json", ["wall_frame", "origin_m"], [0, 0], r"wall_frame\.origin_m", lambda run: run.frame),
         ("run.json", ["epochs", 1, "blocks", 0, "bbox_m"], "wide", r"bbox_m", lambda run: run.blocks),
         ("run.json", ["epochs", 1, "statistics", "outside_blocks"], {"count": 3}, "median_m", lambda run: run.statistics),

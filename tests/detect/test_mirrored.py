@@ -128,7 +128,7 @@ def test_the_threshold_has_no_mirrored_views(tmp_path, capsys):
     (tmp_path / "map.tif").write_bytes(b"")
     words = ["detect", "baseline", str(tmp_path / "map.tif"), "--out", str(tmp_path / "out"), "--mirrored"]
     assert main(words) == 2
-    assert "--mirrored: the option needs a network" in capsys.readouterr().err
+    assert "--mirrored: the option needs a neural network" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

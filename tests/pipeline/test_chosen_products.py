@@ -73,7 +73,7 @@ def test_the_e57_scan_stands_where_the_scanner_does(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("crs", "problem"),
     [
-        ("EPSG:999999", "products.crs: is not understood: 'EPSG:999999'"),
+        ("EPSG:999999", "products.crs: the coordinate system is not understood: 'EPSG:999999'"),
         ("EPSG:4326", "'WGS 84' has the unit degree; allowed: a projected"),
         ("EPSG:2222", "has the unit foot"),
     ],

@@ -149,7 +149,7 @@ def test_a_package_refuses_links_out_of_its_folder(tmp_path: Path, capsys: pytes
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["epochs", "--epoch", "1"], "--epoch: works only with picture, gltf, scan"),
+        (["epochs", "--epoch", "1"], "--epoch: the option works only with picture, gltf, scan"),
         (["picture", "--epoch", "9"], "--epoch: there is no epoch 9; allowed: 0 to 2"),
         (["gltf", "--out", "wall.obj"], "--out: got 'wall.obj'; allowed: .glb"),
         (["movie"], "got 'movie'; allowed: picture"),

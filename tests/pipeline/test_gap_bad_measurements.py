@@ -118,10 +118,10 @@ BAD: dict[str, tuple[Callable[[Path], None], str]] = {
     "infinite": (put(lambda points: points + np.inf), "no point with finite values"),
     "NaN": (put(lambda points: points * np.nan), "no point with finite values"),
     "one of 1e300": (put(lambda points: np.concatenate([points, [[1e300, 0.0, 0.0]]])), "1 of "),
-    "1e9 away": (put(lambda points: points + 1e9), "check the unit"),
+    "1e9 away": (put(lambda points: points + 1e9), "export the points in metres"),
     "1e7 away": (put(lambda points: points + 1e7), "of the points lie in directions"),
     "10 m behind": (put(lambda points: points * (1 + 10 / np.linalg.norm(points, axis=1, keepdims=True))), "10 m behind the"),
-    "in millimetres": (put(lambda points: 1000 * points), "check the sensor's position, the unit (m)"),
+    "in millimetres": (put(lambda points: 1000 * points), "correct the sensor's position"),
     "one long line": (one_line, "a line of more than 65,536 bytes"),
 }  # fmt: skip
 
@@ -192,5 +192,5 @@ def test_a_pair_may_be_off_by_what_a_turned_camera_does(sensor: Sensor, off_m: f
 def test_one_epoch_under_two_names_is_named() -> None:
     points = np.random.default_rng(1).normal(size=(50, 3))
     check_different({"a.laz": PointCloud(points), "b.laz": PointCloud(points + 1e-9)})
-    with pytest.raises(InputError, match=r"c\.laz: has the same points as a\.laz"):
+    with pytest.raises(InputError, match=r"c\.laz: the cloud has the same points as a\.laz"):
         check_different({"a.laz": PointCloud(points), "b.laz": PointCloud(points[1:]), "c.laz": PointCloud(points.copy())})

@@ -227,5 +227,5 @@ def test_a_compression_that_cannot_be_read_is_no_damage(tmp_path: Path, monkeypa
     content = path.read_bytes()
     tag = (259).to_bytes(2, "little") + (3).to_bytes(2, "little") + (1).to_bytes(4, "little")
     path.write_bytes(content.replace(tag + (5).to_bytes(2, "little"), tag + (34925 + 77).to_bytes(2, "little")))
-    with pytest.raises(InputError, match=r"uses a compression that cannot be read.*save it with deflate"):
+    with pytest.raises(InputError, match=r"uses a compression that cannot be read.*save the raster with deflate"):
         read_tiff(path)

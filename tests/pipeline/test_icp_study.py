@@ -99,12 +99,16 @@ def test_what_is_recommended() -> None:
     ("record", "words", "message"),
     [
         ("5", [], "run.json: expected a mapping"),
-        ('{"sensor": "tls", "config": {}, "epochs": 3}', [], "run.json: 'epochs': input should be a valid list"),
-        ('{"sensor": "tls", "config": {}, "epochs": [1, 2]}', [], "run.json: 'epochs.0'"),
+        (
+            '{"sensor": "tls", "config": {}, "epochs": 3}',
+            [],
+            "run.json: keys or values are wrong: 'epochs': input should be a valid list",
+        ),
+        ('{"sensor": "tls", "config": {}, "epochs": [1, 2]}', [], "run.json: keys or values are wrong: 'epochs.0'"),
         (
             '{"sensor": "tls", "config": {}, "epochs": [{"epoch": 0}, {"epoch": 1, "registration": {"rotation": "x"}}]}',
             [],
-            "run.json: 'epochs.1.registration.rotation'",
+            "run.json: keys or values are wrong: 'epochs.1.registration.rotation'",
         ),
         ("{", [], "run.json: is not JSON"),
         ('{"sensor": "tls", "config": {}, "epochs": [{"epoch": 0}]}', [], "no epoch after the reference"),

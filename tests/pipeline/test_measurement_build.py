@@ -398,7 +398,7 @@ BAD: dict[str, tuple[Callable[[Case, Path], list[str]], str]] = {
     "identical points": (move(lambda points: np.repeat(points[:1], 500, axis=0)), "at the same place"),
     "NaN": (move(lambda points: points * np.nan), "no point with finite values"),
     "no order": (move(lambda points: np.random.default_rng(1).permutation(points)), "give --position X,Y,Z"),
-    "another place": (move(lambda points: points + UTM), "export both in one coordinate system"),
+    "another place": (move(lambda points: points + UTM), "export points and reference in one coordinate system"),
     "behind the scanner": (move(lambda points: 2 * POSITION - points), "export both|in directions in which"),
     "position of two numbers": (asked("--position", "1,2"), "3 numbers separated by commas"),
     "no such unit": (asked("--unit", "inch"), "allowed: m, cm, mm, ft, us-ft"),

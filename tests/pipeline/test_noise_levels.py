@@ -99,7 +99,7 @@ def test_a_model_is_named_or_given_as_a_file(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_an_unknown_name_is_told_the_nearest() -> None:
-    with pytest.raises(InputError, match=r"there is no 'glendale_hihg'.*glendale_high"):
+    with pytest.raises(InputError, match=r"there is no bundled config 'glendale_hihg'.*glendale_high"):
         load_config(GLENDALE, ["sensor=glendale_hihg"], "stereo", None)
 
 

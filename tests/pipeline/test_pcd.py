@@ -49,5 +49,5 @@ def test_coordinates_of_a_survey_keep_their_millimetres(tmp_path: Path) -> None:
 def test_a_cloud_without_points_and_a_channel_that_is_no_number(tmp_path: Path) -> None:
     write_pcd(tmp_path / "none.pcd", PointCloud(np.empty((0, 3))))
     assert len(read(tmp_path / "none.pcd")[1]) == 0
-    with pytest.raises(InputError, match="name: has the type"):
+    with pytest.raises(InputError, match="name: the channel has the type"):
         write_pcd(tmp_path / "a.pcd", PointCloud(np.zeros((1, 3)), extra={"name": np.array(["a"])}))

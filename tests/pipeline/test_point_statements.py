@@ -344,7 +344,9 @@ def test_a_cut_e57_says_how_much_is_missing(tmp_path: Path, points: Any) -> None
     write_e57(path, [E57Scan("one", PointCloud(points), np.zeros(3), np.eye(3))])
     size = path.stat().st_size
     path.write_bytes(path.read_bytes()[: size // 2])
-    with pytest.raises(InputError, match=rf"its header states {size:,} bytes, but it has {size // 2:,}.*copy or export"):
+    with pytest.raises(
+        InputError, match=rf"its header states {size:,} bytes, but it has {size // 2:,}.*copy the complete file again, or export"
+    ):
         read_e57(path)
     path.write_bytes(b"PK\3\4" * 100)
     with pytest.raises(InputError, match=r"it begins with b'PK.*suffix of its format"):

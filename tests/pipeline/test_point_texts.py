@@ -211,7 +211,7 @@ def test_missing_values_are_left_out_with_a_word(tmp_path: Path) -> None:
 
 def test_a_binary_file_with_a_suffix_of_text_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.xyz").write_bytes(bytes(range(256)) * 20)
-    with pytest.raises(InputError, match=r"null bytes, like binary files.*export it as text"):
+    with pytest.raises(InputError, match=r"null bytes, like binary files.*export the points as text"):
         read_points(tmp_path / "a.xyz")
 
 

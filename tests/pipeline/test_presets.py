@@ -219,7 +219,7 @@ def test_a_scanner_of_ones_own_is_a_file_away(tmp_path: Path, bare: Path) -> Non
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("scanner=riegl_vz40i", "no 'riegl_vz40i'.*did you mean 'riegl_vz400i'"),
+        ("scanner=riegl_vz40i", "no bundled config 'riegl_vz40i'.*did you mean 'riegl_vz400i'"),
         ("scanner=nowhere.yaml", "nowhere.yaml: cannot be read"),
         ("scanner={preset: leica_p40, azimuth_stp_rad: 0.1}", "did you mean 'azimuth_step_rad'"),
         ("scanner=7", "'scanner'"),

@@ -222,7 +222,9 @@ class Outer(Config):
 
 
 def test_config_mistakes_are_named_with_the_nearest_key() -> None:
-    with pytest.raises(InputError, match=r"file\.yaml: unknown key 'inner\.stepm'; did you mean 'step_m'\?"):
+    with pytest.raises(
+        InputError, match=r"file\.yaml: keys or values are wrong: unknown key 'inner\.stepm'; did you mean 'step_m'\?"
+    ):
         parse(Outer, {"count": 1, "inner": {"stepm": 2}}, "file.yaml")
     with pytest.raises(InputError, match="'count' is missing"):
         parse(Outer, {}, "file.yaml")
@@ -265,7 +267,7 @@ class Shapes(Config):
     ],
 )
 def test_a_key_of_another_kind_is_told_whose_it_is(values: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=re.escape(f"file.yaml: {message}") + "$"):
+    with pytest.raises(InputError, match=re.escape(f"file.yaml: keys or values are wrong: {message}") + "$"):
         parse(Shapes, {"shapes": [{"shape": "round", **values}]}, "file.yaml")
 
 

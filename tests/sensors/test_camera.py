@@ -112,7 +112,7 @@ def test_rectification_puts_corresponding_points_on_one_row_with_the_closed_form
 
 def test_swapped_or_coinciding_cameras_are_refused() -> None:
     left, right = camera(), replace(camera(), position=camera().position + np.array([28.0, 0, 0]))
-    with pytest.raises(InputError, match="swap left and right"):
+    with pytest.raises(InputError, match="exchange the cameras left and right"):
         rectify(CameraPair(right, left))
     with pytest.raises(InputError, match="same place"):
         rectify(CameraPair(left, left))

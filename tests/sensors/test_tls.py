@@ -208,7 +208,7 @@ def test_a_scanner_behind_the_rock_is_refused() -> None:
     ball = sphere(np.zeros(3), 5.0, 3)
     with pytest.raises(InputError, match="in or behind it"):
         check_in_front(RayCaster(ball), np.array([1.0, 0.0, 0.0]), "station")
-    with pytest.raises(InputError, match="no pulse returned"):
+    with pytest.raises(InputError, match="no pulse of the scanner returned"):
         scan(plane(np.array([0, 0, 1.0]), np.array([0.0, 0.0, 90.0])))
 
 

@@ -16,7 +16,7 @@ from scene.common.errors import InputError
 from scene.common.regular_file import check_file
 
 CONFIG, WEIGHTS = "detector.yaml", "model.weights.h5"
-_REMEDY = "train again, or copy the whole folder"
+_REMEDY = "copy the detector's whole folder again from where it was trained, or train it again"
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 """First bytes of an HDF5 file."""
 

@@ -166,7 +166,7 @@ def network_input(labelled: LabelledMap, config: DetectorConfig) -> Batch:
             f"an image shows {count} blocks",
             where="detector.most_blocks",
             allowed=f"at least {count}",
-            remedy="raise it, or cut smaller tiles",
+            remedy="raise detector.most_blocks to this number, or cut smaller tiles",
         )
     boxes, valid = np.zeros((config.most_blocks, 4), np.float32), np.zeros(config.most_blocks, np.float32)
     boxes[:count], valid[:count] = labelled.boxes, np.where(labelled.ignored, -1, 1)

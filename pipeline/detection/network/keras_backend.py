@@ -41,7 +41,12 @@ def check_installed() -> str:
     backend = os.environ.get("KERAS_BACKEND") or "tensorflow"
     os.environ["KERAS_BACKEND"] = backend
     if backend not in _MODULES:
-        raise InputError(f"'{backend}' is unknown", where="KERAS_BACKEND", allowed=", ".join(_MODULES), remedy="set one of them")
+        raise InputError(
+            f"the backend '{backend}' is unknown",
+            where="KERAS_BACKEND",
+            allowed=", ".join(_MODULES),
+            remedy="set the variable to one of these names",
+        )
     missing = [name for name in ("keras", _MODULES[backend]) if importlib.util.find_spec(name) is None]
     if missing:
         raise InputError(

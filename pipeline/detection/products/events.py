@@ -112,17 +112,19 @@ def _written(value: Any) -> Any:
 
 def read_events(path: Path) -> list[Event]:
     """Read a CSV file of detected rockfalls that `write_events` wrote; raise InputError for any other file, naming the line."""
-    remedy = "run scarpsim detect again"
+    remedy = "run scarpsim detect again on the same maps to write the table anew"
     table = csv.DictReader(io.StringIO(read_text(path, remedy=remedy)))
     names = [field.name for field in fields(Event)]
     found: list[Event] = []
     try:
         for row in table:
             if list(row) not in (names, [name for name in names if name not in _PLACE]):
-                raise InputError("not a table of events", where=str(path), allowed=f"columns {', '.join(names)}", remedy=remedy)
+                raise InputError(
+                    "the file is not a table of events", where=str(path), allowed=f"columns {', '.join(names)}", remedy=remedy
+                )
             found.append(_ROW.validate_python({name: value for name, value in row.items() if value or name not in _PLACE}))
     except csv.Error as error:
-        raise InputError(f"not a table of events ({error})", where=str(path), remedy=remedy) from None
+        raise InputError(f"the file is not a table of events ({error})", where=str(path), remedy=remedy) from None
     except ValidationError as error:
         wrong = error.errors()[0]
         raise InputError(

@@ -58,7 +58,9 @@ def detector(model: str, *, mirrored: bool = False) -> Detector:
     """
     if model == BASELINE:
         if mirrored:
-            raise InputError(f"the option needs a network, not '{BASELINE}'", where="--mirrored", remedy="leave it out")
+            raise InputError(
+                f"the option needs a neural network as detector, not '{BASELINE}'", where="--mirrored", remedy="leave it out"
+            )
         return baseline.detect
     from pipeline.detection.network.keras_backend import import_keras
 
@@ -77,7 +79,10 @@ def sorted_confidences(values: Sequence[float]) -> tuple[float, ...]:
     for value in values:
         if not LOWEST_SCORE <= value <= 1:
             raise InputError(
-                f"got {value:g}", where="--confidence", allowed=f"{LOWEST_SCORE:g} to 1", remedy="write 0.95 for 95 %"
+                f"the confidence is {value:g}",
+                where="--confidence",
+                allowed=f"{LOWEST_SCORE:g} to 1",
+                remedy="write 0.95 for 95 %",
             )
     return tuple(sorted(set(values)))
 

@@ -172,9 +172,14 @@ def _groups(images: Sequence[Mapping[str, Any]], keys: Sequence[str], where: str
     for key in keys:
         known = [name for name in sorted(set.intersection(*map(set, images))) if all(_is_word(image[name]) for image in images)]
         if key not in known:
-            problem = f"the images' '{key}' is not a word or number" if any(key in image for image in images) else ""
-            problem = problem or f"the images have no '{key}'"
-            raise InputError(problem, where=where, allowed=", ".join(known), remedy=nearest(key, known) or "use another --by")
+            raise InputError(
+                f"the images' '{key}' is not a word or number"
+                if any(key in image for image in images)
+                else f"the images have no '{key}'",
+                where=where,
+                allowed=", ".join(known),
+                remedy=nearest(key, known) or "use another --by",
+            )
         for value in sorted({image[key] for image in images}, key=str):
             groups[f"{key} {value}"] = [image["id"] for image in images if image[key] == value]
     return groups

@@ -209,7 +209,9 @@ def _restore_or_start(out: Path, config: TrainConfig, model: MaskRCNN, *, resume
     state = parse(_TrainingState, read_json(path, remedy=_NO_CHECKPOINT), str(path))
     if state.config != config.model_dump(mode="json"):
         raise InputError(
-            "the training there has another config", where=str(out), remedy="use its config, or choose another --out"
+            "the training in this folder was started with another config",
+            where=str(out),
+            remedy="give the config that the training was started with, or choose another --out",
         )
     try:
         weights.load_weights(model, inside(path.parent, state.weights, path))

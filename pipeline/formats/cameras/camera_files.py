@@ -78,12 +78,14 @@ def stereo_pair(found: MetashapeCameras, left: str | None, right: str | None, wh
     for label in (label for label in (left, right) if label is not None and label not in found.cameras):
         why = "is not aligned" if label in found.unaligned else "is not in the file"
         why = "belongs to a rig, whose relative poses cannot be read" if label in found.rigged else why
-        raise InputError(f"camera '{label}' {why}", where=where, allowed=known, remedy="choose one of these cameras")
+        raise InputError(
+            f"the pair cannot be read: camera '{label}' {why}", where=where, allowed=known, remedy="choose one of these cameras"
+        )
     if left is not None and right is not None:
         return CameraPair(found.cameras[left], found.cameras[right])
     if left is not None or right is not None or len(found.cameras) != 2:
         raise InputError(
-            f"has {len(found.cameras)} aligned cameras, but a pair has two",
+            f"the file has {len(found.cameras)} aligned cameras, but a pair has two",
             where=where,
             allowed=known,
             remedy="name both as cameras.left and cameras.right",
@@ -116,4 +118,8 @@ def _start(path: Path) -> bytes:
         with path.open("rb") as file:
             return file.read(4096).lstrip()
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
+        raise InputError(
+            f"cannot be read ({error.strerror})",
+            where=str(path),
+            remedy="give the path of an existing camera file that you may read",
+        ) from None

@@ -51,7 +51,7 @@ def read_colmap(folder: Path) -> dict[str, Camera]:
     for words, where in _records(folder / "images.txt", 10, 2):
         if words[8] not in interiors:
             raise InputError(
-                f"names the camera {words[8]}, which is not in cameras.txt",
+                f"the image names the camera {words[8]}, which is not in cameras.txt",
                 where=where,
                 remedy="export cameras.txt and images.txt of the same model",
             )
@@ -112,12 +112,16 @@ def read_map(path: Path) -> NDArray[np.float32]:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy="check the path") from None
+        raise InputError(
+            f"cannot be read ({error.strerror})", where=str(path), remedy="give the path of an existing file that you may read"
+        ) from None
     header = _MAP_HEADER.match(data)
     width, height, depth = (int(number) for number in header.groups()) if header else (0, 0, 0)
     if header is None or len(data) != header.end() + 4 * width * height * depth:
         raise InputError(
-            "is not a complete depth or normal map of COLMAP", where=str(path), remedy="run the reconstruction again"
+            "is not a complete depth or normal map of COLMAP",
+            where=str(path),
+            remedy="compute the depth and normal maps again with COLMAP",
         )
     planes = np.frombuffer(data, "<f4", offset=header.end()).reshape(depth, height, width)
     return planes[0] if depth == 1 else np.moveaxis(planes, 0, 2)
@@ -139,7 +143,7 @@ def _records(path: Path, words: int, stride: int) -> list[tuple[list[str], str]]
     for found, where in records:
         if len(found) < words:
             raise InputError(
-                f"has {len(found)} words",
+                f"the line has {len(found)} words",
                 where=where,
                 allowed=f"at least {words}",
                 remedy="correct the line, or export the model again as text",

@@ -17,7 +17,7 @@ def wkt_of(name: str, where: str) -> str:
     try:
         crs = CRS.from_user_input(name)
     except (CRSError, UnicodeError) as error:
-        problem = f"is not understood: {name!r:.60} ({' '.join(str(error).split())[:100]})"
+        problem = f"the coordinate system is not understood: {name!r:.60} ({' '.join(str(error).split())[:100]})"
         raise InputError(
             problem,
             where=where,

@@ -237,10 +237,10 @@ def _camera(calibration: ElementTree.Element, size: tuple[int, int], pose: Float
     interior = {name: float(_numbers(calibration.findtext(tag, "0"), 1, where)[0]) for tag, name in _TAGS.items()}
     if interior["f_px"] <= 0 or min(size) <= 0:
         raise InputError(
-            "has no frame size or no f",
+            "the calibration has no frame size or no focal length f",
             where=where,
             allowed="width, height and f greater than 0",
-            remedy="align the cameras, and export the file again",
+            remedy="align the cameras in Metashape, and export them again",
         )
     left, scales, right = np.linalg.svd(pose[:3, :3])  # the nearest rotation, without the similarity's scale
     if np.linalg.det(left @ right) < 0 or np.ptp(scales) > 1e-6 * scales[0]:
@@ -274,7 +274,7 @@ def _whole(text: str, where: str) -> int:
     """Parse a whole number."""
     value = float(_numbers(text, 1, where)[0])
     if value != int(value):
-        raise InputError(f"expected a whole number of pixels, got '{text}'", where=where, remedy="export the file again")
+        raise InputError(f"expected a whole number of pixels, got '{text}'", where=where, remedy="export it again from Metashape")
     return int(value)
 
 
@@ -286,6 +286,6 @@ def _numbers(text: str, count: int, where: str) -> FloatArray:
         values = np.empty(0)
     if len(values) != count or not (np.abs(values) <= _LARGEST).all():
         raise InputError(
-            f"expected {count} numbers, got '{' '.join(text.split())[:60]}'", where=where, remedy="export the file again"
+            f"expected {count} numbers, got '{' '.join(text.split())[:60]}'", where=where, remedy="export it again from Metashape"
         )
     return values

@@ -75,7 +75,7 @@ class OpencvInterior:
                     f"{name} = {getattr(camera, name):g} ({meaning}) has no counterpart in OpenCV's camera model",
                     where=where,
                     allowed=f"{name} = 0",
-                    remedy="write Metashape's XML, or calibrate without it",
+                    remedy="write a Metashape XML instead, or calibrate the camera again without this parameter",
                 )
         principal = camera.width / 2 + camera.cx_px, camera.height / 2 + camera.cy_px
         radial = camera.k1, camera.k2
@@ -165,7 +165,9 @@ def read_opencv_text(path: Path) -> Camera:
         values = np.array([float(word) for word in words])
     except ValueError as error:
         raise InputError(
-            f"contains something that is not a number ({error})", where=str(path), remedy="remove what is no number"
+            f"contains something that is not a number ({error})",
+            where=str(path),
+            remedy="remove everything that is no number from the matrix and the distortion",
         ) from None
     if len(values) < 15:
         raise InputError(

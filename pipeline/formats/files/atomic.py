@@ -244,7 +244,11 @@ def _as_input_error(error: OSError, path: Path) -> Exception:
     where, code = str(path), error.errno or _numpy_errno(error)
     if code in _FULL:
         free = shutil.disk_usage(_existing(path)).free / 1e6
-        return InputError(f"{_FULL[code]}, {free:,.0f} MB are free", where=where, remedy=f"make room or {_ELSEWHERE}")
+        return InputError(
+            f"the results cannot be written: {_FULL[code]}, {free:,.0f} MB are free",
+            where=where,
+            remedy=f"make room or {_ELSEWHERE}",
+        )
     if code in _FORBIDDEN:
         return InputError(f"cannot be written ({error.strerror})", where=where, remedy=f"change the permissions or {_ELSEWHERE}")
     if code in _NO_SUCH_PLACE:

@@ -20,5 +20,5 @@ def sha256(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise InputError(
-            f"cannot be read ({error.strerror})", where=str(path), remedy="check the path and its permissions"
+            f"cannot be read ({error.strerror})", where=str(path), remedy="give the path of an existing file that you may read"
         ) from None

@@ -19,14 +19,16 @@ def inside(folder: Path, name: Any, where: Path | str) -> Path:
             f"contains {name!r:.80} where the name of a file is expected",
             where=str(where),
             allowed="a file name",
-            remedy="restore the file from a copy, or make it again",
+            remedy="restore the file from a copy, or run the command again that wrote it",
         )
     pure, path = PurePosixPath(name), folder / name
     try:
         leads_out = pure.is_absolute() or ".." in pure.parts or not path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError) as error:  # too long, a loop of links
         raise InputError(
-            f"names the file '{name:.80}', which is impossible ({error})", where=str(where), remedy="correct the name"
+            f"names the file '{name:.80}', which is impossible ({error})",
+            where=str(where),
+            remedy="correct this name in the file",
         ) from None
     if leads_out:
         raise InputError(

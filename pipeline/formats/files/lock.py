@@ -24,7 +24,7 @@ def locked(folder: Path) -> Iterator[None]:
     lock, or the folder cannot be created.
     """
     if folder.exists() and not folder.is_dir():
-        raise InputError("is a file", where=f"--out {folder}", remedy="choose a folder")
+        raise InputError("is a file, but the results need a folder", where=f"--out {folder}", remedy="choose a folder")
     missing = [each for each in (folder, *folder.parents) if not each.exists()]
     path = folder / LOCK
     with explained(path):
@@ -51,7 +51,12 @@ def _held(path: Path) -> TextIO:
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.exists() and not path.is_file():
-            raise InputError("is not a file", where=str(path), allowed="a lock file or none", remedy="remove it")
+            raise InputError(
+                "is not a file, so it cannot mark the folder as in use",
+                where=str(path),
+                allowed="a lock file or none",
+                remedy="remove it, or choose another folder",
+            )
         try:
             file = path.open("a+", encoding="utf-8")
         except FileNotFoundError:  # the last holder has just removed the folder that it created

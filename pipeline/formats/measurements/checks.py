@@ -110,12 +110,24 @@ def finite(cloud: PointCloud, where: str) -> PointCloud:
         if channel is not None:
             keep = keep & np.isfinite(channel)
     if not keep.any():
-        problem = f"has no point with finite values ({len(keep):,} are NaN or infinite)" if len(keep) else "has no points"
-        raise InputError(problem, where=where, remedy="export the points again")
+        problem = (
+            f"the cloud has no point with finite values ({len(keep):,} are NaN or infinite)"
+            if len(keep)
+            else "the cloud has no points"
+        )
+        raise InputError(problem, where=where, remedy="export the points again with all decimals of their coordinates")
     if keep.sum() > 1 and np.ptp(cloud.points[keep], axis=0).max() < _ONE_PLACE_M:
-        raise InputError(f"all {keep.sum():,} points are at the same place", where=where, remedy="export the points again")
+        raise InputError(
+            f"all {keep.sum():,} points are at the same place",
+            where=where,
+            remedy="export the points again with all decimals of their coordinates",
+        )
     if keep.sum() >= _LINE_POINTS and _on_a_line(cloud.points[keep]):
-        raise InputError(f"all {keep.sum():,} points lie on one line", where=where, remedy="give a scan of a surface")
+        raise InputError(
+            f"all {keep.sum():,} points lie on one line",
+            where=where,
+            remedy="give a scan of a surface, whose points spread in two directions",
+        )
     return cloud if keep.all() else cloud.part(keep)
 
 
@@ -146,7 +158,8 @@ def check_frame(here: PointFit, other: PointFit | None, frame: str, where: str) 
             problem,
             where=where,
             allowed=f"{100 * _FEWEST_HITS:g} % or more",
-            remedy="check `frame`, the sensor's position and rotation, and the coordinate system of points and reference (m)",
+            remedy="correct `frame` or the sensor's position and rotation, or export points and reference "
+            "in one coordinate system in metres",
         )
 
 
@@ -159,7 +172,7 @@ def check_seen(pair: CameraPair, points: FloatArray, where: str) -> float:
     if pair.base_m < _SHORTEST_BASE_M:
         raise InputError(
             f"the two cameras stand {pair.base_m:.3g} m apart", where=where, allowed=f"{_SHORTEST_BASE_M:g} m or more",
-            remedy="check `position_m` of left and right",
+            remedy="correct `position_m` of left and right, in metres",
         )  # fmt: skip
     both, front = np.ones(len(points), dtype=bool), np.ones(len(points), dtype=bool)
     for camera in (pair.left, pair.right):
@@ -173,12 +186,13 @@ def check_seen(pair: CameraPair, points: FloatArray, where: str) -> float:
     if front.mean() < _FEWEST_SEEN:
         raise InputError(
             f"{100 * (1 - front.mean()):.3g} % of the points lie behind a camera", where=where,
-            remedy="check the coordinate system, and that rotations map camera (x right, y down, z forward) to world",
+            remedy="export cameras and points in one coordinate system; "
+            "rotations must map camera (x right, y down, z forward) to world",
         )  # fmt: skip
     if both.mean() < _FEWEST_SEEN:
         raise InputError(
             f"both cameras see {100 * both.mean():.2g} % of the points", where=where,
-            allowed=f"{100 * _FEWEST_SEEN:g} % or more", remedy="check that cameras and points are of one project",
+            allowed=f"{100 * _FEWEST_SEEN:g} % or more", remedy="export cameras and points from one photogrammetric project",
         )  # fmt: skip
     return float(both.mean())
 
@@ -198,7 +212,7 @@ def check_pixels(left: Camera, cloud: PointCloud, where: str) -> None:
         raise InputError(
             f"pixel_x and pixel_y are {off:,.0f} px from where the left camera sees the points (median)", where=where,
             allowed=f"up to {100 * _MOST_OFF:.0f} % of its width",
-            remedy="check that they belong to the left picture, or leave them out",
+            remedy="give the pixels of the left picture, or leave pixel_x and pixel_y out",
         )  # fmt: skip
 
 
@@ -211,7 +225,7 @@ def check_power(cloud: PointCloud, where: str) -> PointCloud:
     if power is None or (power.min(initial=0.0) >= 0 and power.max(initial=0.0) <= _LARGEST_POWER):
         return cloud
     raise InputError(
-        f"has intensities from {power.min():.3g} to {power.max():.3g}", where=where,
+        f"the cloud has intensities from {power.min():.3g} to {power.max():.3g}", where=where,
         allowed=f"0 to {_LARGEST_POWER:g}, relative received power",
         remedy="convert decibels by 10^(dB / 10), or leave out the intensity; `scarpsim measurement` does this for raw files",
     )  # fmt: skip
@@ -223,7 +237,9 @@ def check_different(clouds: Mapping[str, PointCloud]) -> None:
     for name, cloud in clouds.items():
         digest = hashlib.sha256(cloud.points.tobytes()).digest()
         if digest in known:
-            raise InputError(f"has the same points as {known[digest]}", where=name, remedy="give one file for each epoch")
+            raise InputError(
+                f"the cloud has the same points as {known[digest]}", where=name, remedy="give one file for each epoch"
+            )
         known[digest] = name
 
 
@@ -238,7 +254,7 @@ def check_near_rays(here: PointFit, where: str) -> None:
         f"the points are {abs(here.off_m):.3g} m {'behind' if here.off_m > 0 else 'before'} the reference (median along rays)",
         where=where,
         allowed=f"a quarter of them within {_NEAR_M:g} m or {100 * here.reach:g} % of the range",
-        remedy="check the sensor's position, the unit (m) and that points and reference are of one wall",
+        remedy="correct the sensor's position, and export points and reference of the same wall in metres",
     )
 
 
@@ -254,12 +270,12 @@ def check_pulses(azimuth: Sweep, zenith: Sweep, points: int, epochs: int, where:
         raise InputError(
             f"'pattern' has {pulses:,.0f} pulses, too few for {points:,} points", where=where,
             allowed=f"at least one for {_POINTS_PER_PULSE:g} points of an epoch",
-            remedy="check the steps (third value, rad), or remove `pattern`",
+            remedy="correct the steps (third value of each axis, rad), or remove `pattern`",
         )  # fmt: skip
     if pulses > most:
         raise InputError(
             f"'pattern' has {pulses:.3g} pulses for {points:,} points", where=where, allowed=f"at most {most:.3g}",
-            remedy="check the steps (third value, rad), or remove `pattern`",
+            remedy="correct the steps (third value of each axis, rad), or remove `pattern`",
         )  # fmt: skip
 
 
@@ -277,7 +293,8 @@ def check_inside(points: FloatArray, azimuth: Sweep, zenith: Sweep, where: str) 
         raise InputError(
             f"'pattern' contains {100 * inside.mean():.2g} % of the points", where=where,
             allowed=f"{100 * _FEWEST_INSIDE:g} % or more",
-            remedy="azimuth is atan2(y, x), zenith is measured from +z, both in the scanner frame, rad; or remove `pattern`",
+            remedy="correct `pattern`: "
+            "azimuth is atan2(y, x), zenith is measured from +z, both in the scanner frame, rad; or remove `pattern`",
         )  # fmt: skip
 
 
@@ -292,5 +309,5 @@ def check_noise(of: str, sigma: FloatArray) -> None:
             f"the model predicts a standard deviation of {sigma.min():.2g} {unit}",
             where="model.yaml: noise",
             allowed=f"{least:g} {unit} or more",
-            remedy=f"set `{key}`",
+            remedy=f"set `{key}` in the model to the sensor's standard deviation",
         )

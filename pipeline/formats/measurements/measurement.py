@@ -401,7 +401,7 @@ def _scanner_pose(config: MeasurementConfig, where: str) -> ScannerPose:
     if config.scanners:
         return config.scanners[0]
     if config.scanner is None:
-        raise InputError("a TLS measurement needs `scanner`", where=where, remedy="give scanner: position_m and rotation")
+        raise InputError("a TLS measurement needs `scanner`", where=where, remedy="add `scanner` with position_m and rotation")
     return config.scanner
 
 

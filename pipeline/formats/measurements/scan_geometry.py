@@ -141,7 +141,11 @@ def _check(local: FloatArray) -> None:
             remedy="use all points of the scan",
         )
     if not np.isfinite(local).all():
-        raise InputError("has coordinates that are not numbers", where="scan", remedy="leave out the missing returns")
+        raise InputError(
+            "some points of the scan have coordinates that are not numbers",
+            where="scan",
+            remedy="remove these points, which are missing returns",
+        )
 
 
 def _no_pattern(angle: str) -> InputError:

@@ -59,7 +59,7 @@ class SurfaceFit:
         raise InputError(
             f"{100 * self.near:.2g} % of the points lie near the reference; half lie {self.off_m:.3g} m or more from it",
             where=where, allowed=f"{100 * _FEWEST_NEAR:g} % or more within {self.reach_m:.3g} m",
-            remedy="export both in one coordinate system and unit, and check that they show the same wall",
+            remedy="export points and reference of the same wall in one coordinate system and unit",
         )  # fmt: skip
 
 

@@ -65,11 +65,17 @@ def read_ply(path: Path) -> TriangleMesh:
         )
     faces = next((face[name] for name in _FACE_LISTS if name in face), None)
     if faces is None or faces.ndim != 2 or faces.shape[1] != 3:
-        raise InputError("contains faces that are not triangles", where=str(path), remedy="triangulate the mesh")
+        raise InputError(
+            "contains faces that are not triangles",
+            where=str(path),
+            remedy="triangulate the mesh in a mesh editor such as MeshLab",
+        )
     vertices = _points(vertex, path)
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise InputError(
-            f"a face refers to a vertex beyond the {len(vertices):,} there are", where=str(path), remedy="export the mesh again"
+            f"a face refers to a vertex beyond the {len(vertices):,} there are",
+            where=str(path),
+            remedy="copy the complete file again, or export the mesh again",
         )
     return TriangleMesh(
         vertices,
@@ -154,7 +160,9 @@ def _storable(column: NDArray[Any], where: str) -> NDArray[Any]:
             stored = column.astype(kind)
         if np.array_equal(stored.astype(column.dtype), column, equal_nan=column.dtype.kind == "f"):
             return stored
-    raise InputError(f"values of the type {column.dtype} do not fit any type of PLY", where=where, remedy="write LAZ instead")
+    raise InputError(
+        f"values of the type {column.dtype} do not fit any type of PLY", where=where, remedy="write the points as LAZ instead"
+    )
 
 
 def _write(path: Path, elements: Mapping[str, Columns]) -> None:

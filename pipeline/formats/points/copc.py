@@ -84,7 +84,7 @@ def write_copc(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, he
         raise InputError(
             "there are no points to write, and a COPC file cannot be empty",
             where=str(path),
-            remedy="write a LAZ file, which can be empty, or check why there are no points",
+            remedy="write a LAZ file, which can be empty, or export a cloud that has points",
         )
     stored = StoredCloud.of(cloud, pulses, header)
     tree = octree(stored.steps())

@@ -107,7 +107,7 @@ def read_e57(path: Path) -> list[E57Scan]:
         if isinstance(error, InputError):
             raise
         problem = f"is damaged: its {_part_of(error)} cannot be read"
-        raise InputError(problem, where=where, remedy="copy the complete file again, or export it again") from None
+        raise InputError(problem, where=where, remedy="copy the complete file again, or export the scans again as E57") from None
     if not any(len(scan.cloud.points) for scan in scans):
         problem = "has no scans" if not scans else "has no points: all records are marked as invalid, or there are none"
         raise InputError(problem, where=where, remedy="export it again, with its points")
@@ -129,7 +129,9 @@ def _check_length(path: Path) -> None:
     stated = struct.unpack_from("<Q", start, _LENGTH_AT)[0] if len(start) == _HEADER_BYTES else _HEADER_BYTES
     if size < stated:
         problem = f"is not a complete E57 file: its header states {stated:,} bytes, but it has {size:,}"
-        raise InputError(problem, where=where, remedy="the file was cut off: copy or export it again")
+        raise InputError(
+            problem, where=where, remedy="the file was cut off: copy the complete file again, or export the scans again as E57"
+        )
 
 
 def _check_metres(root: Any, where: str) -> tuple[str, ...]:
@@ -213,7 +215,7 @@ def _read_columns(image: Any, points: Any, where: str) -> tuple[dict[str, NDArra
     if found != count:
         raise InputError(
             f"has {found:,} points but states {count:,}", where=where,
-            remedy="copy the complete file again, or export it again",
+            remedy="copy the complete file again, or export the scans again as E57",
         )  # fmt: skip
     return {name: np.concatenate([each[name] for each in pieces]) for name in columns}, unread
 

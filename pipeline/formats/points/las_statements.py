@@ -149,7 +149,7 @@ def check_counts(header: laspy.LasHeader, path: Path) -> None:
         raise InputError(
             f"states {header.point_count:,} points and, in the field of older versions, {older:,}",
             where=str(path),
-            remedy="copy or export it again",
+            remedy="copy the complete file again, or export the points again as LAS or LAZ",
         )
     if header.are_points_compressed or header.global_encoding.waveform_data_packets_internal:
         return
@@ -160,7 +160,8 @@ def check_counts(header: laspy.LasHeader, path: Path) -> None:
     if room != header.point_count:
         raise InputError(
             f"states {header.point_count:,} points but has room for {room:,}", where=str(path),
-            remedy="the file was cut off, or its header is out of date: copy or export it again",
+            remedy="the file was cut off, or its header is out of date: copy the complete file again, or "
+            "export the points again as LAS or LAZ",
         )  # fmt: skip
 
 

@@ -39,7 +39,7 @@ _SCAN_ANGLE_STEP = math.radians(0.006)
 """Step of stored scan angles, rad."""
 _FURTHER = ("classification", "user_data", "point_source_id", "scanner_channel", "red", "green", "blue", "nir")
 """Fields of LAS that become channels if any point has a value above zero."""
-_COPY = "copy the complete file again, or export it again"
+_COPY = "copy the complete file again, or export the points again as LAS or LAZ"
 EXACT_INTENSITY = "intensity_relative"
 """Extra dimension that is read as the intensity, instead of the 16-bit field."""
 
@@ -198,7 +198,11 @@ def read_laz(path: Path) -> PointCloud:
     except InputError:
         raise
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror or error})", where=where, remedy="check the path") from None
+        raise InputError(
+            f"cannot be read ({error.strerror or error})",
+            where=where,
+            remedy="give the path of an existing LAS or LAZ file that you may read",
+        ) from None
     except (laspy.LaspyException, LazrsError, ValueError, struct.error, MemoryError, OverflowError) as error:
         raise damaged(path, error) from None
     if len(las.points) < las.header.point_count:
@@ -250,7 +254,7 @@ def check_quantisation(header: laspy.LasHeader, path: Path) -> None:
             f"has scale factors {scales.tolist()} and offsets {offsets.tolist()}",
             where=str(path),
             allowed="finite ones, scales above 0",
-            remedy="export it again",
+            remedy="export the file again with scale factors above 0",
         )
 
 

@@ -44,7 +44,7 @@ def _stored(column: NDArray[Any], where: str) -> NDArray[Any]:
         return column.astype("<u1")
     if column.dtype.kind not in _LETTERS or column.ndim != 1:
         raise InputError(
-            f"has the type {column.dtype}",
+            f"the channel has the type {column.dtype}",
             where=where,
             allowed="one number for each point",
             remedy="leave the channel out, or write LAZ",

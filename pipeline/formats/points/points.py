@@ -103,7 +103,7 @@ def check_reach(points: FloatArray, where: str) -> None:
     if len(far):
         raise InputError(
             f"{len(far):,} of {len(known):,} points have coordinates up to {known.max():.3g} m", where=where,
-            allowed=f"at most {_LARGEST_M:g} m", remedy="check the unit (m), and the scale and offset of the file",
+            allowed=f"at most {_LARGEST_M:g} m", remedy="export the points in metres; correct the scale and offset in the header",
         )  # fmt: skip
 
 

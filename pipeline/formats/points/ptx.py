@@ -26,7 +26,7 @@ _LONGEST_LINE = 4096
 _CHANNELS = ("red", "green", "blue")
 _ALIKE_M, _ALIKE = 0.01, 1e-3
 """Positions (m) and axes up to this difference are one pose with few digits."""
-_EXPORT = "copy or export the complete file again"
+_EXPORT = "copy the complete file again, or export the scans again as PTX"
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,9 @@ def read_ptx(path: Path) -> list[PtxScan]:
         with path.open(encoding=encoding_of(path), errors="replace") as file:
             scans = list(_scans(_Lines(file, where)))
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=where, remedy="check the path") from None
+        raise InputError(
+            f"cannot be read ({error.strerror})", where=where, remedy="give the path of an existing PTX file that you may read"
+        ) from None
     if not scans:
         raise InputError("has no scans", where=where, remedy="export it again, with its points")
     if not any(len(scan.cloud.points) for scan in scans):
@@ -92,7 +94,7 @@ def orthonormal(rotation: FloatArray, where: str) -> tuple[FloatArray, tuple[str
         raise InputError(
             "the rotation is not a rotation matrix",
             where=where,
-            remedy="rows must be orthonormal, determinant +1; give more digits",
+            remedy="give the matrix with more digits; its rows must be orthonormal, and its determinant +1",
         )
     left, _, right = np.linalg.svd(rotation)
     words = (f"the rotation deviated from orthonormal by {off:.1g} and was corrected",) if off > 1e-6 else ()
@@ -106,7 +108,9 @@ def _scans(lines: _Lines) -> Iterator[PtxScan]:
         count += 1
         columns, rows = _grid_size(first, lines, count), _grid_size(lines.next(), lines, count)
         if columns < 1 or rows < 1:
-            raise InputError(f"has a grid of {columns} x {rows}", where=lines.here, allowed="1 x 1 or more", remedy=_EXPORT)
+            raise InputError(
+                f"the scan has a grid of {columns} x {rows} points", where=lines.here, allowed="1 x 1 or more", remedy=_EXPORT
+            )
         stated = np.array([_row(lines, 3) for _ in range(4)])
         matrix = np.array([_row(lines, 4) for _ in range(4)])
         _check_pose(stated, matrix, f"{lines.where}, scan {count}")
@@ -147,7 +151,7 @@ def _check_pose(stated: FloatArray, matrix: FloatArray, where: str) -> None:
             f"states two poses of the scanner: its position is {there} in lines 3 to 6 of the header but {here} in the matrix",
             where=where,
             allowed="the same pose in both",
-            remedy="export it again, registered",
+            remedy="register the scans in the scanner's software, and export them again as PTX",
         )
 
 
@@ -169,7 +173,8 @@ def _table(lines: _Lines, columns: int, rows: int, count: int) -> FloatArray:
     if len(table) < cells:
         raise InputError(
             f"scan {count} states {columns:,} x {rows:,} = {cells:,} cells but has {len(table):,} lines", where=lines.where,
-            remedy="the file was cut off, or its numbers of columns and rows are wrong: copy or export it again",
+            remedy="the file was cut off, or its numbers of columns and rows are wrong: copy the complete "
+            "file again, or export the scans again as PTX",
         )  # fmt: skip
     if table.shape[1] < 4:
         raise InputError(

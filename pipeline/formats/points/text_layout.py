@@ -101,7 +101,7 @@ def encoding_of(path: Path) -> str:
     even, odd = head[::2].count(0), head[1::2].count(0)
     if max(even, odd) > 0.8 * len(head) / 2 and min(even, odd) < 0.1 * len(head) / 2:
         return "utf-16-be" if even > odd else "utf-16-le"
-    raise InputError("contains null bytes, like binary files", where=str(path), allowed=_ROWS, remedy="export it as text")
+    raise InputError("contains null bytes, like binary files", where=str(path), allowed=_ROWS, remedy="export the points as text")
 
 
 def layout_of(path: Path) -> TextLayout:
@@ -230,7 +230,9 @@ def _header(lines: Sequence[str]) -> tuple[tuple[HeaderLine, ...], int | None]:
 def _no_rows(lines: Sequence[str], where: str) -> InputError:
     """Return the error for a file without rows."""
     if not any(line.strip() for line in lines):
-        return InputError("has no points and no line of numbers", where=where, allowed=_ROWS, remedy="export it again")
+        return InputError(
+            "has no points and no line of numbers", where=where, allowed=_ROWS, remedy="export the points again as text"
+        )
     first = next(line.strip() for line in lines if line.strip())
     return InputError(
         f"has no line of numbers, at least x y z, among its first {_HEADER_LINES} lines (it begins with '{first:.60}')",

@@ -75,7 +75,9 @@ def read_xyz(path: Path, columns: Sequence[str] = ()) -> PointCloud:
         layout = layout_of(path)
         values, found = _values(path, layout)
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=where, remedy="check the path") from None
+        raise InputError(
+            f"cannot be read ({error.strerror})", where=where, remedy="give the path of an existing text file that you may read"
+        ) from None
     _check_counts(len(values), layout, found, where)
     _check_end(path, layout)
     given, notes = _without_words(*_columns(layout, values, columns, where), layout, where)
@@ -147,7 +149,9 @@ def _columns(
             )  # fmt: skip
         return with_stated_units(columns, layout, where), ()
     if count < 3:
-        raise InputError(f"has {count} columns", where=where, allowed="x y z and more", remedy="export x, y and z")
+        raise InputError(
+            f"has {count} columns", where=where, allowed="x y z and more", remedy="export the points with at least x, y and z"
+        )
     found = named_columns(layout, where)
     if found.columns:
         return found.columns, found.notes

@@ -87,7 +87,7 @@ def georeference(tags: dict[int, Any], shape: tuple[int, int], path: Path) -> Ge
             f"has {place}",
             where=str(path),
             allowed=f"sides of {_SIDES_M[0]:g} to {_SIDES_M[1]:g} m, coordinates of up to {_FARTHEST_M:g} m",
-            remedy="export it again, in metres",
+            remedy="export the raster again with pixels and coordinates in metres",
         )
     if keys.get(RASTER_TYPE) == _PIXEL_IS_POINT:
         x, y = x - gsd / 2, y - step_y / 2
@@ -154,7 +154,7 @@ def _geo_keys(tags: dict[int, Any], path: Path) -> dict[int, int]:
         raise InputError(
             f"states {values[3] if len(values) > 3 else 0} GeoTIFF keys but has {len(rows)}",
             where=str(path),
-            remedy="export it again",
+            remedy="export the GeoTIFF again, for example with gdal_translate",
         )
     return {int(key): int(value) for key, location, _, value in rows if location == 0}
 
@@ -170,7 +170,7 @@ def _unit(keys: dict[int, int], key: int, path: Path) -> float | None:
             f"states the unit EPSG {code}, which is not a length",
             where=str(path),
             allowed="a unit of length",
-            remedy="export it in metres",
+            remedy="reproject the raster to coordinates in metres",
         )
     return metres
 
@@ -200,6 +200,8 @@ def scale_and_offset(tags: dict[int, Any], path: Path) -> tuple[float, float]:
         found |= {str(item.get("role")): float(item.text or "") for item in items if item.get("role") in found}
     except ValueError:
         raise InputError(
-            "its scale or offset is not a number", where=f"{path}: GDAL_METADATA", remedy="export it again"
+            "its scale or offset is not a number",
+            where=f"{path}: GDAL_METADATA",
+            remedy="export the GeoTIFF again, for example with gdal_translate",
         ) from None
     return found["scale"], found["offset"]

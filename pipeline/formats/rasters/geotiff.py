@@ -132,7 +132,11 @@ def read_geotiff(path: Path) -> tuple[NDArray[np.float32], Grid]:
     """
     raster = read_raster(path)
     if raster.place.grid is None:
-        raise InputError("has no pixel scale and tie point", where=str(path), remedy="export a GeoTIFF")
+        raise InputError(
+            "the TIFF has no pixel scale and tie point, which say where it lies",
+            where=str(path),
+            remedy="export the raster as a GeoTIFF, with its coordinates",
+        )
     metres = raster.place.vertical_m or 1.0
     return (raster.values if metres == 1.0 else raster.values * np.float32(metres)), raster.place.grid
 
@@ -211,7 +215,11 @@ def _read(path: Path) -> tuple[NDArray[np.float32], dict[int, Any], NDArray[np.b
     except InputError:
         raise
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror or error})", where=str(path), remedy="check the path") from None
+        raise InputError(
+            f"cannot be read ({error.strerror or error})",
+            where=str(path),
+            remedy="give the path of an existing TIFF that you may read",
+        ) from None
     except (*_DAMAGE, tifffile.TiffFileError, zlib.error, lzma.LZMAError, struct.error) as error:
         raise _unreadable(path, " ".join(str(error).split())) from None
     if raster.ndim != 2 or raster.dtype.kind not in "fiub":
@@ -219,7 +227,7 @@ def _read(path: Path) -> tuple[NDArray[np.float32], dict[int, Any], NDArray[np.b
             f"has the shape {raster.shape} and values of type {raster.dtype}",
             where=str(path),
             allowed="one band of numbers",
-            remedy="export it as float32",
+            remedy="export one band of the raster as float32",
         )
     with np.errstate(over="ignore"):  # becomes infinite, which is checked later
         values = raster.astype(np.float32, copy=False)
@@ -239,9 +247,13 @@ def _unreadable(path: Path, problem: str) -> InputError:
             f"uses a compression that cannot be read ({problem})",
             where=str(path),
             allowed="no compression, deflate, LZW, PackBits, LZMA, Zstandard, LERC, JPEG",
-            remedy="save it with deflate or without compression",
+            remedy="save the raster with deflate or without compression",
         )
-    return InputError(f"is not a complete TIFF file ({problem})", where=str(path), remedy="export it again")
+    return InputError(
+        f"is not a complete TIFF file ({problem})",
+        where=str(path),
+        remedy="copy the complete file again, or export the raster again",
+    )
 
 
 def _unstated_nodata(values: NDArray[np.float32], absent: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
@@ -267,7 +279,10 @@ def _nodata(tags: dict[int, Any], path: Path) -> np.float32:
         return np.float32(text)
     except ValueError:
         raise InputError(
-            f"states '{text[:40]}' for missing data", where=str(path), allowed="a number", remedy="export it again"
+            f"states '{text[:40]}' for missing data",
+            where=str(path),
+            allowed="a number",
+            remedy="set the tag GDAL_NODATA to a number, for example with gdal_edit.py -a_nodata -9999",
         ) from None
 
 

@@ -147,7 +147,11 @@ def read_detections(path: Path, truth: Coco, *, masks: bool = True) -> list[Entr
     if not isinstance(entries, list):
         raise InputError("is not a list of COCO detections", where=str(path), remedy="use a detections.json of scarpsim detect")
     if any(isinstance(entry, Mapping) and "score" not in entry for entry in entries):
-        raise InputError("has annotations without a score", where=str(path), remedy="use detections, not the truth")
+        raise InputError(
+            "has annotations without a score",
+            where=str(path),
+            remedy="give a detections.json of scarpsim detect, not the true blocks",
+        )
     ids = {image["id"]: image["id"] for image in truth.images}
     if isinstance(content, Mapping):
         known = {image["file_name"]: image["id"] for image in truth.images}
@@ -183,7 +187,10 @@ class _Masks:
         if image is None:
             allowed = f"the id of one of the {len(self.images)} images"
             raise InputError(
-                f"refers to image {entry['image_id']}, which does not exist", where=where, allowed=allowed, remedy="leave it out"
+                f"refers to image {entry['image_id']}, which does not exist",
+                where=where,
+                allowed=allowed,
+                remedy="leave the annotation out, or correct its image_id",
             )
         if entry["category_id"] not in self.categories:
             allowed = ", ".join(map(str, sorted(self.categories)[:20])) or "none, as the list is empty"
@@ -191,7 +198,7 @@ class _Masks:
                 f"its category {entry['category_id']} is not listed",
                 where=where,
                 allowed=allowed,
-                remedy="list it, or use the right category",
+                remedy="add the category to the list `categories`, or correct category_id",
             )
         height, width = image["height"], image["width"]
         box, segmentation = entry.get("bbox"), entry.get("segmentation")
@@ -201,7 +208,12 @@ class _Masks:
             return {"iscrowd": 0, **entry, "area": box[2] * box[3]}
         if segmentation is None:
             allowed = FORMS if self.needed else f"a bbox, or a segmentation of {FORMS}"
-            raise InputError("has no mask", where=where, allowed=allowed, remedy="draw its mask, or leave it out")
+            raise InputError(
+                "has no mask",
+                where=where,
+                allowed=allowed,
+                remedy="draw the mask of this annotation, or leave the annotation out",
+            )
         mask = run_lengths(segmentation, height, width, where)
         box = coco_mask.toBbox(mask).tolist() if box is None else box
         return {"iscrowd": 0, **entry, "segmentation": mask, "bbox": box, "area": int(coco_mask.area(mask))}
@@ -228,7 +240,7 @@ def _parsed(model: type[EntryT], entries: Sequence[Any], kind: str, path: Path) 
         where = f"{path}: {kind} {own}" if isinstance(own, int) and own < 2**63 else f"{path}: {kind} {number} of the list"
         if not isinstance(entry, Mapping):
             raise InputError(
-                f"is of the type {type(entry).__name__}",
+                f"the entry is of the type {type(entry).__name__}",
                 where=where,
                 allowed=f"a mapping with {', '.join(name for name, field in model.model_fields.items() if field.is_required())}",
                 remedy="export the annotations as COCO again",
@@ -236,9 +248,16 @@ def _parsed(model: type[EntryT], entries: Sequence[Any], kind: str, path: Path) 
         try:
             parse(model, entry, where)
         except InputError as error:
-            raise InputError(error.what, where=where, allowed=_allowed(model), remedy="correct it, or leave it out") from None
+            raise InputError(
+                f"in this entry, {error.what}",
+                where=where,
+                allowed=_allowed(model),
+                remedy="correct this entry, or leave it out",
+            ) from None
         if own in seen:
-            raise InputError("its id occurs twice", where=where, allowed="a unique id", remedy="number them again")
+            raise InputError(
+                "its id occurs twice", where=where, allowed="a unique id", remedy="give each entry of the list an id of its own"
+            )
         if own is not None:
             seen.add(own)
         others = {key: without_nan(value) for key, value in entry.items() if key not in model.model_fields}
@@ -261,7 +280,9 @@ def _unique(entries: Sequence[Entry], key: str, kind: str, path: Path) -> None:
     for entry in entries:
         if entry[key] in seen:
             raise InputError(
-                f"its {key} '{entry[key]}' occurs twice", where=f"{path}: {kind} {entry['id']}", remedy="leave out one of the two"
+                f"its {key} '{entry[key]}' occurs twice",
+                where=f"{path}: {kind} {entry['id']}",
+                remedy="leave out one of the two entries",
             )
         seen.add(entry[key])
 
@@ -271,10 +292,10 @@ def _check_pixels(image: Entry, path: Path) -> None:
     height, width = image["height"], image["width"]
     if height * width > (most := most_pixels()):
         raise InputError(
-            f"has {height} x {width} px",
+            f"the image has {height} x {width} px",
             where=f"{path}: image {image['id']}",
             allowed=f"at most {most:,} px",
-            remedy="cut it into tiles",
+            remedy="cut the image into tiles",
         )
 
 
@@ -287,5 +308,5 @@ def _check_box(box: Sequence[float], height: int, width: int, where: str) -> Non
             f"its bbox is {list(box)}",
             where=where,
             allowed=f"x, y, width, height inside the image of {width} x {height} px",
-            remedy="write the corner, then the lengths",
+            remedy="write bbox as [x, y, width, height] in pixels: first the top-left corner, then the lengths",
         )

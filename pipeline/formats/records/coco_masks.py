@@ -38,7 +38,12 @@ def run_lengths(segmentation: Any, height: int, width: int, where: str) -> dict[
     if isinstance(segmentation, Mapping):
         return _checked(segmentation, height, width, where)
     if not isinstance(segmentation, Sequence) or isinstance(segmentation, str):
-        raise InputError(f"its segmentation is {_kind(segmentation)}", where=where, allowed=FORMS, remedy="draw the mask again")
+        raise InputError(
+            f"its segmentation is {_kind(segmentation)}",
+            where=where,
+            allowed=FORMS,
+            remedy="write the mask in one of these forms",
+        )
     return _of_polygons(segmentation, height, width, where)
 
 
@@ -76,7 +81,9 @@ def _checked(segmentation: Mapping[str, Any], height: int, width: int, where: st
     lengths = _decompressed(counts) if isinstance(counts, str) else _plain(counts)
     if lengths is None or (lengths < 0).any() or lengths.sum() != height * width:
         allowed = f"run lengths, plain or as pycocotools compresses them, of {height * width} pixels in all"
-        raise InputError("its run lengths cannot be decoded", where=where, allowed=allowed, remedy="encode the mask again")
+        raise InputError(
+            "its run lengths cannot be decoded", where=where, allowed=allowed, remedy="encode the mask again with pycocotools"
+        )
     plain = {"size": [height, width], "counts": lengths.tolist()}
     counts = counts if isinstance(counts, str) else coco_mask.frPyObjects(plain, height, width)["counts"].decode("ascii")
     return {"size": [height, width], "counts": counts}

@@ -12,7 +12,7 @@ from pipeline.formats.points.points import check_reach
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray, TriangleMesh
 
-_REMEDY = "make the run again"
+_REMEDY = "make the run again with scarpsim simulate, in another folder"
 
 
 def read_surface(path: Path) -> TriangleMesh:

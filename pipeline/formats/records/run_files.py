@@ -77,6 +77,6 @@ class RunFiles:
             raise InputError(
                 f"the run did not write {name}",
                 where=str(path.parent),
-                remedy="ask for it in `products` of the config, and make the run again",
+                remedy="add it to `products` in the config, and make the run again",
             )
         return path

@@ -41,15 +41,15 @@ def find_footprint(
 ) -> list[EdgeEffect]:
     """Find the divergence of the laser beam from points at depth steps.
 
-    A wide beam hits both sides of a step and returns a range in between. The divergence is named if it explains these points
-    better than noise of the angles does.
+    A wide beam hits both sides of a step and returns a range in between. The divergence is returned if it explains these points
+    better than random errors of the ray direction do.
 
     Parameters
     ----------
-    measurement : scan at its aligned pose.
-    residuals : its residuals of n points, m.
-    registered_residuals : (n,) residuals after a robust pose fit, m.
-    noise_ratio : standard deviation of these over the predicted one.
+    measurement : laser scan with the pose that was estimated by fitting it to the reference surface.
+    residuals : its n range residuals (measured minus predicted from the reference), m.
+    registered_residuals : (n,) these residuals after a small correction of the pose, fitted robustly, m.
+    noise_ratio : observed standard deviation of the registered residuals, divided by the predicted one.
     held_out : (n,) true for validation points, which are not used.
 
     Returns

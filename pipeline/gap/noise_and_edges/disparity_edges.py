@@ -134,18 +134,19 @@ def find_disparity_edge_effects(
 ) -> list[EdgeEffect]:
     """Find effects of the stereo matcher at depth steps: edge fattening, smoothing and filled occlusions.
 
-    Effects are searched one after another, each with those found before in the model.
+    A matcher displaces or invents points there, which is neither noise nor a change of the rock. Effects are searched one after
+    another, each with those found before in the model.
 
     Parameters
     ----------
-    measurement : stereo measurement at its aligned pose.
-    residuals : its residuals of n points, px of disparity.
-    registered_residuals : (n,) residuals after a robust pose fit, px.
+    measurement : stereo measurement with the pose that was estimated by fitting it to the reference surface.
+    residuals : its n disparity residuals (measured minus predicted from the reference), px.
+    registered_residuals : (n,) these residuals after a small correction of the pose, fitted robustly, px.
     held_out : (n,) true for validation points, which are not used.
 
     Returns
     -------
-    list : effects that the model lacks and the points support; empty if the points lie on no pixel raster.
+    list : significant effects that the sensor model lacks; empty if the points lie on no pixel raster.
     """
     raster = DisparityRaster.of(measurement, residuals.geometry)
     if raster is None:

@@ -27,10 +27,10 @@ class EdgeEffect:
 
     Attributes
     ----------
-    effect : the effect of the catalogue with its estimated values.
-    std : standard deviations of its parameters, by key.
+    effect : the effect (of the known sensor effects) with its estimated parameters.
+    std : standard deviations of its parameters, by parameter name.
     gain : log-likelihood ratio of the models with and without it.
-    touched : (n,) true for points that it moves by an amount that cannot be predicted as well as the noise allows.
+    touched : (n,) true for points that it moves by an amount that is uncertain by more than the noise.
     """
 
     effect: Effect
@@ -40,13 +40,13 @@ class EdgeEffect:
 
     @property
     def name(self) -> str:
-        """Name of the effect in the catalogue."""
+        """Name of the edge effect in the catalogue of sensor effects, such as "edge_fattening"."""
         return self.effect.name
 
 
 @dataclass(frozen=True)
 class WallBlocks:
-    """Blocks of the wall with about a hundred points each. An effect is accepted only if they agree on it.
+    """Blocks of the wall with about a hundred points each. An edge effect is accepted only if they agree on it.
 
     Residuals are correlated within a block, so blocks and not points count as independent.
 
@@ -59,11 +59,20 @@ class WallBlocks:
 
     @classmethod
     def over(cls, at: FloatArray) -> WallBlocks:
-        """Divide the wall into blocks, given the (n, 2) positions of the points in the wall frame, m."""
+        """Divide the wall into blocks of about a hundred points. at: (n, 2) positions of the points, wall frame, m."""
         return cls(wall_blocks_by_points(at, _POINTS_PER_BLOCK))
 
     def sums(self, gains: FloatArray) -> FloatArray:
-        """Sum the log-likelihood ratios (n,) of the points over each block; return (b,) sums for b blocks."""
+        """Sum log-likelihood ratios of points over each wall block, to see whether the blocks agree on an effect.
+
+        Parameters
+        ----------
+        gains : (n,) log-likelihood ratio of each point: model with the effect against model without it.
+
+        Returns
+        -------
+        FloatArray : (b,) sums, one for each of b blocks.
+        """
         return np.asarray(np.bincount(self.number, gains))
 
     def total_if_agreed(self, gains: FloatArray, least_sigmas: float | None = None, *, by_signs: bool = False) -> float | None:
@@ -74,7 +83,7 @@ class WallBlocks:
 
         Parameters
         ----------
-        gains : (n,) log-likelihood ratio of each point.
+        gains : (n,) log-likelihood ratio of each point: model with the effect against model without it.
         least_sigmas : smallest agreement that is accepted; None: the threshold `edges.block_sigmas`.
         by_signs : whether agreement of the signs alone is enough, for effects of which a few blocks hold most of the points.
         """
@@ -89,10 +98,10 @@ class WallBlocks:
         return total
 
     def std(self, gains: Callable[[float], FloatArray], value: float, width: float | None = None) -> float:
-        """Return the standard deviation of a parameter at its maximum-likelihood value.
+        """Return the standard deviation of an edge effect's parameter at its maximum-likelihood value.
 
-        It is computed from the scatter of the blocks' derivatives (sandwich estimator), which is valid if points in a block are
-        correlated.
+        It is computed from the scatter of the derivatives of the log-likelihood between wall blocks (sandwich estimator), which
+        is valid if points in a block are correlated.
 
         Parameters
         ----------
@@ -107,17 +116,17 @@ class WallBlocks:
 
 
 def log_density(registered_residuals: FloatArray, shift: FloatArray, sigma: FloatArray) -> FloatArray:
-    """Return the log density of residuals that an effect shifts: a Gaussian with a constant floor for outliers.
+    """Return the log density of residuals that an effect shifts: a Gaussian plus a small constant for outliers.
 
     Parameters
     ----------
-    registered_residuals : (n,) residuals after a robust pose fit, in the unit of the observable.
-    shift : (n,) shift of each point by the effect, same unit; it counts as uncertain by 15 %.
-    sigma : (n,) standard deviations, same unit.
+    registered_residuals : (n,) residuals after a robust pose fit, m (ranges) or px (disparities).
+    shift : (n,) shift of each residual by the effect, same unit; its uncertainty of 15 % is added to the noise.
+    sigma : (n,) standard deviations of the noise, same unit.
 
     Returns
     -------
-    (n,) log densities, up to a constant.
+    FloatArray : (n,) log densities, up to a constant.
     """
     sigma_with_height = np.hypot(sigma, _STEP_HEIGHT_UNCERTAINTY * shift)
     return np.asarray(
@@ -126,7 +135,7 @@ def log_density(registered_residuals: FloatArray, shift: FloatArray, sigma: Floa
 
 
 def maximise_gain(gains: Callable[[float], FloatArray], values: list[float], factors: tuple[float, ...]) -> float:
-    """Find the value of a positive parameter at which the total log-likelihood ratio is largest.
+    """Find the maximum-likelihood value of an edge effect's positive parameter, such as a width.
 
     The search tries a grid, then finer geometric grids around the best value, and ends with a parabola.
 
@@ -134,7 +143,11 @@ def maximise_gain(gains: Callable[[float], FloatArray], values: list[float], fac
     ----------
     gains : function from the parameter's value to the (n,) log-likelihood ratios of the points.
     values : values of the first grid.
-    factors : ratio of neighbouring values in each finer grid, coarsest first.
+    factors : ratio of neighbouring values in each finer grid, coarsest first; empty: no finer grids.
+
+    Returns
+    -------
+    float : the value with the largest total log-likelihood ratio.
     """
     best = max(values, key=lambda each: float(gains(each).sum()))
     step = 0.0

@@ -175,15 +175,17 @@ def separate_white_and_grid_noise(
 ) -> list[VarianceTerm]:
     """Decide whether noise that was taken for white is independent from point to point or correlated between grid nodes.
 
-    The semivariogram of the residuals decides. If it does not, both kinds are reported as indistinguishable. Noise between nodes
-    also replaces an empirical noise term: few nodes have one value of a covariate, so the noise seems to vary with it.
+    The semivariogram of the residuals decides. If it does not, both kinds are reported as indistinguishable. Grid nodes are the
+    widely spaced pixels at which a stereo matcher draws noise, which it interpolates in between. Grid-correlated noise also
+    replaces an empirical noise term (a variance fitted freely to a covariate such as the depth): so few nodes share one value
+    of the covariate that the noise seems to vary with it.
 
     Parameters
     ----------
     found : noise terms that were fitted as white noise.
-    part : residuals, px of disparity.
-    value : (n,) residuals after the systematic effects, px.
-    model : sensor model.
+    part : disparity residuals of n points with their predicted standard deviations, px.
+    value : (n,) their values after the systematic effects are removed, px.
+    model : sensor model of the stereo pair.
 
     Returns
     -------
@@ -198,13 +200,14 @@ def find_grid_noise(
 ) -> tuple[VarianceTerm | None, str]:
     """Find noise that neighbouring points share because the matcher interpolates it between widely spaced grid nodes.
 
-    Points around one node hardly differ by such noise, so it does not show in the deviations within cells of the wall.
+    Points around one node hardly differ by such noise, so it does not show in the deviations from a plane within small cells of
+    the wall, to which other noise terms are fitted.
 
     Parameters
     ----------
-    part : residuals, px of disparity.
-    value : (n,) residuals after the systematic effects, px.
-    model : sensor model.
+    part : disparity residuals of n points with their predicted standard deviations, px.
+    value : (n,) their values after the systematic effects are removed, px.
+    model : sensor model of the stereo pair.
     random : source of random numbers for the null distribution.
 
     Returns

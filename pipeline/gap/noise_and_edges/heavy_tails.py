@@ -17,16 +17,16 @@ _CLIP_SIGMAS = 12.0
 
 @dataclass(frozen=True)
 class HeavyTails:
-    """Outliers in excess of those that normal noise makes.
+    """Outliers among the residuals in excess of those that normally distributed noise makes.
 
     Attributes
     ----------
     share : share of all residuals beyond `limit_sigmas`.
     limit_sigmas : number of predicted standard deviations beyond which a residual is an outlier.
-    sigma : standard deviation that the outliers add, relative to the predicted one.
-    gain : log-likelihood ratio of a mixture in which this share has wider noise.
-    uniform : whether outliers lie all over the wall, as an instrument's own do. Edges, plants and moved rock leave them in parts
-        of it.
+    sigma : standard deviation that the residuals have in addition to the predicted one, relative to it.
+    gain : log-likelihood ratio of a mixture, in which this share of the residuals has larger noise, against normal noise.
+    uniform : whether outliers lie all over the wall, as an instrument's own do. Edges, plants and moved rock leave them in
+        parts of it.
     """
 
     share: float
@@ -37,7 +37,7 @@ class HeavyTails:
 
     @property
     def note(self) -> str:
-        """The outliers as a sentence for the report."""
+        """Description of the excess outliers of the residuals, as a sentence for the report."""
         where = "all over the wall" if self.uniform else "in parts of the wall, as at edges, plants or moved rock"
         return f"{100 * self.share:.2g} % of the points lie beyond {self.limit_sigmas:g} predicted standard deviations, {where}"
 
@@ -48,7 +48,7 @@ def find_heavy_tails(z: FloatArray, block: NDArray[np.int64]) -> HeavyTails | No
     Parameters
     ----------
     z : (n,) residuals over the standard deviation that the model with all named effects predicts.
-    block : (n,) number of each point's wall block.
+    block : (n,) number of each point's wall block, to see whether outliers lie all over the wall.
     """
     by = thresholds().variance
     outlying = np.abs(z) > by.tail_sigmas

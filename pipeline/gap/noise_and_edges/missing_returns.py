@@ -41,13 +41,13 @@ class LossExplanation:
 
     Attributes
     ----------
-    name : name of the effect; for a non-parametric explanation the nearest effect of the catalogue.
+    name : name of the effect; if losses were fitted freely to a covariate (non-parametric), the effect that stands for it.
     gain : log-likelihood ratio against the same probability of loss for all pulses.
     score : gain minus the number of parameters.
-    parameters, std : values of the effect's parameters and their standard deviations, by key.
+    parameters, std : values of the effect's parameters and their standard deviations, by parameter name.
     probability : (m,) probability of losing each pulse.
     tried : names and scores of the explanations that were compared.
-    covariate : covariate of a non-parametric explanation, else "".
+    covariate : name of the covariate of a non-parametric explanation, such as a direction; else "".
     """
 
     name: str
@@ -77,7 +77,7 @@ class LossData:
 
     @classmethod
     def of(cls, lost: BoolArray, fit: BoolArray) -> LossData:
-        """Build the data and compute the log-likelihood with one probability of loss for all pulses.
+        """Collect which laser pulses were lost, and compute the log-likelihood with one probability of loss for all.
 
         Parameters
         ----------
@@ -90,7 +90,7 @@ class LossData:
     def best(
         self, probability: Callable[[FloatArray, FloatArray], FloatArray], x: FloatArray, starts: list[FloatArray]
     ) -> _LossFit:
-        """Fit a model of the probability of loss by maximum likelihood.
+        """Fit a model of the probability that a laser pulse is lost, by maximum likelihood.
 
         Parameters
         ----------
@@ -132,17 +132,17 @@ def explain_missing_returns(
 ) -> LossExplanation | None:
     """Find the effect that explains which laser pulses did not return; None if no explanation improves the likelihood enough.
 
-    Losses come in clusters (shrubs, wet rock), so a likelihood of independent pulses is overconfident. Log-likelihood
-    ratios are therefore divided by the overdispersion: the variance of the losses in patches of the wall relative to that
-    of independent losses.
+    Losses come in clusters (shrubs, wet rock), so a likelihood of independent pulses is overconfident. Log-likelihood ratios
+    are therefore divided by the overdispersion: the variance of the losses in patches of the wall relative to that of
+    independent losses.
 
     Parameters
     ----------
-    missing : pulses that should have returned, with their covariates.
+    missing : m pulses that should have hit the reference, whether they returned, and covariates such as the range.
     fit : (m,) true for pulses to use for fitting.
     early : number of returns from far in front of the wall, which may be rain drops or snow flakes.
     points : number of returns among which `early` were counted.
-    intensity : (n,) recorded powers, or None.
+    intensity : (n,) recorded powers of the returns, to find a detection limit; None if not recorded.
     """
     lost = missing.lost
     losses = LossData.of(lost, fit)
@@ -176,7 +176,7 @@ def count_isolated_returns(at: FloatArray, early: BoolArray) -> int:
     Parameters
     ----------
     at : (n, 2) positions of all returns on the wall, wall frame, m.
-    early : (n,) true for returns from far in front of the wall.
+    early : (n,) true for early returns: those from far in front of the wall.
     """
     patch, count = wall_blocks_by_points(at, _PULSES_PER_PATCH), int(early.sum())
     number = int(patch.max()) + 1

@@ -26,15 +26,21 @@ _SIZES = np.geomspace(1e-4, 1e4, 321)
 def detectable_noise(
     residuals: Residuals, cells: WallCells, value: FloatArray, named: Sequence[str], random: KeyedRandom
 ) -> list[DetectableSize]:
-    """Compute the detectable size of every noise term that neighbouring points do not share.
+    """Compute from which size on noise terms would have been found in a measurement with a probability of 95 %.
+
+    Noise that neighbouring points share is left out, because it hardly shows in the deviations that are used.
 
     Parameters
     ----------
-    residuals : Residuals with their predicted standard deviations.
-    cells : Cells of the wall.
-    value : (n,) residuals after the systematic effects.
-    named : Effects that were found, which are not listed.
-    random : Source of random numbers of the null distribution.
+    residuals : Residuals of n points with their predicted standard deviations.
+    cells : Cells of the wall; deviations from a plane within each are used.
+    value : (n,) residuals after the systematic effects are removed, m (ranges) or px (disparities).
+    named : Names of effects that were found, which are not listed.
+    random : Source of random numbers, for the null distribution of the test statistic.
+
+    Returns
+    -------
+    list : for each noise effect of the catalogue its main parameter and the detectable value of that.
     """
     candidates = variance_candidates(residuals)
     if not candidates:

@@ -51,8 +51,8 @@ class Locking:
     Attributes
     ----------
     amplitude_px, std_px : amplitude of the sine and its standard deviation, px.
-    period_px : size of a pixel of the image that was matched, px of the full image.
-    phase_rad : phase of the sine for the given disparities, rad.
+    period_px : size of a pixel of the image that was matched, px of the full image: above 1 if the image was reduced.
+    phase_rad : phase of the sine at disparity 0, rad.
     tilt_rad : rotation of the matcher's rectification about the base, rad.
     gain : log-likelihood ratio against no locking.
     """
@@ -81,7 +81,7 @@ class NoiseBounds:
     measured: float
 
     def in_matched_pixels(self, frequency: float) -> NoiseBounds:
-        """Convert the bounds to pixels of the image that was matched. `frequency` is the number of these in one px."""
+        """Convert the bounds of the noise to pixels of the (reduced) matched image. frequency: matched pixels per px."""
         return NoiseBounds(self.predicted * frequency, self.measured * frequency)
 
     def noise_range(self, amplitude: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -108,7 +108,7 @@ def find_locking(
     infinity: FloatArray | float = 0.0,
     noise: NoiseBounds | None = None,
 ) -> Locking | None:
-    """Find pixel locking in measured disparities: they crowd around certain fractions of a pixel. None if it is not significant.
+    """Find pixel locking: measured disparities crowd around certain fractions of a pixel. None if not significant.
 
     Test statistic is the mean phasor R of the fractions. Without locking, n |R|^2 is exponentially distributed (Rayleigh test).
 
@@ -116,9 +116,9 @@ def find_locking(
     ----------
     disparity : (n,) measured disparities, px.
     reference : (n,) disparities of the reference, px. Crowding in these is due to the shape of the wall.
-    tangent : (n,) tangent of the angle between each point's rectified row and the optical axis.
-    infinity : disparity of a point at infinity, px.
-    noise : bounds of the matching noise; None if it is unknown.
+    tangent : (n,) tangent of the angle between each point's rectified image row and the optical axis.
+    infinity : disparity of a point at infinity, px, from which disparities are counted.
+    noise : bounds of the matching noise, px; None if it is unknown.
     """
     every = slice(None, None, max(len(disparity) // _MOST_POINTS, 1))
     far = np.broadcast_to(infinity, disparity.shape)[every]

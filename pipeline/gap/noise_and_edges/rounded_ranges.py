@@ -16,7 +16,7 @@ _SMALLEST_STEP_M, _LARGEST_STEP_M = 5e-5, 0.05
 
 @dataclass(frozen=True)
 class RangeStep:
-    """The step to which a scanner rounds its ranges, as found in recorded ranges.
+    """The step, such as 1 mm, to which a scanner rounds its ranges, as found in recorded ranges.
 
     Attributes
     ----------
@@ -33,8 +33,7 @@ class RangeStep:
 def find_range_step(ranges: FloatArray) -> RangeStep | None:
     """Find the step to which recorded ranges are rounded.
 
-    The step is not found if the file stores coordinates rounded to a step of its own, because ranges computed from them are
-    smooth.
+    It is not found if the ranges were computed from coordinates that the file rounds, because these ranges take any value.
 
     Parameters
     ----------

@@ -14,15 +14,15 @@ DRAWS = 1999
 
 
 def null_p_value(squares: FloatArray, shapes: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
-    """Test whether any candidate variance explains the squared deviations.
+    """Test whether any candidate noise effect explains that residuals vary more than predicted.
 
     The test statistic is the largest standardised score over the candidates, which corrects for their number. Its null
     distribution comes from N random sign flips of the scores of whole wall blocks.
 
     Parameters
     ----------
-    squares : (n,) squared deviations over the predicted variance.
-    shapes : for each candidate the (n,) variance that it adds over the predicted one.
+    squares : (n,) squared deviations of the residuals, over their predicted variance.
+    shapes : for each candidate effect the (n,) variance that it adds at each point, divided by the predicted one.
     block : (n,) number of each point's wall block.
     random : source of random numbers.
 
@@ -35,7 +35,18 @@ def null_p_value(squares: FloatArray, shapes: list[FloatArray], block: NDArray[n
 
 
 def null_critical_score(squares: FloatArray, shapes: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
-    """Return the standardised score that is significant; the parameters are those of `null_p_value`."""
+    """Return the critical value for the test whether any candidate noise effect explains the squared deviations.
+
+    The test statistic is the largest standardised score over the candidates. Its null distribution comes from random sign flips
+    of the scores of whole wall blocks; the critical value is its quantile at the threshold `variance.significance`.
+
+    Parameters
+    ----------
+    squares : (n,) squared deviations of the residuals, over their predicted variance.
+    shapes : for each candidate effect the (n,) variance that it adds at each point, divided by the predicted one.
+    block : (n,) number of each point's wall block.
+    random : source of random numbers.
+    """
     _, largest = _scores_with_flipped_signs(squares, shapes, block, random)
     return float(np.quantile(largest, 1 - thresholds().variance.significance))
 

@@ -31,14 +31,14 @@ _AT_ONCE, _REFINED = 512, 201
 
 @dataclass(frozen=True)
 class TileSeams:
-    """Tiles that were found.
+    """Square image tiles, shifted against each other by a stereo matcher, that were found in disparities.
 
     Attributes
     ----------
-    tile_px, amplitude_px : side and shift of a tile, as in the effect `tile_shift`.
-    tile_std_px, amplitude_std_px : their standard deviations.
-    gain : log-likelihood ratio of the differences across seams.
-    p_value : Gaussian p-value of these, times the number of trials.
+    tile_px, amplitude_px : side and shift of a tile, px; the disparities of neighbouring tiles differ by twice the shift.
+    tile_std_px, amplitude_std_px : standard deviations of the side and of the shift, px.
+    gain : log-likelihood ratio of the disparity differences across seams: tiles against no tiles.
+    p_value : Gaussian p-value of the mean difference, times the number of sides that were tried (Bonferroni).
     """
 
     tile_px: float
@@ -76,12 +76,18 @@ class _SeamDifferences:
 
 
 def find_tile_seams(residuals: StereoResiduals, registered_residuals: FloatArray) -> TileSeams | None:
-    """Find shifted tiles; None without any, or if the pixels lie on no raster.
+    """Find image tiles that a stereo matcher processed separately and shifted against each other.
+
+    The test compares the disparities of neighbouring points on both sides of possible seams.
 
     Parameters
     ----------
-    residuals : Residuals of n points, px.
-    registered_residuals : (n,) the same after a robust pose fit.
+    residuals : disparity residuals of n points with their pixels, px.
+    registered_residuals : (n,) these residuals after a robust pose fit, px.
+
+    Returns
+    -------
+    TileSeams or None : the tiles; None if none are significant, or if the points lie on no pixel raster.
     """
     at = residuals.geometry
     step = raster_cell_px(at.u, at.v)

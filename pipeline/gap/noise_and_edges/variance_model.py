@@ -36,7 +36,7 @@ _FISHER_ROUNDS = 25
 
 @dataclass(frozen=True)
 class VarianceCandidate:
-    """A noise effect to try: the variance that it adds at each of n points, with k fitted factors theta (one for each parameter).
+    """A noise effect to fit: the variance that it adds at each of n points, by k fitted factors theta (one a parameter).
 
     Attributes
     ----------
@@ -44,8 +44,8 @@ class VarianceCandidate:
     variance : (n, k) variance that each of k parameters adds at its typical size, squared unit of the observable.
     scale : (k,) typical sizes; a parameter is scale * sqrt(theta).
     names : (k,) names of the parameters.
-    cost : number of free parameters, which is subtracted from the log-likelihood ratio.
-    fixed : values that are not fitted and distinguish variants of the effect.
+    cost : penalty subtracted from the log-likelihood ratio: 1 for each fitted parameter, less for those in `fixed`.
+    fixed : values, by name, of parameters that are not fitted; each of a few trial values makes a candidate of its own.
     """
 
     name: str
@@ -56,11 +56,14 @@ class VarianceCandidate:
     fixed: Mapping[str, float] = field(default_factory=dict)
 
     def parameters(self, theta: FloatArray) -> dict[str, float]:
-        """Return the effect's parameters by name. theta: (k,) fitted factors; 1 is the variance at a parameter's typical size."""
+        """Return a noise effect's parameters by name.
+
+        theta: (k,) fitted factors of the variance, one for each fitted parameter; 1 is the variance at its typical size.
+        """
         return dict(zip(self.names, map(float, np.sqrt(theta) * np.array(self.scale)), strict=True)) | dict(self.fixed)
 
     def standard_deviations(self, theta: FloatArray, error: FloatArray) -> dict[str, float]:
-        """Return the standard deviations of the effect's parameters by name; for a parameter of 0, the size that it may have.
+        """Return the standard deviations of a noise effect's parameters by name; near 0, the size that it may have.
 
         Parameters
         ----------
@@ -74,17 +77,17 @@ class VarianceCandidate:
 
 @dataclass(frozen=True)
 class VarianceTerm:
-    """A noise term that explains part of the residuals' variance.
+    """A noise term that was found: it explains variance of the residuals that the sensor model does not predict.
 
     Attributes
     ----------
-    name : name of the effect, or of an empirical term with the covariate on which it depends.
-    effect : the effect of the catalogue that represents the term in a model.
+    name : name of the noise effect; for an empirical term, the covariate on which the variance depends.
+    effect : name of the effect of the catalogue that represents the term in a sensor model.
     indistinguishable : names of other effects that would explain the variance as well.
     p_value : p-value from the simulated null distribution.
     gain : log-likelihood ratio of the models with and without it.
-    parameters, std : values of the effect's parameters and their standard deviations, by key.
-    empirical : whether no effect of the catalogue fits well.
+    parameters, std : values of the effect's parameters and their standard deviations, by parameter name.
+    empirical : whether no effect of the catalogue fits well, so that a variance fitted freely to a covariate is reported.
     variance : (n,) variance that it adds at each point, squared unit of the observable.
     """
 
@@ -99,7 +102,7 @@ class VarianceTerm:
     variance: FloatArray
 
     def with_constant_variance(self, count: int) -> VarianceTerm:
-        """Return the term for `count` points, each with the mean variance, for noise that is the same everywhere."""
+        """Return this noise term for `count` other points, each with the mean of its variances: noise alike everywhere."""
         return replace(self, variance=np.full(count, float(self.variance.mean())))
 
 
@@ -122,15 +125,16 @@ class VarianceScore:
 
 
 def standardised_deviations(residuals: Residuals, cells: WallCells, value: FloatArray) -> FloatArray:
-    """Return residuals minus a plane fitted in each cell of the wall, over the predicted standard deviation.
+    """Return residuals minus a plane fitted in each small cell of the wall, over the predicted standard deviation.
 
-    They have variance 1 if the noise model is right. The planes remove the reference error, which is correlated over metres.
+    Fits of the noise use them: they have variance 1 if the noise model is right. The planes remove the reference error, which
+    is correlated over metres.
 
     Parameters
     ----------
     residuals : residuals with their predicted standard deviations.
-    cells : cells of the wall.
-    value : (n,) residuals after the systematic effects, in the unit of the observable.
+    cells : the cells into which the wall is divided.
+    value : (n,) residuals after the systematic effects are removed, m (ranges) or px (disparities).
 
     Returns
     -------
@@ -159,9 +163,10 @@ def standardised_deviations(residuals: Residuals, cells: WallCells, value: Float
 
 
 def variance_candidates(residuals: Residuals) -> list[VarianceCandidate]:
-    """List the noise effects of the catalogue that can be tried with the recorded fields.
+    """List the noise effects of the catalogue that can be fitted to residuals, given the fields that were recorded.
 
-    Noise that neighbouring points share is left out, because deviations within cells hardly show it.
+    An effect may need a field such as the intensity. Noise that neighbouring points share is left out, because it hardly shows
+    in deviations within small cells of the wall, to which the effects are fitted.
     """
     found = []
     for effect in residuals.candidates:
@@ -193,8 +198,8 @@ def fit_variance_model(
     Parameters
     ----------
     residuals : residuals with their predicted standard deviations.
-    cells : cells of the wall; deviations within them are used.
-    value : (n,) residuals after the systematic effects, in the unit of the observable.
+    cells : small cells of the wall; deviations from a plane within each are used.
+    value : (n,) residuals after the systematic effects are removed, m (ranges) or px (disparities).
     random : source of random numbers for the null distribution.
     excluded : names of effects that are not tried.
 
@@ -306,7 +311,7 @@ def _unshared_share(residuals: Residuals, value: FloatArray, used: BoolArray, ad
 
 @dataclass(frozen=True)
 class NoiseRatio:
-    """Observed over predicted standard deviation of the residuals within cells of the wall.
+    """Observed over predicted standard deviation of residuals, as deviations from planes in small cells of the wall.
 
     Attributes
     ----------
@@ -319,13 +324,13 @@ class NoiseRatio:
 
     @classmethod
     def of(cls, residuals: Residuals, cells: WallCells, value: FloatArray, random: KeyedRandom) -> NoiseRatio:
-        """Compute the ratio; outliers are clipped.
+        """Compute the ratio of observed to predicted standard deviation of the residuals; outliers are clipped.
 
         Parameters
         ----------
         residuals : residuals with their predicted standard deviations.
-        cells : cells of the wall.
-        value : (n,) residuals after the systematic effects, in the unit of the observable.
+        cells : small cells of the wall; deviations from a plane within each are used.
+        value : (n,) residuals after the systematic effects are removed, m (ranges) or px (disparities).
         random : source of random numbers, with which correlated noise is simulated.
         """
         z = standardised_deviations(residuals, cells, value)
@@ -341,9 +346,9 @@ class NoiseRatio:
 
     @property
     def at_most_one(self) -> float:
-        """The ratio if it is clearly below 1, else 1.
+        """Factor that corrects a predicted noise that is too large: observed over predicted if clearly below 1, else 1.
 
-        A ratio below 1 means that the model's own noise is too large, because no effect removes noise.
+        A ratio below 1 means that the sensor model's own noise is too large, because no effect removes noise.
         """
         return self.value if self.clearly_below and self.value < thresholds().variance.excess_noise_ratio else 1.0
 

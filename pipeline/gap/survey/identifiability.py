@@ -53,7 +53,7 @@ class SurveyExtension:
     Attributes
     ----------
     name : The additional measurement, in words.
-    cosines : (m, m) absolute cosines between the effects' signatures.
+    cosines : (m, m) absolute cosines between the effects' signatures (changes of the observations); 1: indistinguishable.
     detectable_size : (m,) value of each effect's main parameter at a signal-to-noise ratio of 5.
     """
 
@@ -63,7 +63,7 @@ class SurveyExtension:
 
     @property
     def nameable_size(self) -> tuple[float, ...]:
-        """(m,) value of each effect's main parameter from which the effect can be distinguished from all others."""
+        """(m,) value of each effect's main parameter from which the extended survey tells the effect from all others."""
         return _nameable_size(self.cosines, self.detectable_size)
 
 
@@ -75,12 +75,12 @@ class Identifiability:
     ----------
     sensor : "tls" or "stereo".
     names : (m,) names of the effects, with the sensor as prefix.
-    survival : (m,) share of each effect's signature that a fit of the pose leaves.
-    cosines : (m, m) absolute cosines between the signatures.
+    survival : (m,) share of each effect's signature (its change of the observations) that a fit of the pose leaves.
+    cosines : (m, m) absolute cosines between the signatures that the pose fit leaves; 1: indistinguishable.
     parameters : (m,) name of each effect's main parameter.
-    detectable_size : (m,) its value at a signal-to-noise ratio of 5, with noise and reference error.
+    detectable_size : (m,) value of that parameter at a signal-to-noise ratio of 5, with noise and reference error.
     detectable_size_without_reference_error : (m,) the same with noise alone.
-    variants : (m,) the variant of each effect that the numbers belong to, such as a period or a camera, in words.
+    variants : (m,) the variant of each effect for which the numbers hold, such as one period or one camera, in words.
     extensions : The survey with each of several additional measurements.
     points : Number of points of the survey.
     reference_error_m : Standard deviation of the reference's correlated error, m.
@@ -102,33 +102,34 @@ class Identifiability:
 
     @property
     def nameable_size(self) -> tuple[float, ...]:
-        """(m,) value of each effect's main parameter from which the effect can be distinguished from all others."""
+        """(m,) value of each effect's main parameter from which the survey tells the effect from all others."""
         return _nameable_size(self.cosines, self.detectable_size)
 
     def best_extension(self, row: int) -> SurveyExtension:
-        """Return the additional measurement with which an effect can be named from the smallest size on.
+        """Return the survey extended by the one measurement with which an effect is told from others at the smallest size.
 
         Parameters
         ----------
-        row : Index of the effect.
+        row : Index of the effect in `names`.
         """
         return min(self.extensions, key=lambda extension: extension.nameable_size[row])
 
     def similar_effects(self, row: int) -> list[int]:
         """Return the indices of effects that can hardly be told from the effect `row`, most similar first.
 
-        Their signatures have a cosine of at least 0.9 with its own.
+        Their signatures (changes of the observations) have a cosine of at least 0.9 with its own. row: index of the effect in
+        `names`.
         """
         order = np.argsort(-self.cosines[row])
         return [int(other) for other in order if other != row and self.cosines[row, other] >= SIMILAR_COSINE]
 
     def similar_pairs(self) -> list[tuple[int, int]]:
-        """Return the pairs of effects that this survey can hardly tell apart, as indices, most similar first."""
+        """Return the pairs of effects that the survey can hardly tell apart, as indices into `names`, most similar first."""
         found = [(a, b) for a in range(len(self.names)) for b in range(a) if self.cosines[a, b] >= SIMILAR_COSINE]
         return sorted(found, key=lambda pair: -self.cosines[pair])
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the entry of this survey in identifiability.json."""
+        """Return which effects the survey can detect and distinguish, as its entry in the file identifiability.json."""
         return {
             "sensor": self.sensor,
             "points": self.points,
@@ -181,7 +182,7 @@ def _nameable_size(cosines: FloatArray, detectable_size: tuple[float, ...]) -> t
 
 
 def identifiability(survey: Survey, reference_error_m: float | None = None) -> Identifiability:
-    """Analyse which effects a survey can detect and distinguish, and what each of several additional measurements would add.
+    """Analyse which sensor effects a survey can detect and distinguish, and what additional measurements would add.
 
     Parameters
     ----------
@@ -215,9 +216,10 @@ def identifiability(survey: Survey, reference_error_m: float | None = None) -> I
 
 
 def format_table(found: Identifiability) -> str:
-    """Format the result as a text table with a row for each effect.
+    """Format which effects a survey can detect and distinguish as a text table with a row for each effect.
 
-    The columns are the share of the signature that the pose fit leaves, the detectable size, and the most similar effect.
+    The columns are the share of the effect's signature (its change of the observations) that a fit of the pose leaves, the
+    detectable size, and the most similar effect.
     """
     cosines = found.cosines - np.eye(len(found.names))
     lines = [f"{'effect':<32}{'left by pose':>14}  {'detectable from (S/N 5)':<32}most similar (cosine)"]

@@ -38,14 +38,14 @@ _STEP = 0.01
 
 @dataclass(frozen=True)
 class KnownPoints:
-    """Additional observations of points with known positions, such as targets, and how effects would show in them.
+    """Additional observations of points with known positions, such as targets, and how sensor effects change them.
 
     Attributes
     ----------
     title : The points, in words.
     pose_jacobian : (n, 6) derivatives of the observations by the pose of the first station: shift (m) and rotation (rad).
-    sigma : (n,) standard deviations of the observations, in the unit of the observable.
-    columns : Function from k candidate effects to their (n, k) signatures in these observations.
+    sigma : (n,) standard deviations of the observations, m (ranges) or px (disparities).
+    columns : Function from candidate effects to the (n, k) change of the observations per unit of each of their k coefficients.
     """
 
     title: str

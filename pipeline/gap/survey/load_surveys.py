@@ -12,7 +12,7 @@ from scene.common.errors import InputError
 
 
 def load_surveys(path: Path, overrides: Sequence[str] = (), sensor: SensorName | None = None) -> list[Survey]:
-    """Load the survey of a measurement, or simulate one survey for each sensor of a config.
+    """Load the survey (stations or cameras, and points) of a measurement, or simulate one for each sensor of a config.
 
     Parameters
     ----------
@@ -23,7 +23,7 @@ def load_surveys(path: Path, overrides: Sequence[str] = (), sensor: SensorName |
     Raises
     ------
     InputError
-        If the file cannot be read, or options of a config are given for a measurement.
+        If the file cannot be read, or `overrides` or another sensor are given for a measurement.
     """
     if path.is_dir() or path.name == FILE:
         measurement = read_measurement(path)
@@ -31,7 +31,7 @@ def load_surveys(path: Path, overrides: Sequence[str] = (), sensor: SensorName |
             raise InputError(
                 "a measurement takes neither --set nor another --sensor",
                 where=str(path),
-                remedy="leave them out, or give a config",
+                remedy="leave these options out, or give a config instead of the measurement",
             )
         return [measured_survey(measurement)]
     config = load_config(path, overrides, sensor, None)

@@ -32,7 +32,7 @@ class NoiseOrLossEffect:
     name : Name of the effect, with the sensor as prefix.
     parameter : Name of its main parameter.
     detectable_size : Value of that parameter at a signal-to-noise ratio of 5; NaN if it cannot be computed.
-    note : Condition for that size, or why there is none, in words.
+    note : Condition under which that size holds, or why there is none, in words.
     """
 
     name: str
@@ -41,7 +41,7 @@ class NoiseOrLossEffect:
     note: str
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the entry of identifiability.json."""
+        """Return the effect and its detectable size as an entry of the file identifiability.json."""
         return {
             "name": self.name,
             "parameter": self.parameter,
@@ -51,7 +51,10 @@ class NoiseOrLossEffect:
 
 
 def noise_and_loss_effects(survey: Survey) -> tuple[NoiseOrLossEffect, ...]:
-    """List every effect of the catalogue that is not systematic, with its detectable size in a survey if that can be computed."""
+    """List every effect of the catalogue on the noise or on missing returns, with the size that a survey can detect.
+
+    survey: the planned or measured survey. The size is NaN if it cannot be computed.
+    """
     view = survey.views[0]
     found = {each.name: each for each in _variance_effects(view)}
     if isinstance(view, TlsView):

@@ -25,19 +25,29 @@ _NULL = 1e-9
 
 
 def view_signatures(view: SurveyView) -> list[Candidate]:
-    """List every systematic effect of the catalogue, with its variants, as signatures at the points of one view."""
+    """Compute the signatures of all systematic effects: how each would change the observations of one station or pair.
+
+    An effect has several candidates if it has parameters that are not fitted: one for each trial value, such as each camera or
+    period. view: what the station or pair sees of the wall.
+    """
     return systematic_candidates(view.residuals, view.measurement)
 
 
 def group_by_effect(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
-    """Group candidates by effect, and keep a few variants of each.
+    """Group candidates by effect, and keep a few variants of each to analyse which effects can be distinguished.
 
-    The first variant represents the effect in tables. The others, such as other cameras, are alternatives that another
-    effect may be confused with. A wave with searched period is represented by its middle period.
+    A variant is the effect with one choice of the values that are not fitted, such as the camera or a period.
+
+    The first variant represents the effect in tables. The others, such as other cameras, are alternatives that another effect
+    may be confused with. A wave of unknown period is represented by the middle one of the trial periods.
+
+    Parameters
+    ----------
+    candidates : All variants of all effects, as `view_signatures` gives them.
 
     Returns
     -------
-    The variants of each effect, by its name.
+    dict : The variants of each effect that are kept, by the effect's name.
     """
     groups: dict[str, list[Candidate]] = {}
     for candidate in candidates:
@@ -59,7 +69,7 @@ def group_by_effect(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
 
 
 def parameter_label(candidate: Candidate) -> str:
-    """Return the name of an effect's main parameter, to which its detectable size refers.
+    """Return the name of a candidate effect's main parameter, to which its detectable size refers.
 
     Several parameters of the same kind are joined by commas.
     """
@@ -78,18 +88,20 @@ def _scales(candidate: Candidate) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class SurveyDesign:
-    """Signatures of m effects at n observations of a survey, divided by their standard deviations, before and after a pose fit.
+    """Signatures of m effects (changes of n observations of a survey, over their standard deviations), with a pose fit.
+
+    It tells before any fieldwork which effects the survey can detect and distinguish.
 
     Attributes
     ----------
-    projected : (n, k) signatures after the pose of each station is projected out.
+    projected : (n, k) signatures after the pose of each station is projected out, with a column for each of k coefficients.
     signatures : (n, k) signatures before that.
-    pose_basis : (n, p) orthonormal basis of the pose columns.
-    spans : For each effect, the slice of the k columns that belongs to each of its variants (other cameras or periods).
-    scales : For each effect, the parameter value per unit of each coefficient.
+    pose_basis : (n, p) orthonormal basis of the changes of the observations by the p pose parameters.
+    spans : For each effect, the slice of the k columns of each of its variants, such as other cameras or periods.
+    scales : For each effect, the value of its main parameter per unit of each coefficient.
     cells : Cells of the wall, between which the reference's error is correlated.
-    sigma : (n,) standard deviations, reduced so that a subsample has the weight of all points.
-    unit_m : Median metres of range or depth per unit of the observable.
+    sigma : (n,) standard deviations, m or px, reduced so that a subsample has the weight of all points.
+    unit_m : Median metres of range or depth per unit of the observations (m or px).
     wall_rows : Number of rows that are points on the wall; rows of known points follow.
     """
 
@@ -145,17 +157,19 @@ class SurveyDesign:
         return cls(left, whole, base, spans, scales, WallCells.over(at), sigma, unit, wall)
 
     def survival(self) -> FloatArray:
-        """Return the (m,) share of each effect's signature that the pose fit leaves: near 0, the pose hides the effect."""
+        """Return the (m,) share of each effect's change of the observations that a pose fit leaves; near 0, it is hidden."""
         sizes = [
             (float(np.linalg.norm(self.projected[:, v[0]])), float(np.linalg.norm(self.signatures[:, v[0]]))) for v in self.spans
         ]
         return np.array([left / max(whole, 1e-300) for left, whole in sizes])
 
     def cosines(self) -> FloatArray:
-        """Return the (m, m) absolute cosines between the signatures of the effects, after the pose is projected out.
+        """Return the (m, m) absolute cosines between the signatures of the effects that a pose fit leaves.
 
-        A cosine is the largest canonical correlation of an effect's first variant with any variant of the other one, made
-        symmetric.
+        A signature is an effect's change of the observations. Near 1, the survey can hardly tell two effects apart.
+
+        A cosine is the largest canonical correlation of one effect's first variant with any variant of the other effect, such
+        as another camera. Of both orders of the two effects, the larger value counts.
         """
         bases = [[self._basis(span) for span in variants] for variants in self.spans]
         count = len(bases)
@@ -174,7 +188,7 @@ class SurveyDesign:
         return np.asarray(np.linalg.qr(kept)[0]) if kept.shape[1] else np.zeros((len(columns), 1))
 
     def detectable_size(self, reference_error_m: float) -> tuple[float, ...]:
-        """Return the value of each effect's main parameter at a signal-to-noise ratio of 5.
+        """Return the value of each effect's main parameter from which the survey detects it: a signal-to-noise ratio of 5.
 
         Parameters
         ----------
@@ -182,7 +196,7 @@ class SurveyDesign:
 
         Returns
         -------
-        (m,) values; infinite if the pose fit leaves nothing of a signature.
+        tuple : (m,) values; infinite if the pose fit hides the effect altogether.
         """
         first = [list(range(variants[0].start, variants[0].stop)) for variants in self.spans]
         chosen = [column for group in first for column in group]
@@ -219,18 +233,18 @@ class SurveyDesign:
 
 
 def signature_columns(view: SurveyView, wanted: list[Candidate]) -> FloatArray:
-    """Return the signatures of given variants of effects at the points of one view.
+    """Return the signatures (changes of the observations) of given effects at the points of one station or stereo pair.
 
-    Searched periods are those of the variants, so that all views of a survey use the same ones.
+    Waves have the periods of the given candidates, so that all stations of a survey use the same ones.
 
     Parameters
     ----------
-    view : The view.
-    wanted : The variants.
+    view : What the station or pair sees of the wall.
+    wanted : Effects, each with one choice of the values that are not fitted, such as the camera or a period.
 
     Returns
     -------
-    (n, k) change of the observable per unit of each coefficient.
+    FloatArray : (n, k) change of the n observations, m or px, per unit of each of k coefficients.
     """
     own = {_key(each): each for each in view_signatures(view)}
     parts = []

@@ -55,7 +55,7 @@ class SurveyView:
     residuals : Geometry of n points, a subsample on smooth parts of the wall; the residual values have no meaning.
     point_count : Number of points on smooth parts in the full view.
     station : Number of the station or pair, from 0; views with the same number share a pose.
-    measurement : A measurement with the pose or the cameras of the view.
+    measurement : A measurement that holds the pose of the station or the cameras of the pair.
     """
 
     residuals: Residuals
@@ -65,14 +65,14 @@ class SurveyView:
 
     @classmethod
     def of(cls, found: Residuals, whole: int, number: int, measurement: Measurement) -> Self:
-        """Make a view from the subsample's points on smooth parts of the wall.
+        """Make the view of one scanner station or stereo pair from the subsample's points on smooth parts of the wall.
 
         Parameters
         ----------
         found : Geometry of a subsample of the view's points; residuals whose values have no meaning.
         whole : Number of points of the full view, before the subsample was drawn.
         number : Number of the station or pair; views with the same number share a pose.
-        measurement : A measurement with that pose.
+        measurement : A measurement that holds the pose of the station or the cameras of the pair.
 
         Raises
         ------
@@ -90,7 +90,10 @@ class SurveyView:
 
     @property
     def sigma(self) -> FloatArray:
-        """(n,) predicted standard deviations in the unit of the observable; they give a subsample the weight of all points."""
+        """(n,) predicted standard deviations, m (ranges) or px (disparities), to weight n points of a subsample.
+
+        They are reduced so that the subsample has the weight of all points.
+        """
         return self.residuals.sigma * np.sqrt(len(self.residuals) / max(self.point_count, 1))
 
 
@@ -132,7 +135,7 @@ class TlsSurvey:
     ----------
     views : What each station sees.
     centre : (3,) centre of the wall, wall frame, m.
-    observe : Function that makes a view from a measurement with its pose and the number of the pose.
+    observe : Function that simulates the view of a further station from a measurement with its pose and the pose's number.
     sensor, place : "tls", and what a place of observation is called in texts.
     """
 
@@ -143,7 +146,7 @@ class TlsSurvey:
     place: ClassVar[str] = "station"
 
     def moved(self, scale: float, turn_rad: float, number: int) -> TlsView:
-        """Return what the first station would see from another place.
+        """Simulate what the first scanner station would see from another place, to find out what a further scan adds.
 
         Parameters
         ----------
@@ -162,7 +165,7 @@ class TlsSurvey:
         return self.observe(base.changed(station=(position, turn @ base.station[1])), number)
 
     def repeated(self, number: int) -> tuple[str, TlsView]:
-        """Return the first scan repeated in the other face of the instrument, at the same pose.
+        """Return the first scan repeated in the other face of the instrument, to find out what this adds to the survey.
 
         In the second face, azimuths are larger by pi and zenith angles z become 2 pi - z.
 
@@ -188,7 +191,7 @@ class StereoSurvey:
     ----------
     views : What each pair sees.
     centre : (3,) centre of the wall, wall frame, m.
-    observe : Function that makes a view from a measurement with its cameras and the number of the pose.
+    observe : Function that simulates the view of a further pair from a measurement with its cameras and the pose's number.
     sensor, place : "stereo", and what a place of observation is called in texts.
     """
 
@@ -199,7 +202,7 @@ class StereoSurvey:
     place: ClassVar[str] = "pair of exposures"
 
     def moved(self, scale: float, turn_rad: float, number: int) -> StereoView:
-        """Return what the first pair would see from another place.
+        """Simulate what the first stereo pair would see from another place, to find out what a further pair adds.
 
         Parameters
         ----------
@@ -224,7 +227,7 @@ class StereoSurvey:
         return self.observe(base.changed(cameras=pair), number)
 
     def repeated(self, number: int) -> tuple[str, StereoView]:
-        """Return the first pair repeated with its cameras rolled by 45 degrees in opposite directions.
+        """Simulate the first stereo pair repeated with its cameras rolled by 45 degrees in opposite directions.
 
         Parameters
         ----------
@@ -245,7 +248,7 @@ Survey = TlsSurvey | StereoSurvey
 
 
 def planned_survey(config: SimulationConfig, sensor: SensorName) -> Survey:
-    """Simulate the survey that a config describes.
+    """Simulate what the stations or cameras of a config would see of the wall, to judge a survey before fieldwork.
 
     Parameters
     ----------
