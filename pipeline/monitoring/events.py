@@ -2,8 +2,9 @@
 
 A region begins where the mean difference over a small square is far beyond its error, and grows over neighbouring pixels of the
 same sign that exceed half their level of detection. Its volume is the sum of the differences, its standard deviation that of the
-mean over so many pixels, with the registration's, times the area. Where edges were sampled differently, a few pixels make most
-of a mean. So the median has to be significant too, and the volume larger than its standard deviation.
+mean over so many pixels, with the registration's, times the area. Where an edge was sampled differently, one point changes 3 x 3
+pixels. So a region has to be significant without those about its deepest one too, and its volume has to exceed its standard
+deviation.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ _GROWS = 0.5
 """Share of the level of detection that pixels at a region's rim exceed."""
 LEAST_PIXELS = 16
 SIGNIFICANT = 7.0
-"""Standard deviations by which the mean and the median over a whole region must differ from zero."""
+"""Standard deviations by which the mean over a whole region must differ from zero."""
+_SIGNIFICANT_BESIDE = 5.0
+"""The same without the 3 x 3 pixels about the deepest one."""
 INSIGNIFICANT = "insignificant"
 """The mark of a detection that noise or an edge may explain wholly."""
 _STEEP = 4.0
@@ -215,20 +218,25 @@ def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change
     grid, gsd, sign = change.grid, change.grid.gsd, 1.0 if kind == "missing" else -1.0
     whole, depth = _with_gaps_filled(mask, sign * change.difference[window].astype(np.float64))
     pixels = int(whole.sum())
-    one_sigma = float(np.mean(change.significance.one_sigma[window][mask]))
-    registration = float(np.sqrt(np.mean(change.registration[window][mask].astype(np.float64) ** 2)))
-    noise = float(np.hypot(one_sigma * change.significance.sigma_of_mean(int(mask.sum())), registration))
+    sigmas, shifts = (values[window].astype(np.float64) for values in (change.significance.one_sigma, change.registration))
+
+    def noise(part: NDArray[np.bool_]) -> float:
+        """Return the standard deviation of the mean change of some pixels, m."""
+        independent = float(sigmas[part].mean() * change.significance.sigma_of_mean(int(part.sum())))
+        return max(float(np.hypot(independent, np.sqrt(np.mean(shifts[part] ** 2)))), 1e-9)
+
+    def significance(part: NDArray[np.bool_]) -> float:
+        return float(depth[part].mean()) / noise(part) if part.any() else 0.0
+
     rim = whole & ~ndimage.binary_erosion(whole)
     rough = _GAP_SHARE * depth[whole & ~mask].sum(), _RIM_SHARE * np.abs(depth[rim]).sum()
     deepest = ndimage.grey_dilation(np.where(whole, depth, 0.0), size=(_EDGE_PX, _EDGE_PX))
     inner = _without_islands(whole & (depth >= _EDGE_SHARE * deepest))
     rows, columns = np.nonzero(inner)
     volume = float(depth[whole].sum()) * gsd**2
-    volume_std = float(np.sqrt((noise * pixels) ** 2 + rough[0] ** 2 + rough[1] ** 2)) * gsd**2
-    significance = float(depth[mask].mean()) / max(noise, 1e-9)
-    typical = float(np.median((depth / change.significance.one_sigma[window])[mask]))
-    least = min(significance, typical / float(change.significance.sigma_of_mean(int(mask.sum()))))
-    insignificant = (INSIGNIFICANT,) if least < SIGNIFICANT or volume < volume_std else ()
+    volume_std = float(np.sqrt((noise(mask) * pixels) ** 2 + rough[0] ** 2 + rough[1] ** 2)) * gsd**2
+    doubtful = significance(_without_deepest(mask, depth)) < _SIGNIFICANT_BESIDE or volume < volume_std
+    insignificant = (INSIGNIFICANT,) if doubtful or significance(mask) < SIGNIFICANT else ()
     return ChangedRegion(
         kind=kind,
         row=row,
@@ -244,9 +252,17 @@ def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change
         depth_largest_m=float(depth[inner].max()),
         volume_m3=volume,
         volume_std_m3=volume_std,
-        significance=significance,
+        significance=significance(mask),
         marks=(*_marks(mask, window, sign, change), *insignificant),
     )
+
+
+def _without_deepest(mask: NDArray[np.bool_], depth: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Drop the 3 x 3 pixels about the deepest one of a mask."""
+    row, column = np.unravel_index(np.argmax(np.where(mask, depth, -np.inf)), mask.shape)
+    rest = mask.copy()
+    rest[max(int(row) - 1, 0) : int(row) + 2, max(int(column) - 1, 0) : int(column) + 2] = False
+    return rest
 
 
 def _without_islands(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
