@@ -143,7 +143,7 @@ def maximise_gain(gains: Callable[[float], FloatArray], values: list[float], fac
     ----------
     gains : function from the parameter's value to the (n,) log-likelihood ratios of the points.
     values : values of the first grid.
-    factors : ratio of neighbouring values in each finer grid, coarsest first; empty: the best value of the first grid is returned.
+    factors : ratio of neighbouring values in each finer grid, coarsest first; empty: only the first grid is tried.
 
     Returns
     -------

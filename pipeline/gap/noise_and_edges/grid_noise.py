@@ -212,7 +212,7 @@ def find_grid_noise(
 
     Returns
     -------
-    tuple : the grid-correlated noise term, or None if there is none; and a note if the reference surface may be the cause, else "".
+    tuple : the grid-correlated noise term or None; and a note if the reference surface may be the cause, else "".
     """
     variogram = _variogram(part, value, model)
     best = None if variogram is None else variogram.best_grid()
