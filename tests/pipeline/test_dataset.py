@@ -366,5 +366,5 @@ def test_mistakes_in_the_config(changes: dict[str, Any], message: str) -> None:
 
 def test_blocks_that_do_not_fit_name_the_epoch(tmp_path: Path) -> None:
     sizes = {"large": {"blocks_per_m2": 0.1, "rockfall": {"size_m": 20.0}}}
-    with pytest.raises(InputError, match=r"ledge_tls_low_large_train0001: size_m: .* are larger than the wall"):
+    with pytest.raises(InputError, match=r"ledge_tls_low_large_train0001: .*size_m: .* are larger than the wall"):
         make_dataset(tiny(sizes=sizes, sensors=["tls"]), tmp_path / "set")
