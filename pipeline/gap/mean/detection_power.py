@@ -47,7 +47,7 @@ class DetectableSize:
     name : Name of the effect, or what an error outside the catalogue depends on.
     parameter : Name of the parameter that holds the size; "" for the unit of the observable.
     size : Value of that parameter; infinite if no size shows, NaN if it was not computed.
-    at : Values of the variant for which it holds, such as a period or a camera.
+    at : Choices for which the size holds and that are not fitted, such as the period of a wave or the camera.
     note : Condition or reason, in words.
     """
 
@@ -58,20 +58,20 @@ class DetectableSize:
     note: str = ""
 
     def to_dict(self) -> dict[str, object]:
-        """Return the entry of gap.json."""
+        """Return the size as one entry of the list `detectable` in gap.json, by attribute."""
         size = self.size if np.isfinite(self.size) else None
         return {"name": self.name, "parameter": self.parameter, "size": size, "at": dict(self.at), "note": self.note}
 
 
 @dataclass(frozen=True, eq=False)
 class Signature:
-    """One direction in the columns of a candidate.
+    """One way in which a candidate effect may show, whose detectable size is wanted: one parameter, or a wave of any phase.
 
     Attributes
     ----------
     candidate : The candidate.
     parameter : Name of the parameter that holds the size.
-    columns : Numbers of its columns among all columns that are examined.
+    columns : Numbers of the candidate's design columns among all columns that are examined.
     sine : Whether the candidate has a phase; the phase that is hardest to detect is then taken.
     needed : Function from the numbers of the covariances, the most likely first, to the log-likelihood ratio from which it shows.
     """
@@ -83,19 +83,24 @@ class Signature:
     needed: Callable[[Sequence[int]], float]
 
     def direction(self, information: FloatArray) -> FloatArray:
-        """Return the (k,) direction of coefficients: one parameter alone, or the phase with the least information (k, k)."""
+        """Return the (k,) unit vector of coefficients whose size is computed: one parameter alone, or the least visible phase.
+
+        information: (k, k) Fisher information of the coefficients.
+        """
         if self.sine:
             return np.asarray(np.linalg.eigh(information)[1][:, 0])
         return np.eye(len(information))[self.candidate.names.index(self.parameter)]
 
     @property
     def at(self) -> dict[str, float | str]:
-        """Values of the variant."""
+        """Choices that are not fitted, by name: the period of a wave, or the camera."""
         return dict(self.candidate.fixed)
 
 
 def noncentrality(needed: float, columns: int, power: float = POWER) -> float:
-    """Return the noncentrality with which a log-likelihood ratio reaches a value with a given probability.
+    """Return the noncentrality of a chi-square variable that exceeds twice a log-likelihood ratio with a given probability.
+
+    The detectable size follows from it: the noncentrality grows with the square of the size.
 
     Parameters
     ----------
@@ -109,7 +114,10 @@ def noncentrality(needed: float, columns: int, power: float = POWER) -> float:
 
 @dataclass(frozen=True, eq=False)
 class DetectionPower:
-    """Products of the examined columns with the simulations, under each of C covariances.
+    """Simulated measurements without further effects, from which the detectable size of any examined effect follows.
+
+    These are inner products under each of C covariances of the residuals. Nuisance columns are those that every model has, such
+    as the pose.
 
     Attributes
     ----------
@@ -117,7 +125,7 @@ class DetectionPower:
     plain : (C, d) log-likelihood of the nuisance columns alone.
     right : (C, k, d) products of the columns with the simulations, beside the nuisance columns.
     matrix : (C, k, k) products of the columns with each other, beside the nuisance columns.
-    whole : (C, k) squares of the columns before.
+    whole : (C, k) squared norms of the columns before the nuisance columns are projected out.
     """
 
     likely: int
@@ -130,7 +138,7 @@ class DetectionPower:
     def of(
         cls, design: Design, members: Sequence[Candidate], plain: list[int], sines: list[int], random: KeyedRandom
     ) -> DetectionPower:
-        """Simulate measurements without further effects.
+        """Simulate measurements without further effects, and return their products with the columns to examine.
 
         Parameters
         ----------
@@ -166,8 +174,8 @@ class DetectionPower:
     def size(self, signature: Signature) -> float:
         """Return the detectable size of a signature; infinite if no size shows.
 
-        An effect of that size makes the estimated error of the reference larger, and thereby the log-likelihood ratio that it
-        needs. The size is therefore computed twice.
+        An effect of that size also makes the estimated error of the reference larger, and with it the log-likelihood ratio that
+        the effect needs. The size is therefore computed a second time, with that larger error.
         """
         rows = signature.columns
         precision = signature.candidate.prior_precision

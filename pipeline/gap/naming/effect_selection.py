@@ -71,7 +71,8 @@ class SelectionResult:
     systematic : names of the selected systematic effects, empirical ones included.
     p_value : p-value of the misfit that remains with all of these in the model; None if nothing was left to try.
     p_without_effects : p-value of the misfit without any of them; None if nothing was tried.
-    unexplained_noise : observed over predicted standard deviation within cells of the wall; 1 if a noise term explains it.
+    unexplained_noise : observed over predicted standard deviation within small squares of the wall; 1 if a noise term explains
+        it.
     notes : notes for the report.
     identifiability : names of the effects, cosines between their signatures, and the share of each signature that the pose fit
         leaves.

@@ -97,7 +97,7 @@ class Gap:
 
     @property
     def uncertain(self) -> bool:
-        """Whether both before - floor and before - after are within their uncertainties."""
+        """Whether scores cannot tell the models apart: before - floor and before - after are both within their uncertainties."""
         return not self.above_floor and self.before - self.after <= thresholds().verdict.gap_sigmas * self.error
 
     def to_dict(self) -> dict[str, Any]:
@@ -301,5 +301,5 @@ def _crps(draws: FloatArray, value: FloatArray) -> FloatArray:
 
 
 def subsampling(count: int) -> slice:
-    """Return a slice that keeps at most about 30,000 of `count` points, evenly spaced."""
+    """Return a slice that keeps at most about 30,000 of `count` points, evenly spaced, so that scoring stays quick."""
     return slice(None, None, max(count // _MOST_POINTS, 1))

@@ -45,7 +45,7 @@ class SearchInput:
     ----------
     measurement : measurement of the training points.
     part : their residuals.
-    families : candidates to search.
+    families : candidate effects to search, one entry for each effect, and one grid of frequencies for each kind of wave.
     variance_at : function from residuals, computed with some systematic effects in the model, to their noise terms.
     added : variance to add to the predicted one, in squared units of the observable.
     random : source of random numbers for the null distributions.
@@ -164,8 +164,8 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
 
     The linearised model is inexact for a large effect, and forward selection then adds spurious effects that absorb the
     linearisation error. The strongest effects are therefore refitted alone without linearising, and the selection is repeated
-    with the best one in the model. It is also repeated at the joint fit of all effects. The explanation with the fewest effects
-    is kept.
+    with the best one in the model. It is also repeated with the model linearised where all effects of the catalogue, fitted
+    together, put it. The explanation with the fewest effects is kept.
 
     Parameters
     ----------
@@ -202,8 +202,8 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
 def search_at_joint_fit(given: SearchInput) -> SearchOutcome | None:
     """Search for effects with the model linearised at the joint fit of all effects of the catalogue.
 
-    There, rays are traced to where they really went, so the Jacobian is right even if an effect is large. The fitted part
-    of all effects is added back to the residuals before the search.
+    With these effects in the model, rays meet the reference where the real rays did, so the Jacobian is right even if an effect
+    is large. The fitted part of all effects is added back to the residuals before the search.
 
     Parameters
     ----------

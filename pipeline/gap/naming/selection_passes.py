@@ -36,7 +36,7 @@ _MOST_POINTS = 60_000
 
 @dataclass(frozen=True)
 class PassInput:
-    """Input of one selection pass: the measurement and its residuals after edge effects have been applied.
+    """Input of one run of the selection of effects: the measurement and its residuals with edge effects in the model.
 
     Edge effects act at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint.
 
@@ -50,7 +50,7 @@ class PassInput:
     changed : (n,) true for points in these regions.
     registered_residuals : (n,) residuals after a robust pose fit, in the observable's unit.
     noise_ratio : standard deviation of these over the predicted one.
-    cells : cells of the wall, over which the mean model averages.
+    cells : small squares of the wall, over whose residuals the search for systematic effects averages.
     held_out : (n,) true for points that are kept for validation.
     training_rows : (k,) rows of the residuals that the selection may use.
     """
@@ -76,7 +76,9 @@ class PassInput:
         edge_effects: list[EdgeEffect],
         realigned: bool = True,
     ) -> PassInput:
-        """Build the input of a pass: put edge effects into the model, register, and find scene changes.
+        """Build the input of one run of the selection: put edge effects into the model, register, and find scene changes.
+
+        Edge effects act at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint.
 
         Parameters
         ----------
@@ -133,7 +135,7 @@ class PassInput:
     def training_part(self) -> tuple[Measurement, Residuals]:
         """The measurement and the residuals of the training points alone.
 
-        What edge effects do at these points is kept fixed, because it hardly changes while the cameras move by millimetres.
+        What edge effects do at these points is kept fixed while the pose is fitted: a move by millimetres hardly changes it.
         """
         measurement, residuals = self.measurement, self.residuals
         if isinstance(measurement, StereoMeasurement) and isinstance(residuals, StereoResiduals):
@@ -160,7 +162,7 @@ class SelectionPass:
 
     @classmethod
     def of(cls, pass_input: PassInput, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]) -> SelectionPass:
-        """Run the selection on one input.
+        """Run the selection of effects on one input.
 
         Parameters
         ----------
@@ -186,7 +188,9 @@ class SelectionPass:
 
 @dataclass(frozen=True, eq=False)
 class PassInputs:
-    """Builds the inputs that a selection pass may have: with all edge effects that were found, with some, or with none.
+    """Builds the inputs that a run of the selection of effects may have: with all edge effects found, with some, or with none.
+
+    Edge effects act at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint.
 
     Attributes
     ----------
@@ -206,26 +210,32 @@ class PassInputs:
 
     @cached_property
     def with_edge_effects(self) -> PassInput:
-        """The input with the edge effects that the residuals show, and the pose estimated again with them."""
+        """Input of the selection with the edge effects that the residuals show, and the pose estimated again with them."""
         return self.with_these(self._edge_effects)
 
     @cached_property
     def at_initial_pose(self) -> PassInput:
-        """The input with the same edge effects as `with_edge_effects`, at the pose that was estimated without them."""
+        """Input of the selection with the edge effects that the residuals show, at the pose that was estimated without them.
+
+        It is for smoothing, which can shift a pose that is estimated with it.
+        """
         return PassInput.of(self.measurement, self.plain, self.held_out_points, self._edge_effects, realigned=False)
 
     @cached_property
     def without_edge_effects(self) -> PassInput:
-        """The input without any edge effect."""
+        """Input of the selection without any effect at depth steps (edge fattening, smoothing, beam footprint)."""
         return self.with_these([])
 
     def edge_effects_given(self, named: list[NamedEffect]) -> list[EdgeEffect]:
-        """Return the edge effects that the residuals show once some named effects are in the model."""
+        """Search effects at depth steps (edge effects) again after some effects were named; return those that the residuals show.
+
+        named: the named effects, which are put into the model before.
+        """
         seen = aligned_with(self.measurement, named, self.plain.index[~self.held_out_points[self.plain.index]])
         return _find_edge_effects(seen.measurement, seen.residuals, self.held_out_points)
 
     def with_these(self, edge_effects: list[EdgeEffect]) -> PassInput:
-        """Return the input with the given edge effects, and the pose estimated again with them."""
+        """Return the input of the selection with the given edge effects in the model, and the pose estimated again with them."""
         return PassInput.of(self.measurement, self.plain, self.held_out_points, edge_effects)
 
 
@@ -233,9 +243,9 @@ def best_pass(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple
     """Run the selection with several inputs and return the simplest pass that explains the residuals.
 
     An effect that moves all rays can hide or imitate an edge effect. Edge effects are therefore searched again with the named
-    effects in the model. If some were found, they are also searched with what is named without them. Smoothing can shift the
-    estimated pose, so a pass at the initial pose is tried too if the first pass needs an empirical term and no single effect
-    explains everything.
+    effects in the model. If there are some, a run without them is tried too, and they are searched again with what that run
+    names. Smoothing can shift the estimated pose, so a pass at the initial pose is tried too if the first pass needs an
+    empirical term and no single effect explains everything.
 
     Among the passes whose noise is close to the lowest, the one of least complexity wins. The noise is compared because enough
     noise can take the place of any effect.

@@ -84,7 +84,8 @@ class Evidence:
     def model_is_accepted(self) -> bool:
         """Whether the model without any further effect is accepted.
 
-        It must reach the floor of the gap within the uncertainty, and neither misfit, outliers nor variance may be significant.
+        Its score must be within its uncertainty of the score that noise alone leaves, and neither misfit, outliers nor variance
+        may be significant.
         """
         measured = self.gap is not None and not self.gap.above_floor and self.p_value is not None
         return measured and not (self.misfit_is_significant or self.outlier_share or self.is_overdispersed)
@@ -93,8 +94,8 @@ class Evidence:
     def gap_stays_open(self) -> bool:
         """Whether the named effects leave most of the gap open.
 
-        The score after must exceed the floor, and most of the gap must be left, both by more than their uncertainty. It also
-        counts if the score is worse with the effects and the misfit is significant.
+        The score with the effects must exceed the score that noise alone leaves, and most of the gap must be left, both by more
+        than their uncertainty. The gap also stays open if the score is worse with the effects and the misfit is significant.
         """
         gap = self.gap
         if gap is not None and gap.after > gap.before and self.misfit_is_significant:
@@ -113,7 +114,10 @@ class Evidence:
 
     @property
     def closes_little(self) -> bool:
-        """Whether the named effects close clearly less than the required share of the gap, or the gap is uncertain."""
+        """Whether the named effects close clearly less of the gap than a diagnosis must, or the gap is uncertain.
+
+        The required share is the threshold `least_closed`.
+        """
         gap = self.gap
         by = thresholds().verdict
         if gap is None or gap.closed is None:
@@ -134,7 +138,10 @@ class Evidence:
 
 
 def verdict_of(named: Sequence[NamedEffect], evidence: Evidence) -> str:
-    """Return the verdict, a key of `VERDICTS`, that follows from the named effects and the evidence."""
+    """Decide the verdict of a diagnosis, a key of `VERDICTS` such as "no_gap", "named" or "unknown".
+
+    named: the named effects. evidence: scores and p-values that decide.
+    """
     if evidence.much_moved:
         return "insufficient_data"
     if not named:
@@ -188,7 +195,7 @@ def describe_closing(gap: Gap, model_changed: bool) -> str:
 
     Parameters
     ----------
-    gap : scores before and after, and the floor.
+    gap : scores of the model without and with the named effects, and the score that noise alone leaves (floor).
     model_changed : whether the model after differs from the model before.
     """
     if gap.closed is None:

@@ -21,12 +21,15 @@ _OBSERVABLE = {"tls": "smooth_m", "stereo": "smooth_px"}
 
 
 def unseen_entry(found: GapDiagnosis) -> list[dict[str, Any]]:
-    """Return the entry `detectable` of gap.json."""
+    """Return the entry `detectable` of gap.json: sizes from which effects that were not found would have shown."""
     return [{**each.to_dict(), "name": _full_name(each, found.residuals.sensor)} for each in found.unseen]
 
 
 def unseen_rows(found: GapDiagnosis) -> list[dict[str, str]]:
-    """Return the rows of the report's table: name, size, and the variant or the reason for no size."""
+    """Return the rows of the report's table of effects that may be there unseen.
+
+    Columns: name, the size that would have shown, and the choice (period, camera) for which it holds or why there is no size.
+    """
     return [
         {
             "name": _full_name(each, found.residuals.sensor),
@@ -38,7 +41,7 @@ def unseen_rows(found: GapDiagnosis) -> list[dict[str, str]]:
 
 
 def unseen_line(found: GapDiagnosis) -> str:
-    """Return the effects that could be largest without having shown, as one line; "" where none was computed."""
+    """Return one line for the terminal that names the effects that could be largest without having shown; "" without any."""
     sensor = found.residuals.sensor
     known = [each for each in found.unseen if np.isfinite(each.size) and each.parameter]
     largest = sorted(known, key=lambda each: -each.size / _typical(each))[:_MOST_NAMED]
