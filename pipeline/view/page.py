@@ -134,9 +134,19 @@ def register_callbacks(app: dash.Dash, results: Results, lock: Lock, other: Resu
         move = 1 if ctx.triggered_id == "next" else -1
         return (now + move) % len(options) if now is not None else (0 if move > 0 else len(options) - 1)
 
+    def chosen_item(number: int | None, step: str) -> Any:
+        with lock:
+            items = results.items(step)
+        return None if number is None or number >= len(items) else items[number]
+
+    @app.callback(Output("facts", "children"), Input("item", "value"), State("step", "value"), prevent_initial_call=True)
+    def tell(number: int | None, step: str) -> Any:
+        """Facts have a callback of their own: Dash drops the answer to a click if the map's redrawing asks the same callback."""
+        item = chosen_item(number, step)
+        return None if item is None else facts_table(item)
+
     @app.callback(
         Output("window", "data"),
-        Output("facts", "children"),
         Input("item", "value"),
         Input("whole", "n_clicks"),
         Input("map", "relayoutData"),
@@ -146,14 +156,11 @@ def register_callbacks(app: dash.Dash, results: Results, lock: Lock, other: Resu
     )
     def move(number: int | None, _whole: Any, zoomed: Any, step: str, now: Any) -> Any:
         if ctx.triggered_id == "whole":
-            return None, no_update
+            return None
         if ctx.triggered_id == "map":
-            return zoom(zoomed, now), no_update
-        with lock:
-            items = results.items(step)
-        if number is None or number >= len(items):
-            return no_update, None
-        return list(items[number].window()), facts_table(items[number])
+            return zoom(zoomed, now)
+        item = chosen_item(number, step)
+        return no_update if item is None else list(item.window())
 
     @app.callback(
         Output("wall", "figure"),
