@@ -30,7 +30,7 @@ def picture(
     points : (n, 3) measured points, m.
     mesh : Reference surface, in the frame of the points.
     position : (3,) position of the sensor, in the frame of the points, m.
-    rotation : (3, 3) rotation from the sensor's frame (x forward, z up) to the frame of the points.
+    rotation : (3, 3) rotation from the sensor's frame (z up) to the frame of the points.
     title : Title of the picture.
     sensor : Whether a sensor is at that position; otherwise it is only a place to look from.
     """
