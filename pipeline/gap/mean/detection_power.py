@@ -22,8 +22,9 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import ncx2
 
-from pipeline.gap.mean.candidates import Candidate, robust_extent
+from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.mean.design import NULL_DRAWS, Design
+from pipeline.gap.mean.nonparametric_terms import robust_extent
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 

@@ -7,19 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.gap.mean.candidates import (
-    HARMONIC_ORDERS,
-    HARMONIC_SERIES,
-    LINE_PATTERN,
-    SPATIAL_NULL,
-    Candidate,
-    ExplanationKey,
-    SineGrid,
-    harmonics,
-)
+from pipeline.gap.mean.candidates import Candidate, ExplanationKey, SineGrid
 from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.detection_power import DetectableSize, detectable_sizes
 from pipeline.gap.mean.mean_model import MeanFit
+from pipeline.gap.mean.nonparametric_terms import HARMONIC_ORDERS, HARMONIC_SERIES, LINE_PATTERN, SPATIAL_NULL, harmonics
 from pipeline.gap.mean.null_distribution import NullDistribution
 from pipeline.gap.mean.selection import EffectSet, FamilyScore, ForwardSelection, SelectedEffect
 from pipeline.gap.residuals.residuals import Residuals

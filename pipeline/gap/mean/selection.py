@@ -12,7 +12,8 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
-from pipeline.gap.mean.candidates import POLYNOMIAL, SPATIAL_NULL, Candidate
+from pipeline.gap.mean.candidates import Candidate
+from pipeline.gap.mean.nonparametric_terms import POLYNOMIAL, SPATIAL_NULL
 from pipeline.gap.thresholds import thresholds
 from sensors.effects.range_offset import RangeOffset
 
