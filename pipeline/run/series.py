@@ -223,9 +223,9 @@ class Series:
         wall = self.config.wall
         if not isinstance(wall, ImportedWall):
             raise InputError(
-                "surfaces of epochs need a wall that is imported from a mesh",
+                "own meshes of the epochs need a wall that is imported from a mesh",
                 where="series.surfaces",
-                remedy="leave `wall` out, or give it a mesh",
+                remedy="leave `wall` out: the first of these meshes is then the wall",
             )
         mesh, _ = wall.model_copy(update={"mesh": path}).load()
         mesh = mesh.with_vertices(self.site.frame.to_wall(mesh.vertices))

@@ -257,13 +257,13 @@ def _require_same(earlier: dict[str, Any], identity: dict[str, Any], out: Path) 
             Path(path).name for path, digest in identity["inputs"].items() if earlier.get("inputs", {}).get(path) != digest
         ]
         raise InputError(
-            f"the run in the folder was started with another {', '.join(replaced)}",
+            f"these input files have changed since the run in the folder was started: {', '.join(replaced)}",
             where=f"--out {out}",
-            remedy="put the file back as it was, or choose another --out",
+            remedy="put them back as they were, or choose another --out",
         )
     if changed:
         raise InputError(
-            f"the run in the folder has another {' and '.join(changed)}",
+            f"the run in the folder was started with another {' and '.join(changed)}",
             where=f"--out {out}",
             remedy="resume with the same config, sensor and seed, or choose another --out",
         )

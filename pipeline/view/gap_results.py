@@ -152,20 +152,20 @@ def _cloud(path: Path) -> PointCloud:
     missing = [name for name in _CHANNELS if name not in cloud.extra]
     if missing:
         raise InputError(
-            f"has no channel {missing[0]}",
+            f"the point cloud has no channel {missing[0]}",
             where=str(path),
-            allowed="a file of scarpsim gap",
+            allowed="before.laz and after.laz as scarpsim gap writes them",
             remedy="run scarpsim gap again on the measurement",
         )
     if not all(np.isfinite(cloud.extra[name]).all() and cloud.extra[name].ndim == 1 for name in _CHANNELS):
         raise InputError(
-            f"has values in {' or '.join(_CHANNELS)} that are not finite",
+            f"the point cloud has values of {' or '.join(_CHANNELS)} that are not finite numbers",
             where=str(path),
             remedy="run scarpsim gap again on the measurement",
         )
     if len(cloud.points) < _FEWEST:
         raise InputError(
-            f"contains only {len(cloud.points)} points",
+            f"the point cloud contains only {len(cloud.points)} points",
             where=str(path),
             allowed=f"at least {_FEWEST}",
             remedy="run scarpsim gap again on the measurement",

@@ -52,11 +52,11 @@ class RunResults:
         self.surfaces = {"surface": "as measured", "reference": "reference, as measured", "truth": "as it really is"}
         self._found = _detections(detections) if detections else {}
         if detections and not set(self._found) & set(self.steps):
-            allowed = ", ".join(f"difference_{int(key):03d}.tif" for key in self.steps)
+            maps = ", ".join(f"difference_{int(key):03d}.tif" for key in self.steps)
             raise InputError(
                 "contains no detections of this run's maps",
                 where=str(detections),
-                allowed=allowed,
+                allowed=f"detections in {maps}",
                 remedy="give the folder that scarpsim detect filled for this run",
             )
         self._map = lru_cache(4)(read_geotiff)
@@ -166,7 +166,9 @@ def _detections(folder: Path) -> dict[str, list[Item]]:
     """Read the events of `scarpsim detect` at its lowest confidence, by epoch."""
     tables = sorted((_confidence(path), path) for path in folder.glob("events_*.csv"))
     if not tables:
-        raise InputError("contains no events_*.csv", where=str(folder), remedy="give the folder that scarpsim detect filled")
+        raise InputError(
+            "contains no table of events (events_*.csv)", where=str(folder), remedy="give the folder that scarpsim detect filled"
+        )
     found: dict[str, list[Item]] = {}
     for event in read_events(tables[0][1]):
         number = re.search(r"difference_(\d{1,9})", event.image)
@@ -186,7 +188,7 @@ def _confidence(path: Path) -> float:
             "is not the name of a table of events",
             where=str(path),
             allowed="such as events_0.9.csv",
-            remedy="use the names that scarpsim detect gave",
+            remedy="give the file the name that scarpsim detect gave it",
         )
     return value
 

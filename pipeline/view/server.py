@@ -56,7 +56,9 @@ def open_results(folder: Path, detections: Path | None = None) -> Results:
         return RunResults(folder, detections)
     if detections:
         raise InputError(
-            "detections can only be shown with a run", where="--detections", remedy="leave it out, or give the run's folder"
+            "detections can only be shown with a simulated run",
+            where="--detections",
+            remedy="leave it out, or give the folder of the run in which they were found",
         )
     if (folder / "gap.json").exists():
         return GapResults(folder)
@@ -128,7 +130,9 @@ def open_second(folder: Path, first: Results) -> Results:
     second = open_results(folder)
     if not isinstance(first, RunResults) or not isinstance(second, RunResults):
         raise InputError(
-            "only two runs of one wall can be shown side by side", where=str(folder), remedy="give the folders of two runs"
+            "only two runs of one wall can be shown side by side",
+            where=str(folder),
+            remedy="give two folders of scarpsim simulate",
         )
     check_same_wall(first.world_to_wall, second.world_to_wall, first.extent_m, str(folder))
     return second
