@@ -66,7 +66,9 @@ class GapResults:
         return [Layer("residual", "deeper than predicted (missing rock positive)", "mm", _MM, diverging=True, limit=self._limit)]
 
     def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
-        """Return the measured surface in a part of the wall, coloured by the residuals, both averaged over cells of about four points.
+        """Return the measured surface in a part of the wall, coloured by the residuals.
+
+        Heights and residuals are means over cells of about four points.
 
         step: key of the model, such as "before" or "after" the diagnosis. window: part of the wall; None: all of it.
         budget: upper limit on the number of cells. `surface` and `layer` have no effect, as there is one of each.

@@ -35,7 +35,7 @@ class Pair:
 
     @property
     def choices(self) -> dict[str, str]:
-        """Labels of what can be shown right of the border, by key: the epochs (or other states) of the folder and of a second run."""
+        """Labels of what can be shown right of the border, by key: epochs (or other states) of the folder and of a second run."""
         own = {f"{OWN}{key}": label for key, label in self.results.steps.items()}
         if self.other is None:
             return own
