@@ -199,7 +199,10 @@ class SineGrid:
     angle: str = ""
 
     def candidate(self, index: int) -> Candidate:
-        """Return the sinusoidal error at one of the trial frequencies as a candidate; index: its number from 0."""
+        """Return the sinusoidal error at one of its trial frequencies as a candidate for a regression.
+
+        index: index into `frequencies`, from 0.
+        """
         return self.at_period(1 / float(self.frequencies[index]))
 
     def at_period(self, period: float) -> Candidate:
@@ -295,7 +298,7 @@ def frequency_grid(low: float, high: float, step: float, most: int = 200) -> Flo
     Parameters
     ----------
     low, high : First and last frequency, in any unit.
-    step : Largest spacing, same unit; it is exceeded only where `most` requires it.
+    step : Approximate spacing, same unit; the spacing is wider where `most` requires it.
     most : Largest number of frequencies.
     """
     return np.linspace(low, high, int(np.clip(np.ceil((high - low) / step), 2, most)))

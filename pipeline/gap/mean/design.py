@@ -109,7 +109,7 @@ class Design:
         any.
     column_numbers : For each candidate the numbers of its columns.
     sine_products : Inner products of the columns of all trial sines with the other columns.
-    noise_products : (k, NULL_DRAWS) inner products of the k columns in `fixed` with simulated noise within cells.
+    noise_products : (k, d) inner products of the k columns in `fixed` with d = NULL_DRAWS draws of simulated noise within cells.
     equations : Normal equations of all columns, under each covariance of the reference error that the residuals allow.
     """
 

@@ -80,7 +80,7 @@ class Signature:
     columns : Numbers of the candidate's design columns among those of all candidates that are examined.
     sine : Whether the candidate has a phase; the phase that is hardest to detect is then taken.
     needed : Function that returns the log-likelihood ratio from which the error shows. Its argument is the indices of the
-        trial covariances of the residuals, the most likely first.
+        trial covariances of the reference surface's error, the most likely first.
     """
 
     candidate: Candidate
@@ -131,8 +131,8 @@ class DetectionPower:
     """Simulated measurements without further effects, from which the detectable size of any examined sensor error follows.
 
     They are kept as inner products of d simulations with the k design columns of the examined errors, under each of C trial
-    covariances. Columns that every model has, of the pose and of the effects found, are projected out; they are called
-    nuisance columns.
+    covariances of the reference surface's error. Columns that every model has, of the pose and of the effects found, are
+    projected out; they are called nuisance columns.
 
     Attributes
     ----------
@@ -270,7 +270,7 @@ def detectable_sizes(
     design : The regression problem with the found effects in the model (`Design.conditioned_on`).
     members : The found effects; they are fitted beside each other error, and no size is computed for them.
     needed : Function that returns the log-likelihood ratio from which a candidate error shows. Its arguments are the
-        candidate, and the indices of the trial covariances with the most likely first.
+        candidate, and the indices of the trial covariances of the reference surface's error, the most likely first.
     random : Source of the random numbers of the simulations.
 
     Returns

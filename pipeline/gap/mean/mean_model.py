@@ -256,6 +256,10 @@ class MeanModel:
         weighted : (n, k) columns, divided by the standard deviation of each point.
         planes : Coefficients of the planes, as `plane_coefficients` returns them for these columns.
         rows : Slice of the n points for which deviations are returned.
+
+        Returns
+        -------
+        (n', k) deviations at the n' points of the slice, divided by the standard deviation of each point.
         """
         return np.asarray(weighted[rows] - self._across[rows] @ planes)
 

@@ -113,8 +113,9 @@ def _spline_columns(x: FloatArray) -> FloatArray:
 def robust_extent(x: FloatArray) -> float:
     """Return the extent of n values, largest minus smallest, without the outermost 0.5 % at either end.
 
-    The trial periods of a wave along a covariate are chosen from this extent, so that single far values do not matter. x: (n,)
-    values, in any unit.
+    The trial periods of a wave along a covariate are chosen from this extent, so that single far values do not matter.
+
+    x: (n,) values, in any unit.
     """
     return float(np.ptp(np.quantile(x, [0.005, 0.995])))
 

@@ -47,13 +47,18 @@ class ProjectedColumns:
         return cls(within, weighed, [np.concatenate(basis, axis=1) for basis in bases])
 
     def select(self, columns: list[int]) -> ProjectedColumns:
-        """Return some of the design columns; columns: their numbers, from 0, in the wanted order."""
+        """Return some of the k design columns, such as those of one candidate error.
+
+        columns: their numbers, from 0, in the wanted order.
+        """
         within = self.within[:, columns]
         weighed = within if self.within_weighted is self.within else self.within_weighted[:, columns]
         return ProjectedColumns(within, weighed, [part[:, columns] for part in self.between])
 
     def in_bases(self, bases: list[int]) -> ProjectedColumns:
         """Return the same design columns for only some trial correlation functions of the reference surface's error.
+
+        It saves time after unlikely functions have been dropped (`MeanModel.restrict`).
 
         bases: indices of these functions in the list `between`, which holds the cell means for each of them.
         """

@@ -108,6 +108,8 @@ class WithinCellNoise:
     def whiten(self, on_nodes: FloatArray) -> FloatArray:
         """Transform k columns over the q nodes of the grid-correlated noise so that their inner products are weighted by K^-1.
 
+        It is a step of computing products of design columns under the inverse covariance of the noise.
+
         The result is L^-1 times the columns, with L L' = K = w C^-1 + Z'Z: the share w of white noise, the covariance C of the
         node values, and their weights Z at the points.
 
