@@ -89,7 +89,7 @@ class RasterPair:
 
         centre: (3,) centre of the rotation, wall frame, m.
 
-        Returns (6, h, w): derivatives by the three shifts, m/m, and the three rotation angles, m/rad, wall frame; NaN without data.
+        For each view (separately mapped part) of the wall, the pixels that did not change: registration and noise rest on them.
         """
         found = _design(self.epoch, self.from_wall.apply(centre))
         if self.from_wall is SAME:
