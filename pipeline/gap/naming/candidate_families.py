@@ -10,11 +10,10 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.formats.measurements.measurement import Measurement
-from pipeline.gap.mean.candidates import (
+from pipeline.gap.mean.candidates import Candidate, SineGrid
+from pipeline.gap.mean.nonparametric_terms import (
     MOST_CYCLES,
     MOST_CYCLES_OF_A_SENSOR,
-    Candidate,
-    SineGrid,
     angle_error_terms,
     half_pixel_sine,
     line_pattern_terms,

@@ -10,8 +10,8 @@ import numpy as np
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement
-from pipeline.gap.mean.candidates import LINE_PATTERN, SPATIAL_NULL
 from pipeline.gap.mean.detection_power import DetectableSize
+from pipeline.gap.mean.nonparametric_terms import LINE_PATTERN, SPATIAL_NULL
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
 from pipeline.gap.naming.candidate_families import candidate_families, model_has

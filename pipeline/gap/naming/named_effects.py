@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import Measurement
-from pipeline.gap.mean.candidates import POLYNOMIAL, Candidate
+from pipeline.gap.mean.candidates import Candidate
+from pipeline.gap.mean.nonparametric_terms import POLYNOMIAL
 from pipeline.gap.mean.selection import SelectedEffect
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
 from pipeline.gap.noise_and_edges.missing_returns import LossExplanation

@@ -8,15 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.formats.measurements.measurement import Measurement
-from pipeline.gap.mean.candidates import (
-    HARMONIC_ORDERS,
-    HARMONICS,
-    Candidate,
-    ExplanationKey,
-    SineGrid,
-    harmonics,
-    prior_precision,
-)
+from pipeline.gap.mean.candidates import Candidate, ExplanationKey, SineGrid, prior_precision
+from pipeline.gap.mean.nonparametric_terms import HARMONIC_ORDERS, HARMONICS, harmonics
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import FamilyScore, SelectedEffect, equivalence_margin
 from pipeline.gap.naming.candidate_families import PERIODIC, candidate_families, catalogue_families
