@@ -150,7 +150,7 @@ class Evidence:
 
 
 def verdict_of(named: Sequence[NamedEffect], evidence: Evidence) -> str:
-    """Decide the verdict of a diagnosis: does the sensor model agree with the measurement, and if not, is it known why?
+    """Decide the verdict of a diagnosis: whether the sensor model agrees with the measurement, and if not, what explains it.
 
     Parameters
     ----------
