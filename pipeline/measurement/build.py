@@ -37,13 +37,14 @@ _PLANES = "incidence angles refer to planes through 24 of its points, as noise a
 
 
 def build(request: Request, out: Path) -> Interpretation:
-    """Write the measurement folder of laser scans, and a record of how the files were interpreted.
+    """Convert raw laser scans to a measurement folder, the input of `scarpsim gap`.
 
-    The folder has measurement.yaml, model.yaml, points and reference.
+    The folder has measurement.yaml, model.yaml (the scanner's noise), the points, the reference surface, and a record of how the
+    files were interpreted.
 
     Parameters
     ----------
-    request : The files and what the user says of them.
+    request : The raw files and what the user says of them.
     out : Folder to write.
 
     Returns
@@ -91,19 +92,24 @@ def build(request: Request, out: Path) -> Interpretation:
 
 
 def build_stereo(request: Request, cameras: Path, labels: tuple[str, str] | None, out: Path) -> Interpretation:
-    """Write the measurement folder of clouds from photographs with a known stereo pair.
+    """Convert photogrammetric clouds with a known stereo pair to a measurement folder, the input of `scarpsim gap`.
 
     Parameters
     ----------
-    request : The files and what the user says of them.
-    cameras : File with the pair's calibration.
-    labels : Names of the left and right camera in a project; None: the only two.
+    request : The raw files and what the user says of them.
+    cameras : File or folder with the calibration and pose of the cameras.
+    labels : Names of the left and right camera, if `cameras` has more than two; else None.
     out : Folder to write.
+
+    Returns
+    -------
+    How the files were interpreted.
 
     Raises
     ------
     InputError
-        As `build` does, and if the pair does not see the cloud.
+        If a file cannot be used, the reference is to be half of the cloud, the sensor model is not that of a stereo pair, the
+        pair does not see the cloud, or points and reference do not overlap.
     """
     if request.reference == HALF:
         raise InputError(
@@ -247,7 +253,7 @@ def _with_rounding(model: TlsModel, scan: RawScan, station: Station) -> tuple[Tl
 
 
 def replace_noise(model: TlsModel, sigma_m: float) -> TlsModel:
-    """Return the model with another standard deviation of its white range noise."""
+    """Return a laser scanner's model with another standard deviation, m, of the white noise of its ranges."""
     return model.model_copy(update={"noise": model.noise.model_copy(update={"range_sigma_m": sigma_m})})
 
 

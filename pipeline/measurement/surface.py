@@ -33,12 +33,16 @@ _FIRST_GUESS = 0.1
 
 
 def build_surface(request: Request, out: Path) -> Interpretation:
-    """Write the folder of a measurement without cameras.
+    """Convert surfaces from photographs whose cameras are unknown to a measurement folder, the input of `scarpsim gap`.
 
     Parameters
     ----------
-    request : The files and what the user says of them.
+    request : The raw files (clouds, meshes or elevation models) and what the user says of them.
     out : Folder to write.
+
+    Returns
+    -------
+    How the files were interpreted.
 
     Raises
     ------

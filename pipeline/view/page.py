@@ -245,7 +245,10 @@ def pictures(
 
 
 def following(steps: list[str], step: str) -> str:
-    """Return the key of the state (such as an epoch) after `step`, to play all in turn; after the last comes the first."""
+    """Return the key of the next state (such as an epoch), to play all states in turn; after the last comes the first.
+
+    steps: keys of all states. step: key of the present one.
+    """
     return steps[(steps.index(step) + 1) % len(steps)]
 
 

@@ -122,7 +122,10 @@ class Item:
     facts: Mapping[str, str] = field(default_factory=dict)
 
     def window(self) -> ViewWindow:
-        """Return the part of the wall to show when the user selects this item: around it, four times as high as it is large."""
+        """Return the part of the wall to show when this item is selected: centred on it, four times as high as its longer side.
+
+        An item smaller than 1 m counts as 1 m large.
+        """
         x0, x1, y0, y1 = self.box[:4]
         half = max(x1 - x0, y1 - y0, _LEAST_M) * _SURROUNDINGS / 2
         x, y = (x0 + x1) / 2, (y0 + y1) / 2
