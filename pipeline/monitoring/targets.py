@@ -111,7 +111,7 @@ def fit_targets(targets: Targets, reference: str, epoch: str, frame: WallFrame) 
     if apart.max() > _FAR_M:
         worst = common[int(np.argmax(apart))]
         raise InputError(
-            f"target {worst} of {epoch} is {apart.max():.2f} m from its place in {reference}",
+            f"target {worst} of {epoch} is {apart.max():.2f} m from its place in {reference} after the fit",
             where="--targets",
             remedy="leave out targets that moved or were mistaken",
         )
