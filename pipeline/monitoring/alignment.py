@@ -89,7 +89,8 @@ class RasterPair:
 
         centre: (3,) centre of the rotation, wall frame, m.
 
-        For each view (separately mapped part) of the wall, the pixels that did not change: registration and noise rest on them.
+        Returns (6, h, w): derivatives by the three shifts, m/m, and the three rotation angles, m/rad, wall frame. NaN without
+        data.
         """
         found = _design(self.epoch, self.from_wall.apply(centre))
         if self.from_wall is SAME:
