@@ -67,20 +67,21 @@ _CURVE_POINTS = 60
 
 @dataclass(frozen=True)
 class DetectionLaw:
-    """Probability that `monitor` lists a change of volume V, from a logistic regression on trial blocks.
+    """Give the probability that `monitor` lists a change of volume V, by a logistic regression on simulated trial blocks.
 
-    logit P = coefficients . (1, ln V, ln u), with the displacement u of a block that moved; missing rock has no term in u.
+    logit P = coefficients . (1, ln V, ln u), where u is the displacement of a block that has moved. For rock that has fallen
+    the term in u is absent.
 
     Attributes
     ----------
     coefficients : (2,) or (3,) array
         Coefficients of the best fit, for V in m3 and u in m.
     resampled : (b, 2) or (b, 3) array
-        Coefficients fitted to b bootstrap samples of the trial blocks.
+        Coefficients fitted to b bootstrap samples of the trial blocks, for confidence intervals.
     blocks : int
-        Number of trial blocks of which the sensor sees enough.
+        Number of trial blocks that were used: those of which the sensor sees at least half.
     seen_share : float
-        Their share of all trial blocks.
+        `blocks` divided by the number of all trial blocks.
     """
 
     coefficients: FloatArray
@@ -89,26 +90,63 @@ class DetectionLaw:
     seen_share: float
 
     def probability(self, volume_m3: FloatArray, moved_m: FloatArray | float = 1.0) -> FloatArray:
-        """Return the probability (k,) for volumes (k,), m3, and displacements, m (ignored for missing rock)."""
+        """Return the probability that changes are listed.
+
+        Parameters
+        ----------
+        volume_m3 : (k,) array
+            Volumes of the blocks, m3.
+        moved_m : (k,) array or float
+            How far each block has moved, m; ignored by a law for rock that has fallen.
+
+        Returns
+        -------
+        (k,) array
+            Probabilities, 0 to 1.
+        """
         return _logistic(_design(np.asarray(volume_m3), np.asarray(moved_m), len(self.coefficients)) @ self.coefficients)
 
     def volume_m3(self, probability: float = PROBABILITY) -> tuple[float, float, float]:
-        """Return the volume of missing rock that is listed with a probability, and its 95 % interval, m3."""
+        """Return the volume of fallen rock, m3, that is listed with a given probability, by default 0.95.
+
+        The three numbers are the volume and the lower and upper end of its 95 % confidence interval.
+        """
         logit = np.log(probability / (1 - probability))
         return _with_interval(self, lambda fit: np.exp((logit - fit[..., 0]) / fit[..., 1]))
 
     def displacement_m(self, volume_m3: float, probability: float = PROBABILITY) -> tuple[float, float, float]:
-        """Return the displacement at which a block of a volume, m3, is listed with a probability, and its 95 % interval, m."""
+        """Return how far a block must have moved, m, to be listed with a given probability.
+
+        Parameters
+        ----------
+        volume_m3 : float
+            Volume of the block, m3.
+        probability : float
+            Probability of being listed, between 0 and 1.
+
+        Returns
+        -------
+        (float, float, float)
+            The displacement, and the lower and upper end of its 95 % confidence interval.
+        """
         logit = np.log(probability / (1 - probability))
         return _with_interval(self, lambda fit: np.exp((logit - fit[..., 0] - fit[..., 1] * np.log(volume_m3)) / fit[..., 2]))
 
 
 @dataclass(frozen=True)
 class EpochPromise:
-    """What an epoch shows that consists of one or more scans, whose points are joined.
+    """State which changes an epoch is predicted to show if it consists of a given number of scans, whose points are joined.
 
-    scans: number of scans in the epoch. level_m: its median level of detection, m. The laws are the detection probabilities of
-    missing rock and of blocks that moved.
+    Attributes
+    ----------
+    scans : int
+        Number of scans in the epoch.
+    level_m : float
+        Median level of detection of the epoch's map of changes, m.
+    missing : DetectionLaw
+        Probability that fallen rock is listed, by its volume.
+    moved : DetectionLaw
+        Probability that a block that has moved is listed, by its volume and displacement.
     """
 
     scans: int
@@ -119,22 +157,22 @@ class EpochPromise:
 
 @dataclass(frozen=True)
 class SeriesPlan:
-    """What a series of epochs is predicted to show.
+    """Store which rockfalls a series of epochs is predicted to show, and how early it shows a moving block.
 
     Attributes
     ----------
     sensor : str
         "stereo" or "tls".
     gsd_m : float
-        Side of a pixel of the maps, m.
+        Side of a pixel of the maps of changes, m.
     every_h : float or None
-        The config's own interval, h; None: its times are not regular.
+        Interval between the epochs of the config's series, h; None if it is not regular.
     promises : tuple of EpochPromise
-        What an epoch shows, for each number of scans that it may consist of.
+        What an epoch shows, for each number of scans of which it may consist.
     volumes_m3 : tuple of float
-        Volumes, m3, of the moving blocks for which lead times are predicted.
+        Volumes, m3, of the moving blocks for which warning times are predicted.
     motion : Motion
-        How these blocks move before they fall.
+        How these blocks move out of the wall before they fall.
     """
 
     sensor: SensorName
@@ -146,15 +184,15 @@ class SeriesPlan:
 
     @property
     def schedules_h(self) -> list[float]:
-        """Intervals between epochs, h, for which lead times are predicted."""
+        """Intervals between epochs, h, for which warning times are predicted: an hour, a day, a week and the config's own."""
         own = () if self.every_h is None else (self.every_h,)
         return sorted({*SCHEDULES_H, *own})
 
     def lead_h(self, volume_m3: float, every_h: float, promise: EpochPromise) -> tuple[float, float]:
-        """Return how long before its fall a moving block is noticed, h, as a cautious and a median value.
+        """Return how long before its fall, h, a moving block is noticed: a cautious value and a median value.
 
-        The cautious value is reached in 95 % of cases even if the last epoch was a whole interval ago when the motion became
-        large enough. Both are 0 if the motion is not noticed before the fall.
+        The cautious value is reached in 95 % of cases, even if a whole interval between epochs passes after the block has moved
+        far enough. Both are 0 if the motion is not noticed before the fall.
 
         Parameters
         ----------
@@ -163,14 +201,14 @@ class SeriesPlan:
         every_h : float
             Interval between epochs, h.
         promise : EpochPromise
-            What an epoch shows.
+            What an epoch shows, by which the displacement is known from which the motion is noticed.
         """
         late = self.motion.time_left(promise.moved.displacement_m(volume_m3)[0]) - every_h
         usual = self.motion.time_left(promise.moved.displacement_m(volume_m3, 0.5)[0]) - every_h / 2
         return max(late, 0.0), max(usual, late, 0.0)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the prediction as plan.json stores it."""
+        """Return what the series is predicted to show as a dictionary for JSON, as plan.json stores it."""
         return {
             "sensor": self.sensor,
             "gsd_m": self.gsd_m,
@@ -211,16 +249,18 @@ class SeriesPlan:
 
 
 def plan_series(config: SimulationConfig, sensor: SensorName, progress: Progress | None = None) -> SeriesPlan:
-    """Predict what the series of a config will show with a sensor, from trial epochs that are compared as `monitor` does.
+    """Predict which rockfalls and moving blocks the series of a config will show with a sensor.
+
+    It simulates trial epochs with blocks that have fallen or moved, and compares them with a reference as `monitor` does.
 
     Parameters
     ----------
     config : SimulationConfig
-        A config with a section `series` that has no `surfaces`.
+        A config with a section `series` that simulates rockfalls, so without its key `surfaces` (given surfaces of epochs).
     sensor : str
         "stereo" or "tls".
     progress : Progress, optional
-        Receives the progress.
+        Object that is told which stage is running, to show it to the user.
 
     Raises
     ------

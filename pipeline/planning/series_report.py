@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.planning.series import PROBABILITY, EpochPromise, SeriesPlan
-from pipeline.report.figures import CurvePanel, curves_figure
+from pipeline.report.curve_figures import CurvePanel, curves_figure
 from pipeline.report.page import litres, millimetres
 
 _SENSORS = {"tls": "Laser scanner", "stereo": "Stereo pair"}
@@ -17,7 +17,19 @@ _CURVE_POINTS = 80
 
 @dataclass(frozen=True)
 class SeriesPart:
-    """What the report's page shows of one series: sentences, curves as PNG, and a table's header and rows."""
+    """Hold what report.html of `scarpsim inspect` shows about one series of epochs.
+
+    Attributes
+    ----------
+    title : str
+        Heading of the section.
+    sentences : list of str
+        The main statements, such as the smallest rockfall that is listed.
+    curves : bytes
+        Picture of the detection probabilities, PNG.
+    heads, rows : list of str, list of lists of str
+        Header and rows of a table: how early moving blocks are noticed, by number of scans, volume and interval.
+    """
 
     title: str
     sentences: list[str]
@@ -27,7 +39,7 @@ class SeriesPart:
 
 
 def series_summary(plan: SeriesPlan) -> str:
-    """Describe the prediction for a series as lines of text for the terminal."""
+    """Describe which rockfalls a series of epochs is predicted to show, and how early, as lines of text for the terminal."""
     part = series_part(plan)
     widths = [max(len(row[place]) for row in [part.heads, *part.rows]) for place in range(len(part.heads))]
     table = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in [part.heads, *part.rows]]
@@ -35,7 +47,7 @@ def series_summary(plan: SeriesPlan) -> str:
 
 
 def series_part(plan: SeriesPlan) -> SeriesPart:
-    """Collect what the report's page shows of one series."""
+    """Prepare the section of report.html that shows what one series of epochs is predicted to detect."""
     return SeriesPart(
         title=f"{_SENSORS[plan.sensor]}, series, maps of {plan.gsd_m * 1e3:g} mm a pixel",
         sentences=_sentences(plan),
@@ -103,5 +115,5 @@ def _hours(hours: float) -> str:
 
 
 def series_parts(plans: Sequence[SeriesPlan]) -> list[SeriesPart]:
-    """Collect what the report's page shows of several series."""
+    """Prepare the sections of report.html for several predicted series of epochs, one for each sensor."""
     return [series_part(plan) for plan in plans]
