@@ -219,7 +219,7 @@ BAD = {
     "elsewhere": "lie",
     "beside": "of the points lie near the reference",
     "millimetres": "--unit mm",
-    "one point": "has 1 points",
+    "one point": "has only 1 points",
     "all NaN": "no point with finite values",
     "scanner": "needs laser scans",
     "half": "half works only with laser scans",
