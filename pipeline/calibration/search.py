@@ -373,7 +373,7 @@ class NoiseSearch:
             self.progress.advance((number + 1) / len(points))
         if len(found) < len(points) / 2:
             raise InputError(
-                f"{len(points) - len(found)} of {len(points)} simulations failed",
+                f"{len(points) - len(found)} of {len(points)} simulated measurements failed, more than half",
                 where="calibration",
                 remedy="run scarpsim simulate with the same config to see the error, and correct the config",
             )
