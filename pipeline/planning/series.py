@@ -67,9 +67,10 @@ _CURVE_POINTS = 60
 
 @dataclass(frozen=True)
 class DetectionLaw:
-    """Probability that `monitor` lists a change of volume V, from a logistic regression on trial blocks.
+    """Probability that `monitor` lists a change, by the volume of the rock; from a logistic regression on simulated trial blocks.
 
-    logit P = coefficients . (1, ln V, ln u), with the displacement u of a block that moved; missing rock has no term in u.
+    The model is logit P = coefficients . (1, ln V, ln u), with the volume V and, for a block that moved, its displacement u. The
+    model of missing rock has no term in u.
 
     Attributes
     ----------
@@ -78,7 +79,7 @@ class DetectionLaw:
     resampled : (b, 2) or (b, 3) array
         Coefficients fitted to b bootstrap samples of the trial blocks.
     blocks : int
-        Number of trial blocks of which the sensor sees enough.
+        Number of trial blocks of which the sensor sees at least half.
     seen_share : float
         Their share of all trial blocks.
     """
@@ -89,26 +90,41 @@ class DetectionLaw:
     seen_share: float
 
     def probability(self, volume_m3: FloatArray, moved_m: FloatArray | float = 1.0) -> FloatArray:
-        """Return the probability (k,) for volumes (k,), m3, and displacements, m (ignored for missing rock)."""
+        """Return the probability that `monitor` lists a change, (k,), for k volumes of rock.
+
+        volume_m3: (k,) volumes. moved_m: displacements of blocks that moved, (k,) or one for all; ignored for missing rock.
+        """
         return _logistic(_design(np.asarray(volume_m3), np.asarray(moved_m), len(self.coefficients)) @ self.coefficients)
 
     def volume_m3(self, probability: float = PROBABILITY) -> tuple[float, float, float]:
-        """Return the volume of missing rock that is listed with a probability, and its 95 % interval, m3."""
+        """Return the volume of missing rock, m3, from which on `monitor` lists it with the given probability.
+
+        Returns the volume and the ends of its 95 % interval.
+        """
         logit = np.log(probability / (1 - probability))
         return _with_interval(self, lambda fit: np.exp((logit - fit[..., 0]) / fit[..., 1]))
 
     def displacement_m(self, volume_m3: float, probability: float = PROBABILITY) -> tuple[float, float, float]:
-        """Return the displacement at which a block of a volume, m3, is listed with a probability, and its 95 % interval, m."""
+        """Return the displacement, m, from which on `monitor` lists a moved block of the given volume with the given probability.
+
+        Returns the displacement and the ends of its 95 % interval.
+        """
         logit = np.log(probability / (1 - probability))
         return _with_interval(self, lambda fit: np.exp((logit - fit[..., 0] - fit[..., 1] * np.log(volume_m3)) / fit[..., 2]))
 
 
 @dataclass(frozen=True)
 class EpochPromise:
-    """What an epoch shows that consists of one or more scans, whose points are joined.
+    """What `monitor` is predicted to find in an epoch that consists of one or more scans, whose points are joined.
 
-    scans: number of scans in the epoch. level_m: its median level of detection, m. The laws are the detection probabilities of
-    missing rock and of blocks that moved.
+    Attributes
+    ----------
+    scans : int
+        Number of scans in the epoch; more scans average out noise.
+    level_m : float
+        Median level of detection of the epoch, m.
+    missing, moved : DetectionLaw
+        Probabilities of detection of missing rock and of blocks that moved.
     """
 
     scans: int
@@ -119,7 +135,7 @@ class EpochPromise:
 
 @dataclass(frozen=True)
 class SeriesPlan:
-    """What a series of epochs is predicted to show.
+    """What `monitor` is predicted to find in a planned time series of epochs: rockfalls and, before them, moving blocks.
 
     Attributes
     ----------
@@ -128,13 +144,13 @@ class SeriesPlan:
     gsd_m : float
         Side of a pixel of the maps, m.
     every_h : float or None
-        The config's own interval, h; None: its times are not regular.
+        Interval between the epochs in the config, h; None: they are not at equal intervals.
     promises : tuple of EpochPromise
         What an epoch shows, for each number of scans that it may consist of.
     volumes_m3 : tuple of float
-        Volumes, m3, of the moving blocks for which lead times are predicted.
+        Volumes, m3, of moving blocks for which lead times (from notice to fall) are predicted.
     motion : Motion
-        How these blocks move before they fall.
+        How such blocks move before they fall.
     """
 
     sensor: SensorName
@@ -146,12 +162,12 @@ class SeriesPlan:
 
     @property
     def schedules_h(self) -> list[float]:
-        """Intervals between epochs, h, for which lead times are predicted."""
+        """Intervals between epochs for which lead times (from notice of a moving block to its fall) are predicted, h."""
         own = () if self.every_h is None else (self.every_h,)
         return sorted({*SCHEDULES_H, *own})
 
     def lead_h(self, volume_m3: float, every_h: float, promise: EpochPromise) -> tuple[float, float]:
-        """Return how long before its fall a moving block is noticed, h, as a cautious and a median value.
+        """Predict how long before its fall a moving block is noticed, h, as a cautious and a median value.
 
         The cautious value is reached in 95 % of cases even if the last epoch was a whole interval ago when the motion became
         large enough. Both are 0 if the motion is not noticed before the fall.
@@ -163,14 +179,14 @@ class SeriesPlan:
         every_h : float
             Interval between epochs, h.
         promise : EpochPromise
-            What an epoch shows.
+            From which displacement on an epoch shows the motion.
         """
         late = self.motion.time_left(promise.moved.displacement_m(volume_m3)[0]) - every_h
         usual = self.motion.time_left(promise.moved.displacement_m(volume_m3, 0.5)[0]) - every_h / 2
         return max(late, 0.0), max(usual, late, 0.0)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the prediction as plan.json stores it."""
+        """Return the prediction for the series as plan.json stores it."""
         return {
             "sensor": self.sensor,
             "gsd_m": self.gsd_m,
@@ -211,16 +227,21 @@ class SeriesPlan:
 
 
 def plan_series(config: SimulationConfig, sensor: SensorName, progress: Progress | None = None) -> SeriesPlan:
-    """Predict what the series of a config will show with a sensor, from trial epochs that are compared as `monitor` does.
+    """Predict which rockfalls and moving blocks `monitor` will find in a planned time series, from simulated trial epochs.
 
     Parameters
     ----------
     config : SimulationConfig
-        A config with a section `series` that has no `surfaces`.
+        Wall, sensor, and a section `series` with rockfalls (not with `surfaces`, the user's own meshes).
     sensor : str
         "stereo" or "tls".
     progress : Progress, optional
         Receives the progress.
+
+    Returns
+    -------
+    SeriesPlan
+        The prediction.
 
     Raises
     ------

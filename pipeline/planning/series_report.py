@@ -17,7 +17,19 @@ _CURVE_POINTS = 80
 
 @dataclass(frozen=True)
 class SeriesPart:
-    """What the report's page shows of one series: sentences, curves as PNG, and a table's header and rows."""
+    """The section of the planning report about one planned time series of epochs.
+
+    Attributes
+    ----------
+    title : str
+        Heading.
+    sentences : list of str
+        Main statements.
+    curves : bytes
+        PNG picture of the probability of detection, by the volume that falls and by the displacement of a moving block.
+    heads, rows : lists
+        Header and rows of a table of moving blocks: from which displacement each shows, and how long before its fall.
+    """
 
     title: str
     sentences: list[str]
@@ -27,7 +39,7 @@ class SeriesPart:
 
 
 def series_summary(plan: SeriesPlan) -> str:
-    """Describe the prediction for a series as lines of text for the terminal."""
+    """Describe what a planned time series is predicted to show as lines of text for the terminal."""
     part = series_part(plan)
     widths = [max(len(row[place]) for row in [part.heads, *part.rows]) for place in range(len(part.heads))]
     table = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in [part.heads, *part.rows]]
@@ -35,7 +47,7 @@ def series_summary(plan: SeriesPlan) -> str:
 
 
 def series_part(plan: SeriesPlan) -> SeriesPart:
-    """Collect what the report's page shows of one series."""
+    """Make the section of the planning report about one planned time series."""
     return SeriesPart(
         title=f"{_SENSORS[plan.sensor]}, series, maps of {plan.gsd_m * 1e3:g} mm a pixel",
         sentences=_sentences(plan),
@@ -103,5 +115,5 @@ def _hours(hours: float) -> str:
 
 
 def series_parts(plans: Sequence[SeriesPlan]) -> list[SeriesPart]:
-    """Collect what the report's page shows of several series."""
+    """Make the sections of the planning report about several planned time series, one each."""
     return [series_part(plan) for plan in plans]
