@@ -86,8 +86,8 @@ def move_onto_rays(left: Camera, points: FloatArray, u: FloatArray, v: FloatArra
     """Undo the registration of a stereo reconstruction: move its points rigidly so that they project into their matched pixels.
 
     A reconstruction lies on the rays of its pixels until it is registered to other data. Measured disparities can only be
-    computed from points on these rays. The motion is found by Gauss-Newton from some thousand points. It is applied only if it reduces the
-    reprojection error to less than a tenth.
+    computed from points on these rays. The motion is found by Gauss-Newton from some thousand points. It is applied only if it
+    reduces the reprojection error to less than a tenth.
 
     Parameters
     ----------

@@ -98,7 +98,7 @@ class TlsResiduals(Residuals):
         return np.asarray(self.reference_error_m**2 * np.einsum("nab,na,nb->n", same, weight, weight[other]))
 
     def draw_reference_error(self, random: KeyedRandom) -> FloatArray:
-        """Simulate errors of the reference surface's vertices, to see how much they alone make the residuals scatter.
+        """Simulate errors of the reference surface's vertices, to include them in simulated errors of the ranges.
 
         random: source of the random numbers. Returns the (n,) range errors of the rays that they cause, m.
         """
