@@ -52,9 +52,9 @@ class ConditionsConfig(Config):
 
 
 class SeriesConfig(Config):
-    """Settings of a wall that changes over a series of epochs.
+    """Settings of a time series: times of the epochs, and how the wall and the conditions of measurement change between them.
 
-    What falls stays fallen, blocks move before they fall, fragments lie below, and the conditions of measurement drift.
+    Rocks that fall stay fallen, can move before, and can lie at the foot of the wall afterwards.
     """
 
     times: Times = Field(description="times of the epochs, the reference first: start, every_h, count; or a list")
@@ -103,13 +103,13 @@ class SeriesConfig(Config):
         return len(self.times) if isinstance(self.times, tuple) else self.times.count
 
     def when(self, number: int) -> datetime:
-        """Return the time, in UTC, of the epoch with a number; 0 is the reference."""
+        """Return the time of an epoch, in UTC; `number` counts from 0, the reference."""
         if isinstance(self.times, tuple):
             return utc(self.times[number])
         return utc(self.times.start) + number * self.times.every_h * _HOUR
 
     def hours_of(self, time: datetime) -> float:
-        """Return a time as hours after the first epoch."""
+        """Convert a time of a series to hours after its first epoch."""
         return (utc(time) - self.when(0)) / _HOUR
 
     @property

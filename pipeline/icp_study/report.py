@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from pipeline.comparison.report import write_csv
 from pipeline.formats.files.atomic import filling, write_bytes, write_json, write_text
-from pipeline.icp_study.study import IcpStudy, Parameter, Recommendation, StudyRow
+from pipeline.icp_study.results import IcpStudy, Parameter, Recommendation, StudyRow
 from pipeline.report.figures import DPI, FAMILY, label_axes, plain_numbers, png_bytes
 from pipeline.report.page import millimetres, template
 from pipeline.report.provenance import versions
@@ -27,9 +27,10 @@ _LEAST_KEPT = 5e-4
 
 
 def write_icp_study(out: Path, study: IcpStudy) -> Path:
-    """Write report, tables and pictures of an ICP study into the folder `out`; return the path of the report.
+    """Write the results of an ICP study, which registers epochs with many values of ICP's settings, and return the report's path.
 
-    The folder appears when everything has been written.
+    The folder `out` gets report.html, tables (icp_study.json, icp_study.csv) and a picture for each setting. It appears only when
+    everything has been written.
     """
     with filling(out) as folder:
         _write(folder, study)
@@ -50,7 +51,10 @@ def _write(out: Path, study: IcpStudy) -> None:
 
 
 def recommendation_sentence(found: Recommendation) -> str:
-    """State the recommended value of an ICP setting, and the error that remains with it, as a sentence for the report."""
+    """State a recommended value of an ICP setting, and the error that remains with it, as a sentence for the report.
+
+    found: the recommendation.
+    """
     low, high = found.good
     error = f"{millimetres(found.normal_error_m, 2)} of error along the surface's normal remains"
     if found.parameter == "subsample_ratio":
@@ -61,7 +65,10 @@ def recommendation_sentence(found: Recommendation) -> str:
 
 
 def summary(study: IcpStudy) -> str:
-    """State the main results of an ICP study as lines of text for the terminal."""
+    """State the main results of an ICP study as lines of text for the terminal.
+
+    They are the recommended settings, and the error of the registration that `simulate` itself applied to each epoch.
+    """
     lines = [recommendation_sentence(each) for each in study.recommended]
     for number, error in study.applied.items():
         if error is not None:
@@ -73,9 +80,12 @@ def summary(study: IcpStudy) -> str:
 
 
 def study_figure(study: IcpStudy, parameter: Parameter) -> bytes:
-    """Draw RMS of the fit, error of the pose and share of inliers against one ICP setting (`parameter`), as PNG.
+    """Draw how well ICP registers with different values of one of its settings, and return the picture as PNG.
 
-    Lines are medians, dots single registrations.
+    Three panels show the RMS residual, the error of the pose and the share of inliers. Lines are medians, dots single
+    registrations.
+
+    study: the results. parameter: the setting, "subsample_ratio" or "outlier_distance_threshold".
     """
     rows = [row for row in study.rows if row.parameter == parameter]
     figure = Figure(figsize=(13.0, 4.2), dpi=DPI, layout="constrained")

@@ -14,12 +14,11 @@ error can.
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -28,6 +27,7 @@ from pipeline.config.simulation import SensorName, SimulationConfig, load_config
 from pipeline.formats.records.result_files import read_surface
 from pipeline.formats.records.result_records import RUN_FILE, read_run
 from pipeline.formats.records.run_files import epoch_folder
+from pipeline.icp_study.results import IcpStudy, Parameter, PoseError, Recommendation, StudyRow
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import IcpConfig, measure_fit, register_to
 from pipeline.registration.rigid import RigidTransform
@@ -38,7 +38,6 @@ from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray, TriangleMesh, area_normals
 
-Parameter = Literal["subsample_ratio", "outlier_distance_threshold"]
 RATIOS = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
 """Shares of the points that are left out."""
 _THRESHOLDS = np.geomspace(0.5, 12.0, 13)
@@ -53,20 +52,20 @@ _TO_TRUTH = IcpConfig(outlier_distance_threshold=0.2, threshold=0.0, delta_thres
 
 @dataclass(frozen=True)
 class StudyEpoch:
-    """An epoch of the study, displaced by a known motion, that is to be registered.
+    """An epoch of an ICP study: it is moved away from the reference by a known motion, and ICP has to bring it back.
 
     Attributes
     ----------
     number : int
         Number of the epoch.
     points : (n, 3) array
-        Displaced points, wall frame, m.
+        Measured points after the known motion, wall frame, m.
     true : RigidTransform
-        Brings them to the reference.
+        True motion that brings `points` to the reference.
     applied : RigidTransform or None
-        What the run applied to the points before they were displaced.
+        Registration that `simulate` estimated for the points as measured, without the known motion; None if it used no ICP.
     true_applied : RigidTransform
-        What it should have applied.
+        True motion for these points as measured, with which `applied` is compared.
     """
 
     number: int
@@ -77,138 +76,13 @@ class StudyEpoch:
 
 
 @dataclass(frozen=True)
-class PoseError:
-    """Error of an estimated rigid transform against the true one, evaluated at the reference's points.
-
-    Attributes
-    ----------
-    normal_m, displacement_m : float
-        RMS along the normals, and of the whole displacement, m.
-    translation_m, rotation_rad : (3,) tuples
-        Translation at the points' centroid, m, and rotation vector, rad.
-    """
-
-    normal_m: float
-    displacement_m: float
-    translation_m: tuple[float, ...]
-    rotation_rad: tuple[float, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the values for JSON."""
-        return dataclasses.asdict(self)
-
-
-@dataclass(frozen=True)
-class StudyRow:
-    """Result of one registration with one setting.
-
-    Attributes
-    ----------
-    parameter, value
-        The parameter that is studied, and its value.
-    gradual : bool
-        Whether the outlier threshold decreased to its value over the iterations, as the config says, or was constant.
-    epoch, repeat : int
-        Number of the epoch and of the repetition.
-    rms_m, inlier_share
-        Residuals of all points, not only the subsample, within the threshold, m, and share of these points.
-    normal_error_m, displacement_m
-        As in PoseError.
-    iterations, seconds
-        Iterations and duration of the registration.
-
-    Notes
-    -----
-    Results are None if ICP found too few pairs.
-    """
-
-    parameter: Parameter
-    value: float
-    gradual: bool
-    epoch: int
-    repeat: int
-    rms_m: float | None
-    normal_error_m: float | None
-    displacement_m: float | None
-    inlier_share: float | None
-    iterations: int | None
-    seconds: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the values for JSON and CSV."""
-        return dataclasses.asdict(self)
-
-
-@dataclass(frozen=True)
-class Recommendation:
-    """A recommended value of an ICP setting, for the report of a study.
-
-    parameter: the setting. good: lowest and highest of the values that are as good. normal_error_m: remaining RMS error along the
-    normals, m.
-    """
-
-    parameter: Parameter
-    value: float
-    good: tuple[float, float]
-    normal_error_m: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the values for JSON."""
-        return dataclasses.asdict(self)
-
-
-@dataclass(frozen=True)
-class IcpStudy:
-    """The result of an ICP study: how the error of the registration depends on the settings of ICP.
-
-    Attributes
-    ----------
-    sensor : str
-        "stereo" or "tls".
-    config : IcpConfig
-        The other settings.
-    offset_m : float
-        Size of the epochs' displacement, m.
-    sigma_m : float
-        NMAD of the residuals along the normals at the true pose, m.
-    rows : list of StudyRow
-        All registrations.
-    recommended : list of Recommendation
-        The recommended settings.
-    applied : dict
-        Error of the transform that the run itself applied, by number of the epoch; None without ICP.
-    """
-
-    sensor: str
-    config: IcpConfig
-    offset_m: float
-    sigma_m: float
-    rows: list[StudyRow]
-    recommended: list[Recommendation]
-    applied: dict[int, PoseError | None]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the values for JSON."""
-        return {
-            "schema": 1,
-            "sensor": self.sensor,
-            "icp": self.config.model_dump(mode="json"),
-            "offset_m": self.offset_m,
-            "sigma_m": self.sigma_m,
-            "recommended": [each.to_dict() for each in self.recommended],
-            "applied": [{"epoch": k, **({} if e is None else e.to_dict())} for k, e in self.applied.items()],
-            "rows": [row.to_dict() for row in self.rows],
-        }
-
-
-@dataclass(frozen=True)
 class EpochSurfaces:
-    """What a sensor measured of an epoch, and the true wall.
+    """Measured and true surface of an epoch, from which an ICP study knows the true registration.
 
     Attributes
     ----------
-    number : Number of the epoch, from 0.
-    measured, truth : Surface that the sensor measured, and true surface, wall frame, m.
+    number : Number of the epoch, from 0; 0 is the reference.
+    measured, truth : Surface that the sensor measured, before registration, and true surface, wall frame, m.
     applied : Registration that `simulate` estimated and applied to the epoch; None if it applied none.
     """
 
@@ -219,7 +93,25 @@ class EpochSurfaces:
 
 
 def surfaces_of_run(folder: Path, epochs: int) -> tuple[SimulationConfig, str, list[EpochSurfaces]]:
-    """Read config, sensor, reference and the first `epochs` epochs of a run. Raises InputError if it has fewer epochs."""
+    """Read config, measured and true surfaces from the folder of a run of `simulate`, for an ICP study.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the run.
+    epochs : int
+        Number of epochs to read after the reference.
+
+    Returns
+    -------
+    (SimulationConfig, str, list of EpochSurfaces)
+        Config of the run, name of its sensor, and the surfaces of the reference and the epochs.
+
+    Raises
+    ------
+    InputError
+        If the folder is no run, or has fewer epochs.
+    """
     path = folder / RUN_FILE
     if not path.exists():
         raise InputError(
@@ -235,7 +127,7 @@ def surfaces_of_run(folder: Path, epochs: int) -> tuple[SimulationConfig, str, l
         )
     if epochs >= len(records):
         raise InputError(
-            f"got {epochs}",
+            f"asks for {epochs} epochs",
             where="--epochs",
             allowed=f"1 to {len(records) - 1}, as many epochs as {folder} has",
             remedy="choose a number in this range",
@@ -257,7 +149,24 @@ def _applied(record: dict[str, Any]) -> RigidTransform | None:
 
 
 def simulated_surfaces(config: SimulationConfig, sensor: SensorName, epochs: int, progress: Progress) -> list[EpochSurfaces]:
-    """Simulate the reference and some epochs of a config, as `simulate` does, without writing anything."""
+    """Simulate the epochs of an ICP study as `simulate` does, without writing files.
+
+    Parameters
+    ----------
+    config : SimulationConfig
+        The wall, the sensors and what falls.
+    sensor : str
+        "stereo" or "tls" (laser scanner).
+    epochs : int
+        Number of epochs after the reference.
+    progress : Progress
+        Receives the progress.
+
+    Returns
+    -------
+    list of EpochSurfaces
+        The reference, then the epochs.
+    """
     random = KeyedRandom(config.seed)
     with progress.stage("wall"):
         site = prepare_site(config, sensor, random)
@@ -280,24 +189,29 @@ def study(
     repeats: int = 3,
     progress: Progress | None = None,
 ) -> IcpStudy:
-    """Register every epoch to the reference (the first of `surfaces`) with each setting, and recommend the best.
+    """Find good settings of ICP: register every epoch to the reference with many subsample ratios and outlier thresholds.
 
     Parameters
     ----------
     sensor : str
-        "stereo" or "tls".
+        "stereo" or "tls" (laser scanner), which is stored with the results.
     surfaces : sequence of EpochSurfaces
-        The reference and the epochs.
+        The reference, then the epochs.
     config : IcpConfig
-        All other settings.
+        Settings of ICP; in each registration the subsample ratio or the outlier threshold is replaced.
     random : KeyedRandom
         Source of subsamples and displacements.
     offset_m : float
-        Size of the epochs' displacement, m; 0 for none.
+        Size of the random motion by which each epoch is moved before its registration, m; 0 for none.
     repeats : int
-        Number of subsamples drawn for each ratio.
+        Number of random subsamples drawn for each subsample ratio.
     progress : Progress, optional
         Receives the progress.
+
+    Returns
+    -------
+    IcpStudy
+        All registrations with their errors, and the recommended settings.
     """
     progress = progress or Progress()
     progress.plan({"truth": 2.0, "subsample ratio": float(len(RATIOS) * repeats), "outlier threshold": 2.0 * len(_THRESHOLDS)})
@@ -325,9 +239,11 @@ def study(
 
 
 def true_pose(surface: EpochSurfaces, random: KeyedRandom) -> RigidTransform:
-    """Find the rigid motion that brings what was measured onto the true wall.
+    """Find the rigid motion that brings a measured surface onto the true wall, as the truth for an ICP study.
 
-    All points are fitted, point to plane, to the vertices and centroids of the true triangles.
+    All measured vertices are fitted, point to plane, to the vertices and centroids of the true triangles.
+
+    surface: measured and true surface of an epoch. random: source of random numbers for the fit.
     """
     truth = surface.truth
     corners = truth.corners()
@@ -341,13 +257,24 @@ def true_pose(surface: EpochSurfaces, random: KeyedRandom) -> RigidTransform:
 
 
 def recommend(rows: Iterable[StudyRow], parameter: Parameter) -> Recommendation | None:
-    """Recommend a value of an ICP setting from registrations (`rows`) with several values; None if all of them failed.
+    """Recommend a value of an ICP setting from registrations with several values.
 
-    Values are compared by their largest error over epochs and repetitions.
+    Values are compared by their largest error over epochs and repetitions. An error counts as good if it exceeds the smallest one
+    (for ratios: the one with all points) by at most 10 % or 0.1 mm. The recommended subsample ratio, the share of points that
+    are left out, is the largest up to which all errors are good. The recommended outlier threshold is the geometric middle of
+    the range of good ones around the best.
 
-    The subsample ratio is the share of points that are left out: the recommendation is the largest one up to which all errors are
-    as small as with all points. The recommended outlier threshold is the geometric middle of the range of thresholds around
-    the best one whose errors are as small. Only registrations whose threshold decreases gradually count.
+    Parameters
+    ----------
+    rows : iterable of StudyRow
+        Registrations. Only those whose outlier threshold decreased gradually count.
+    parameter : str
+        The setting, "subsample_ratio" or "outlier_distance_threshold".
+
+    Returns
+    -------
+    Recommendation or None
+        None if all registrations failed.
     """
     chosen = [row for row in rows if row.parameter == parameter and row.gradual]
     values = sorted({row.value for row in chosen})

@@ -27,9 +27,14 @@ INTERPRETATION_FILE = "understood.json"
 
 @dataclass(frozen=True)
 class Interpretation:
-    """How raw files were interpreted when a measurement folder was made, for the user to check.
+    """How raw files were interpreted when a measurement folder was made from them, for the user to check.
 
-    folder: the measurement folder, which the next command uses. about: lines of text by subject.
+    Attributes
+    ----------
+    folder : Path
+        The measurement folder, the input of `scarpsim gap`.
+    about : dict
+        Lines of text by subject, such as "scan", "scanner" and "reference".
     """
 
     folder: Path
@@ -37,34 +42,35 @@ class Interpretation:
 
     @property
     def next_command(self) -> str:
-        """The command line with which the user analyses the measurement folder next."""
+        """The command line with which the user analyses the measurement folder next, `scarpsim gap`."""
         return f"scarpsim gap {self.folder} --out {self.folder}_gap"
 
     def summary(self) -> str:
-        """Return the text for users, one line for each statement."""
+        """Return how the raw files were interpreted as text for the user, one line for each statement, and the next command."""
         lines = [f"{name}: {line}" for name, words in self.about.items() for line in words]
         return "\n".join([*lines, f"next: {self.next_command}"])
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content as `understood.json` holds it."""
+        """Return how the raw files were interpreted as `understood.json` in the measurement folder stores it."""
         words = {name: list(lines) for name, lines in self.about.items()}
         return {"schema": 1, "folder": str(self.folder), **words, "next": self.next_command}
 
 
 @dataclass(frozen=True)
 class MeasurementContent:
-    """What a measurement folder contains.
+    """What is written into a measurement folder, the input of `scarpsim gap`.
 
     Attributes
     ----------
-    sensor : "tls" or "stereo".
-    clouds : One for each epoch, world frame, m.
-    reference : Reference surface, world frame, m.
-    model : Sensor model.
-    eye : Position (3,), m, and rotation (3, 3) to the world of the sensor, or of a place to look from.
-    title : Title of the picture.
+    sensor : "tls" (laser scanner) or "stereo".
+    clouds : Measured points, world frame, m, one cloud for each scan file of the folder.
+    reference : Reference surface, with which the points are compared, world frame, m.
+    model : Noise model of the sensor.
+    eye : Place from which the picture of points and reference is drawn, the sensor's if it is known: position (3,), world
+        frame, m, and rotation (3, 3) from a frame there to the world frame.
+    title : Title of that picture.
     cameras : The stereo pair; None if there is none or it is unknown.
-    keys : Further keys of measurement.yaml.
+    keys : Further keys of measurement.yaml, such as the scanner's pose.
     """
 
     sensor: str
@@ -78,18 +84,18 @@ class MeasurementContent:
 
 
 def write(out: Path, content: MeasurementContent, found: Interpretation) -> None:
-    """Write the folder of a measurement and check that `gap` can read it.
+    """Write a measurement folder, and check that `scarpsim gap` can read it.
 
     Parameters
     ----------
     out : Folder to write; it appears only if the check succeeds.
-    content : What it contains.
-    found : How the files were interpreted.
+    content : Points, reference, sensor model and further content.
+    found : How the raw files were interpreted, which is stored in the folder for the user to check.
 
     Raises
     ------
     InputError
-        If points and reference do not overlap.
+        If the folder could not be used, for example because points and reference do not overlap.
     """
     with filling(out) as folder:
         names = [f"scan_{number}.laz" for number in range(len(content.clouds))]
@@ -143,7 +149,7 @@ def _check_readable(folder: Path, out: Path) -> None:
     except InputError as error:
         where = error.where.replace(str(folder), str(out))
         raise InputError(
-            f"the measurement cannot be used: {error.what}",
+            f"scarpsim gap cannot use the measurement: {error.what}",
             where=where,
             allowed=error.allowed,
             remedy=error.remedy or "correct the file that is named",

@@ -41,13 +41,13 @@ _GROUPS = 24
 
 @dataclass(frozen=True)
 class Origin:
-    """Where the scanner stood, found from the pattern of its points.
+    """Position of a laser scanner, estimated from its points: seen from there, they lie on a regular grid of angles.
 
     Attributes
     ----------
-    position : (3,) m, in the points' frame.
-    sigma_m : (3,) its standard deviation, m.
-    geometry : The scan pattern seen from there.
+    position : (3,) position of the scanner, m, in the points' frame.
+    sigma_m : (3,) standard deviation of its coordinates, m.
+    geometry : Scan lines and angular steps of the points, seen from there.
     """
 
     position: FloatArray
@@ -56,9 +56,17 @@ class Origin:
 
 
 def pattern_from(points: FloatArray, position: FloatArray, rotation: FloatArray) -> ScanGeometry | None:
-    """Find the scan lines and angular steps of points (n, 3), m, seen from a position (3,); None if they lie on no pattern.
+    """Find the scan lines and angular steps of a laser scan's points, seen from a position.
 
-    rotation: (3, 3) scanner to the points' frame.
+    Parameters
+    ----------
+    points : (n, 3) points, m.
+    position : (3,) position of the scanner, same frame, m.
+    rotation : (3, 3) rotation from the scanner's frame to the points' frame.
+
+    Returns
+    -------
+    The scan lines and steps; None if, seen from there, the points do not lie on a regular grid of angles.
     """
     try:
         found = recover_pattern(points, position, rotation)
@@ -69,14 +77,18 @@ def pattern_from(points: FloatArray, position: FloatArray, rotation: FloatArray)
 
 
 def refine_origin(points: FloatArray, position: FloatArray, rotation: FloatArray, geometry: ScanGeometry) -> Origin:
-    """Improve the origin of a scan, where its scanner stood, by least squares: from there the points lie on a regular pattern.
+    """Improve the position of a laser scanner by least squares, so that its points lie on a regular grid of angles.
 
     Parameters
     ----------
     points : (n, 3) points, m.
-    position : (3,) initial origin, m.
-    rotation : (3, 3) scanner to the points' frame.
-    geometry : The pattern seen from the initial origin.
+    position : (3,) approximate position of the scanner, same frame, m.
+    rotation : (3, 3) rotation from the scanner's frame to the points' frame.
+    geometry : Scan lines and angular steps of the points, seen from the approximate position.
+
+    Returns
+    -------
+    The improved position, its standard deviation, and the scan lines seen from there.
     """
     for _ in range(_TURNS):
         step, sigma = _step(geometry, rotation)
@@ -188,10 +200,12 @@ def _project_out(
 
 
 def origin_from_point_order(points: FloatArray) -> Origin | None:
-    """Find the origin of points (n, 3), m, that are in the order of measurement; None if their lines do not determine it.
+    """Find the position of a laser scanner from points (n, 3), m, that are in the order of measurement.
 
-    The planes of vertical lines meet in the scanner's axis. The height on the axis is where the zenith angles of a line are
+    The planes of vertical scan lines meet in the scanner's axis. The height on the axis is where the zenith angles of a line are
     equally spaced. The scanner is assumed to be upright in the points' frame to some degrees.
+
+    Returns None if the lines do not determine the position.
     """
     centre = points.mean(axis=0)
     pieces = _pieces(points - centre)
@@ -205,17 +219,18 @@ def origin_from_point_order(points: FloatArray) -> Origin | None:
 
 
 def origin_near(points: FloatArray, position: FloatArray, rotation: FloatArray) -> Origin | None:
-    """Find the origin of a scan, where its scanner stood, near an approximate position.
+    """Find the exact position of a laser scanner near an approximate one, from the regular grid of angles of its points.
 
     Parameters
     ----------
     points : (n, 3) points, m.
-    position : (3,) approximate origin, m.
-    rotation : (3, 3) scanner to the points' frame.
+    position : (3,) approximate position of the scanner, same frame, m.
+    rotation : (3, 3) rotation from the scanner's frame to the points' frame.
 
     Returns
     -------
-    The origin; None if the points lie on no pattern seen from the position.
+    The position, its standard deviation and the scan lines; None if, seen from the approximate position, the points lie on no
+    regular grid of angles.
     """
     some = points[:: max(len(points) // _SAMPLE, 1)] if len(points) > 3 * _SAMPLE else points
     seen = pattern_from(some, position, rotation)

@@ -15,9 +15,17 @@ from sensors.cameras.camera import Camera, CameraPair
 
 
 def read_pair(path: Path, labels: tuple[str, str] | None) -> CameraPair:
-    """Read the stereo pair from cameras.yaml, a Metashape file or a COLMAP text model, world frame.
+    """Read a stereo pair, with calibration and poses in the world frame, from a camera file.
 
-    labels names the left and right camera of a project. Raises InputError if the file does not determine a pair.
+    Parameters
+    ----------
+    path : cameras.yaml, a Metashape file or the folder of a COLMAP text model.
+    labels : Names of the left and right camera in the Metashape or COLMAP file; None if it has only two.
+
+    Raises
+    ------
+    InputError
+        If the file does not exist or does not determine a pair.
     """
     if not path.exists():
         raise InputError(
@@ -32,22 +40,34 @@ def read_pair(path: Path, labels: tuple[str, str] | None) -> CameraPair:
     if labels is None and len(found.cameras) != 2:
         raise InputError(
             f"the file has {len(found.cameras)} aligned cameras, but a pair has two", where=str(path),
-            allowed=", ".join(sorted(found.cameras)[:20]), remedy="name them: --pair LEFT,RIGHT",
+            allowed=", ".join(sorted(found.cameras)[:20]), remedy="name two of them with --pair LEFT,RIGHT",
         )  # fmt: skip
     left, right = labels or (None, None)
     return stereo_pair(found, left, right, str(path))
 
 
 def viewing_rotation(camera: Camera) -> FloatArray:
-    """Return the (3, 3) rotation from a frame at the camera to the world: x forward, y left, z up in the picture."""
+    """Return the rotation (3, 3) to the world from a frame at the camera with x forward, y left and z up in its picture.
+
+    Drawing and meshing as seen from the camera use this frame, which is like that of a laser scanner.
+    """
     right, down, forward = camera.rotation.T
     return np.stack([forward, -right, -down], axis=1)
 
 
 def describe_view(pair: CameraPair, points: FloatArray, where: str) -> tuple[str, ...]:
-    """Describe how much of a cloud (n, 3), m, the stereo pair sees, as lines for the user.
+    """Describe how much of a cloud a stereo pair sees, and how precisely, as lines of text for the user.
 
-    where: name of the file in errors. Raises InputError if the pair sees almost nothing of the cloud.
+    Parameters
+    ----------
+    pair : The stereo pair.
+    points : (n, 3) points of the cloud, world frame, m.
+    where : Name of the file, for errors.
+
+    Raises
+    ------
+    InputError
+        If the pair sees almost nothing of the cloud.
     """
     both = check_seen(pair, points, where)
     left = pair.left

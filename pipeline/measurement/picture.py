@@ -23,15 +23,15 @@ def picture(
     *,
     sensor: bool = True,
 ) -> bytes:
-    """Draw points and reference from above and from the sensor, as PNG.
+    """Draw measured points and reference surface, from above and from the sensor, as PNG: the user checks the set-up with it.
 
     Parameters
     ----------
-    points : (n, 3) points, m.
-    mesh : Reference in the same frame.
-    position : (3,) position of the sensor, m.
-    rotation : (3, 3) sensor to that frame.
-    title : Title.
+    points : (n, 3) measured points, m.
+    mesh : Reference surface, in the frame of the points.
+    position : (3,) position of the sensor, in the frame of the points, m.
+    rotation : (3, 3) rotation from the sensor's frame (z up) to the frame of the points.
+    title : Title of the picture.
     sensor : Whether a sensor is at that position; otherwise it is only a place to look from.
     """
     figure = Figure(figsize=(11.0, 5.0), layout="constrained")

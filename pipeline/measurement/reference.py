@@ -36,16 +36,17 @@ variance.
 
 @dataclass(frozen=True)
 class Reference:
-    """Reference surface of a measurement, points' frame, m.
+    """Reference surface with which measured points are compared.
 
     Attributes
     ----------
-    mesh : The surface.
-    error_m : Standard error of its vertices along the rays, m; 0 if it is taken as exact.
-    words : Description of the surface.
-    limits : What a comparison with it cannot show.
-    rows : (k,) points of the scan that are compared with it; None: all.
-    of_points : Whether it is made of a cloud, so that noise and relief tilt its triangles.
+    mesh : The surface, in the frame of the measured points, m.
+    error_m : Standard error of its vertices along the lines of sight, m; 0 if it is taken as exact.
+    words : Description of the surface for the user.
+    limits : What a comparison with it cannot show, for the user.
+    rows : (k,) indices of the measured points that are compared with it, if it was made of the other ones; None: all.
+    of_points : Whether it was meshed from points. Noise and relief then tilt its triangles, so that incidence angles must not
+        refer to them.
     """
 
     mesh: TriangleMesh
@@ -57,7 +58,7 @@ class Reference:
 
 
 def is_cloud(path: Path) -> bool:
-    """Whether a file contains points without triangles."""
+    """Return whether a file contains points without triangles. A PLY file is opened for this; others tell by their suffix."""
     if path.suffix.lower() != ".ply":
         return path.suffix.lower() in SUFFIXES
     faces = read_elements(path).get("face")
@@ -67,15 +68,15 @@ def is_cloud(path: Path) -> bool:
 def reference_from_file(
     path: Path, unit: str | None, position: FloatArray, rotation: FloatArray, seen_from: str = "from the scanner"
 ) -> Reference:
-    """Read the reference surface, to which measured points are compared, from a file.
+    """Read the reference surface, with which measured points are compared, from a file.
 
     Parameters
     ----------
     path : A mesh, a cloud or an elevation model.
-    unit : Unit of its coordinates; None: as the file states, or metres.
-    position : (3,) place from which a cloud is meshed, m.
-    rotation : (3, 3) that place's frame to the points' frame.
-    seen_from : That place in words.
+    unit : Unit of its coordinates, such as "mm"; None: as the file states, or metres.
+    position : (3,) place as seen from which a cloud is meshed, m, in the frame of the measured points.
+    rotation : (3, 3) rotation from a frame at that place to the frame of the measured points.
+    seen_from : That place in words, for the description of the reference.
 
     Raises
     ------
@@ -116,19 +117,19 @@ def reference_from_dem(path: Path, unit: str | None = None, option: str = "--uni
     Parameters
     ----------
     path : GeoTIFF of heights.
-    unit : Unit of coordinates and heights; None: as the file states, or metres.
+    unit : Unit of coordinates and heights, such as "ft"; None: as the file states, or metres.
     option : Command-line option that gives the unit, for errors.
 
     Raises
     ------
     InputError
-        If `unit` contradicts the file, or the raster has no heights or no place.
+        If `unit` contradicts the file, or the raster has no heights or no coordinates.
     """
     raster = read_raster(path)
     heights, place = raster.values, raster.place
     if place.grid is None:
         raise InputError(
-            "the raster has no pixel scale and tie point",
+            "the raster has no pixel scale and tie point, so its place is unknown",
             where=str(path),
             remedy="export the raster as a GeoTIFF, with its coordinates",
         )
@@ -162,9 +163,11 @@ def reference_from_dem(path: Path, unit: str | None = None, option: str = "--uni
 
 
 def reference_from_half(scan: RawScan, station: Station) -> Reference:
-    """Mesh every second line of a scan (or pulse, if these are much denser) as the reference for its other half.
+    """Mesh one half of a laser scan as the reference for the other half, where no other reference exists.
 
-    station: position and scan pattern of the scanner, which tell the lines.
+    One half is every second scan line, or every second pulse of each line if pulses are much denser than lines.
+
+    scan: the whole scan. station: position of the scanner, and the scan lines of the points.
     """
     even, what = _halves(scan, station)
     surface = triangulate_seen_points(scan.cloud.points[even], station.position, station.rotation, scan.name)

@@ -9,18 +9,19 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Request:
-    """The raw files of a measurement and what the user says of them.
+    """The raw files from which a measurement folder is to be made, and what the user says of them.
 
     Attributes
     ----------
-    scans : Files, one for each epoch.
-    reference : A file, or "half" for one half of the scan.
-    scanner : Name or file of a scanner preset.
+    scans : Files of measured points, one for each epoch.
+    reference : File of the reference surface, or "half" to compare one half of the scan with the other.
+    scanner : Name or file of a scanner preset, which gives the noise model.
     model : File of a sensor model, instead of a preset.
-    position : (3,) position of the scanner, m.
-    unit, reference_unit : Units of the files' coordinates; None: as each file states, or metres.
-    columns : Names of a text file's columns.
-    number : Which scan of a file with several, from 1.
+    position : (3,) position of the scanner, frame of the files, m; for clouds from photographs any place in front of the wall.
+        None: unknown.
+    unit, reference_unit : Units of the coordinates of scans and reference, such as "mm"; None: as each file states, or metres.
+    columns : Names of the columns of text files, in order; empty: as each file states.
+    number : Which scan to use of a file with several, from 1; None: all.
     """
 
     scans: Sequence[Path]

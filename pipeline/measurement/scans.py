@@ -26,15 +26,15 @@ _FEWEST = 100
 
 @dataclass(frozen=True)
 class RawScan:
-    """One scan of a file.
+    """One laser scan or cloud of a file, with what the file states of the scanner.
 
     Attributes
     ----------
     name : Name of the scan.
     cloud : Points with finite coordinates, m, in the file's frame; intensity from 0 up.
-    position : (3,) position of the scanner, m; None if the file does not state it.
-    rotation : (3, 3) scanner to the file's frame; None if the file does not state it.
-    words : What was assumed or changed.
+    position : (3,) position of the scanner, file's frame, m; None if the file does not state it.
+    rotation : (3, 3) rotation from the scanner's frame to the file's frame; None if the file does not state it.
+    words : What was assumed or changed when the file was read, for the user.
     """
 
     name: str
@@ -44,12 +44,12 @@ class RawScan:
     words: tuple[str, ...] = ()
 
     def part(self, rows: NDArray[Any]) -> RawScan:
-        """Return the scan with some of its points only; rows: their indices, or a mask."""
+        """Return the scan with only the points that `rows` selects: their indices (k,), or a mask (n,)."""
         return replace(self, cloud=part_of(self.cloud, rows))
 
 
 def part_of(cloud: PointCloud, rows: NDArray[Any]) -> PointCloud:
-    """Return some points (indices or a mask) of a cloud with all their channels."""
+    """Return the points of a cloud that `rows` selects (indices (k,) or a mask (n,)), with intensity, time and other channels."""
     return PointCloud(
         cloud.points[rows],
         None if cloud.intensity is None else cloud.intensity[rows],
@@ -59,19 +59,19 @@ def part_of(cloud: PointCloud, rows: NDArray[Any]) -> PointCloud:
 
 
 def read_scans(path: Path, unit: str | None = None, columns: Sequence[str] = (), option: str = "--unit") -> list[RawScan]:
-    """Read all scans of a file.
+    """Read all laser scans or clouds of a point file, in metres.
 
     Parameters
     ----------
-    path : File of any format that `read_placed_scans` reads.
-    unit : Unit of the coordinates; None: as the file states, or metres.
-    columns : Names of a text file's columns.
+    path : LAS, LAZ, PLY, E57, PTX or text file, or one of a format that a plug-in reads.
+    unit : Unit of the coordinates, such as "mm"; None: as the file states, or metres.
+    columns : Names of the columns of a text file, in order; empty: as the file states.
     option : Command-line option that gives the unit, for errors.
 
     Raises
     ------
     InputError
-        If the format is unknown, the file is wrong, or a scan has almost no points.
+        If the format is unknown, the file is wrong, or a scan has fewer than 100 points.
     """
     scans = read_placed_scans(path, unit, columns, option)
     raw = (RawScan(scan.name, scan.cloud, scan.position, scan.rotation, scan.cloud.notes) for scan in scans)
@@ -86,7 +86,10 @@ def _checked(scan: RawScan, where: str) -> RawScan:
         words.append(f"{lost:,} points with coordinates that are not numbers are left out")
     if len(cloud.points) < _FEWEST:
         raise InputError(
-            f"the scan has {len(cloud.points)} points", where=where, allowed=f"{_FEWEST} or more", remedy="use a whole scan"
+            f"the scan has only {len(cloud.points)} points",
+            where=where,
+            allowed=f"{_FEWEST} or more",
+            remedy="export the whole scan",
         )
     if unused := sorted(set(cloud.extra) - _OF_GRID - _OF_RETURNS):
         words.append(f"the file also has {', '.join(unused)}, which {'is' if len(unused) == 1 else 'are'} not used")

@@ -24,15 +24,15 @@ _ORIGIN_M = 0.02
 
 @dataclass(frozen=True)
 class Station:
-    """Position and scan pattern of a scanner.
+    """Position of the scanner of a raw scan, and the scan lines of its points.
 
     Attributes
     ----------
-    position : (3,) m.
-    rotation : (3, 3) orthonormal rotation, scanner to the points' frame.
-    sigma_m : (3,) standard deviation of the position, m, if it comes from the scan lines; else None.
-    geometry : Pattern on which the points lie; None if they lie on none.
-    words : How it was found.
+    position : (3,) position of the scanner, in the points' frame, m.
+    rotation : (3, 3) rotation from the scanner's frame to the points' frame.
+    sigma_m : (3,) standard deviation of the position, m, if it was checked or found by the scan lines; else None.
+    geometry : Scan lines and angular steps of the points; None if the points lie on no regular grid of angles.
+    words : How the position was found, for the user.
     """
 
     position: FloatArray
@@ -43,17 +43,34 @@ class Station:
 
     @property
     def line(self) -> IntArray | None:
-        """(n,) scan line of each point; None without a pattern."""
+        """Number of each point's scan line, (n,) integers; None if no scan lines were found."""
         return None if self.geometry is None else self.geometry.line
 
     @property
     def pattern(self) -> dict[str, list[float]] | None:
-        """The pattern as measurement.yaml has it; None without one, and if lines are slanted or begin anywhere."""
+        """The scan's grid of azimuths and zenith angles, as the key `pattern` of measurement.yaml has it.
+
+        None without such a grid, and if lines are slanted or do not all begin at the same zenith angle.
+        """
         return self.geometry.pattern if self.geometry is not None and self.geometry.synchronous else None
 
 
 def find_station(scan: RawScan, position: FloatArray | None = None) -> Station:
-    """Find the station of a scan; position: (3,) m, as stated by the user. Raises InputError if nothing determines it."""
+    """Find the position of a raw scan's scanner, and the scan lines of its points.
+
+    The position comes from the user, the file's header or the scan lines, in this order. A stated one is corrected if the scan
+    lines determine it better.
+
+    Parameters
+    ----------
+    scan : The raw scan.
+    position : (3,) position that the user stated, in the points' frame, m; None: unknown.
+
+    Raises
+    ------
+    InputError
+        If nothing determines the position.
+    """
     points = _in_order(scan)
     if position is not None:
         return _in_file_order(_stated_station(points, position, np.eye(3), "as given by --position"), scan)

@@ -33,12 +33,16 @@ _FIRST_GUESS = 0.1
 
 
 def build_surface(request: Request, out: Path) -> Interpretation:
-    """Write the folder of a measurement without cameras.
+    """Convert surfaces from photographs whose cameras are unknown to a measurement folder, the input of `scarpsim gap`.
 
     Parameters
     ----------
-    request : The files and what the user says of them.
+    request : The raw files (clouds, meshes or elevation models), and what the user says of them: reference, units, noise model.
     out : Folder to write.
+
+    Returns
+    -------
+    How the files were interpreted.
 
     Raises
     ------
@@ -153,7 +157,7 @@ def _model(request: Request, cloud: RawScan, reference: Reference) -> tuple[Ster
         model = read_model(request.model)
         if not isinstance(model, StereoModel):
             raise InputError(
-                "the model is of a laser scanner",
+                "the model is of a laser scanner, but the points come from photographs",
                 where=str(request.model),
                 allowed="sensor: stereo",
                 remedy="name a model of a stereo pair with --model",

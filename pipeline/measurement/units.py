@@ -15,13 +15,13 @@ _ALIKE = 1.3
 
 
 def check_extent(points: FloatArray, where: str, unit: str | None) -> None:
-    """Raise InputError if a cloud is wider or sparser than any scan.
+    """Raise InputError if a cloud is so wide (above 20 km) or sparse (5 m between points) that its unit must be wrong.
 
     Parameters
     ----------
     points : (n, 3) points, m, converted from `unit`.
     where : Name of the file, for errors.
-    unit : Unit that the user gave; None: metres.
+    unit : Unit that the user gave, such as "mm"; None: metres.
     """
     wide, high = np.sort(np.ptp(points, axis=0))[:0:-1]
     apart = float(np.sqrt(wide * high / len(points)))
@@ -39,13 +39,18 @@ def _merged(wide: float, apart: float) -> str:
 
 
 def check_same_unit(points: FloatArray, surface: FloatArray, where: str, unit: str | None, reference_unit: str | None) -> None:
-    """Raise InputError if scan and reference would have the same size in another unit, or lie in different coordinate systems.
+    """Check that scan and reference have one unit and one coordinate system.
 
     Parameters
     ----------
-    points, surface : (n, 3) points and (m, 3) vertices of the reference, m.
-    where : Name of the file, for errors.
-    unit, reference_unit : Units that the user gave; None: metres.
+    points, surface : (n, 3) measured points and (m, 3) vertices of the reference, m.
+    where : Name of the scan's file, for errors.
+    unit, reference_unit : Units that the user gave of scan and reference, such as "mm"; None: metres.
+
+    Raises
+    ------
+    InputError
+        If the two would have the same size with another unit, if they lie far apart, or if all points of one coincide.
     """
     ends = [np.stack([np.min(each, axis=0), np.max(each, axis=0)]) for each in (points, surface)]
     sizes = [float(np.linalg.norm(each[1] - each[0])) for each in ends]

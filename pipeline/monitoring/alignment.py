@@ -63,10 +63,16 @@ _UNDETERMINED = 1e-7
 
 @dataclass(frozen=True)
 class RasterPair:
-    """Heights of the reference and of an epoch on one grid, those of one view of the wall.
+    """Heights of the reference and of an epoch on one grid, for one view of the wall, from which the epoch is registered.
 
-    A view is a part of the wall with a frame and a grid of its own. from_wall: transform from the wall frame, in which the epoch
-    is registered, to the view's frame; the identity if the wall is a single view.
+    A view is a part of the wall that is mapped along a direction of its own.
+
+    Attributes
+    ----------
+    reference, epoch : HeightRaster
+        Heights of the two epochs, frame of the view, m.
+    from_wall : RigidTransform
+        From the wall frame, in which the epoch is registered, to the frame of the view; the identity for one view.
     """
 
     reference: HeightRaster
@@ -75,13 +81,16 @@ class RasterPair:
 
     @property
     def difference(self) -> NDArray[np.float32]:
-        """(h, w) height of the reference minus that of the epoch before registration, m; NaN without data."""
+        """Height of the reference minus that of the epoch before registration, (h, w), m; NaN without data."""
         return self.reference.height - self.epoch.height
 
     def design(self, centre: FloatArray) -> NDArray[np.float32]:
-        """(6, h, w) derivatives of the epoch's heights by shift, m, and rotation, rad, about `centre` (3,), m; NaN without data.
+        """Return how each height of the epoch changes with a small motion: the design matrix of the least-squares registration.
 
-        They are the design matrix of the least-squares registration. `centre` is in the wall frame.
+        centre: (3,) centre of the rotation, wall frame, m.
+
+        Returns (6, h, w): derivatives by the three shifts, m/m, and the three rotation angles, m/rad, wall frame. NaN without
+        data.
         """
         found = _design(self.epoch, self.from_wall.apply(centre))
         if self.from_wall is SAME:
@@ -90,7 +99,7 @@ class RasterPair:
         return np.concatenate([np.tensordot(turned, part, 1) for part in (found[:3], found[3:])])
 
     def points(self, where: NDArray[np.bool_]) -> FloatArray:
-        """(n, 3) surface points of the epoch at the n pixels selected by the mask `where` (h, w), wall frame, m."""
+        """Return the epoch's surface points (n, 3), wall frame, m, at the n pixels that the mask `where` (h, w) selects."""
         x, y = _places(self.epoch.grid)
         found = np.stack([x[where], y[where], self.epoch.height[where].astype(np.float64)], axis=1)
         return self.from_wall.inverse().apply(found)
@@ -98,20 +107,22 @@ class RasterPair:
 
 @dataclass(frozen=True)
 class Alignment:
-    """Result of registering an epoch on the reference.
+    """Result of registering an epoch finely on the reference, by the rock that did not change.
+
+    ICP or survey targets have brought the epoch near the reference before.
 
     Attributes
     ----------
     transform : RigidTransform
-        Moves the epoch's points to the reference, wall frame.
+        Moves the epoch's points, which are near the reference already, onto it, wall frame.
     covariance : (6, 6) array
         Covariance of shift (m) and rotation (rad) about `centre`, wall frame.
     centre : (3,) array
         Centre of the rotation, wall frame, m.
     stable : tuple of (h, w) bool arrays
-        Pixels of each view that did not change, on which the registration rests and noise is measured.
+        For each view (separately mapped part) of the wall, the pixels that did not change: registration and noise come from them.
     rms_m : float
-        Root mean square of the differences on these pixels.
+        Root mean square of the height differences on these pixels after the registration, m.
     notes : tuple of str
         Remarks on the registration for the user.
     """
@@ -124,13 +135,16 @@ class Alignment:
     notes: tuple[str, ...] = ()
 
     def sigma(self, pair: RasterPair) -> NDArray[np.float32]:
-        """Return the standard deviation (h, w), m, that the registration's uncertainty gives each height; NaN without data."""
+        """Return the standard deviation of each registered height, (h, w), m, that comes from the registration's uncertainty.
+
+        pair: heights of the reference and of the epoch in one view of the wall. Pixels without data are NaN.
+        """
         design = pair.design(self.centre)
         variance = (design * np.tensordot(self.covariance.astype(np.float32), design, 1)).sum(axis=0)
         return np.sqrt(np.maximum(variance, 0.0)).astype(np.float32)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the registration as monitor.json stores it."""
+        """Return the fine registration of an epoch, with its standard deviations, by the names that monitor.json has for them."""
         sigma = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         return {
             **self.transform.to_dict(),
@@ -143,7 +157,11 @@ class Alignment:
 
 
 def reference_surface(rasters: Sequence[HeightRaster], from_wall: Sequence[RigidTransform] = (SAME,)) -> ReferenceSurface:
-    """Build the search index for ICP from the pixels of the reference's views and their normals, wall frame."""
+    """Build the surface to which ICP registers epochs, from the pixels of the reference's height rasters and their normals.
+
+    rasters: one for each view (separately mapped part) of the wall. from_wall: transform from the wall frame to the frame of each
+    view. The surface is in the wall frame.
+    """
     points, normals = [], []
     step = max(sum(int(raster.known.sum()) for raster in rasters) // _MOST_REFERENCE, 1)
     for raster, transform in zip(rasters, from_wall, strict=True):
@@ -157,18 +175,23 @@ def reference_surface(rasters: Sequence[HeightRaster], from_wall: Sequence[Rigid
 
 
 def coarse(surface: ReferenceSurface, points: FloatArray, gsd_m: float, seed: int) -> RigidTransform:
-    """Bring an epoch's points near the reference by ICP.
+    """Bring an epoch's points near the reference by ICP, before the finer registration on stable rock.
 
     Parameters
     ----------
     surface : ReferenceSurface
-        Search index of the reference, wall frame.
+        Points and normals of the reference, wall frame, m.
     points : (n, 3) array
         Points of the epoch, wall frame, m.
     gsd_m : float
-        Side of a pixel of the maps, m, from which the distances of ICP follow.
+        Side of a pixel of the maps, m. Pairs farther apart than three pixels, but at least 0.1 m, are outliers for ICP.
     seed : int
         Seed of the random subsets of the points.
+
+    Returns
+    -------
+    RigidTransform
+        From the points to the reference, wall frame.
 
     Raises
     ------
@@ -181,19 +204,24 @@ def coarse(surface: ReferenceSurface, points: FloatArray, gsd_m: float, seed: in
 
 
 def refine(pairs: Sequence[RasterPair], areas: Sequence[Area]) -> Alignment:
-    """Estimate the small shift and rotation that ICP left, from the stable pixels of all views, wall frame.
+    """Estimate the small shift and rotation of an epoch that remain after ICP, by a robust fit on rock that did not change.
 
     Parameters
     ----------
     pairs : sequence of RasterPair
-        One for each view of the wall.
+        Heights of the reference and of the epoch, one pair for each view (separately mapped part) of the wall.
     areas : sequence of Area
-        Areas of stable rock given by the user, wall frame; empty: stable pixels are found here.
+        Areas of stable rock given by the user, wall frame, m; empty: unchanged pixels are found from the differences.
+
+    Returns
+    -------
+    Alignment
+        The remaining motion, its covariance, and the unchanged pixels.
 
     Raises
     ------
     InputError
-        If too few pixels are stable.
+        If fewer than 300 pixels can be compared.
     """
     compared = [_compared(pair, areas) for pair in pairs]
     count = sum(int(each.sum()) for each in compared)
@@ -219,7 +247,10 @@ def refine(pairs: Sequence[RasterPair], areas: Sequence[Area]) -> Alignment:
 
 
 def applied(alignment: Alignment, pair: RasterPair) -> NDArray[np.float32]:
-    """Return the epoch's heights (h, w), m, moved by the shift and rotation that `refine` found, to first order in them."""
+    """Return the epoch's heights (h, w), m, after the small motion that `refine` estimated, to first order in it.
+
+    alignment: the motion. pair: heights of the reference and of the epoch in one view of the wall.
+    """
     shift = alignment.transform.apply(alignment.centre) - alignment.centre
     parameters = np.concatenate([shift, alignment.transform.rotation_vector])
     return np.asarray(pair.epoch.height + np.tensordot(parameters.astype(np.float32), pair.design(alignment.centre), 1))
@@ -237,7 +268,7 @@ def _compared(pair: RasterPair, areas: Sequence[Area]) -> NDArray[np.bool_]:
 def _check_enough(count: int, given: bool) -> None:
     if count >= _LEAST_PIXELS:
         return
-    place = "in the stable areas" if given else "of the epoch on the reference"
+    place = "in the stable areas" if given else "of the maps"
     remedy = "give larger stable areas" if given else "give epochs of the same wall, or a larger --gsd"
     raise InputError(
         f"only {count:,} pixels {place} have data in both epochs",

@@ -21,7 +21,9 @@ from scene.geometry.mesh import FloatArray
 
 @dataclass(frozen=True)
 class ReferenceHeights:
-    """The reference epoch: the heights of each view (part) of the wall, and their pixels as a surface for ICP.
+    """The reference epoch, with which all others are compared: rasters of its heights, and a surface for ICP.
+
+    A wall that turns a corner has several views: parts that are mapped along directions of their own.
 
     Attributes
     ----------
@@ -32,7 +34,7 @@ class ReferenceHeights:
     partition : Partition or None
         Says which points belong to which view, wall frame; None for a single view.
     surface : ReferenceSurface
-        Search index of the pixels of all views, wall frame.
+        Points and normals of all views, wall frame, m, to which ICP registers.
     """
 
     rasters: tuple[HeightRaster, ...]
@@ -48,12 +50,27 @@ class ReferenceHeights:
         from_wall: Sequence[RigidTransform] = (SAME,),
         partition: Partition | None = None,
     ) -> ReferenceHeights:
-        """Prepare the reference from its points, wall frame. `grids` and `from_wall` have an element for each view."""
+        """Prepare the reference epoch from its points.
+
+        Parameters
+        ----------
+        points : WallPoints
+            Points of the reference, wall frame, m.
+        grids : sequence of Grid
+            Raster of each view (separately mapped part) of the wall.
+        from_wall : sequence of RigidTransform
+            Transforms from the wall frame to the frame of each view.
+        partition : Partition or None
+            Says which points belong to which view, wall frame; None for a single view.
+        """
         rasters = _gridded(points.chunks(), grids, from_wall, partition)
         return cls(tuple(rasters), tuple(from_wall), partition, reference_surface(rasters, from_wall))
 
     def gridded(self, chunks: Iterable[FloatArray]) -> list[HeightRaster]:
-        """Grid another epoch like the reference, one raster a view. chunks: points (n, 3) of the epoch, wall frame, m."""
+        """Return the heights of another epoch on the reference's rasters, one for each view (separately mapped part) of the wall.
+
+        chunks: points of the epoch in arrays (n, 3), wall frame, m.
+        """
         return _gridded(chunks, [raster.grid for raster in self.rasters], self.from_wall, self.partition)
 
 
@@ -68,7 +85,7 @@ class EpochChange:
     alignment : Alignment
         The final registration, with its uncertainty.
     changes : list of Change
-        Difference map and level of detection of each view.
+        Difference map and level of detection of each view (separately mapped part) of the wall.
     regions : list of ChangedRegion
         Regions that changed, the largest volume first.
     """
@@ -82,7 +99,7 @@ class EpochChange:
 def compare_epoch(
     reference: ReferenceHeights, points: WallPoints, stable: Sequence[Area], seed: int, start: RigidTransform | None = None
 ) -> EpochChange:
-    """Compare an epoch's points with the reference.
+    """Register an epoch on the reference, and find where the wall changed between the two.
 
     Parameters
     ----------
@@ -91,16 +108,21 @@ def compare_epoch(
     points : WallPoints
         Points of the epoch, wall frame, m.
     stable : sequence of Area
-        Areas of stable rock given by the user, wall frame; empty: stable rock is found here.
+        Areas of stable rock given by the user, wall frame, m; empty: unchanged rock is found from the differences.
     seed : int
         Seed of the random subsets of points for ICP.
     start : RigidTransform, optional
         Transform that brings the points near the reference, wall frame; None: ICP finds one.
 
+    Returns
+    -------
+    EpochChange
+        Registration, difference maps, levels of detection and changed regions.
+
     Raises
     ------
     InputError
-        If the epoch does not overlap the reference, or too few pixels are stable.
+        If the epoch does not overlap the reference, or too few pixels can be compared.
     """
     gsd = reference.rasters[0].grid.gsd
     first = coarse(reference.surface, points.sample, gsd, seed) if start is None else start

@@ -21,13 +21,28 @@ _WRONG_INPUT = 2
 
 
 def regions_of_detector(detector: str, difference: Path, change: Change) -> list[ChangedRegion]:
-    """Search a difference map with a detector, and return its detections as measured regions, the largest volume first.
+    """Find changed regions in a difference map with a trained detector, instead of with the level of detection.
 
-    detector: name or folder, as for `scarpsim detect`. difference: the map's GeoTIFF. change: the same map with its levels of
-    detection, in which the regions are measured.
+    The detector works in a process of its own, because TensorFlow and the ray tracer's compiler do not work in one.
 
-    The detector works in a process of its own, as TensorFlow and the ray tracer's compiler do not belong into one. Raises
-    InputError for a detector that cannot be used.
+    Parameters
+    ----------
+    detector : str
+        Name or folder of the detector, as for `scarpsim detect`.
+    difference : Path
+        GeoTIFF of the difference map.
+    change : Change
+        The same map with its levels of detection, in which the detections are measured.
+
+    Returns
+    -------
+    list of ChangedRegion
+        The detections with a score of at least 0.9, the largest volume first.
+
+    Raises
+    ------
+    InputError
+        If the detector cannot be used.
     """
     with tempfile.TemporaryDirectory(prefix="scarpsim_detect_") as folder:
         words = [detector, str(difference), "--out", str(Path(folder) / "found"), f"--confidence={CONFIDENCE:g}", "--quiet"]

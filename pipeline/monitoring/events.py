@@ -59,34 +59,35 @@ _SAME_PLACE = 0.3
 
 @dataclass(frozen=True)
 class ChangedRegion:
-    """A connected part of the wall that changed.
+    """A connected part of the wall that changed between the reference and an epoch.
 
     Attributes
     ----------
     kind : "missing" or "added"
+        Whether rock is missing or material was added.
     row, column : int
-        Top-left pixel of the mask in the map.
+        Pixel of the difference map at which the mask's top-left pixel lies.
     mask : (m, n) bool array
         Pixels of the region, within its bounding box.
     x_m, y_m, z_m : float
-        Centre of the mask and the reference's height there, wall frame.
+        Centre of the mask and the reference's median height there, wall frame, m.
     width_m, height_m, area_m2 : float
-        Size of the mask, in the plane of the wall.
+        Size of the mask, in the plane of the wall, m and m2.
     depth_median_m, depth_largest_m : float
         Median and largest change along the wall's normal, m, positive for both kinds.
     volume_m3, volume_std_m3 : float
-        Volume, positive for both kinds, and its standard deviation.
+        Volume, positive for both kinds, and its standard deviation, m3.
     significance : float
-        Mean change over its standard deviation.
+        Mean change divided by its standard deviation.
     score : float
-        Score of the detection, 0 to 1; NaN without a detector.
+        A detector's score of the detection, 0 to 1; NaN without a detector.
     marks : tuple of str
         "edge", "vegetation", "thin": another explanation of the change; "insignificant": a detection that noise or an
         edge may explain wholly.
     identity : int
-        Number of the event; 0 if it is not yet known.
+        Number of the event, which regions of several epochs at one place share; 0 if it is not yet known.
     view : int
-        Number of the view of the wall in whose map it lies, from 1 on.
+        Number of the view (separately mapped part of the wall) in whose map it lies, from 1 on.
     """
 
     kind: Kind
@@ -111,12 +112,15 @@ class ChangedRegion:
 
     @property
     def window(self) -> tuple[slice, slice]:
-        """Slices of the map's rows and columns that the mask covers."""
+        """Slices of the rows and columns of the difference map that the region's bounding box covers."""
         height, width = self.mask.shape
         return slice(self.row, self.row + height), slice(self.column, self.column + width)
 
     def numbers(self) -> dict[str, Any]:
-        """Return all attributes except the mask by name, as JSON and tables store them."""
+        """Return the region's attributes except the mask, as JSON and tables store them.
+
+        Keys are the names of the attributes, except that `identity` has the key "id".
+        """
         names = (
             "kind", "row", "column", "x_m", "y_m", "z_m", "width_m", "height_m", "area_m2", "depth_median_m", "depth_largest_m",
             "volume_m3", "volume_std_m3", "significance", "score",
@@ -130,10 +134,18 @@ class ChangedRegion:
 
 @dataclass(frozen=True)
 class Change:
-    """Change between the reference and one registered epoch on the grid of one view, with its uncertainty.
+    """Difference map between the reference and one registered epoch for one view of the wall, with its uncertainty.
 
-    difference: (h, w) float32, reference minus epoch, m. registration: (h, w) standard deviation of the difference that is due to
-    the registration, m.
+    Attributes
+    ----------
+    difference : (h, w) float32 array
+        Height of the reference minus that of the epoch, m: positive where rock is missing.
+    significance : Significance
+        Level of detection of each pixel, and standard deviations of means over several pixels.
+    registration : (h, w) float32 array
+        Standard deviation of the difference that comes from the registration, m.
+    reference, epoch : HeightRaster
+        Heights of the two epochs; the epoch's are those before the final registration.
     """
 
     difference: NDArray[np.float32]
@@ -144,12 +156,15 @@ class Change:
 
     @property
     def grid(self) -> Grid:
-        """The grid of the maps."""
+        """Raster of the difference map and of its levels of detection."""
         return self.reference.grid
 
 
 def find_regions(change: Change) -> list[ChangedRegion]:
-    """Find the regions whose change is significant, the largest volume first."""
+    """Find the connected regions of a difference map whose change noise cannot explain, the largest volume first.
+
+    change: the difference map with its levels of detection.
+    """
     standard = change.difference / change.significance.one_sigma
     beyond = np.abs(change.difference) > _GROWS * change.significance.level
     regions: list[ChangedRegion] = []
@@ -164,18 +179,23 @@ def find_regions(change: Change) -> list[ChangedRegion]:
 
 
 def region_of_mask(mask: NDArray[np.bool_], row: int, column: int, score: float, change: Change) -> ChangedRegion | None:
-    """Measure a detection as a region of change; None if the map has no data in its mask.
+    """Measure depth, volume and significance of a detection in a difference map.
 
     Parameters
     ----------
     mask : (m, n) bool array
         Pixels of the detection, within its bounding box.
     row, column : int
-        Top-left pixel of the mask in the map.
+        Pixel of the difference map at which the mask's top-left pixel lies.
     score : float
-        Score of the detection.
+        The detector's score of the detection, 0 to 1.
     change : Change
-        The map.
+        The difference map with its levels of detection.
+
+    Returns
+    -------
+    ChangedRegion or None
+        None if the map has no data in the mask.
     """
     window = change.difference[row : row + mask.shape[0], column : column + mask.shape[1]]
     known = mask & np.isfinite(window)
@@ -319,13 +339,19 @@ def _is_thin(mask: NDArray[np.bool_]) -> bool:
 
 
 class Catalogue:
-    """Numbers the events over all epochs: a region that overlaps one of an earlier epoch belongs to the same event."""
+    """Numbers the events of a wall over all epochs.
+
+    An event is a change at one place: a region that overlaps one of an earlier epoch, of the same kind, belongs to its event.
+    """
 
     def __init__(self) -> None:
         self._last: dict[int, ChangedRegion] = {}
 
     def identified(self, regions: Sequence[ChangedRegion]) -> list[ChangedRegion]:
-        """Return the regions of the next epoch with the numbers of their events; new events take the next free numbers."""
+        """Return the changed regions of the next epoch with the numbers of their events (changes at one place over all epochs).
+
+        A region that overlaps one of an earlier epoch gets its number; others get the next free numbers.
+        """
         named, taken = [], set()
         for region in sorted(regions, key=lambda each: -each.volume_m3):
             shared = {

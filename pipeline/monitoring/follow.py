@@ -32,16 +32,24 @@ def follow(
     ended: Callable[[], bool] = lambda: False,
     told: Callable[[str], None] = print,
 ) -> Result:
-    """Compare the files of a folder with the reference, and wait for further files.
+    """Compare the epochs in a folder with the reference, and go on waiting for further files, for example of a permanent scanner.
 
     Parameters
     ----------
     paths : sequence of Path
-        The reference, and epochs that exist already.
+        Files of the reference, and of epochs that exist already.
     folder : Path
-        Folder into which new files are written; they are compared in the order of their names.
-    out, options, times, workers, resume
-        As in `monitor_paths`. Epochs that are finished in `out` are kept after an interruption.
+        Folder into which new files are written, one for each epoch; they are compared in the order of their names.
+    out : Path
+        Folder of the results; new or empty unless it is to be resumed.
+    options : MonitorOptions
+        All other options of `scarpsim monitor`.
+    times : sequence of str
+        Must be empty: the time of each epoch comes from its file.
+    workers : int
+        Number of processes; the results do not depend on it.
+    resume : bool
+        Whether to keep the epochs that an earlier call finished in `out`. A complete result there is always continued.
     every_s : float
         Time between two looks at the folder, s.
     ended : callable
@@ -57,11 +65,11 @@ def follow(
     Raises
     ------
     InputError
-        For a folder that does not exist, and for a reference that cannot be used. A new file that cannot be used is reported to
-        `told` and left out.
+        If the folder does not exist, the reference cannot be used, times are given, or no epoch arrived. A new file that cannot
+        be used is reported to `told` and left out.
     """
     if not folder.is_dir():
-        raise InputError("is not a folder", where=f"--follow {folder}", remedy="name the folder in which new scans come")
+        raise InputError("is not a folder", where=f"--follow {folder}", remedy="name the folder into which new scans are written")
     if times:
         raise InputError(
             "cannot be combined with --follow, which reads the time of each epoch from its file",

@@ -27,9 +27,26 @@ _FINEST_M = 0.002
 
 
 def towards_sensor(data: EpochData, options: MonitorOptions, name: str) -> tuple[FloatArray, str]:
-    """Return a place in front of the wall, (3,), survey coordinates, m, and in words how it is known.
+    """Find a place in front of the wall, from which it is known which side of the wall is rock and which is air.
 
-    Raises InputError if neither the options nor the file `name` tell from which side the wall was measured.
+    Parameters
+    ----------
+    data : EpochData
+        Content of the reference's file.
+    options : MonitorOptions
+        May state the sensor's position or the direction of change.
+    name : str
+        Name of the file, for errors.
+
+    Returns
+    -------
+    ((3,) array, str)
+        The place, survey coordinates, m, and in words how it is known.
+
+    Raises
+    ------
+    InputError
+        If neither the options, the file nor its scan lines tell from which side the wall was measured.
     """
     if options.position is not None:
         return options.position, "as given by --position"
@@ -49,9 +66,16 @@ def towards_sensor(data: EpochData, options: MonitorOptions, name: str) -> tuple
 
 
 def wall_frame(points: FloatArray, towards: FloatArray, direction: FloatArray | None) -> WallFrame:
-    """Fit the wall frame to points (n, 3), survey coordinates, m.
+    """Fit the wall frame, whose z axis points from the wall to the sensor: changes are measured along it.
 
-    z is along `direction`; without one, it is along the normal of the points' mean plane, to the side of the place `towards`.
+    Parameters
+    ----------
+    points : (n, 3) array
+        Points of the wall, survey coordinates, m.
+    towards : (3,) array
+        A place in front of the wall, survey coordinates, m, which tells the sign of z.
+    direction : (3,) array or None
+        Direction of z, survey coordinates, of any length; None: the normal of the points' mean plane.
     """
     few = points[:: max(len(points) // _SAMPLE, 1)]
     if direction is None:
@@ -60,11 +84,21 @@ def wall_frame(points: FloatArray, towards: FloatArray, direction: FloatArray | 
 
 
 def raster_of(points: FloatArray, gsd_m: float | None, count: int | None = None) -> Grid:
-    """Return the raster over points (n, 3), wall frame, m; the pixel is chosen by their density where `gsd_m` is None.
+    """Choose the raster of a wall's maps so that it covers all points.
 
-    count: number of points in the files, of which `points` are a sample; None: all.
+    Parameters
+    ----------
+    points : (n, 3) array
+        Points, wall frame, m.
+    gsd_m : float or None
+        Side of a pixel, m; None: 1.5 times the mean distance of neighbouring points, rounded up.
+    count : int, optional
+        Number of points in the files, of which `points` are a sample; None: `points` are all.
 
-    Raises InputError if the raster of this pixel is empty or too large.
+    Raises
+    ------
+    InputError
+        If the wall has fewer than ten pixels across, or the raster more than 60 million.
     """
     bounds = np.array([points.min(axis=0), points.max(axis=0)])
     gsd = gsd_m if gsd_m is not None else _usual_gsd(points, count or len(points))

@@ -34,12 +34,14 @@ _BAND = 64
 
 @dataclass(frozen=True)
 class HeightRaster:
-    """Heights of one epoch over one view of the wall, from planes fitted to the points round each pixel.
+    """Heights of one epoch over one view (separately mapped part) of the wall, from planes fitted about each pixel.
+
+    The plane of a pixel is fitted to the points in the 3 x 3 pixels about it.
 
     Attributes
     ----------
     grid : Grid
-        Raster of h x w pixels, wall frame.
+        Raster of h x w pixels, frame of the view.
     height, sigma, scatter : (h, w) float32, m
         Height at the pixel's centre, its standard deviation, and the standard deviation of the points about the plane. NaN where
         there are too few points.
@@ -59,25 +61,25 @@ class HeightRaster:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """(h, w) whether the pixel has a height."""
+        """Mask (h, w) of the pixels that have a height."""
         return np.isfinite(self.height)
 
     @property
     def steepness(self) -> NDArray[np.float32]:
-        """(h, w) tangent of the angle between the surface's normal and the wall's."""
+        """Tangent of the angle between the surface's normal and the raster's z axis, (h, w); NaN without data."""
         return np.asarray(np.hypot(self.slope_x, self.slope_y))
 
 
 @dataclass(frozen=True)
 class WallPoints:
-    """Points of an epoch, wall frame, m, which are read chunk by chunk if they do not fit into memory.
+    """Points of an epoch in the wall frame, which are read in chunks if they do not fit into memory.
 
     Attributes
     ----------
     sample : (n, 3) array
-        A subset of the points, spread over all of the epoch.
+        A subset of the points, spread over all of the epoch, m.
     chunks : callable
-        Function that yields all points, in chunks (k, 3), each time it is called.
+        Function that yields all points in chunks (k, 3), m, each time it is called.
     """
 
     sample: FloatArray
@@ -85,14 +87,14 @@ class WallPoints:
 
     @classmethod
     def of(cls, points: FloatArray) -> WallPoints:
-        """Wrap points (n, 3), wall frame, m, that are in memory."""
+        """Make the points of an epoch from an array (n, 3), wall frame, m, that is in memory."""
         return cls(points, lambda: [points])
 
 
 def gridded(points: FloatArray | Iterable[FloatArray], grid: Grid) -> HeightRaster:
-    """Fit a plane about each pixel to points (n, 3), wall frame, m, or to chunks of them.
+    """Return a raster of heights from points: a plane is fitted to the points in the 3 x 3 pixels about each pixel.
 
-    Points outside the grid are left out.
+    points: (n, 3), frame of the grid, m, or chunks of such arrays. grid: the raster; points outside it are left out.
     """
     sums = PointSums.over(grid)
     for chunk in [points] if isinstance(points, np.ndarray) else points:
@@ -102,23 +104,32 @@ def gridded(points: FloatArray | Iterable[FloatArray], grid: Grid) -> HeightRast
 
 @dataclass(frozen=True)
 class PointSums:
-    """Sums over the points of each pixel, (10, h w), from which planes are fitted; points can be added in chunks."""
+    """Sums over the points of each pixel, from which a plane can be fitted about it; points can be added in chunks.
+
+    Attributes
+    ----------
+    grid : Grid
+        Raster of h x w pixels.
+    sums : (10, h w) array
+        For each pixel the sums over its points of 1, u, v, z, uu, uv, vv, uz, vz and zz: u and v are x and y in pixels from the
+        pixel's centre, z is the height, m.
+    """
 
     grid: Grid
     sums: FloatArray
 
     @classmethod
     def over(cls, grid: Grid) -> PointSums:
-        """Return sums over no points on a grid."""
+        """Return sums that are still zero for the pixels of a raster, so that points can be added to them."""
         return cls(grid, np.zeros((10, grid.height * grid.width)))
 
     def add(self, points: FloatArray) -> None:
-        """Add points (n, 3), frame of the grid, m; those outside the grid are left out."""
+        """Add points (n, 3), frame of the raster, m, to the sums of their pixels; those outside the raster are left out."""
         for start in range(0, len(points), _CHUNK):
             _add_moments(self.sums, points[start : start + _CHUNK], self.grid)
 
     def heights(self) -> HeightRaster:
-        """Fit a plane to the points round each pixel, of all that were added, and return the heights of the planes."""
+        """Fit a plane to all added points in the 3 x 3 pixels about each pixel, and return the raster of heights."""
         return _fitted(self.sums.reshape(10, self.grid.height, self.grid.width), self.grid)
 
 

@@ -13,9 +13,16 @@ _FEWEST = 8
 
 @dataclass(frozen=True)
 class PowerLaw:
-    """Power law N(> V) = n (V / smallest)^-exponent: the number of rockfalls larger than a volume V, for V >= smallest, m3.
+    """Magnitude-frequency law of rockfalls, N(> V) = n (V / V0)^-b: how many are larger than a volume V.
 
-    The exponent has a 95 % interval; n is the number of events of the smallest volume or more.
+    Attributes
+    ----------
+    exponent, low, high : float
+        The exponent b, and the ends of its 95 % interval.
+    smallest_m3 : float
+        Volume V0, m3, above which the law holds.
+    count : int
+        Number n of rockfalls of at least this volume.
     """
 
     exponent: float
@@ -26,11 +33,13 @@ class PowerLaw:
 
 
 def fit_power_law(volumes_m3: Sequence[float]) -> PowerLaw | None:
-    """Fit a power law N(> V) = n (V / smallest)^-b to rockfall volumes V, m3; None for fewer than eight events.
+    """Fit the magnitude-frequency law N(> V) = n (V / V0)^-b, the number of rockfalls larger than V, to their volumes, m3.
 
-    The exponent is the maximum-likelihood estimate n / sum(log(V / smallest)). Its interval follows from 2 n b / estimate, which
-    has a chi-square distribution with 2 n degrees of freedom. The smallest volume is the one with the least Kolmogorov-Smirnov
-    distance (Clauset, Shalizi and Newman 2009, section 3.3).
+    The exponent is the maximum-likelihood estimate b = n / sum(log(V / V0)) over the n rockfalls of at least V0. Its interval
+    follows from 2 n (true b) / (estimated b), which has a chi-square distribution with 2 n degrees of freedom. V0 is the volume
+    for which data and law have the least Kolmogorov-Smirnov distance (Clauset, Shalizi and Newman 2009, section 3.3).
+
+    Returns None for fewer than eight rockfalls.
     """
     ordered = np.sort(np.asarray(volumes_m3, dtype=np.float64))
     ordered = ordered[ordered > 0]

@@ -18,7 +18,10 @@ DISAGREES = 1 / 3
 
 
 def scanner_model(options: MonitorOptions) -> TlsModel | None:
-    """Return the scanner's model that the options name; None if they name none. Raises InputError for a stereo pair's model."""
+    """Return the laser scanner's noise model that the options name by a file or a preset; None if they name neither.
+
+    Raises InputError if the file holds the model of a stereo pair.
+    """
     if options.model is not None:
         model = read_model(options.model)
         if not isinstance(model, TlsModel):
@@ -33,14 +36,14 @@ def scanner_model(options: MonitorOptions) -> TlsModel | None:
 
 
 def predicted_level(model: TlsModel, reference: HeightRaster, epoch: HeightRaster, station: FloatArray) -> float:
-    """Predict the median level of detection at 95 %, m, from a scanner's white noise of range and angles.
+    """Predict the median level of detection at 95 %, m, from a scanner's white noise, to compare it with the measured one.
 
     Parameters
     ----------
     model : TlsModel
-        The scanner's noise.
+        The scanner's noise of range and angles.
     reference, epoch : HeightRaster
-        The two epochs, whose slopes and numbers of points in each pixel are used.
+        The two epochs. The reference's heights give the ranges; the points in each pixel tell how much averaging reduces noise.
     station : (3,) array
         Position of the scanner, wall frame, m.
     """
@@ -58,7 +61,7 @@ def predicted_level(model: TlsModel, reference: HeightRaster, epoch: HeightRaste
 
 
 def compared_in_words(measured_m: float, predicted_m: float) -> str:
-    """Say how the measured level of detection compares with the predicted one (both m), and what to do if they disagree."""
+    """State the measured and the predicted level of detection, both m, and what to do if they differ by more than a third."""
     told = f"Level of detection: measured {1e3 * measured_m:.1f} mm, predicted by the model {1e3 * predicted_m:.1f} mm"
     if abs(measured_m / predicted_m - 1) <= DISAGREES:
         return f"{told}. They agree within a third."

@@ -27,23 +27,23 @@ class MonitorOptions:
     position : (3,) array or None
         Where the sensor stood, or any place in front of the wall, survey coordinates, m; None: as the files state.
     direction : (3,) array or None
-        Direction along which change is measured, towards the sensor; None: the normal of the mean plane.
+        Direction along which change is measured, towards the sensor, survey coordinates; None: the normal of the mean plane.
     views : int or None
-        Number of views of the wall, each along a direction of its own; None: as many as its shape needs.
+        Number of views: parts of the wall that are mapped along directions of their own; None: as many as its shape needs.
     gsd_m : float or None
         Side of a pixel of the maps, m; None: derived from the density of the reference's points.
     stable : tuple of Area
         Areas of stable rock, wall frame, m; empty: `monitor` finds stable rock itself.
     targets : Path or None
-        Targets measured in each epoch, which replace ICP: a file that `read_targets` reads.
+        CSV file of targets that were measured in each epoch, which replace ICP; None: there are none.
     unit : str or None
-        Unit of the coordinates, a key of METRES such as "foot"; None: as the files state.
+        Unit of the coordinates: "m", "cm", "mm", "ft" or "us-ft"; None: as the files state.
     columns : tuple of str
         Names of the columns of text files, in order; empty: as their header states.
     scanner, model : str and Path, or None
         Scanner for which a level of detection is also predicted: name of a preset, or path of a model.yaml; None: no prediction.
     photographs : bool
-        Whether the epochs were reconstructed from photographs.
+        Whether the epochs were reconstructed from photographs; no level of detection is predicted then.
     detector : str
         "none": events are regions beyond the level of detection; else the name or folder of a detector of `scarpsim detect`.
     seed : int
@@ -66,7 +66,7 @@ class MonitorOptions:
     seed: int = 1
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the options as monitor.json stores them: by name, as JSON types."""
+        """Return the options of `scarpsim monitor` as monitor.json stores them: by name, as JSON types."""
         values = {name: getattr(self, name) for name in self.__dataclass_fields__}
         plain = {name: value.tolist() if hasattr(value, "tolist") else value for name, value in values.items()}
         return {name: str(value) if isinstance(value, Path) else value for name, value in plain.items()}
@@ -75,7 +75,8 @@ class MonitorOptions:
 def read_areas(path: Path) -> tuple[Area, ...]:
     """Read stable areas from a YAML or JSON file: a list of boxes [x0, y0, x1, y1] or polygons [[x, y], ...], wall frame, m.
 
-    The list may stand under the key `stable_areas`. Raises InputError for anything else.
+    `monitor` registers epochs on the rock in these areas. The list may stand under the key `stable_areas`. Raises InputError for
+    anything else.
     """
     values = load_yaml(path)
     areas = values.get("stable_areas") if isinstance(values, dict) else values
@@ -90,5 +91,5 @@ def read_areas(path: Path) -> tuple[Area, ...]:
             remedy="write the stable areas in this form, in metres in the wall frame",
         ) from None
     if not found:
-        raise InputError("contains no area", where=str(path), remedy="leave --stable out, or draw an area")
+        raise InputError("contains no area", where=str(path), remedy="add a box or polygon to the file, or leave --stable out")
     return found

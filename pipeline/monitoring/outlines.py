@@ -16,9 +16,9 @@ _FINER = 2
 
 
 def rings(mask: NDArray[np.bool_]) -> list[FloatArray]:
-    """Return the outline of each connected part of a mask as a closed ring (n, 2).
+    """Return the outline of each connected part of a mask (h, w), for files of outlines.
 
-    A ring has the column and row of each corner, in pixels from the mask's top-left corner.
+    Each outline is a closed ring (n, 2): column and row of its corners, in pixels from the mask's top-left corner.
     """
     fine = np.kron(mask.astype(np.uint8), np.ones((_FINER, _FINER), np.uint8))
     found, _ = cv2.findContours(fine, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
@@ -27,9 +27,23 @@ def rings(mask: NDArray[np.bool_]) -> list[FloatArray]:
 
 
 def in_survey(region: ChangedRegion, grid: Grid, heights: NDArray[np.float32], frame: WallFrame) -> list[FloatArray]:
-    """Return a region's outlines as rings (n, 3) on the reference's surface, survey coordinates, m.
+    """Return the outlines of a changed region in survey coordinates, for files that GIS programs read.
 
-    heights: (h, w) heights of the reference on `grid`, m. frame: the frame of the grid.
+    Parameters
+    ----------
+    region : ChangedRegion
+        The region.
+    grid : Grid
+        Raster of the map in which it lies.
+    heights : (h, w) array
+        Heights of the reference on that raster, m.
+    frame : WallFrame
+        Frame of the raster.
+
+    Returns
+    -------
+    list of (n, 3) arrays
+        A closed ring on the reference's surface for each connected part, survey coordinates, m.
     """
     result = []
     for ring in rings(region.mask):

@@ -45,8 +45,14 @@ _SCALE_M = 1e-4
 class Followed:
     """The result of one epoch of `monitor` after its events were numbered over all epochs.
 
-    source: the epoch's files and time. record: its result before the numbering. regions: the regions of the record, with the
-    numbers of their events.
+    Attributes
+    ----------
+    source : EpochSource
+        The epoch's files and time.
+    record : EpochRecord
+        Registration, level of detection and changed regions of the epoch.
+    regions : list of ChangedRegion
+        The changed regions with the numbers of their events, which regions of several epochs at one place share.
     """
 
     source: EpochSource
@@ -61,7 +67,21 @@ class Followed:
 
 @dataclass(frozen=True)
 class Result:
-    """Result of a finished `monitor`: folder, files of all epochs (the reference first), and results of the later epochs."""
+    """Result of a finished `monitor`.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder of the results.
+    sources : tuple of EpochSource
+        Files and times of all epochs, the reference first.
+    site : ReferenceSite
+        The reference epoch: its frames, rasters and heights.
+    epochs : tuple of Followed
+        Results of the epochs after the reference.
+    options : MonitorOptions
+        Options of the call.
+    """
 
     folder: Path
     sources: tuple[EpochSource, ...]
@@ -70,7 +90,10 @@ class Result:
     options: MonitorOptions
 
     def rows(self) -> list[dict[str, Any]]:
-        """The table of events: a row for each event and epoch with the columns `COLUMNS`; None for an unknown value."""
+        """Return the table of events: a row for each changed region of each epoch, as events.csv has it.
+
+        A row holds the number of the event, epoch, time, place, size, depths, volume and marks by column name; None: unknown.
+        """
         first = self._first_seen()
         rows = []
         for epoch in self.epochs:
@@ -85,7 +108,10 @@ class Result:
         return rows
 
     def outlines(self) -> list[list[FloatArray]]:
-        """Outlines of the event of each row of the table, as rings (n, 3), survey coordinates, m."""
+        """Return the outlines of the changed regions, in the order of the table of events.
+
+        Each has a ring (n, 3) for each connected part, survey coordinates, m.
+        """
         found = []
         for epoch in self.epochs:
             for region in epoch.regions:
@@ -104,9 +130,18 @@ class Result:
 
 
 def write_points(epoch: Followed, data: EpochData, site: ReferenceSite, out: Path) -> None:
-    """Write an epoch's registered points, survey coordinates, with difference, level of detection and event at each point.
+    """Write an epoch's registered points as LAZ, with the difference, level of detection and event at each point.
 
-    data: its points as they were read. site: the reference. out: folder of the results.
+    Parameters
+    ----------
+    epoch : Followed
+        Result of the epoch.
+    data : EpochData
+        Its points as they were read, survey coordinates, m.
+    site : ReferenceSite
+        The reference epoch.
+    out : Path
+        Folder of the results, which has the epoch's maps already.
     """
     maps = [_maps_of(epoch, view, out) for view in site.views]
     partition = site.reference.partition
@@ -133,7 +168,11 @@ def _maps_of(epoch: Followed, view: WallView, out: Path) -> list[NDArray[np.floa
 
 
 def write_results(result: Result) -> None:
-    """Write the tables, outlines, COCO annotations and report, and last monitor.json, which marks the folder as complete."""
+    """Write the results of `monitor` into its folder, once all epochs have been compared.
+
+    These are the reference's heights, tables and outlines of events, COCO annotations and the report. monitor.json comes last and
+    marks the folder as complete.
+    """
     from pipeline.monitoring.report import write_report
 
     rows = result.rows()
@@ -147,7 +186,10 @@ def write_results(result: Result) -> None:
 
 
 def event_raster(regions: Sequence[ChangedRegion], view: WallView) -> NDArray[np.int32]:
-    """Return the number of the event at each pixel (h, w) of a view, 0 for none; smaller events are drawn over larger ones."""
+    """Return the number of the event at each pixel (h, w) of a map, 0 for none; smaller events are drawn over larger ones.
+
+    regions: changed regions of an epoch, numbered. view: the part of the wall that the map shows.
+    """
     raster = np.zeros(view.grid.shape, dtype=np.int32)
     inside = (region for region in regions if region.view == view.number)
     for region in sorted(inside, key=lambda each: -each.area_m2):

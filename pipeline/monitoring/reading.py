@@ -62,17 +62,17 @@ class EpochSource:
 
     @property
     def name(self) -> str:
-        """Name of the epoch in reports and messages."""
+        """Name of the epoch in reports and messages: that of its file or folder."""
         return self.path.name if self.run is None else f"{self.path.parent.name}/{self.path.name}"
 
     def checksums(self) -> dict[str, str]:
-        """SHA-256 of each file, by its path."""
+        """Return the SHA-256 checksum of each file of the epoch, by its path: it tells whether a file was changed."""
         return {str(file): sha256(file) for file in self.files}
 
 
 @dataclass(frozen=True)
 class LargeFiles:
-    """The LAS and LAZ files of one epoch, which are read chunk by chunk.
+    """The LAS and LAZ files of an epoch with many points, which are read chunk by chunk.
 
     Attributes
     ----------
@@ -83,9 +83,9 @@ class LargeFiles:
     count : int
         Number of points, without those that the files flag as withheld, synthetic or noise.
     first : (n, 3) array
-        The first points, survey coordinates, m.
+        The first points in the order of the files, survey coordinates, m.
     bounds : (2, 3) array
-        Corners of the box about all points, survey coordinates, m.
+        Smallest and largest coordinates of all points, survey coordinates, m.
     kept : tuple of (n, 3) int32 arrays
         All points as steps of 0.01 mm from the first one, if they fit into memory easily; else empty.
     """
@@ -98,7 +98,7 @@ class LargeFiles:
     kept: tuple[NDArray[np.int32], ...] = ()
 
     def chunks(self) -> Iterator[FloatArray]:
-        """All points (n, 3), survey coordinates, m, chunk by chunk."""
+        """Yield all points of the files in chunks (n, 3), survey coordinates, m."""
         if self.kept:
             return (steps * _STEP_M + self.first[0] for steps in self.kept)
         return itertools.chain.from_iterable(read_chunks(file, self.unit) for file in self.files)
@@ -106,14 +106,14 @@ class LargeFiles:
 
 @dataclass(frozen=True)
 class EpochData:
-    """Content of an epoch's files.
+    """Points of an epoch as read from its files, and what these state of sensor and coordinate system.
 
     Attributes
     ----------
     points : (n, 3) array
-        Survey coordinates, m; the vertices of a mesh. For large files a sample, spread over the files.
+        Points, or the vertices of a mesh, survey coordinates, m. For large files a sample, spread over the files.
     mesh : TriangleMesh or None
-        The surface, if the files contain one.
+        The surface, survey coordinates, m, if the files contain one.
     position : (3,) array or None
         Position of the sensor, survey coordinates, m, if the files state it.
     crs : str
@@ -133,34 +133,35 @@ class EpochData:
 
     @property
     def count(self) -> int:
-        """Number of points in the files."""
+        """Number of points in the epoch's files."""
         return len(self.points) if self.large is None else self.large.count
 
     @property
     def in_order(self) -> FloatArray:
-        """(n, 3) points in the order of the file, survey coordinates, m; of large files only the first ones."""
+        """Points (n, 3) in the order of the file, survey coordinates, m; of large files only the first ones."""
         return self.points if self.large is None else self.large.first
 
     @property
     def bounds(self) -> FloatArray:
-        """(2, 3) corners of the box about all points, survey coordinates, m."""
+        """Smallest and largest coordinates of all points, (2, 3), survey coordinates, m."""
         return np.array([self.points.min(axis=0), self.points.max(axis=0)]) if self.large is None else self.large.bounds
 
     def chunks(self) -> Iterator[FloatArray]:
-        """All points (n, 3), survey coordinates, m, chunk by chunk."""
+        """Yield all points of the epoch in chunks (n, 3), survey coordinates, m."""
         return iter(np.array_split(self.points, -(-len(self.points) // CHUNK))) if self.large is None else self.large.chunks()
 
     def wall_points(self, frame: WallFrame, gsd_m: float, *, several: bool = False) -> WallPoints:
-        """Return the points in the wall frame, m; those of a mesh are drawn at random on it.
+        """Return the epoch's points in the wall frame, m; on a mesh, points are spread at about four a pixel.
 
         Parameters
         ----------
         frame : WallFrame
             The wall frame.
         gsd_m : float
-            Side of a pixel of the maps, m; a mesh gets about four points a pixel.
+            Side of a pixel of the maps, m.
         several : bool
-            Whether the wall has several views, so that points are also drawn on triangles that are steep in the wall frame.
+            Whether the wall has several views (separately mapped parts). On a mesh, points are then drawn at random on all
+            triangles, also on those that are steep in the wall frame.
         """
         if self.mesh is None:
             return WallPoints(frame.to_wall(self.points), lambda: map(frame.to_wall, self.chunks()))
@@ -189,7 +190,7 @@ def _spread_over(mesh: TriangleMesh, apart_m: float) -> FloatArray:
 
 
 def find_epochs(paths: Sequence[Path], times: Sequence[str] = ()) -> list[EpochSource]:
-    """Find the epochs that some paths name, in order.
+    """Find the epochs that the user's paths name, in order, with their times.
 
     Parameters
     ----------
@@ -230,7 +231,10 @@ def find_epochs(paths: Sequence[Path], times: Sequence[str] = ()) -> list[EpochS
 
 
 def read_epoch(source: EpochSource, options: MonitorOptions) -> EpochData:
-    """Read the files of an epoch. Raises InputError if a file cannot be used."""
+    """Read the points of an epoch from its files, in metres.
+
+    source: the files. options: they give the unit and the columns of text files. Raises InputError if a file cannot be used.
+    """
     if source.run is not None:
         return _of_run(source, source.run)
     if all(file.suffix.lower() in _LAS for file in source.files) and sum(map(count_points, source.files)) > WHOLE_POINTS:
@@ -267,7 +271,11 @@ def _sampled(files: tuple[Path, ...], unit: str | None) -> EpochData:
         highs.append(chunk.max(axis=0))
         count += len(chunk)
     if first is None:
-        raise InputError("contains no point that is in use", where=str(files[0]), remedy="export it again, with its points")
+        raise InputError(
+            "contains no points but those flagged as withheld, synthetic or noise",
+            where=str(files[0]),
+            remedy="export it again, with its points, or clear these flags",
+        )
     bounds = np.array([np.min(lows, axis=0), np.max(highs, axis=0)])
     large = LargeFiles(files, unit, count, first, bounds, tuple(kept))
     note = f"its {count:,} points were read in chunks: memory depends on the maps alone"
@@ -275,7 +283,7 @@ def _sampled(files: tuple[Path, ...], unit: str | None) -> EpochData:
 
 
 def epoch_files(folder: Path) -> list[Path]:
-    """Return the files of a folder that contain scans, clouds, meshes or elevation models, sorted by name."""
+    """Return the files of a folder that, by their suffix, contain scans, clouds, meshes or elevation models, sorted by name."""
     return sorted(each for each in folder.iterdir() if each.suffix.lower() in _ANY and each.is_file())
 
 

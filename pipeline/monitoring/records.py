@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ KEPT = ".monitor"
 
 @dataclass(frozen=True)
 class EpochRecord:
-    """The result of comparing one epoch with the reference, as it is kept in the folder of the results.
+    """The result of comparing one epoch with the reference, as it is stored so that an interrupted `monitor` can go on.
 
     Attributes
     ----------
@@ -58,16 +58,16 @@ class EpochRecord:
     regions: tuple[ChangedRegion, ...]
 
     def write(self, folder: Path, fingerprint: str, shapes: Sequence[tuple[int, ...]]) -> None:
-        """Write the record into the folder of the results.
+        """Write the result of the epoch into the folder of the results, so that an interrupted `monitor` can go on.
 
         Parameters
         ----------
         folder : Path
             Folder of the results.
         fingerprint : str
-            Checksum of the reference and the options, with which a later call tells whether the record still applies.
+            Checksum of the reference and the options, with which a later call tells whether the stored result still applies.
         shapes : sequence of (int, int)
-            Rows and columns of each view's maps.
+            Rows and columns of the map of each view (separately mapped part) of the wall.
         """
         values = {name: getattr(self, name) for name in ("number", "inputs", "points", "notes", "registration", "area_m2")}
         levels = {
@@ -82,9 +82,7 @@ class EpochRecord:
 
 
 def kept(folder: Path, number: int, inputs: Mapping[str, str], fingerprint: str) -> EpochRecord | None:
-    """Read the record that an earlier call wrote of an epoch, which then need not be computed again.
-
-    Returns None if there is none, or if it was made from other files, options or another reference.
+    """Read the result of an epoch that an interrupted `monitor` stored, so that it need not be computed again.
 
     Parameters
     ----------
@@ -96,6 +94,11 @@ def kept(folder: Path, number: int, inputs: Mapping[str, str], fingerprint: str)
         SHA-256 of the epoch's files by path.
     fingerprint : str
         Checksum of the reference and the options.
+
+    Returns
+    -------
+    EpochRecord or None
+        None if there is none, or if it was made from other files, options or another reference.
     """
     path = _file(folder, number)
     if not path.is_file():
@@ -117,11 +120,6 @@ def kept(folder: Path, number: int, inputs: Mapping[str, str], fingerprint: str)
         area_m2=values["area_m2"],
         regions=tuple(_region(each) for each in values["regions"]),
     )
-
-
-def without_numbers(region: ChangedRegion) -> ChangedRegion:
-    """Return the region without the number of its event."""
-    return replace(region, identity=0)
 
 
 def _file(folder: Path, number: int) -> Path:

@@ -27,7 +27,7 @@ _EPOCHS_FOR_LAW = 3
 
 
 def write_report(result: Result) -> None:
-    """Write report.html of a finished `monitor`, its pictures as separate files, and styles of the maps for GIS programs."""
+    """Write report.html of a finished `scarpsim monitor`, its pictures as files, and styles of the maps for GIS programs."""
     pictures: dict[str, bytes] = {}
     for view in result.site.views:
         pictures[f"reference{view.suffix}.png"] = hillshade_figure(view.raster.height, view.grid)
@@ -56,7 +56,7 @@ def write_report(result: Result) -> None:
 
 
 def headline(result: Result) -> list[str]:
-    """Return one sentence for each epoch: what fell, what was added, and the smallest change that would be noticed."""
+    """Return one sentence for each epoch: what fell, what was added, and the level of detection of a pixel."""
     told = []
     for epoch in result.epochs:
         when = f" ({epoch.source.time.text})" if epoch.source.time.when else ""
@@ -72,7 +72,7 @@ def headline(result: Result) -> list[str]:
 
 
 def law_in_words(law: PowerLaw) -> str:
-    """Return the exponent of a magnitude-frequency law with its 95 % interval, as text."""
+    """State the magnitude-frequency law of the rockfalls, with the 95 % interval of its exponent, as a sentence."""
     return (
         f"{law.count} rockfalls of {law.smallest_m3:.3g} m³ and more follow N(> V) ~ V^-{law.exponent:.2f} "
         f"(95 % interval {law.low:.2f} to {law.high:.2f})."

@@ -47,7 +47,35 @@ def monitor_paths(
     resume: bool = False,
     progress: Progress | None = None,
 ) -> Result:
-    """Find the epochs that the paths name, the reference first, and compare them. Further arguments as in `monitor`."""
+    """Compare the epochs that the user's paths name with the first one, and write the folder of results.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Files, folders of scans or runs of `simulate`; the first epoch is the reference.
+    out : Path
+        New or empty folder, or with `resume` the folder of an interrupted run.
+    options : MonitorOptions
+        All other options.
+    times : sequence of str
+        Time of each epoch, ISO 8601; empty: as the files state.
+    workers : int
+        Number of processes; the results do not depend on it.
+    resume : bool
+        Whether to keep the epochs that are finished in `out`.
+    progress : Progress, optional
+        Receives the progress.
+
+    Returns
+    -------
+    Result
+        The result of all epochs, as it was written.
+
+    Raises
+    ------
+    InputError
+        If a path or file cannot be used, or if an epoch does not overlap the reference.
+    """
     return monitor(find_epochs(paths, times), out, options, workers=workers, resume=resume, progress=progress)
 
 
@@ -60,12 +88,12 @@ def monitor(
     resume: bool = False,
     progress: Progress | None = None,
 ) -> Result:
-    """Compare epochs with the first one, and write the folder of results.
+    """Compare the epochs of a wall with the first one, and write the folder of results.
 
     Parameters
     ----------
     sources : sequence of EpochSource
-        Files of all epochs, the reference first.
+        Files and times of all epochs, the reference first.
     out : Path
         New or empty folder, or with `resume` the folder of an interrupted run.
     options : MonitorOptions
@@ -76,6 +104,11 @@ def monitor(
         Whether to keep the epochs that are finished in `out`.
     progress : Progress, optional
         Receives the progress.
+
+    Returns
+    -------
+    Result
+        The result of all epochs, as it was written.
 
     Raises
     ------
@@ -172,7 +205,7 @@ def _site_of_worker(reference: EpochSource, frozen: _Frozen) -> ReferenceSite:
 def processed(
     number: int, source: EpochSource, site: ReferenceSite, out: Path, options: MonitorOptions, fingerprint: str
 ) -> tuple[EpochRecord, EpochData]:
-    """Compare one epoch with the reference, and write its maps and its record.
+    """Read one epoch, compare it with the reference, and write its maps and its stored result.
 
     Parameters
     ----------
@@ -181,18 +214,18 @@ def processed(
     source : EpochSource
         Its files.
     site : ReferenceSite
-        The reference.
+        The reference epoch: its frames, rasters and heights.
     out : Path
         Folder of the results.
     options : MonitorOptions
         All other options.
     fingerprint : str
-        Checksum of the reference and the options, which is stored with the record.
+        Checksum of the reference and the options, which is stored with the result.
 
     Returns
     -------
     (EpochRecord, EpochData)
-        The record, and the content of the files.
+        The result, and the content of the epoch's files.
     """
     data = read_epoch(source, options)
     notes = [*data.notes, *_check_same_site(data, site, source)]
@@ -253,10 +286,10 @@ def _check_same_site(data: EpochData, site: ReferenceSite, source: EpochSource) 
         np.abs(wall[:, 1] - grid.y_max + grid.height * grid.gsd / 2) < grid.height * grid.gsd
     )
     if not inside.mean() > _TENTH:
-        unit = " or their units differ" if ratio > _UNLIKE_UNITS or ratio < 1 / _UNLIKE_UNITS else ""
+        unit = " or units" if ratio > _UNLIKE_UNITS or ratio < 1 / _UNLIKE_UNITS else ""
         raise InputError(
             f"lies elsewhere than the reference {site.source.name}: its middle is "
-            f"{np.linalg.norm(np.median(wall, axis=0)):,.0f} m from the wall's corner; the coordinates differ{unit}",
+            f"{np.linalg.norm(np.median(wall, axis=0)):,.0f} m from the wall's corner; their coordinate systems{unit} differ",
             where=source.name,
             allowed="epochs of one coordinate system",
             remedy="export all epochs in one coordinate system, or give the unit of their coordinates with --unit",

@@ -41,15 +41,15 @@ _FILLED = 0.5
 
 @dataclass(frozen=True)
 class Significance:
-    """Size of the differences that noise alone causes.
+    """Size of the height differences that noise alone causes in a difference map.
 
     Attributes
     ----------
     level : (h, w) float32, m
-        Level of detection (95 %) of each pixel; NaN without data.
+        Level of detection of each pixel: noise alone exceeds it in 5 % of cases; NaN without data.
     side_px, sigma : (k,) arrays
-        Sides of squares, px, and the standard deviation on stable rock of means over such squares. Before averaging, each
-        difference is divided by the standard deviation of its pixel.
+        Sides of squares, px, and the standard deviation of means over such squares of stable rock. It has no unit, because
+        each difference is first divided by the standard deviation of its pixel.
     """
 
     level: NDArray[np.float32]
@@ -58,29 +58,34 @@ class Significance:
 
     @property
     def one_sigma(self) -> NDArray[np.float32]:
-        """(h, w) standard deviation of a pixel's difference, m."""
+        """Standard deviation of each pixel's height difference, (h, w), m; NaN without data."""
         return np.asarray(self.level / np.float32(NORMAL_95))
 
     def sigma_of_mean(self, pixels: float | NDArray[np.floating]) -> FloatArray:
-        """Return the standard deviation of a mean of standardised differences over so many pixels, at most the largest square."""
+        """Return the standard deviation of a mean over so many neighbouring `pixels`, whose errors are correlated.
+
+        The mean is of differences that are each divided by the standard deviation of their pixel, so it has no unit. The result
+        for more pixels than the largest square that was measured on stable rock is that of this square.
+        """
         side = np.sqrt(np.maximum(pixels, 1.0))
         return np.asarray(np.exp(np.interp(np.log(side), np.log(self.side_px), np.log(self.sigma))))
 
 
 def significance(difference: NDArray[np.float32], predicted: NDArray[np.float32], stable: NDArray[np.bool_]) -> Significance:
-    """Compare the differences on stable rock with what was predicted.
+    """Estimate levels of detection and the errors of means from how much the differences on stable rock really scatter.
 
     Parameters
     ----------
     difference, predicted : (h, w) float32, m
-        Reference minus epoch, and its predicted standard deviation; NaN without data.
+        Height of the reference minus that of the epoch, and the standard deviation that error propagation predicts for it;
+        NaN without data.
     stable : (h, w) bool
         Pixels of stable rock.
 
     Returns
     -------
     Significance
-        Levels of detection, and standard deviations of means.
+        Level of detection of each pixel, and standard deviations of means.
     """
     level = predicted * _factor(difference, predicted, stable)
     standard = np.where(stable, difference / (level / NORMAL_95), np.nan)

@@ -26,7 +26,7 @@ _STEEP = float(np.tan(np.radians(65.0)))
 
 @dataclass(frozen=True)
 class WallView:
-    """A part of the wall with maps of its own.
+    """A part of the wall with maps of its own, which are made along a direction of its own.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class WallView:
     frame : WallFrame
         Frame of the view; z is the direction in which change is measured, towards the sensor.
     raster : HeightRaster
-        Heights of the reference.
+        Heights of the reference epoch, frame of the view.
     """
 
     number: int
@@ -44,25 +44,25 @@ class WallView:
 
     @property
     def grid(self) -> Grid:
-        """The grid of the view's maps."""
+        """Raster of the maps of this part of the wall."""
         return self.raster.grid
 
     @property
     def suffix(self) -> str:
-        """Ending of the names of the view's files; empty for the first view."""
+        """Ending of the names of the files of this part of the wall, such as "_view2"; empty for the first part."""
         return "" if self.number == 1 else f"_view{self.number}"
 
 
 @dataclass(frozen=True)
 class ReferenceSite:
-    """The reference epoch, prepared for comparisons.
+    """The reference epoch, prepared so that other epochs can be compared with it.
 
     Attributes
     ----------
     source : EpochSource
-        Its files.
+        Its files and time.
     views : tuple of WallView
-        The view of the whole wall, or several views if the wall turns a corner or overhangs.
+        The view of the whole wall, or several views (separately mapped parts) if the wall turns a corner or overhangs.
     station : (3,) array
         Position of the sensor, or a place in front of the wall, wall frame, m.
     reference : ReferenceHeights
@@ -85,17 +85,23 @@ class ReferenceSite:
 
     @property
     def frame(self) -> WallFrame:
-        """The wall frame: that of the first view."""
+        """The wall frame, which is the frame of the first and largest view (separately mapped part) of the wall."""
         return self.views[0].frame
 
     @property
     def grid(self) -> Grid:
-        """The grid of the first view's maps."""
+        """Raster of the maps of the first and largest view (separately mapped part) of the wall."""
         return self.views[0].grid
 
 
 def prepared(source: EpochSource, options: MonitorOptions) -> ReferenceSite:
-    """Read the reference epoch, and choose its views, frames and rasters. Raises InputError if it cannot be used."""
+    """Read the reference epoch, and prepare it for comparisons with other epochs.
+
+    The wall is divided into views (parts that are mapped along directions of their own) where needed. Each gets a frame and a
+    raster.
+
+    source: files of the reference. options: options of `monitor`. Raises InputError if the files cannot be used.
+    """
     data = read_epoch(source, options)
     towards, how = towards_sensor(data, options, source.name)
     frames, partition = _frames(data, towards, options)
@@ -116,7 +122,10 @@ def _frames(data: EpochData, towards: FloatArray, options: MonitorOptions) -> tu
     count = options.views or (None if options.direction is None else 1)
     if count is not None and not 1 <= count <= MOST_VIEWS:
         raise InputError(
-            f"got {count} views", where="--views", allowed=f"1 to {MOST_VIEWS}", remedy="choose a number in this range"
+            f"the wall cannot be divided into {count} views",
+            where="--views",
+            allowed=f"1 to {MOST_VIEWS}",
+            remedy="choose a number in this range",
         )
     found = divided(data.points - single.origin, towards - single.origin, single.rotation[2], count)
     if found is None:

@@ -29,7 +29,7 @@ Targets = Mapping[str, Mapping[str, FloatArray]]
 
 @dataclass(frozen=True)
 class TargetFit:
-    """Transform from an epoch to the reference that was fitted to targets, and how well it fits.
+    """Rigid motion from an epoch to the reference that was fitted to survey targets, and how well it fits.
 
     Attributes
     ----------
@@ -44,14 +44,16 @@ class TargetFit:
 
 
 def read_targets(path: Path) -> Targets:
-    """Read a CSV file with the columns epoch, target, x, y, z: epoch is the name of a file, x, y, z are its coordinates, m.
+    """Read the coordinates of survey targets, which were measured in several epochs, from a CSV file.
 
-    Raises InputError for other columns and for values that are no numbers.
+    Its columns are epoch (name of the epoch's file), target (name of the target), x, y, z (survey coordinates, m).
+
+    Returns the coordinates (3,) by epoch and target. Raises InputError for other columns and for values that are no numbers.
     """
     table = csv.DictReader(io.StringIO(read_text(path)))
     if not set(_COLUMNS) <= set(table.fieldnames or ()):
         raise InputError(
-            f"has the columns {', '.join(table.fieldnames or ()) or 'none'}",
+            f"lacks a column; it has {', '.join(table.fieldnames or ()) or 'none'}",
             where=str(path),
             allowed=", ".join(_COLUMNS),
             remedy="name all of these columns in the first line, separated by commas",
@@ -71,21 +73,21 @@ def read_targets(path: Path) -> Targets:
 
 
 def fit_targets(targets: Targets, reference: str, epoch: str, frame: WallFrame) -> TargetFit:
-    """Fit the rigid motion that brings an epoch's targets to those of the reference (Kabsch 1976).
+    """Fit the rigid motion that brings the targets of an epoch to those of the reference (Kabsch 1976), to register the epoch.
 
     Parameters
     ----------
     targets : mapping
-        As `read_targets` gives them.
+        Survey coordinates (3,), m, by epoch and target, as `read_targets` returns them.
     reference, epoch : str
-        Names of the epochs' files.
+        Names of the two epochs' files.
     frame : WallFrame
-        Of the result.
+        The wall frame, in which the motion is returned.
 
     Raises
     ------
     InputError
-        Where fewer than three targets are common, they lie on a line, or one is far from its place.
+        If fewer than three targets are common, they lie on a line, or one is more than 0.1 m from its place after the fit.
     """
     before, after = targets.get(reference, {}), targets.get(epoch, {})
     common = sorted(set(before) & set(after))
@@ -109,7 +111,7 @@ def fit_targets(targets: Targets, reference: str, epoch: str, frame: WallFrame) 
     if apart.max() > _FAR_M:
         worst = common[int(np.argmax(apart))]
         raise InputError(
-            f"target {worst} of {epoch} is {apart.max():.2f} m from its place in {reference}",
+            f"target {worst} of {epoch} is {apart.max():.2f} m from its place in {reference} after the fit",
             where="--targets",
             remedy="leave out targets that moved or were mistaken",
         )

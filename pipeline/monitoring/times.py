@@ -30,19 +30,32 @@ _ISO = "a time in ISO 8601, such as 2026-03-14T15:30:00Z"
 
 @dataclass(frozen=True)
 class EpochTime:
-    """When an epoch was measured, in UTC (`when`; None if unknown), and in words where this is stated."""
+    """When an epoch was measured.
+
+    Attributes
+    ----------
+    when : datetime or None
+        The time in UTC; None if it is unknown.
+    source : str
+        In words where it is stated, such as "from its name".
+    """
 
     when: datetime | None
     source: str
 
     @property
     def text(self) -> str:
-        """The time in ISO 8601; empty if it is unknown."""
+        """Time of the epoch in ISO 8601; empty if it is unknown."""
         return "" if self.when is None else self.when.isoformat().replace("+00:00", "Z")
 
 
 def time_of(path: Path, given: str | None = None) -> EpochTime:
-    """Return the time of an epoch's file or folder; given: the user's text. Raises InputError if it is no time."""
+    """Find out when an epoch was measured.
+
+    The time comes from the user, a file NAME.time.txt beside the epoch's, the LAS header or a date in the name, in this order.
+
+    path: file or folder of the epoch. given: the user's text, ISO 8601. Raises InputError if a text is no time.
+    """
     if given is not None:
         return EpochTime(parsed_time(given, "--times"), "as given by --times")
     beside = path.with_name(path.name + SIDECAR)
@@ -52,9 +65,9 @@ def time_of(path: Path, given: str | None = None) -> EpochTime:
 
 
 def parsed_time(text: str, where: str) -> datetime:
-    """Read a time in ISO 8601; without a zone it is UTC.
+    """Read a time in ISO 8601, such as 2026-03-14T15:30:00Z, and return it in UTC; without a zone it is UTC.
 
-    where: option or file that states it, for the error. Raises InputError for anything else.
+    where: option or file that states it, for errors. Raises InputError for any other text.
     """
     try:
         found = datetime.fromisoformat(text)
@@ -66,14 +79,14 @@ def parsed_time(text: str, where: str) -> datetime:
 
 
 def check_order(times: Sequence[EpochTime], names: Sequence[str]) -> None:
-    """Raise InputError where an epoch is earlier than the one before it; names: the epochs' names, for the error."""
+    """Raise InputError if an epoch is earlier than the one that is listed before it. names: the epochs' names, for errors."""
     known = [(time.when, name) for time, name in zip(times, names, strict=True) if time.when is not None]
     for (before, first), (after, second) in itertools.pairwise(known):
         if after < before:
             raise InputError(
                 f"{second} ({after:%Y-%m-%d %H:%M}) is earlier than {first} ({before:%Y-%m-%d %H:%M}), which comes before it",
                 where="EPOCH",
-                remedy="give the epochs in the order of their times, or say them with --times",
+                remedy="give the epochs in the order of their times, or state the times with --times",
             )
 
 

@@ -32,14 +32,21 @@ _FEWEST = 50
 
 
 def unchanged_pixels(standard: NDArray[np.floating], candidates: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which candidates (h, w) are unchanged: no area round them has differences of mainly one sign.
+    """Find the pixels of a difference map where the wall did not change, on which registration and noise are then measured.
+
+    Noise has both signs everywhere. A place has changed where differences of mainly one sign fill an area.
 
     Parameters
     ----------
     standard : (h, w) array
-        Differences over their predicted standard deviation, with mean zero where nothing changed; NaN without data.
+        Height differences divided by their predicted standard deviation, with mean zero where nothing changed; NaN without data.
     candidates : (h, w) bool
         Pixels that may be stable: all with data, or those in the stable areas that the user gave.
+
+    Returns
+    -------
+    (h, w) bool
+        The unchanged pixels.
     """
     unchanged = candidates & np.isfinite(standard)
     means = {side: _mean_over_squares(standard, side) for side in _SQUARES_PX}
@@ -55,9 +62,11 @@ def unchanged_pixels(standard: NDArray[np.floating], candidates: NDArray[np.bool
 
 
 def quieter_scatter(values: NDArray[np.floating]) -> float:
-    """Estimate the standard deviation of noise about zero from the values of the sign that scatters less.
+    """Estimate the standard deviation of noise about zero where some of the differences are changes of mainly one sign.
 
-    values: differences, any shape. Long tails are included.
+    It is computed from the positive or from the negative values, whichever scatter less, and allows for long tails.
+
+    values: (n,) differences, in any unit. Infinite if there are none.
     """
     sides = [side for side in (values[values > 0], -values[values < 0]) if len(side) >= _FEWEST]
     if not sides:

@@ -32,20 +32,22 @@ _CELLS = 128
 
 @dataclass(frozen=True)
 class Partition:
-    """Assigns each place in space to one of the n views (parts) of a wall, by means of cells of space.
+    """Division of a wall into views (parts that are mapped along directions of their own), by a grid of cubes in space.
+
+    The cubes also tell to which view a point of a later epoch belongs.
 
     Attributes
     ----------
     to_cells : RigidTransform
-        Transform from the frame of the points to the frame along whose axes the cells lie.
+        From the frame of the points to the frame along whose axes the cubes lie.
     origin : (3,) array
-        Corner of the cells, m, in that frame.
+        Corner of the first cube in that frame, m.
     cell_m : float
-        Side of a cell, m.
+        Side of a cube, m.
     view : (i, j, k) int8 array
-        Number of the view, from 0 on, of each cell.
+        Number of the view of each cube, from 0 on.
     directions : (n, 3) array
-        Unit vectors from the wall to its outer side, one a view, in that frame.
+        Unit vector from the rock towards the air for each of the n views, frame of the cubes.
     """
 
     to_cells: RigidTransform
@@ -55,29 +57,41 @@ class Partition:
     directions: FloatArray
 
     def of(self, points: FloatArray) -> NDArray[np.int8]:
-        """Return the view (k,) of points (k, 3), m; outside the cells, the view of the nearest cell."""
+        """Return to which view (separately mapped part) of the wall each point belongs: numbers (k,) from 0 on.
+
+        points: (k, 3), m, in the frame for which the partition was made. Points far from the wall count to the
+        nearest view.
+        """
         cell = np.floor((self.to_cells.apply(points) - self.origin) / self.cell_m).astype(np.int64)
         cell = np.clip(cell, 0, np.array(self.view.shape) - 1)
         return np.asarray(self.view[cell[:, 0], cell[:, 1], cell[:, 2]])
 
     def for_points(self, to_cells: RigidTransform) -> Partition:
-        """Return the same partition for points in another frame; `to_cells` transforms from that frame to the cells' frame."""
+        """Return the same division of the wall for points in another frame.
+
+        to_cells: transform from that frame to the frame of the grid by which the wall is divided.
+        """
         return replace(self, to_cells=to_cells)
 
 
 def divided(points: FloatArray, towards: FloatArray, main: FloatArray, count: int | None) -> Partition | None:
-    """Divide a wall into views; None if a single view is enough.
+    """Divide a wall that turns a corner or overhangs into views: parts that are mapped along directions of their own.
 
     Parameters
     ----------
     points : (n, 3) array
         Points of the reference, m; a subset suffices.
     towards : (3,) array
-        A place on the outer side of all parts, m.
+        A place in the air in front of the wall, which all parts of it face, same frame, m.
     main : (3,) array
-        Unit vector along which a single view would look.
+        Unit vector along which the wall would be mapped with a single view, same frame.
     count : int or None
         Number of views given by the user; None: as many as the surface normals need, perhaps one.
+
+    Returns
+    -------
+    Partition or None
+        None if a single view is enough.
     """
     if count == 1:
         return None

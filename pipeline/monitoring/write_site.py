@@ -23,9 +23,12 @@ _HEAD = """# The site of {name}, as `scarpsim monitor` saw it: simulate it with
 
 
 def write_site(result: Result, path: Path) -> None:
-    """Write a config for `scarpsim simulate` to `path`, and the wall's mesh beside it, from the reference epoch of `monitor`.
+    """Write a config from a result of `monitor`, with which `scarpsim simulate` simulates the same wall and noise.
 
-    Raises InputError if the reference has no surface, or if a file of that name exists.
+    The mesh of the reference's surface is written beside it.
+
+    result: the result. path: file of the config. Raises InputError if the reference has no surface, or if one of the files
+    exists.
     """
     site = result.site
     wall = path.with_name(f"{path.stem}_wall.ply")

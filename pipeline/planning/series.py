@@ -262,6 +262,11 @@ def plan_series(config: SimulationConfig, sensor: SensorName, progress: Progress
     progress : Progress, optional
         Object that is told which stage is running, to show it to the user.
 
+    Returns
+    -------
+    SeriesPlan
+        The prediction.
+
     Raises
     ------
     InputError

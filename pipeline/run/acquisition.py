@@ -27,18 +27,19 @@ DepthMaps = tuple[DepthMap, DepthMap]
 
 @dataclass(frozen=True)
 class Acquisition:
-    """Everything that is recorded of the wall in one epoch.
+    """Everything that the sensor records of the wall in one epoch (one visit), simulated.
 
     Attributes
     ----------
     observation : Observation
-        The sensor's observation; with several stations that of the first.
+        The grid of measured points; for a laser scanner with several stations (set-ups) that of the first.
     depth_maps : DepthMaps, optional
-        Depth maps of a stereo pair; None unless another program or COLMAP needs them.
+        Depth maps of a stereo pair's left and right camera; None unless the config asks for an export to Metashape or for a
+        reconstruction with COLMAP.
     joined : JoinedStations, optional
-        All stations of a laser scanner that has several.
+        For a laser scanner with several stations: the observations of all and the surface merged from them.
     vertices : TriangleMesh, optional
-        Surface of a pair that measures the wall's own vertices.
+        For a stereo pair with `reconstruction: vertices`: the wall's own mesh, each vertex with the error of its measurement.
     """
 
     observation: Observation
@@ -48,31 +49,34 @@ class Acquisition:
 
     @property
     def observations(self) -> tuple[Observation, ...]:
-        """The observations of all stations."""
+        """What the sensor recorded: one observation for each station (set-up) of a laser scanner; a stereo pair has one."""
         return (self.observation,) if self.joined is None else self.joined.observations
 
 
 def acquire(config: SimulationConfig, site: SensorSite, scene: RayCaster, random: KeyedRandom) -> Acquisition:
-    """Observe `scene` with the site's sensor.
-
-    The right depth map takes a second observation, so it is only made if it is needed.
+    """Simulate what the sensor measures of a wall in one epoch.
 
     Parameters
     ----------
     config : SimulationConfig
-        Says which products are needed.
+        Method of reconstruction and products; the right depth map is only made if one of these needs it.
     site : SensorSite
         The sensor and its position.
     scene : RayCaster
-        The wall, wall frame.
+        The wall of this epoch, wall frame.
     random : KeyedRandom
         Source of the sensor's noise.
+
+    Returns
+    -------
+    Acquisition
+        The measurement.
 
     Raises
     ------
     InputError
-        If the reconstruction does not fit the sensor: COLMAP for a laser scanner, or vertices for anything but a simulated
-        pair.
+        If the reconstruction does not fit the sensor: `colmap` for a laser scanner, or `vertices` for anything but a stereo
+        pair with simulated matching.
     """
     sensor, colmap = site.sensor, config.reconstruction == "colmap"
     vertices = None
@@ -105,7 +109,10 @@ def acquire(config: SimulationConfig, site: SensorSite, scene: RayCaster, random
 
 
 def reconstruct(config: SimulationConfig, seen: Acquisition) -> TriangleMesh:
-    """Make the surface of an acquisition, wall frame, by the config's method of reconstruction."""
+    """Make a surface from what the sensor recorded in one epoch, by the method that the config names (`reconstruction`).
+
+    config: method and settings of the surface. seen: the measurement. Returns the surface as a mesh, wall frame.
+    """
     observation = seen.observation
     if seen.joined is not None:
         return seen.joined.surface

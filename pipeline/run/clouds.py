@@ -21,10 +21,20 @@ _HEADER = LazHeader()
 def write_formats(
     stem: Path, formats: Sequence[str], cloud: PointCloud, scans: Callable[[], list[E57Scan]], header: LazHeader
 ) -> None:
-    """Write points in the formats that a config asks for besides LAZ.
+    """Write a point cloud in the formats that the config asks for besides LAZ.
 
-    stem: path without ending. formats: names of the formats. scans: makes the E57 scans, called only if they are needed.
-    header: coordinate system and time for COPC.
+    Parameters
+    ----------
+    stem : Path
+        Path of the files without their ending.
+    formats : sequence of str
+        Names of the formats: "copc", "ply", "xyz", "pcd" or "e57".
+    cloud : PointCloud
+        The points.
+    scans : callable
+        Returns the scans for an E57 file; only called if that is asked for.
+    header : LazHeader
+        Coordinate system and date for COPC.
     """
     if "copc" in formats:
         write_cloud(stem.with_suffix(COPC), cloud, header)
@@ -41,9 +51,11 @@ def write_formats(
 def write_cloud(path: Path, cloud: PointCloud, header: LazHeader = _HEADER) -> None:
     """Write a point cloud as LAZ, or as COPC if `path` ends in .copc.laz.
 
-    Channels with a field of their own in the format go there.
+    The extra channels `return_number`, `number_of_returns` and `scan_angle_rad` go into the fields that LAZ has for them, all
+    others into extra dimensions.
 
-    header: coordinate system and time. Raises InputError as `write_laz` and `write_copc` do.
+    header: coordinate system and date of the file. Raises InputError if the file cannot be written, or for a COPC file without
+    points.
     """
     extra = dict(cloud.extra)
     pulses = PulseChannels(*(extra.pop(name, None) for name in ("return_number", "number_of_returns", "scan_angle_rad")))

@@ -25,18 +25,23 @@ _OUTLIER = 6.0
 
 
 def displacement(observations: tuple[Observation, ...], registration: Registration | None, grid: Grid) -> NDArray[np.float32]:
-    """Estimate how far a map is displaced sideways at the pixels of `grid`: x and y of the map minus the truth, m.
+    """Estimate how far the errors of sensor and registration move each place of a difference map sideways.
 
-    Returns (h, w, 2) displacements, 0 where the samples do not tell.
+    The labels of fallen blocks are moved by as much, so that they lie where the map shows the blocks.
 
     Parameters
     ----------
     observations : tuple of Observation
-        Of all stations.
+        What the sensor recorded, one observation for each station (set-up).
     registration : Registration, optional
-        Transform that was applied to the points.
+        Registration that was applied to the points; None: none.
     grid : Grid
-        Pixels of the map.
+        Pixels of the map, h x w.
+
+    Returns
+    -------
+    (h, w, 2) float32 array
+        Displacement at each pixel: x and y in the map minus the true x and y, wall frame, m; 0 if the true places are unknown.
     """
     samples = [_samples(each, registration) for each in observations]
     place, offset = (np.concatenate(parts) for parts in zip(*samples, strict=True))

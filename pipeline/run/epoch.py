@@ -34,15 +34,15 @@ class ReferenceEpoch:
     Attributes
     ----------
     seen : Acquisition, optional
-        What the sensor recorded; None once it is written, which frees its memory.
+        What the sensor recorded; None once it is written to files, which frees its memory.
     caster : RayCaster
-        The untouched wall.
+        The true, untouched wall, ready for ray casting.
     surface : TriangleMesh
-        The reconstructed surface.
+        The surface reconstructed from the measurement, wall frame.
     raster : SurfaceRaster
-        The surface as a raster; every difference map has its grid.
+        The heights of this surface as a raster; every difference map has its grid.
     target : ReferenceSurface, optional
-        The surface to which epochs are registered.
+        The surface to which ICP registers later epochs; None: without registration.
     """
 
     seen: Acquisition | None
@@ -54,36 +54,37 @@ class ReferenceEpoch:
 
 @dataclass(frozen=True)
 class LaterEpoch:
-    """A later epoch.
+    """A simulated epoch after the reference: the wall after rockfalls, its measurement, and what the difference map shows.
 
     Attributes
     ----------
     number : int
-        Number of the epoch, from 1.
+        Number of the epoch, from 1; 0 is the reference.
     seen : Acquisition
         What the sensor recorded.
     carved : Carved
-        The wall without the blocks.
+        The true wall, from which the fallen blocks are missing.
     solids : Blocks
-        The blocks.
+        The fallen blocks as closed meshes.
     blocks : list of dict
-        Records of the carved blocks, with what the difference map shows of each.
+        Record of each fallen block: its true shape, place and volume, and what the difference map shows of it.
     surface : TriangleMesh
         The reconstructed surface before registration.
     registration : Registration, optional
         Registration of the surface to the reference; None without ICP.
     raster : SurfaceRaster
-        The registered surface.
+        Heights of the registered surface, and block labels.
     difference : (h, w) float32 array
-        Reference minus epoch, m.
+        Heights of the reference minus those of this epoch, m; positive where rock is missing.
     statistics : BlockStatistics
         Statistics of the difference map.
     m3c2 : M3c2Map, optional
-        Distances of the registered surface's vertices, if the config asks for them.
+        M3C2 distances from the reference to the registered surface, if the config asks for them.
     since_last : SinceLast, optional
-        Change since the epoch before, in a series.
+        Change since the epoch before, in a time series.
     rockfalls : int
-        Number of rockfalls of a series, from which its block labels follow (scene/series/evolution.py); 0 without a series.
+        Number of all rockfalls of a time series, by which its labels tell niches, moved blocks and deposits apart; 0 without a
+        series.
     """
 
     number: int
@@ -103,7 +104,11 @@ class LaterEpoch:
 
 @dataclass(frozen=True)
 class SinceLast:
-    """Change since the epoch before. difference: (h, w) that epoch minus this one, m; block: (h, w) labels of what is new."""
+    """Change of the wall from the previous epoch of a time series to this one.
+
+    difference: (h, w) heights of the previous epoch minus those of this one, m. block: (h, w) labels of the rocks that fell,
+    moved or came to rest between the two, 0 elsewhere.
+    """
 
     difference: NDArray[np.float32]
     block: IntArray
@@ -111,18 +116,18 @@ class SinceLast:
 
 @dataclass(frozen=True)
 class EpochScene:
-    """The wall that a later epoch observes.
+    """The true wall that the sensor observes in a later epoch, and the blocks that have fallen from it.
 
     Attributes
     ----------
     carved : Carved
-        The wall without the blocks.
+        The wall, from which the fallen blocks are missing.
     solids : Blocks
-        The blocks.
+        The fallen blocks as closed meshes.
     records : list of dict
-        Records of the blocks, in the order of their labels.
+        Record of each fallen block (shape, size, volume and place), in the order of their labels.
     labels : int
-        Largest label of a missing block.
+        Largest label that the niche of a fallen block can have.
     """
 
     carved: Carved
@@ -136,7 +141,24 @@ STAGES = {"carve": 4.0, "observe": 3.0, "mesh": 1.0, "register": 4.0, "differenc
 
 
 def observe_reference(config: SimulationConfig, site: SensorSite, random: KeyedRandom, progress: Progress) -> ReferenceEpoch:
-    """Observe the untouched wall, reconstruct it and rasterise it. `random` is the run's source."""
+    """Simulate the first epoch: observe the untouched wall, reconstruct its surface and convert that to a raster of heights.
+
+    Parameters
+    ----------
+    config : SimulationConfig
+        Config of the run.
+    site : SensorSite
+        Wall and sensor.
+    random : KeyedRandom
+        The run's source of random numbers.
+    progress : Progress
+        Receives the progress.
+
+    Raises
+    ------
+    InputError
+        If the sensor does not stand in front of the wall or sees too little of it.
+    """
     with progress.stage("epoch 0: observe"):
         caster = site.caster_of(with_wetness(config, site.mesh))
         for where, viewpoint in site.viewpoints.items():
@@ -155,7 +177,8 @@ def observe_epoch(
 ) -> LaterEpoch:
     """Simulate a later epoch: carve blocks from the untouched wall, observe it and compare it with the reference.
 
-    The result is a pure function of config, site and (seed, number); it does not depend on other epochs.
+    Its random numbers depend on the run's seed and its own number alone, so the result is the same whichever other epochs are
+    made.
 
     Parameters
     ----------
@@ -164,13 +187,18 @@ def observe_epoch(
     site : SensorSite
         Wall and sensor.
     reference : ReferenceEpoch
-        The reference epoch.
+        The first epoch.
     number : int
         Number of the epoch, from 1.
     random : KeyedRandom
         The run's source of random numbers.
     progress : Progress
         Receives the progress.
+
+    Raises
+    ------
+    InputError
+        If the blocks find no room on the wall, or if the measurement cannot be reconstructed or registered.
     """
     with progress.stage(f"epoch {number}: carve"):
         blocks = place_blocks(config.rockfall, site.mesh, random.child("epoch", number, "blocks"), reference.caster)
@@ -188,7 +216,7 @@ def observe_scene(
     random: KeyedRandom,
     progress: Progress,
 ) -> LaterEpoch:
-    """Observe a wall at a later epoch and compare it with the reference.
+    """Simulate the measurement of a given wall in a later epoch, and compare it with the reference.
 
     Parameters
     ----------
@@ -197,11 +225,11 @@ def observe_scene(
     site : SensorSite
         The sensor.
     reference : ReferenceEpoch
-        The reference epoch.
+        The first epoch.
     number : int
         Number of the epoch, from 1.
     scene : EpochScene
-        The wall, and what is missing from it.
+        The wall of this epoch, and the blocks that are missing from it.
     random : KeyedRandom
         The run's source of random numbers.
     progress : Progress
@@ -238,23 +266,32 @@ def observe_scene(
 
 
 def with_wetness(config: SimulationConfig, mesh: TriangleMesh) -> TriangleMesh:
-    """Return the wall as sensors see it: with wet patches if the config has them."""
+    """Return a wall with wet, darker patches of rock if the config asks for them (`wetness`), else the given mesh itself.
+
+    mesh: the wall, wall frame.
+    """
     return mesh if config.wetness is None else config.wetness.with_wet_patches(mesh)
 
 
 def measure_blocks(change: NDArray[np.float32], raster: SurfaceRaster, ratio: FloatArray) -> list[dict[str, Any]]:
-    """Measure what the difference map shows of each block: area (of its label, with data), volume and mean depth, SI.
+    """Measure the area, volume and mean depth of each fallen block in a difference map, to compare them with the truth.
 
-    The volume is the sum of the differences over the label's pixels, times the area of a pixel.
+    The volume of a block is the sum of the differences over the pixels with its label and with data, times the area of a pixel.
 
     Parameters
     ----------
     change : (h, w) array
-        Difference map, m.
+        Difference map, m; NaN without data.
     raster : SurfaceRaster
-        Labels of the map.
+        Gives the grid of the map and the block label of each pixel.
     ratio : (k,) array
-        Signal-to-noise ratios of the matched filter, which are added to the records.
+        Signal-to-noise ratio of each of the k blocks, which is copied to the results.
+
+    Returns
+    -------
+    list of k dict
+        measured_area_m2, measured_volume_m3, measured_mean_depth_m (None for a block that is not in the map), and
+        signal_to_noise (None if unknown).
     """
     count = len(ratio)
     seen = (raster.block != WALL) & ~np.isnan(change)

@@ -22,9 +22,9 @@ _ONE_SIGMA = "(1 \N{GREEK SMALL LETTER SIGMA})"
 
 
 def instrument_figures(site: SensorSite) -> dict[str, str]:
-    """Return name and value, with unit, of what a reader asks first about a run.
+    """Describe the sensor of a run for the table at the top of its report: type, noise, errors, position and distance.
 
-    They say which sensor observed the wall, from where, and how precisely.
+    site: the wall and the sensor. Returns the value with its unit, by the name of the table's row.
     """
     own = _scanner_figures(site.sensor, site) if isinstance(site.sensor, LaserScanner) else _pair_figures(site.sensor, site)
     return {**own, **_places(site)}

@@ -23,22 +23,24 @@ Statistics = Mapping[str, float | int | None]
 
 @dataclass(frozen=True)
 class BlockRow:
-    """One carved block in the report.
+    """One carved block, as a row of a table in the report of a run.
 
     Attributes
     ----------
-    label, shape
-        As in blocks.json.
+    label : int
+        Number of the block in the epoch, from 1.
+    shape : str
+        "cube" or "sphere".
     size_m : (3,) sequence
-        Lengths of the axes, m.
+        Lengths of the block's axes, m.
     volume_m3 : float
-        True volume.
+        True volume of the rock that fell.
     measured_volume_m3 : float or None
         Volume in the difference map; None if the map does not show the block.
     position_m, world_position_m : (3,) sequences
-        Position in the wall frame and in world coordinates, m.
+        Centre of the block in the wall frame and in world coordinates, m.
     annotated : bool
-        Whether it is in annotations.json.
+        Whether annotations.json, the labels for training, contains the block.
     """
 
     label: int
@@ -52,7 +54,7 @@ class BlockRow:
 
     @property
     def relative_error(self) -> float | None:
-        """Measured over true volume, minus one; None if the block was not measured."""
+        """Relative error of the block's measured volume: measured over true volume, minus one; None if it was not measured."""
         if self.measured_volume_m3 is None or not self.volume_m3:
             return None
         return self.measured_volume_m3 / self.volume_m3 - 1
@@ -60,22 +62,26 @@ class BlockRow:
 
 @dataclass(frozen=True)
 class EpochReport:
-    """What the report shows of one epoch. Pictures are PNG bytes.
+    """What the report of a run shows of one epoch.
 
     Attributes
     ----------
     number, points : int
-        Number of the epoch, and of its points.
+        Number of the epoch, and of its measured points.
     inside, outside : Statistics
-        Statistics of the difference map inside and outside the blocks.
+        Statistics of the difference map inside and outside the fallen blocks.
     sigma_m : float
-        Noise level that sets the colour scale of the difference map, m.
+        Noise level of the difference map, which sets its colour scale, m.
     blocks : sequence of BlockRow
-        The carved blocks.
-    hillshade, difference, histogram, convergence, zooms : bytes
-        Pictures; convergence is None without registration, zooms None without blocks.
+        The blocks that have fallen.
+    hillshade, difference, histogram : bytes
+        PNG pictures of the surface, of the difference map, and of the distribution of the differences.
+    convergence : bytes, optional
+        PNG picture of the registration's residuals by iteration; None without registration.
     registration : RegistrationSummary, optional
         How the registration ended.
+    zooms : bytes, optional
+        PNG picture of the difference map around the blocks; None without blocks.
     """
 
     number: int
@@ -93,16 +99,16 @@ class EpochReport:
 
     @property
     def annotated(self) -> int:
-        """Number of annotated blocks."""
+        """Number of the epoch's blocks that annotations.json, the labels for training, contains."""
         return sum(block.annotated for block in self.blocks)
 
     @property
     def total(self) -> tuple[float, float]:
-        """True volume of all blocks, m3, and measured volume of those that the map shows."""
+        """True volume of all blocks of the epoch, and the measured volume of those that the difference map shows, m3."""
         return sum(block.volume_m3 for block in self.blocks), sum(block.measured_volume_m3 or 0.0 for block in self.blocks)
 
     def summary(self) -> str:
-        """Describe the epoch in one or two sentences."""
+        """Describe the epoch for the report in a sentence: number and volume of its blocks, and noise of its difference map."""
         true, measured = map(litres, self.total)
         volumes = f" of {true} l together, of which the map shows {measured} l" if self.blocks else ""
         carved = f"Epoch {self.number}: {_count(len(self.blocks), 'block')} carved{volumes}, {self.annotated} annotated"
@@ -114,7 +120,19 @@ class EpochReport:
 
 @dataclass(frozen=True)
 class RegistrationSummary:
-    """How the registration ended. rms_m: RMS of the inliers' residuals, m; reason: why it stopped, in words."""
+    """How the registration of an epoch to the reference ended, for the report of a run.
+
+    Attributes
+    ----------
+    rms_m : float
+        RMS of the inliers' residuals, m.
+    inliers, points : int
+        Points kept as inliers, and points used.
+    iterations : int
+        Number of iterations.
+    reason : str
+        Why the iteration stopped, in words.
+    """
 
     rms_m: float
     inliers: int
@@ -125,7 +143,7 @@ class RegistrationSummary:
 
 @dataclass(frozen=True)
 class RunReport:
-    """What the report of a run shows.
+    """Everything that report.html of a run shows.
 
     Attributes
     ----------
@@ -134,19 +152,19 @@ class RunReport:
     sensor : str
         "stereo" or "tls".
     seed : int
-        Seed of the run.
+        Seed of the run's random numbers.
     reference : bytes
-        Hillshade of the reference, PNG.
+        Hillshade of the first epoch, PNG.
     epochs : sequence of EpochReport
-        The later epochs.
+        The later epochs that the page shows.
     config : mapping
-        The resolved config.
+        The config with all defaults.
     key_figures : mapping
         Further rows of the table at the top: name to value with its unit.
     complete : bool
         False if the run was interrupted.
     total : int, optional
-        Number of later epochs, with those of a series that the page leaves out; None: all are shown.
+        Number of all later epochs: of a time series the page leaves out those in which nothing fell. None: all are shown.
     """
 
     title: str
@@ -160,7 +178,7 @@ class RunReport:
     total: int | None = None
 
     def summary(self) -> str:
-        """Describe in words what was done."""
+        """Describe the run for the top of its report: sensor, number of epochs, and whether it was interrupted."""
         sensor = _SENSORS.get(self.sensor, self.sensor)
         end = "" if self.complete else " The run was interrupted: later epochs are missing."
         total = len(self.epochs) if self.total is None else self.total
@@ -169,7 +187,11 @@ class RunReport:
 
 
 def write_report(path: Path, report: RunReport) -> None:
-    """Write report.html completely or not at all. Equal arguments give equal bytes. Raises InputError if it cannot be written."""
+    """Write the report of a run as a web page.
+
+    path: the file, report.html; it is complete or absent. report: its content; equal contents give equal bytes. Raises InputError
+    if the file cannot be written.
+    """
     config = yaml.safe_dump(dict(report.config), sort_keys=False, allow_unicode=True)
     values = {"report": report, "config": config, "scale_sigmas": SCALE_SIGMAS, "unfolded_rows": _UNFOLDED_ROWS}
     page = template("run/report.html.jinja").render(values)

@@ -21,14 +21,17 @@ from scene.geometry.mesh import WALL
 
 
 def write_reference_pictures(out: Path, reference: ReferenceEpoch) -> None:
-    """Write the hillshade of the reference into the run's folder."""
+    """Write the hillshade of the first epoch as reference.png.
+
+    out: folder of the run. reference: the first epoch.
+    """
     write_bytes(out / "reference.png", hillshade_figure(reference.raster.heights, reference.raster.grid, "Reference"))
 
 
 def write_epoch_pictures(out: Path, epoch: LaterEpoch, grid: Grid, sigma: float) -> None:
-    """Write the style of an epoch's difference map, and its pictures, into the run's folder.
+    """Write the pictures of an epoch for the report, and the colour style with which QGIS shows its difference map.
 
-    In a series, only the epochs in which rocks fell since the epoch before have pictures.
+    In a time series, only the epochs in which rocks fell since the epoch before have pictures.
 
     Parameters
     ----------
@@ -63,13 +66,13 @@ def _is_pictured(epoch: LaterEpoch) -> bool:
 
 
 def write_m3c2_pictures(out: Path, number: int, found: M3c2Map, sigma: float) -> None:
-    """Write the styles of an epoch's M3C2 maps and the picture of the distances into the run's folder.
+    """Write the picture of an epoch's M3C2 distances, and the colour styles with which QGIS shows its M3C2 maps.
 
     Parameters
     ----------
     out : Folder of the run.
     number : Number of the epoch.
-    found : Distances and levels of detection.
+    found : M3C2 distances and their levels of detection.
     sigma : Standard deviation of the distances outside blocks, m, which sets the range of colours.
     """
     difference_style(out / f"m3c2_{number:03d}.tif", SCALE_SIGMAS * sigma)

@@ -50,9 +50,26 @@ CHANGE_ANNOTATIONS = "annotations_change"
 
 
 def is_whole(out: Path, checksums: Checksums, where: Path) -> bool:
-    """Return whether all files of the run folder `out` exist with the given checksums (by name).
+    """Check whether an epoch's files are all there and unchanged, so that a resumed run need not make it again.
 
-    Raises InputError if a name in the file `where` leads out of the folder.
+    Parameters
+    ----------
+    out : Path
+        Folder of the run.
+    checksums : dict
+        SHA-256 of the epoch's files, by name relative to `out`.
+    where : Path
+        File from which the checksums come, for error messages.
+
+    Returns
+    -------
+    bool
+        True if all files exist with these checksums; False if there are none.
+
+    Raises
+    ------
+    InputError
+        If a name leads out of the folder.
     """
     files = {inside(out, name, where): digest for name, digest in checksums.items()}
     return bool(files) and all(path.is_file() and sha256(path) == digest for path, digest in files.items())
@@ -61,7 +78,26 @@ def is_whole(out: Path, checksums: Checksums, where: Path) -> bool:
 def write_reference(
     out: Path, config: SimulationConfig, site: SensorSite, reference: ReferenceEpoch, seen: Acquisition
 ) -> Checksums:
-    """Write epoch_000, with what the sensor recorded (`seen`), and the hillshade of the reference."""
+    """Write the files of the first epoch: its folder epoch_000 and the hillshade.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the run.
+    config : SimulationConfig
+        Says which files are wanted.
+    site : SensorSite
+        Wall and sensor.
+    reference : ReferenceEpoch
+        The first epoch.
+    seen : Acquisition
+        What the sensor recorded in it.
+
+    Returns
+    -------
+    dict
+        SHA-256 of each file, by name relative to `out`.
+    """
     from pipeline.run import pictures  # loads slowly, so not before it is needed
 
     with noting() as written, _folder(out, 0) as folder:
@@ -79,7 +115,26 @@ def write_reference(
 
 
 def write_epoch(out: Path, config: SimulationConfig, site: SensorSite, reference: ReferenceEpoch, epoch: LaterEpoch) -> Checksums:
-    """Write an epoch's folder, its difference map, tiles and pictures."""
+    """Write the files of a later epoch: its folder, difference map, tiles and pictures.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the run.
+    config : SimulationConfig
+        Says which files are wanted.
+    site : SensorSite
+        Wall and sensor.
+    reference : ReferenceEpoch
+        The first epoch, whose grid the maps have.
+    epoch : LaterEpoch
+        The epoch.
+
+    Returns
+    -------
+    dict
+        SHA-256 of each file, by name relative to `out`.
+    """
     from pipeline.run import pictures  # loads slowly, so not before it is needed
 
     name = f"difference_{epoch.number:03d}"

@@ -17,11 +17,14 @@ if TYPE_CHECKING:
 
 
 def recorded_points(observations: Sequence[Observation]) -> PointCloud:
-    """Collect the points of every station, one after another, each in the order of its pulses and their returns, in m.
+    """Collect all points that the sensor recorded in an epoch as one point cloud, as points.laz stores it.
 
-    The extra channels are those of the truth; `block`; `return_number` and `number_of_returns` if a pulse has several returns;
-    `scan_angle_rad` of a scanner (nominal, from straight down); and, with several stations, `station`, counted from 1. Times
-    start with each station's scan.
+    observations: one for each station (set-up). Its points follow in the order of the pulses and of the returns of a pulse, m.
+    Times count from the start of the station's scan.
+
+    Extra channels are the true values (such as `true_range_m`, if asked for); `block`, the label of the fallen block;
+    `return_number` and `number_of_returns` if a pulse has several returns; `scan_angle_rad` of a scanner (nominal, from straight
+    down); and `station`, from 1, if there are several.
     """
     clouds = [_of_station(observation) for observation in observations]
     if len(clouds) == 1:
@@ -39,16 +42,19 @@ def recorded_points(observations: Sequence[Observation]) -> PointCloud:
 
 
 def at_time(cloud: PointCloud, start_s: float) -> PointCloud:
-    """Return a cloud whose times begin at `start_s`, s; those of a sensor that records everything at once are equal."""
+    """Return a cloud with absolute times: the start of the scan, `start_s`, plus the time of each point since then, s.
+
+    A cloud without times, of a sensor that records everything at once, gets `start_s` for all points.
+    """
     time = np.zeros(len(cloud.points)) if cloud.gps_time is None else cloud.gps_time
     return replace(cloud, gps_time=start_s + time)
 
 
 def scans_of(observations: Sequence[Observation], frame: WallFrame | None = None) -> list[E57Scan]:
-    """Convert each observation to an E57 scan, with its grid as `row` and `column`.
+    """Convert each observation of an epoch to a scan for an E57 file, with the channels `row` and `column` of the sensor's grid.
 
-    The pose has the sensor's position and the wall frame's axes. frame: if given, the pose leads to the world instead of the wall
-    frame.
+    observations: one for each station (set-up). frame: the wall frame, for poses (position and rotation) in world coordinates;
+    None: poses in the wall frame.
     """
     from pipeline.formats.points.e57 import E57Scan  # its library takes a tenth of a second to load
 

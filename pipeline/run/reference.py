@@ -17,7 +17,10 @@ from sensors.stereo.stereo_pair import StereoPair
 
 
 def reference_sensor(config: SimulationConfig, site: SensorSite) -> SensorSite:
-    """Return the site as the reference epoch is observed: without the sensor's noise if the config says so."""
+    """Return the sensor for the first epoch: without noise if the config says so (`noisy_reference: false`), else as it is.
+
+    site: the wall and the sensor; the result is a copy of it with that sensor. Systematic effects stay in any case.
+    """
     if config.noisy_reference:
         return site
     sensor = site.sensor
@@ -39,21 +42,26 @@ def _quiet(pair: StereoPair) -> StereoPair:
 def reference_and_target(
     config: SimulationConfig, surface: TriangleMesh, wall: TriangleMesh, random: KeyedRandom
 ) -> tuple[TriangleMesh, ReferenceSurface | None]:
-    """Return the reference surface, wall frame, and the target of the later epochs' ICP (None without ICP).
+    """Prepare the surface of the first epoch for the comparison, and the surface to which ICP registers later epochs.
 
-    With `icp_target: true_wall` (thesis 3.6) the reference itself is also registered to the wall; otherwise its own
-    misorientation would appear in every difference map.
+    With `icp_target: true_wall` the first epoch is itself registered to the true wall, like all others. Otherwise its own error
+    of orientation would appear in every difference map.
 
     Parameters
     ----------
     config : SimulationConfig
-        Config of the run.
+        Registration and its target.
     surface : TriangleMesh
-        The reconstructed reference surface.
+        The reconstructed surface of the first epoch, wall frame.
     wall : TriangleMesh
         The true wall.
     random : KeyedRandom
-        Source of the registration's subsamples.
+        Source of random numbers for the points that the registration uses.
+
+    Returns
+    -------
+    TriangleMesh and ReferenceSurface or None
+        The surface of the first epoch, wall frame, and the target of ICP; None without registration.
     """
     if config.icp is None:
         return surface, None

@@ -39,16 +39,16 @@ SERIES_FILE = "series.json"
 
 @dataclass(frozen=True)
 class SeriesConditions:
-    """Conditions at each epoch of a time series.
+    """Conditions of measurement that change from epoch to epoch of a simulated time series.
 
     Attributes
     ----------
     poses : list of PoseShift
-        Real minus surveyed pose of the sensor, for each of n epochs.
+        Real minus surveyed pose (position and rotation) of the sensor, for each of n epochs.
     effects : dict of dicts of (n,) arrays
-        Increase of each parameter of the sensor's effects, by effect and parameter.
+        Increase of the parameters of the sensor's systematic effects over the configured values, by effect and parameter.
     covers : list of Cover
-        Snow and vegetation at each epoch.
+        Snow and vegetation on the wall, for each epoch.
     """
 
     poses: list[PoseShift]
@@ -57,7 +57,10 @@ class SeriesConditions:
 
     @classmethod
     def of(cls, series: SeriesConfig, random: KeyedRandom) -> SeriesConditions:
-        """Draw pose, sensor effects and cover of all epochs. `random` is the run's source of random numbers."""
+        """Draw the conditions of all epochs of a time series: pose and effects of the sensor, snow and vegetation.
+
+        series: section `series` of the config. random: the run's source of random numbers.
+        """
         keyed, hours, given = random.child("series", "conditions"), series.hours, series.conditions
         snow, vegetation = (
             np.zeros(len(hours)) if course is None else course.values(hours, keyed.child(name))
@@ -68,7 +71,7 @@ class SeriesConditions:
         return cls(poses, effect_values(given.effects, hours, keyed.child("effects")), covers)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the values at each epoch, for JSON; those that never change are left out."""
+        """Return the conditions at each epoch for series.json, as lists by name; conditions that are always zero are left out."""
         found = {f"{name}.{key}": values.tolist() for name, each in self.effects.items() for key, values in each.items()}
         for name in ("position_m", "rotation_rad"):
             values = np.array([getattr(pose, name) for pose in self.poses])
@@ -81,20 +84,20 @@ class SeriesConditions:
 
 @dataclass(frozen=True)
 class Series:
-    """A time series of epochs, as the section `series` of a config describes it.
+    """A time series of epochs to be simulated: it yields the true wall and the state of the sensor at each epoch.
 
     Attributes
     ----------
     config : SimulationConfig
         Config of the run.
     series : SeriesConfig
-        Section `series` of the config.
+        Its section `series`.
     site : SensorSite
-        The untouched wall, and the sensor with the config's model.
+        The untouched wall, and the sensor as configured.
     random : KeyedRandom
         The run's source of random numbers.
     conditions : SeriesConditions
-        Conditions at each epoch.
+        Pose and effects of the sensor, snow and vegetation at each epoch.
     """
 
     config: SimulationConfig
@@ -105,16 +108,32 @@ class Series:
 
     @classmethod
     def of(cls, config: SimulationConfig, series: SeriesConfig, site: SensorSite, random: KeyedRandom) -> Series:
-        """Prepare the time series of a run: draw the conditions of all epochs."""
+        """Prepare the time series of a run: draw the pose and effects of the sensor, snow and vegetation of all epochs.
+
+        Parameters
+        ----------
+        config : SimulationConfig
+            Config of the run.
+        series : SeriesConfig
+            Its section `series`.
+        site : SensorSite
+            The untouched wall, and the sensor as configured.
+        random : KeyedRandom
+            The run's source of random numbers.
+        """
         return cls(config, series, site, random, SeriesConditions.of(series, random))
 
     @property
     def up(self) -> FloatArray:
-        """(3,) direction against gravity, wall frame."""
+        """(3,) unit vector against gravity, wall frame."""
         return self.site.frame.direction_to_wall(np.array([0.0, 0.0, 1.0]))
 
     def site_at(self, number: int) -> SensorSite:
-        """Return the wall with its snow and vegetation, and the sensor with its pose and effects, at an epoch."""
+        """Return the wall and the sensor in the conditions of an epoch: with snow and plants, and with the pose of that time.
+
+        The wall is the untouched one; the parameters of the sensor's systematic effects are also those of that time.
+        number: of the epoch; 0 is the reference.
+        """
         shift = self.conditions.poses[number]
         values = {
             name: {key: float(course[number]) for key, course in each.items()} for name, each in self.conditions.effects.items()
@@ -141,11 +160,17 @@ class Series:
         return replace(self.site, mesh=mesh, sensor=pair(sensor))
 
     def covered(self, mesh: TriangleMesh, number: int) -> TriangleMesh:
-        """Return a wall with the snow and vegetation of an epoch."""
+        """Return a wall with the snow and vegetation of an epoch added to its surface.
+
+        mesh: the bare wall, wall frame. number: of the epoch; 0 is the reference.
+        """
         return self.conditions.covers[number].on(mesh, self.up, self.random.child("series", "cover"))
 
     def rules(self) -> Rules:
-        """Draw the rockfalls, and collect what is the same at all epochs. Raises InputError if the wall has no room for any."""
+        """Draw all rockfalls of the time series, and collect what else is the same at all its epochs.
+
+        Raises InputError if the wall has no room for blocks, or if there would be too many rockfalls.
+        """
         keyed, given = self.random.child("series", "rockfalls"), self.series
         rockfalls = given_rockfalls(given.events, given.falls_h())
         if given.rockfall is not None:
@@ -155,7 +180,10 @@ class Series:
         return Rules(zone, self.config.rockfall, given.deposits, ground, numbered(rockfalls), keyed)
 
     def states(self, rules: Rules) -> Iterator[WallState]:
-        """Yield the wall at each epoch after the reference."""
+        """Follow the wall through time: yield its state at each epoch after the first, with the rocks that have moved or fallen.
+
+        rules: the rockfalls of the series. With `cumulative: false`, each state has only what fell since the epoch before.
+        """
         hours, untouched = self.series.hours, self.site.mesh
         state = WallState(0.0, untouched)
         for before, now in zip(hours[:-1].tolist(), hours[1:].tolist(), strict=True):
@@ -163,7 +191,11 @@ class Series:
             yield state
 
     def scenes(self) -> Iterator[SeriesScene]:
-        """Yield the scene of each epoch after the reference, in order."""
+        """Yield the true wall of each epoch after the first, in order, for the sensor to observe.
+
+        The rockfalls are drawn or given by the config; with `surfaces`, each wall is a mesh of the user. Raises InputError if a
+        rockfall finds no room or a mesh cannot be used.
+        """
         if self.series.surfaces:
             for number in range(1, self.series.count):
                 yield self._surface(number)
@@ -191,9 +223,9 @@ class Series:
         wall = self.config.wall
         if not isinstance(wall, ImportedWall):
             raise InputError(
-                "surfaces of epochs need a wall that is imported from a mesh",
+                "own meshes of the epochs need a wall that is imported from a mesh",
                 where="series.surfaces",
-                remedy="leave `wall` out, or give it a mesh",
+                remedy="leave `wall` out: the first of these meshes is then the wall",
             )
         mesh, _ = wall.model_copy(update={"mesh": path}).load()
         mesh = mesh.with_vertices(self.site.frame.to_wall(mesh.vertices))
@@ -204,20 +236,21 @@ class Series:
 
 @dataclass(frozen=True)
 class SeriesScene:
-    """The scene of one epoch of a series.
+    """The true wall at one epoch of a simulated time series.
 
     Attributes
     ----------
     number : int
-        Number of the epoch.
+        Number of the epoch, from 1.
     scene : EpochScene
-        The wall as the sensor observes it, with the records of its blocks.
+        The wall as the sensor observes it, with the records of the fallen blocks.
     state : WallState, optional
-        The wall with its niches and loose rocks; None, as is `rules`, if the user gives the meshes (`surfaces`).
+        The wall without snow and plants, with the rocks that have moved or fallen; None, as is `rules`, if the user gives the
+        meshes of the wall (`surfaces`).
     rules : Rules, optional
-        Rockfalls and their placement, which are the same for the whole series.
+        All rockfalls of the series and the placement of their blocks.
     new : (k,) int32 array
-        Block labels of what has changed since the epoch before.
+        Labels of what has fallen, moved or come to rest since the epoch before.
     """
 
     number: int
@@ -234,18 +267,18 @@ def observe_series_epoch(
     before: NDArray[np.float32] | None,
     progress: Progress,
 ) -> LaterEpoch:
-    """Observe one epoch of a time series and compare it with the reference.
+    """Simulate the measurement of one epoch of a time series, and compare it with the first and with the previous epoch.
 
     Parameters
     ----------
     series : Series
-        The series.
+        The time series.
     reference : ReferenceEpoch
-        The reference epoch.
+        Its first epoch.
     scene : SeriesScene
-        The wall at this epoch.
+        The true wall of this epoch.
     before : (h, w) array, optional
-        Registered heights of the epoch before, m; None: the change since then is not computed.
+        Heights of the previous epoch after registration, m; None: it is not compared.
     progress : Progress
         Receives the progress.
     """
@@ -273,9 +306,9 @@ def _new_labels(state: WallState, before: WallState, rules: Rules) -> IntArray:
 
 @dataclass
 class SeriesTruth:
-    """Collects the true rockfalls and motions of a series for series.json while its epochs are made.
+    """The true rockfalls and motions of a simulated time series, collected epoch by epoch for the file series.json.
 
-    The attributes but `series` are None until the first epoch is added.
+    All attributes except `series` are None until the first epoch is added.
 
     Attributes
     ----------
@@ -284,10 +317,11 @@ class SeriesTruth:
     rules : Rules
         All rockfalls, and how their blocks are shaped and placed.
     rocks : dict
-        By the number of a rockfall, the rock that has been cut out of the wall, and the bounds of its deposit (wall frame, m);
-        None for the bounds if it has left no deposit.
+        By the number of the rockfall, the rock cut out of the wall and the bounding box of its fragments at the foot of the wall
+        (wall frame, m); None in place of the box if there are no fragments.
     volumes : list of dict
-        For each epoch its number, and the fallen, moving and remaining volumes, m3.
+        For each epoch its number, the volumes that have fallen and that have begun to move, the volume of the first wall, and
+        the balance of volumes (0 except for rounding), m3.
     """
 
     series: Series
@@ -296,7 +330,7 @@ class SeriesTruth:
     volumes: list[dict[str, float]] | None = None
 
     def add(self, scene: SeriesScene) -> None:
-        """Add the true state of an epoch."""
+        """Add the true wall of an epoch of the series; one whose mesh the user gives has no rockfalls and is skipped."""
         if scene.state is None:
             return
         self.rules = scene.rules
@@ -316,7 +350,7 @@ class SeriesTruth:
         self.volumes = [*(self.volumes or []), epoch]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of series.json."""
+        """Return the content of series.json: times, rockfalls, volumes and conditions of the epochs added so far."""
         series, rules = self.series.series, self.rules
         held = self.rocks or {}
         return {

@@ -50,7 +50,15 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class RunSummary:
-    """What a run has written: its folder, its report.html, and the records of the finished epochs."""
+    """What a simulation has written.
+
+    Attributes
+    ----------
+    folder, report : Path
+        Folder of the run, and its report.html.
+    epochs : list of dict
+        Record of each finished epoch, as in run.json: number of points, registration, statistics of the difference map, blocks.
+    """
 
     folder: Path
     report: Path
@@ -98,22 +106,28 @@ class _Run:
 def simulate(
     config: SimulationConfig, sensor: SensorName, out: Path, *, resume: bool = False, progress: Progress | None = None
 ) -> RunSummary:
-    """Observe a wall before and after rocks fall, and write a run folder.
+    """Simulate a rock wall before and after rockfalls as a sensor measures it, and write everything to a folder (a run).
 
-    On an interrupt, the products that cover all finished epochs are written before KeyboardInterrupt is raised again.
+    If the user interrupts it, the report and the other files about all finished epochs are written before KeyboardInterrupt is
+    raised again.
 
     Parameters
     ----------
     config : SimulationConfig
-        Config of the run.
+        Wall, rockfalls, sensor and products.
     sensor : str
-        "stereo" or "tls".
+        "stereo" (stereo pair) or "tls" (laser scanner).
     out : Path
         A new or empty folder; with `resume`, that of an interrupted run with the same config.
     resume : bool
         Whether to continue an interrupted run.
     progress : Progress, optional
         Receives the progress.
+
+    Returns
+    -------
+    RunSummary
+        The folder, the report and the records of the epochs.
 
     Raises
     ------
@@ -243,13 +257,13 @@ def _require_same(earlier: dict[str, Any], identity: dict[str, Any], out: Path) 
             Path(path).name for path, digest in identity["inputs"].items() if earlier.get("inputs", {}).get(path) != digest
         ]
         raise InputError(
-            f"the run in the folder was started with another {', '.join(replaced)}",
+            f"these input files have changed since the run in the folder was started: {', '.join(replaced)}",
             where=f"--out {out}",
-            remedy="put the file back as it was, or choose another --out",
+            remedy="put them back as they were, or choose another --out",
         )
     if changed:
         raise InputError(
-            f"the run in the folder has another {' and '.join(changed)}",
+            f"the run in the folder was started with another {' and '.join(changed)}",
             where=f"--out {out}",
             remedy="resume with the same config, sensor and seed, or choose another --out",
         )

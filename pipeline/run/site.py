@@ -34,19 +34,19 @@ class SensorSite:
     name : str
         Name of the wall.
     repairs : tuple of str
-        What was repaired in an imported mesh.
+        What was repaired in an imported mesh, in words.
     mesh : TriangleMesh
         The wall, wall frame.
     frame : WallFrame
-        The wall frame.
+        Transform between world coordinates and the wall frame, whose z axis points from the wall to the sensor.
     sensor : LaserScanner or stereo sensor
-        The sensor; of several stations the first.
+        The sensor; for a scanner with several stations (set-ups) that of the first.
     viewpoints : dict of (3,) arrays
-        Positions of the sensor's viewpoints, by their place in the config, wall frame, m.
+        Positions of cameras or stations, wall frame, m, by the name that reports and error messages give them.
     further_stations : tuple of LaserScanner
-        The stations after the first.
+        The scanner at its second and further stations.
     caster : RayCaster, optional
-        A ray caster of the wall, if one was needed to orient it.
+        A ray caster of the wall, if one was needed to find out which side of the mesh faces the sensor.
     """
 
     name: str
@@ -59,12 +59,14 @@ class SensorSite:
     caster: RayCaster | None = None
 
     def caster_of(self, mesh: TriangleMesh) -> RayCaster:
-        """Return a ray caster of a mesh: the site's own, if the mesh is the wall as it is, else a new one."""
+        """Return a ray caster of a mesh: the one that this site has, if the mesh is its untouched wall, else a new one."""
         return self.caster if self.caster is not None and self.caster.mesh is mesh else RayCaster(mesh)
 
 
 def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRandom, given: Wall | None = None) -> SensorSite:
-    """Build the wall, place the sensor, and fit the wall frame, whose z axis points to the sensor.
+    """Set up a simulation: build the wall, place the sensor in front of it, and fit the wall frame.
+
+    The z axis of the wall frame points to the sensor.
 
     Parameters
     ----------
@@ -76,6 +78,11 @@ def prepare_site(config: SimulationConfig, sensor: SensorName, random: KeyedRand
         The run's source of random numbers.
     given : Wall, optional
         A wall to use instead of the config's.
+
+    Returns
+    -------
+    SensorSite
+        The wall, its frame and the sensor.
 
     Raises
     ------

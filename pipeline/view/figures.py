@@ -44,22 +44,22 @@ def wall_figure(
     shown: Collection[str],
     selected: int | None = None,
 ) -> go.Figure:
-    """Draw the wall in 3D.
+    """Draw the wall in 3D with Plotly, for the page of `scarpsim view`.
 
     Parameters
     ----------
     patch : Patch
-        The surface in the window.
+        Heights and values of the surface in the part of the wall that is shown.
     points : PointLayer or None
-        The measured points in the window.
+        The measured points in this part; None: there are none.
     items : sequence of Item
-        Blocks, detections and the like.
+        Blocks, detections, events or changes, drawn as boxes.
     layer : Layer
-        Gives the colours.
+        The quantity that gives the colours.
     shown : collection of str
-        Which of "surface", "points" and the kinds of items to draw.
+        What to draw: "surface", "points" and kinds of items.
     selected : int, optional
-        Number of the item to highlight.
+        Index in `items` of the one to highlight.
     """
     figure = go.Figure()
     if "surface" in shown:
@@ -109,16 +109,22 @@ def map_figure(
     window: ViewWindow | None,
     selected: int | None = None,
 ) -> go.Figure:
-    """Draw the shown part of the difference map, with outlines of its items; zooming it also moves the view of the wall in 3D.
+    """Draw a part of the wall as a map with Plotly, with outlines of its blocks or events, for the page of `scarpsim view`.
 
     Parameters
     ----------
-    patch : Values of the map in the shown part.
-    items : All blocks, detections or events; those that overlap the patch are drawn.
-    layer : Colours and unit of the values.
-    shown : Kinds of items that are drawn.
-    window : Left, right, lower and upper limit of the axes, wall frame, m; None for the whole patch.
-    selected : Number of the highlighted item.
+    patch : Patch
+        Values of the map in the part of the wall that is shown.
+    items : sequence of Item
+        All blocks, detections, events or changes; those that overlap the patch are drawn.
+    layer : Layer
+        The quantity that gives the colours.
+    shown : collection of str
+        Kinds of items to draw.
+    window : ViewWindow or None
+        Left, right, lower and upper limit of the axes, wall frame, m; None for the whole patch.
+    selected : int, optional
+        Index in `items` of the one to highlight.
     """
     figure = go.Figure(_heatmap(patch, layer))
     for kind in ITEM_TRACES:
@@ -209,7 +215,10 @@ def _scale(colour: NDArray[np.floating], layer: Layer) -> dict[str, Any]:
 
 
 def hillshade(patch: Patch) -> NDArray[np.floating]:
-    """Compute a hillshade of the patch (a part of the wall), lit from the upper left like those of the reports."""
+    """Compute a shaded relief of a part of the wall, lit from the upper left, like the hillshades of the reports.
+
+    Returns the brightness of each cell of the patch, (h, w), at most 1.
+    """
     if min(patch.height.shape) < 2:
         return np.ones_like(patch.height)
     down, right = np.gradient(patch.height, -patch.y, patch.x)

@@ -35,9 +35,11 @@ _QUANTILE = 0.98
 
 
 class GapResults:
-    """Result of `scarpsim gap`, as `scarpsim view` shows it in the browser.
+    """Result of `scarpsim gap` (the diagnosis of a measurement), as `scarpsim view` shows it in the browser.
 
-    It shows the residuals: how much deeper the measured surface is than the predicted one; positive where rock is missing.
+    It shows the residuals: how much deeper the measured surface is than the sensor model predicts, positive where rock is
+    missing. The user switches between the model before and after the diagnosis (a `step` of `Results`); the latter includes the
+    systematic effects that were found.
 
     The folder does not state the sensor's position, so the wall is shown from the side on which its normal points upwards.
     """
@@ -60,17 +62,24 @@ class GapResults:
         self._cells = lru_cache(8)(self._binned)
 
     def layers(self, step: str) -> list[Layer]:
-        """Return the only layer, the residual."""
+        """Return the only quantity that can give the colours, the residual; `step` has no effect."""
         return [Layer("residual", "deeper than predicted (missing rock positive)", "mm", _MM, diverging=True, limit=self._limit)]
 
     def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
-        """Return the residuals in the window, averaged over cells, as height and colour."""
+        """Return the measured surface in a part of the wall, coloured by the residuals.
+
+        Heights and residuals are means over cells of about four points.
+
+        step: key of the model, such as "before" or "after" the diagnosis. window: part of the wall; None: all of it.
+        budget: upper limit on the number of cells. `surface` and `layer` have no effect, as there is one of each.
+        """
         return self._cells(step, window, budget)
 
     def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
-        """Return at most about `budget` of the measured points in a window, with their residuals, m; never None.
+        """Return at most about `budget` of the measured points in a part of the wall, with their residuals, mm; never None.
 
-        Arguments as in `Results.patch`.
+        step: key of the model, such as "before" or "after" the diagnosis. window: part of the wall; None: all of it.
+        `layer` has no effect, as there is only one.
         """
         shown = np.flatnonzero(inside(self._local[step], window))
         shown = shown[:: max(1, int(np.ceil(len(shown) / budget)))]
@@ -82,7 +91,7 @@ class GapResults:
         )
 
     def items(self, step: str) -> list[Item]:
-        """Return the regions where the scene itself changed."""
+        """Return the regions where the scene itself changed, according to the diagnosis; `step` has no effect."""
         return [self._change(number, each) for number, each in enumerate(self._record.get("scene_changes", []), start=1)]
 
     def _change(self, number: int, change: dict[str, Any]) -> Item:
@@ -152,20 +161,20 @@ def _cloud(path: Path) -> PointCloud:
     missing = [name for name in _CHANNELS if name not in cloud.extra]
     if missing:
         raise InputError(
-            f"has no channel {missing[0]}",
+            f"the point cloud has no channel {missing[0]}",
             where=str(path),
-            allowed="a file of scarpsim gap",
+            allowed="before.laz and after.laz as scarpsim gap writes them",
             remedy="run scarpsim gap again on the measurement",
         )
     if not all(np.isfinite(cloud.extra[name]).all() and cloud.extra[name].ndim == 1 for name in _CHANNELS):
         raise InputError(
-            f"has values in {' or '.join(_CHANNELS)} that are not finite",
+            f"the point cloud has values of {' or '.join(_CHANNELS)} that are not finite numbers",
             where=str(path),
             remedy="run scarpsim gap again on the measurement",
         )
     if len(cloud.points) < _FEWEST:
         raise InputError(
-            f"contains only {len(cloud.points)} points",
+            f"the point cloud contains only {len(cloud.points)} points",
             where=str(path),
             allowed=f"at least {_FEWEST}",
             remedy="run scarpsim gap again on the measurement",

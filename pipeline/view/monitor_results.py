@@ -25,10 +25,10 @@ _REMEDY = "run scarpsim monitor again with another --out"
 
 
 class MonitorResults:
-    """Result of `scarpsim monitor`, as `scarpsim view` shows it in the browser.
+    """Result of `scarpsim monitor` (what changed on a wall from epoch to epoch), as `scarpsim view` shows it in the browser.
 
-    The user moves between the epochs in each view of the wall (a `step` of `Results`) and selects events (an `item` of
-    `Results`).
+    The user moves between the epochs (a `step` of `Results`; each view of the wall, if there are several, is a step of its own)
+    and selects events, the changes that monitor lists (an `item` of `Results`).
     """
 
     step_name = "epoch"
@@ -49,7 +49,9 @@ class MonitorResults:
             }
             self._events = [dict(each) for each in self._record["events"]]
         except (KeyError, TypeError, ValueError):
-            raise InputError("is not a record of scarpsim monitor", where=str(folder / MONITOR_FILE), remedy=_REMEDY) from None
+            raise InputError(
+                "is damaged or is not a record of scarpsim monitor", where=str(folder / MONITOR_FILE), remedy=_REMEDY
+            ) from None
         self.title = (
             f"{folder.name}: {len(epochs)} {'epoch' if len(epochs) == 1 else 'epochs'} against {names.get('0', 'the reference')}"
         )
@@ -58,13 +60,13 @@ class MonitorResults:
             for key, view in self._views.items()
         }
         if not self.steps:
-            raise InputError("contains no epoch", where=str(folder), remedy=_REMEDY)
+            raise InputError("contains no epoch that was compared with the reference", where=str(folder), remedy=_REMEDY)
         self._map = lru_cache(6)(read_geotiff)
         self._cloud = lru_cache(1)(read_laz)
         self._numbers = lru_cache(2)(self._event_raster)
 
     def layers(self, step: str) -> list[Layer]:
-        """Return the quantities that can give the colours: change, level of detection, shaded rock and relief."""
+        """Return the quantities that can colour an epoch (`step`): change, level of detection, shaded rock and relief."""
         limit = SCALE_SIGMAS * self._levels[step] / _NORMAL_95 * _MM
         return [
             Layer("difference", "reference minus epoch (missing rock positive)", "mm", _MM, diverging=True, limit=limit),
@@ -74,7 +76,21 @@ class MonitorResults:
         ]
 
     def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
-        """Return the surface in the window: the reference, or the epoch (reference minus change), coloured by the layer."""
+        """Return a surface of an epoch in a part of the wall, coloured by a quantity.
+
+        Parameters
+        ----------
+        step : str
+            Key of the epoch.
+        surface : str
+            "reference" for the reference's heights, "epoch" for those of the epoch (reference minus change).
+        layer : Layer
+            The quantity that gives the colours.
+        window : ViewWindow or None
+            Part of the wall; None: all of it.
+        budget : int
+            Approximate upper limit on the number of cells.
+        """
         reference, grid = self._map(self._reference(step))
         rows, columns, factor = cut(grid, window, budget)
         part = reference[rows, columns]
@@ -92,7 +108,8 @@ class MonitorResults:
     def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
         """Return at most about `budget` registered points of an epoch, with their change and level of detection, m.
 
-        Returns None if the folder has no points of the epoch. Arguments as in `Results.patch`.
+        step: key of the epoch. window: part of the wall; None: all of it. `layer` has no effect. Returns None if the folder has
+        no points of the epoch.
         """
         path = self.folder / f"epoch_{_epoch(step):03d}.laz"
         if not path.is_file():
@@ -105,7 +122,7 @@ class MonitorResults:
         return PointLayer(local[shown], None, facts, len(shown) / max(len(local), 1))
 
     def items(self, step: str) -> list[Item]:
-        """Return the events of an epoch."""
+        """Return the events (changes that monitor lists) of an epoch; `step` is its key."""
         return [_item(each) for each in self._events if _key(each["epoch"], each.get("view", 1)) == step]
 
     def _path(self, name: str, step: str) -> Path:

@@ -26,9 +26,9 @@ _GRAPH: Any = {
 
 
 def layout(results: Results, other: Results | None = None) -> html.Main:
-    """Make the page: controls on the left, the wall in 3D, the map, and a table for the item that is selected.
+    """Make the page of `scarpsim view`: controls on the left, the wall in 3D, the map, and the properties of the selected item.
 
-    other: a second run of the same wall, to be shown beside.
+    results: what is shown. other: a second run of the same wall, to be shown beside it.
     """
     first, surface = next(iter(results.steps)), next(iter(results.surfaces))
     shown = ["surface", *ITEM_TRACES]
@@ -77,7 +77,7 @@ def layout(results: Results, other: Results | None = None) -> html.Main:
 
 
 def register_callbacks(app: dash.Dash, results: Results, lock: Lock, other: Results | None = None) -> None:
-    """Connect the parts of the page, so that a choice in one redraws the others.
+    """Connect the parts of the page of `scarpsim view`, so that a choice in one redraws the others.
 
     Parameters
     ----------
@@ -86,9 +86,9 @@ def register_callbacks(app: dash.Dash, results: Results, lock: Lock, other: Resu
     results : Results
         What is shown.
     lock : Lock
-        Lets one request at a time compute.
+        Lets only one request at a time compute.
     other : Results, optional
-        A second run of the same wall.
+        A second run of the same wall, to be shown beside it.
     """
 
     @app.callback(Output("layer", "options"), Output("layer", "value"), Input("step", "value"), State("layer", "value"))
@@ -197,24 +197,30 @@ def pictures(
     window: ViewWindow | None,
     second: tuple[Pair, str, float] | None = None,
 ) -> tuple[Any, Any, str]:
-    """Draw the wall inside a window in 3D and as a map, and make a note about both for the page.
+    """Draw a part of the wall in 3D and as a map, and make a note about both, for the page of `scarpsim view`.
 
     Parameters
     ----------
     results : Results
         What is shown.
     step, surface : str
-        Keys of the step and the surface.
+        Keys of the state (such as an epoch) and of the surface to draw.
     layer : Layer
-        Gives the colours.
+        The quantity that gives the colours.
     shown : list of str
-        What to draw.
+        What to draw: "surface", "points" and kinds of items.
     number : int or None
-        The selected item.
+        Index of the selected item.
     window : ViewWindow or None
-        Part of the wall.
+        Part of the wall; None: all of it.
     second : (Pair, str, float), optional
-        What is shown right of a border, its choice, and the border's share of the width, 0 to 1.
+        For a picture with a border: what can be shown right of it, the key of the choice, and the share of the width, 0 to 1,
+        left of it.
+
+    Returns
+    -------
+    figure, figure and str
+        The wall in 3D, the map, and the note.
     """
     patch = results.patch(step, surface, layer, window, CELLS)
     sides = ""
@@ -239,12 +245,15 @@ def pictures(
 
 
 def following(steps: list[str], step: str) -> str:
-    """Return the step after the given one; after the last comes the first."""
+    """Return the key of the next state (such as an epoch), to play all states in turn; after the last comes the first.
+
+    steps: keys of all states. step: key of the present one.
+    """
     return steps[(steps.index(step) + 1) % len(steps)]
 
 
 def clicked(data: Any) -> int | None:
-    """Return the number of the item (such as a block) that was clicked; None for a click on the wall itself.
+    """Return the index of the block or other item that the user clicked in a picture; None for a click on the wall itself.
 
     data: what Plotly reports of the click.
     """
@@ -254,9 +263,9 @@ def clicked(data: Any) -> int | None:
 
 
 def zoom(change: Any, now: Any) -> Any:
-    """Return the window after the user zoomed or moved the map; None for the whole wall.
+    """Return the part of the wall to show after the user zoomed or moved the map: [x0, x1, y0, y1], m; None for the whole wall.
 
-    change: what Plotly reports of the map's axes. now: the present window [x0, x1, y0, y1], m.
+    change: what Plotly reports of the map's axes. now: the part shown so far. If nothing changed, returns Dash's `no_update`.
     """
     change = change or {}
     if change.get("xaxis.autorange") or change.get("yaxis.autorange"):
@@ -269,7 +278,7 @@ def zoom(change: Any, now: Any) -> Any:
 
 
 def facts_table(item: Item) -> html.Div:
-    """Make the table of an item's properties."""
+    """Make the table of a selected item's properties, such as the volume of a block, under its name."""
     rows = [html.Tr([html.Th(name), html.Td(value)]) for name, value in item.facts.items()]
     return html.Div([html.H2(item.name), html.Table(html.Tbody(rows))])
 

@@ -17,7 +17,7 @@ _SURROUNDINGS, _LEAST_M, _ASPECT = 4.0, 1.0, 2.5
 
 
 class ViewWindow(NamedTuple):
-    """A part of the wall, m, wall frame."""
+    """A rectangular part of the wall that the viewer shows: limits in x (along the wall) and y (up the wall), wall frame, m."""
 
     x0: float
     x1: float
@@ -27,18 +27,18 @@ class ViewWindow(NamedTuple):
 
 @dataclass(frozen=True)
 class Layer:
-    """A quantity that gives the colours of the picture.
+    """A quantity by which the viewer colours the wall, such as the difference of two epochs.
 
     Attributes
     ----------
     key, label, unit : str
-        Identifier, title and unit.
+        Identifier, title of the colour scale, and unit.
     factor : float
-        Conversion from the file's metres to `unit`.
+        Conversion of the values from the file's metres to `unit`.
     diverging : bool
-        Whether the scale is symmetric about zero, from -limit to limit.
+        Whether the colour scale is symmetric about zero, from -limit to limit.
     limit : float, optional
-        End of the colour scale, in `unit`; None: the 1 and 99 % quantiles.
+        End of a symmetric colour scale, in `unit`. Other scales end at the 1 and 99 % quantiles of the values.
     """
 
     key: str
@@ -54,18 +54,20 @@ INSTRUMENTS = {"stereo": "stereo pair", "tls": "laser scanner"}
 
 @dataclass(frozen=True)
 class Patch:
-    """Heights and colour values of the surface in a part of the wall.
+    """Heights and colours of the surface in the part of the wall that the viewer shows, as a raster.
+
+    A cell of the raster is the mean of several pixels of the file if the part has too many to draw.
 
     Attributes
     ----------
     x, y : (w,) and (h,) arrays
-        Centres of the cells, m.
+        Centres of the cells, wall frame, m; y decreases from row to row.
     height, value : (h, w) arrays
-        Height, m, and value in the layer's unit; NaN without data.
+        Height, m, and the quantity that gives the colours, in the unit of the layer; NaN without data.
     label : (h, w) array
-        Block label, 0 for none.
+        Number of the block or event in each cell, 0 for none.
     pooled : int
-        Pixels of the file per cell, along a row or a column.
+        Number of pixels along each side of a cell.
     """
 
     x: FloatArray
@@ -78,18 +80,18 @@ class Patch:
 
 @dataclass(frozen=True)
 class PointLayer:
-    """Measured points in a part of the wall.
+    """Measured points in the part of the wall that the viewer shows.
 
     Attributes
     ----------
     points : (n, 3) array
-        Positions, m.
+        Positions, wall frame, m.
     value : (n,) array, optional
-        Values of the layer.
+        Values that give the colours, in the layer's unit; None: the points are grey.
     facts : mapping of (n,) arrays
-        Further properties by name.
+        Further properties by name, shown when the user points at a point.
     share : float
-        Share of all points that are shown.
+        Number of these points over that of all measured ones, as large clouds are drawn in part.
     """
 
     points: FloatArray
@@ -100,18 +102,18 @@ class PointLayer:
 
 @dataclass(frozen=True)
 class Item:
-    """Something on the wall that can be selected: a block, a detection, an event or a change.
+    """Something on the wall that the user can select in the viewer: a block, a detection, an event or a change.
 
     Attributes
     ----------
     kind : str
         "block", "detection", "event" or "scene change".
     name : str
-        Title.
+        Title, such as "block 3".
     box : tuple
-        x0, x1, y0, y1, z0, z1, wall frame, m; z is NaN if unknown.
+        Limits x0, x1, y0, y1, z0, z1, wall frame, m; z is NaN if unknown.
     facts : mapping of str
-        Properties by name.
+        Properties by name, as text, such as the volume.
     """
 
     kind: str
@@ -120,7 +122,10 @@ class Item:
     facts: Mapping[str, str] = field(default_factory=dict)
 
     def window(self) -> ViewWindow:
-        """Return the window that shows the item with its surroundings, with the page's aspect ratio."""
+        """Return the part of the wall to show when this item is selected: centred on it, four times as high as its longer side.
+
+        An item smaller than 1 m counts as 1 m large.
+        """
         x0, x1, y0, y1 = self.box[:4]
         half = max(x1 - x0, y1 - y0, _LEAST_M) * _SURROUNDINGS / 2
         x, y = (x0 + x1) / 2, (y0 + y1) / 2
@@ -128,7 +133,7 @@ class Item:
 
 
 class Results(Protocol):
-    """Base class of the result folders that the page of `scarpsim view` can show, one class for each kind of folder.
+    """Interface of the folders of results that the page of `scarpsim view` can show, with one class for each kind of folder.
 
     A step is one of the states between which the user moves, such as an epoch. A surface is a raster of heights that the page
     can draw, such as that of the first or of the second epoch. An item is something on the wall that the user can select from a
@@ -141,7 +146,7 @@ class Results(Protocol):
     step_name : str
         What a step is called, such as "epoch".
     steps, surfaces : mapping of str to str
-        Label on the page by key, where the key is the argument of the methods; the first is shown first.
+        Label on the page by key; methods take the key. The first one is shown first.
     """
 
     title: str
@@ -149,50 +154,77 @@ class Results(Protocol):
 
     @property
     def steps(self) -> Mapping[str, str]:
-        """Labels of the steps by key; the first is shown first."""
+        """Labels of the states between which the user moves, such as epochs, by key; the first is shown first."""
         ...
 
     @property
     def surfaces(self) -> Mapping[str, str]:
-        """Labels of the surfaces by key; the first is shown first."""
+        """Labels of the surfaces that can be drawn, such as the reference and the epoch, by key; the first is shown first."""
         ...
 
     def layers(self, step: str) -> Sequence[Layer]:
-        """Return the quantities that can give the colours of a step, given by its key."""
+        """Return the quantities that can give the colours, such as the difference.
+
+        step: key of the state that is shown, such as an epoch.
+        """
         ...
 
     def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
-        """Return the surface in a window (None: all of it), coloured by the layer, with at most about `budget` cells.
+        """Return the surface in a part of the wall, coloured by a quantity, to be drawn by the viewer.
 
         Parameters
         ----------
         step, surface : str
-            Keys of the step and the surface.
+            Keys of the state (such as an epoch) and of the surface (such as that of the reference).
         layer : Layer
-            Gives the colours.
+            The quantity that gives the colours.
         window : ViewWindow or None
-            Part of the wall.
+            Part of the wall; None: all of it.
         budget : int
-            Approximate limit on the number of cells.
+            Approximate upper limit on the number of cells; pixels are averaged to keep it.
         """
         ...
 
     def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
-        """Return at most about `budget` of the measured points in a window; None if the folder has none.
+        """Return at most about `budget` of the measured points in a part of the wall; None if the folder has no points.
 
-        Arguments as in `patch`.
+        Parameters
+        ----------
+        step : str
+            Key of the state, such as an epoch.
+        layer : Layer
+            The quantity that gives the colours.
+        window : ViewWindow or None
+            Part of the wall; None: all of it.
+        budget : int
+            Approximate upper limit on the number of points.
         """
         ...
 
     def items(self, step: str) -> Sequence[Item]:
-        """Return the blocks, detections, events or changes of a step, given by its key, that the user can select."""
+        """Return the blocks, detections, events or changes that the user can select.
+
+        step: key of the state that is shown, such as an epoch.
+        """
         ...
 
 
 def cut(grid: Grid, window: ViewWindow | None, budget: int) -> tuple[slice, slice, int]:
-    """Return the rows and columns of `grid` inside `window`, and how many pixels to average.
+    """Find the pixels of a raster in a part of the wall, and how many of them to average so that the viewer can draw them.
 
-    There is at least one row and one column. The number of pixels is that along a row or a column for `budget` cells.
+    Parameters
+    ----------
+    grid : Grid
+        The raster.
+    window : ViewWindow or None
+        Part of the wall; None: all of it.
+    budget : int
+        Approximate upper limit on the number of cells to draw.
+
+    Returns
+    -------
+    slice, slice and int
+        Rows and columns, at least one of each, and the number of pixels along each side of a cell.
     """
     window = window or ViewWindow(-np.inf, np.inf, -np.inf, np.inf)
     columns = _inside(grid.columns(np.array([window.x0, window.x1])), grid.width)
@@ -209,7 +241,17 @@ def _inside(edges: FloatArray, size: int) -> slice:
 
 
 def centres(grid: Grid, rows: slice, columns: slice, factor: int) -> tuple[FloatArray, FloatArray]:
-    """Return x (w,) and y (h,) of the centres of cells of `factor` pixels, m."""
+    """Return the centres of the cells into which a part of a raster is divided for drawing: x (w,) and y (h,), wall frame, m.
+
+    Parameters
+    ----------
+    grid : Grid
+        The raster.
+    rows, columns : slice
+        The part of it.
+    factor : int
+        Number of pixels along each side of a cell.
+    """
     width, height = (columns.stop - columns.start) // factor, (rows.stop - rows.start) // factor
     x = grid.x_min + (columns.start + (np.arange(width) + 0.5) * factor) * grid.gsd
     y = grid.y_max - (rows.start + (np.arange(height) + 0.5) * factor) * grid.gsd
@@ -217,7 +259,10 @@ def centres(grid: Grid, rows: slice, columns: slice, factor: int) -> tuple[Float
 
 
 def inside(points: FloatArray, window: ViewWindow | None) -> NDArray[np.bool_]:
-    """Return which of the points (n, 3), wall frame, m, lie in the window, as a mask (n,); None: all."""
+    """Return a mask (n,) of the points that lie in a part of the wall, as seen by the viewer; all do if it is None.
+
+    points: (n, 3), wall frame, m. window: limits of the part in x and y.
+    """
     if window is None:
         return np.ones(len(points), bool)
     x, y = points[:, 0], points[:, 1]

@@ -27,9 +27,10 @@ _ROCK, _HEIGHT = Layer("rock", "rock (shaded)", ""), Layer("height", "relief", "
 
 
 class RunResults:
-    """Result of `scarpsim simulate`, as `scarpsim view` shows it in the browser, with detections if a folder of them is given.
+    """Result of `scarpsim simulate` (a simulated run), as `scarpsim view` shows it in the browser.
 
-    The user moves between epochs (a `step` of `Results`) and selects blocks and detections (an `item` of `Results`).
+    The user moves between epochs (a `step` of `Results`) and selects fallen blocks (an `item` of `Results`). If a folder of
+    `scarpsim detect` is given, its detections can be selected too.
     """
 
     step_name = "epoch"
@@ -52,11 +53,11 @@ class RunResults:
         self.surfaces = {"surface": "as measured", "reference": "reference, as measured", "truth": "as it really is"}
         self._found = _detections(detections) if detections else {}
         if detections and not set(self._found) & set(self.steps):
-            allowed = ", ".join(f"difference_{int(key):03d}.tif" for key in self.steps)
+            maps = ", ".join(f"difference_{int(key):03d}.tif" for key in self.steps)
             raise InputError(
                 "contains no detections of this run's maps",
                 where=str(detections),
-                allowed=allowed,
+                allowed=f"detections in {maps}",
                 remedy="give the folder that scarpsim detect filled for this run",
             )
         self._map = lru_cache(4)(read_geotiff)
@@ -65,12 +66,16 @@ class RunResults:
 
     @property
     def extent_m(self) -> float:
-        """Longer side of the maps, m."""
+        """Longer side of the run's difference maps, m."""
         grid = self._map(self._map_path("difference", next(iter(self.steps))))[1]
         return max(grid.width, grid.height) * grid.gsd
 
     def layers(self, step: str) -> list[Layer]:
-        """Return the layers of an epoch: difference, change in a series, M3C2 if computed, shaded rock and relief."""
+        """Return the quantities that can colour an epoch (`step`).
+
+        They are the difference to the reference; in a time series the change since the epoch before; the M3C2 distance if it was
+        computed; shaded rock and relief.
+        """
         limit = SCALE_SIGMAS * self._epochs[step]["statistics"]["sigma_m"] * _MM
         maps = [Layer("difference", "reference minus epoch (missing rock positive)", "mm", _MM, diverging=True, limit=limit)]
         if self._map_path("change", step).exists():
@@ -80,7 +85,21 @@ class RunResults:
         return [*maps, _ROCK, _HEIGHT]
 
     def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
-        """Return a surface of an epoch in the window."""
+        """Return a surface of an epoch in a part of the wall, coloured by a quantity.
+
+        Parameters
+        ----------
+        step : str
+            Key of the epoch.
+        surface : str
+            "surface" (as measured), "reference" (the first epoch, as measured) or "truth".
+        layer : Layer
+            The quantity that gives the colours.
+        window : ViewWindow or None
+            Part of the wall; None: all of it.
+        budget : int
+            Approximate upper limit on the number of cells.
+        """
         grid = self._map(self._map_path("difference", step))[1]
         raster = self._heights(self._surface_path(step, surface), grid)
         rows, columns, factor = cut(grid, window, budget)
@@ -93,7 +112,7 @@ class RunResults:
     def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
         """Return at most about `budget` measured points of an epoch; None if the run has no points.laz of it.
 
-        Arguments as in `Results.patch`.
+        step: key of the epoch. window: part of the wall; None: all of it. `layer` has no effect: the points are shown in grey.
         """
         path = epoch_folder(self.folder, int(step)) / "points.laz"
         if not path.exists():
@@ -104,7 +123,7 @@ class RunResults:
         return PointLayer(cloud.points[shown], None, facts, len(shown) / max(len(cloud.points), 1))
 
     def items(self, step: str) -> list[Item]:
-        """Return the blocks and detections of an epoch."""
+        """Return the blocks that are missing in an epoch, and the detections in its map; `step` is the key of the epoch."""
         blocks = [_block(each) for each in self._epochs[step]["blocks"]]
         return blocks + self._found.get(step, [])
 
@@ -166,7 +185,9 @@ def _detections(folder: Path) -> dict[str, list[Item]]:
     """Read the events of `scarpsim detect` at its lowest confidence, by epoch."""
     tables = sorted((_confidence(path), path) for path in folder.glob("events_*.csv"))
     if not tables:
-        raise InputError("contains no events_*.csv", where=str(folder), remedy="give the folder that scarpsim detect filled")
+        raise InputError(
+            "contains no table of events (events_*.csv)", where=str(folder), remedy="give the folder that scarpsim detect filled"
+        )
     found: dict[str, list[Item]] = {}
     for event in read_events(tables[0][1]):
         number = re.search(r"difference_(\d{1,9})", event.image)
@@ -186,7 +207,7 @@ def _confidence(path: Path) -> float:
             "is not the name of a table of events",
             where=str(path),
             allowed="such as events_0.9.csv",
-            remedy="use the names that scarpsim detect gave",
+            remedy="give the file the name that scarpsim detect gave it",
         )
     return value
 

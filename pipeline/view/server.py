@@ -46,9 +46,10 @@ Plotly sets styles from scripts and saves pictures through data and blob address
 
 
 def open_results(folder: Path, detections: Path | None = None) -> Results:
-    """Open a folder of results for `scarpsim view`; its files tell which kind it is.
+    """Open a folder of results for `scarpsim view`: of `simulate`, `gap` or `monitor`, or a split of a data set.
 
-    detections: folder of `scarpsim detect`, to show with a run. Raises InputError if the folder cannot be shown.
+    Its files tell which kind it is. detections: folder of `scarpsim detect`, to be shown on a simulated run. Raises InputError if
+    the folder cannot be shown.
     """
     if not folder.is_dir():
         raise InputError("there is no such folder", where=str(folder), remedy="give a folder with results of a scarpsim command")
@@ -56,7 +57,9 @@ def open_results(folder: Path, detections: Path | None = None) -> Results:
         return RunResults(folder, detections)
     if detections:
         raise InputError(
-            "detections can only be shown with a run", where="--detections", remedy="leave it out, or give the run's folder"
+            "detections can only be shown with a simulated run",
+            where="--detections",
+            remedy="leave it out, or give the folder of the run in which they were found",
         )
     if (folder / "gap.json").exists():
         return GapResults(folder)
@@ -74,9 +77,10 @@ def open_results(folder: Path, detections: Path | None = None) -> Results:
 
 
 def make_app(results: Results, token: str, other: Results | None = None) -> dash.Dash:
-    """Make the web page that shows `results`.
+    """Make the web page of `scarpsim view` as a Dash application, which refuses requests without the token.
 
-    token: secret that grants access. other: a second run of the same wall, shown beside; None: none.
+    results: what is shown. token: secret in the page's address that grants access. other: a second run of the same wall, shown
+    beside it.
     """
     app = dash.Dash(
         __name__,
@@ -96,18 +100,18 @@ def make_app(results: Results, token: str, other: Results | None = None) -> dash
 
 
 def make_page_server(results: Results, port: int, token: str, other: Results | None = None) -> BaseWSGIServer:
-    """Make the page's server.
+    """Make the local web server of `scarpsim view`, which other machines cannot reach.
 
     Parameters
     ----------
     results : Results
-        What is shown.
+        What the page shows.
     port : int
         Port, or 0 for any free one.
     token : str
-        Secret that grants access.
+        Secret in the page's address that grants access.
     other : Results, optional
-        A second run of the same wall.
+        A second run of the same wall, shown beside it.
 
     Raises
     ------
@@ -124,31 +128,42 @@ def make_page_server(results: Results, port: int, token: str, other: Results | N
 
 
 def open_second(folder: Path, first: Results) -> Results:
-    """Open a second run of the same wall as `first`. Raises InputError if either is not a run, or if walls or frames differ."""
+    """Open a second run of the same wall, to be shown beside the first.
+
+    folder: the second run. first: the opened first run. Raises InputError if either is not a simulated run, or if they have
+    different walls or wall frames.
+    """
     second = open_results(folder)
     if not isinstance(first, RunResults) or not isinstance(second, RunResults):
         raise InputError(
-            "only two runs of one wall can be shown side by side", where=str(folder), remedy="give the folders of two runs"
+            "only two runs of one wall can be shown side by side",
+            where=str(folder),
+            remedy="give two folders of scarpsim simulate",
         )
     check_same_wall(first.world_to_wall, second.world_to_wall, first.extent_m, str(folder))
     return second
 
 
 def serve(folder: Path, second: Path | None, detections: Path | None, port: int, *, open_browser: bool) -> None:
-    """Show a folder until interrupted.
+    """Show a folder of results in the browser until the user interrupts: the command `scarpsim view`.
 
     Parameters
     ----------
     folder : Path
-        What to show.
+        Folder of results.
     second : Path or None
-        A run to show beside it.
+        Folder of a second run of the same wall, to be shown beside it.
     detections : Path or None
-        Folder of `scarpsim detect`.
+        Folder of `scarpsim detect`, to be shown on a simulated run.
     port : int
         Port, or 0 for any free one.
     open_browser : bool
         Whether to open the page in the browser.
+
+    Raises
+    ------
+    InputError
+        If a folder cannot be shown or the port cannot be used.
     """
     token = secrets.token_urlsafe(24)
     results = open_results(folder, detections)
@@ -178,7 +193,11 @@ def _refuse_other_names() -> Any:
 
 
 def cookie_name(host: str) -> str:
-    """Return the name of the page's cookie, by its port, because a browser sends cookies to all ports of a machine."""
+    """Return the name of the cookie by which the viewer's page recognises its browser; it contains the port.
+
+    A browser sends cookies to all ports of a machine, so pages on different ports need different names. host: host and port of
+    the request, such as "localhost:8050".
+    """
     return f"scarpsim_view_{host.rpartition(':')[2]}"
 
 

@@ -20,14 +20,14 @@ _APART_M = 0.02
 
 @dataclass(frozen=True)
 class Pair:
-    """What can be shown beside the present picture.
+    """What the viewer can show right of a border for comparison: other epochs of the same folder, or those of a second run.
 
     Attributes
     ----------
     results
-        Results of the same folder.
+        The folder that is shown.
     other
-        Results of a second run of the same wall, or None.
+        A second run of the same wall, or None.
     """
 
     results: Results
@@ -35,27 +35,27 @@ class Pair:
 
     @property
     def choices(self) -> dict[str, str]:
-        """The choices by key, with their labels."""
+        """Labels of what can be shown right of the border, by key: epochs (or other states) of the folder and of a second run."""
         own = {f"{OWN}{key}": label for key, label in self.results.steps.items()}
         if self.other is None:
             return own
         return own | {f"{OTHER}{key}": f"{self.other.title}, {label}" for key, label in self.other.steps.items()}
 
     def patch(self, choice: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
-        """Return the picture of a choice, coloured by the same layer or, if it has none with that key, by its first one.
+        """Return the surface to draw right of the border.
 
         Parameters
         ----------
         choice : str
-            A key of `choices`.
+            Key of an epoch (or other state) of either folder, from `choices`.
         surface : str
-            The surface that is shown; the first one if the other folder lacks it.
+            Key of the surface that is shown left of the border; if the other folder lacks it, its first one is drawn.
         layer : Layer
-            The layer of the present picture.
+            The quantity that gives the colours on the left; if the choice lacks it, its first one is drawn.
         window : ViewWindow, optional
-            Part of the wall.
+            Part of the wall; None: all of it.
         budget : int
-            Approximate limit on the number of cells.
+            Approximate upper limit on the number of cells.
         """
         results = self.other if choice.startswith(OTHER) and self.other is not None else self.results
         step = choice.removeprefix(OTHER).removeprefix(OWN)
@@ -67,12 +67,20 @@ class Pair:
 
 
 def border(patch: Patch, share: float) -> float:
-    """Return x of the border, m, at a share 0 to 1 of the picture's width."""
+    """Return x of the border between two pictures of the wall, wall frame, m.
+
+    patch: the part of the wall that is shown. share: of its width left of the border, 0 to 1.
+    """
     return float(patch.x[0] + share * (patch.x[-1] - patch.x[0]))
 
 
 def split_patch(left: Patch, right: Patch, share: float) -> Patch:
-    """Return `left` up to the border, and beyond it `right` at the same cells (nearest neighbour, no data where it has none)."""
+    """Combine two pictures of the same wall, such as two epochs, into one with a vertical border.
+
+    The right one is resampled to the cells of the left one (nearest neighbour; no data where it has none).
+
+    left, right: what is shown left and right of the border. share: of the width left of the border, 0 to 1.
+    """
     beyond = left.x > border(left, share)
     columns, outside_x = _nearest(left.x, right.x)
     rows, outside_y = _nearest(left.y, right.y)
@@ -100,7 +108,17 @@ def _nearest(wanted: FloatArray, there: FloatArray) -> tuple[NDArray[np.intp], N
 
 
 def check_same_wall(first: FloatArray, second: FloatArray, extent_m: float, where: str) -> None:
-    """Raise InputError if the matrices (4, 4), world to wall frame, of two runs differ on a wall of size `extent_m`."""
+    """Check that two runs have the same wall frame, so that they can be shown side by side; raise InputError if not.
+
+    Parameters
+    ----------
+    first, second : (4, 4) arrays
+        Transforms from world coordinates to the wall frames of the two runs.
+    extent_m : float
+        Size of the wall, m; nowhere on it may the frames differ by more than 2 cm.
+    where : str
+        Folder of the second run, for the error message.
+    """
     difference = np.abs(first - second)
     if float(difference[:3, :3].max()) * extent_m > _APART_M or float(difference[:3, 3].max()) > _APART_M:
         raise InputError(

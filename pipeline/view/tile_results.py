@@ -21,7 +21,8 @@ _SIGMA_M = 0.01
 class TileResults:
     """A split of a data set (train, val or test), as `scarpsim view` shows it in the browser.
 
-    The user moves from tile to tile (a `step` of `Results`) and selects annotated blocks (an `item` of `Results`).
+    The user moves from tile to tile, the images of difference maps (a `step` of `Results`), and selects annotated blocks (an
+    `item` of `Results`).
     """
 
     step_name = "tile"
@@ -36,7 +37,7 @@ class TileResults:
         self._map = lru_cache(8)(read_geotiff)
 
     def layers(self, step: str) -> list[Layer]:
-        """Return the only layer, the difference."""
+        """Return the only quantity that can colour a tile (`step`), the difference of two epochs."""
         sigma = _number(self._images[step].get("noise_sigma_m")) or _SIGMA_M
         return [
             Layer(
@@ -50,18 +51,22 @@ class TileResults:
         ]
 
     def patch(self, step: str, surface: str, layer: Layer, window: ViewWindow | None, budget: int) -> Patch:
-        """Return the part of a tile in the window, with the difference as height and colour."""
+        """Return a part of a tile, with the difference of the two epochs as colour and, with its sign reversed, as relief.
+
+        step: key of the tile. window: part of it; None: all. budget: approximate upper limit on the number of cells.
+        `surface` and `layer` have no effect, as there is one of each.
+        """
         values, grid = self._map(self._coco.path(self._images[step]))
         rows, columns, factor = cut(grid, window, budget)
         shown = mean_pooled(values[rows, columns], factor)
         return Patch(*centres(grid, rows, columns, factor), -shown, shown * _MM, np.zeros(shown.shape, int), factor)
 
     def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
-        """Return None: a data set has no points."""
+        """Return None, as a data set contains difference maps but no measured points; the arguments have no effect."""
         return None
 
     def items(self, step: str) -> list[Item]:
-        """Return the blocks of a tile."""
+        """Return the annotated blocks of a tile; `step` is its key."""
         grid = self._map(self._coco.path(self._images[step]))[1]
         found = [each for each in self._coco.annotations if each["image_id"] == self._images[step]["id"]]
         return [_block(each, grid.x_min, grid.y_max, grid.gsd) for each in found]

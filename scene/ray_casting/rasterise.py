@@ -50,8 +50,8 @@ class TopFaces:
 class FlatMesh:
     """A mesh whose triangles are ready to be drawn on a raster, seen along -z, to find the highest face in each pixel.
 
-    It takes the mesh (wall frame, m) and the raster. Raises InputError if the mesh has no triangles or lies too far from the
-    origin.
+    It gives heights and block labels of a surface, often quicker than ray casting. It takes the mesh (wall frame, m) and the
+    raster. Raises InputError if the mesh has no triangles or lies too far from the origin.
     """
 
     def __init__(self, mesh: TriangleMesh, grid: Grid) -> None:
@@ -76,11 +76,11 @@ class FlatMesh:
 
     @property
     def is_quick(self) -> bool:
-        """Whether the faces are so small that drawing them on the raster is quicker than casting a ray through each pixel."""
+        """Whether the mesh's faces are so small that drawing them on the raster is quicker than casting a ray for each pixel."""
         return float(dr.sum(mi.Float64(self._count))[0]) <= _MOST_TESTS * len(self._mesh.faces)
 
     def top_faces(self) -> TopFaces:
-        """Draw all triangles on the raster and return the highest face in each pixel."""
+        """Draw all triangles of the mesh on the raster and return the highest face in each pixel, seen along -z."""
         pixels = self._grid.width * self._grid.height
         highest, face = dr.zeros(mi.UInt32, pixels), dr.full(mi.UInt32, _NONE, pixels)
 
@@ -98,9 +98,10 @@ class FlatMesh:
         return TopFaces(valid, face, self._points(face, valid))
 
     def labels(self, top: TopFaces, labels: mi.Int32) -> mi.Int32:
-        """Return the block label in each pixel of the raster: that of the face's vertex which is nearest to the pixel's point.
+        """Return the label of the fallen block that each pixel of the raster shows, for a mesh with labels only at its vertices.
 
-        top: the highest faces, as `top_faces` returns them. labels: (v,) int32, the block labels of the mesh's vertices.
+        It is the label of the face's vertex that is nearest to the place seen in the pixel. top: the highest faces, as
+        `top_faces` returns them. labels: (v,) int32, the label of each of the mesh's vertices, 0 for the wall.
         """
         return label_of_nearest_vertex(self._vertices, self._face_vertices, top.face, top.valid, top.point, labels)
 

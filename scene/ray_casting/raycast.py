@@ -234,7 +234,9 @@ class RayCaster:
         return self.bare.ray_test(ray, coherent=coherent)
 
     def nearest_vertex_label(self, hits: Hits, point: mi.Array3f64, labels: mi.Int32) -> mi.Int32:
-        """Return, for each of n hits, the block label of the face's vertex that is nearest to the hit point.
+        """Return the label of the fallen block at each of n hit points, for a mesh with labels only at its vertices.
+
+        It is the label of the hit face's vertex that is nearest to the hit point.
 
         Parameters
         ----------
@@ -242,8 +244,8 @@ class RayCaster:
             The n hits.
         point : 3 x (n,) float64
             The hit points, m.
-        labels : int32, one per vertex
-            Block labels of the mesh's vertices.
+        labels : (v,) int32
+            Label of each of the mesh's vertices, 0 for the wall.
         """
         return label_of_nearest_vertex(self._vertices, self._face_vertices, hits.face, hits.valid, point, labels)
 
@@ -282,23 +284,23 @@ class RayCaster:
         return face[met], np.einsum("ij,ij->i", self.mesh.face_normals(face[met]), sight[met]) > 0
 
     def labels_down(self, grid: Grid, shift_m: NDArray[np.float32]) -> IntArray:
-        """Return the block label (h, w) of the face below each pixel centre of a raster (`grid`), looking along -z.
+        """Return the label (h, w) of the fallen block that each pixel of a difference map shows from above; 0 for the wall.
 
-        It labels the pixels of a difference map. shift_m: (h, w, 2) displacement in x and y, m, which is subtracted from each
-        pixel centre before looking down.
+        The view is along -z. grid: the raster. shift_m: (h, w, 2) how far the map is displaced in x and y by errors of
+        measurement, m; it is subtracted from each pixel centre before looking down.
         """
         hits, _ = self.look_down(grid, shift_m)
         return np.array(hits.block).reshape(grid.shape)
 
     def look_down(self, grid: Grid, shift_m: NDArray[np.float32] | None = None) -> tuple[Hits, mi.Array3f64]:
-        """Cast one ray along -z through each pixel centre of `grid`, from above the mesh, row by row.
+        """Cast one ray along -z through each pixel centre of a raster, row by row, to find the mesh's height and face there.
 
         Parameters
         ----------
         grid : Grid
-            The raster.
+            The raster, h x w pixels.
         shift_m : (h, w, 2) array, optional
-            Offset of each ray towards -x and -y, m.
+            Offset of each ray towards -x and -y, m; None: none.
 
         Returns
         -------
@@ -320,23 +322,25 @@ class RayCaster:
 def label_of_nearest_vertex(
     vertices: mi.Float64, face_vertices: mi.UInt32, face: mi.UInt32, valid: mi.Bool, point: mi.Array3f64, labels: mi.Int32
 ) -> mi.Int32:
-    """Return, for each of n places on faces of a mesh, the block label of the face's vertex that is nearest.
+    """Return the label of the fallen block at each of n places on faces of a mesh that has labels only at its vertices.
+
+    It is the label of the face's vertex that is nearest to the place.
 
     Parameters
     ----------
     vertices, face_vertices : (3 v,) float64 and (3 f,) uint32
-        Coordinates of the mesh's vertices, m, and numbers of the vertices of its faces.
+        Coordinates of the mesh's v vertices, m, and numbers of the vertices of its f faces.
     face, valid : (n,) uint32 and bool
         Number of the face at each place, and whether there is one.
     point : 3 x (n,) float64
         The places, m.
     labels : (v,) int32
-        Block labels of the vertices.
+        Label of each vertex, 0 for the wall.
 
     Returns
     -------
     (n,) int32
-        The labels; WALL where there is no face.
+        The labels; WALL (0) where there is no face.
     """
     nearest, result = mi.Float32(np.inf), mi.Int32(WALL)
     for corner in range(3):
@@ -378,7 +382,10 @@ def _plane_normal(axis: mi.UInt32, negative: mi.Bool, following: mi.Float64, las
 
 
 def heights(caster: RayCaster, grid: Grid) -> NDArray[np.float32]:
-    """Return the highest z of a mesh at each pixel centre of a raster, (height, width), m; NaN where there is no surface."""
+    """Return the heights of a surface as a raster: the highest z of the mesh at each pixel centre, m.
+
+    caster: the mesh, ready for ray casting. grid: the raster, in the mesh's frame. Returns (h, w); NaN where there is no surface.
+    """
     hits, point = caster.look_down(grid)
     z = mi.Float32(dr.select(hits.valid, point.z, np.nan))
     return np.array(z).reshape(grid.shape)

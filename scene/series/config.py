@@ -52,7 +52,7 @@ class VolumeLaw(Config):
 
 
 class RockfallRate(Config):
-    """Rockfalls at random: a Poisson process in time, with a magnitude-frequency law.
+    """Settings of random rockfalls: how often rocks fall (a Poisson process in time), and the distribution of their volumes.
 
     Their times and volumes are drawn for the whole duration of a time series.
     """
@@ -97,20 +97,17 @@ class Motion(Config):
 
 
 class PrecursorConfig(Motion):
-    """Motion before the fall, of a share of the rockfalls drawn at random.
+    """Settings of precursors: the slow motion of a block out of the wall, in the hours before it falls.
 
-    A precursor is the slow motion of a block out of the wall, in the hours before it falls. Its other keys say how the block
-    moves.
+    They apply to a share of the rockfalls drawn at random. Besides `share` there are the keys of `Motion`, which say how the
+    block moves: `law`, `lead_h` and `displacement_m`.
     """
 
     share: float = Field(1.0, ge=0, le=1, description="share of the rockfalls that move before they fall")
 
 
 class EventConfig(Config):
-    """A rockfall by hand.
-
-    Its time, volume and place are given in the config of a time series, instead of drawn at random.
-    """
+    """Settings of one rockfall whose time, volume and place the user prescribes, instead of having them drawn at random."""
 
     time: datetime | None = Field(None, description="when it falls, ISO 8601; or `after_h`")
     after_h: float | None = Field(None, gt=0, le=1e6, description="when it falls, after the first epoch; or `time` [h]")
@@ -126,10 +123,9 @@ class EventConfig(Config):
 
 
 class DepositsConfig(Config):
-    """Fallen rock at the foot of the wall: fragments with the same volume together, each at rest.
+    """Settings of the fragments into which fallen rock breaks, and which come to rest at the foot of the wall below its place.
 
-    The volume of a rock is divided at random among its fragments; they come to rest near the foot of the wall below the rock's
-    place.
+    The volume of the rock is divided at random among the fragments and stays the same in total.
     """
 
     fragments: int = Field(8, ge=1, le=200, description="number of fragments into which a rock breaks")

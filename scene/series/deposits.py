@@ -54,9 +54,9 @@ class Ground:
 
     @classmethod
     def below(cls, wall: TriangleMesh, up: FloatArray) -> Ground:
-        """Return the ground at the foot of a wall: level, at the height of the wall's lowest point.
+        """Return the ground at the foot of a wall, on which fallen rocks come to rest: level, at the height of its lowest point.
 
-        up: (3,) direction against gravity, wall frame.
+        wall: its mesh, wall frame. up: (3,) direction against gravity, wall frame.
         """
         outward = np.array([0.0, 0.0, 1.0]) - up[2] * up
         if np.linalg.norm(outward) < 1e-3:  # terrain seen from above: any horizontal direction

@@ -55,10 +55,10 @@ class Rules:
     random: KeyedRandom
 
     def label(self, number: int, kind: str) -> int:
-        """Return the label by which the faces of a mesh tell what a rockfall left there.
+        """Return the label by which the faces of the wall's mesh show what a rockfall left there.
 
-        number: number of the rockfall. kind: "missing" (its niche), "moved" (its block, moved but not fallen) or "deposit" (its
-        fragments).
+        number: number of the rockfall, from 1. kind: "missing" (its niche), "moved" (its block, moved but not fallen) or
+        "deposit" (its fragments at the foot of the wall).
         """
         return KINDS.index(kind) * len(self.rockfalls) + number
 
@@ -73,18 +73,18 @@ class Rules:
 
 @dataclass(frozen=True)
 class Loose:
-    """A rock that has been cut out of the wall.
+    """A rock of a simulated time series that has been cut out of the wall, as it has begun to move or has fallen.
 
     Attributes
     ----------
     rockfall : Rockfall
         Time, volume and motion of the rockfall.
     block : Blocks
-        The block that cut it out.
+        The closed block with which it was cut out.
     volume_m3 : float
         Volume of the rock, m3.
     rock : TriangleMesh, optional
-        The rock as a closed mesh in its place, for one that moves before it falls.
+        The rock as a closed mesh in its original place, for one that moves before it falls; None for one that does not.
     """
 
     rockfall: Rockfall
@@ -95,14 +95,14 @@ class Loose:
 
 @dataclass(frozen=True)
 class WallState:
-    """The wall at one time of a time series of rockfalls.
+    """The true wall at one time of a simulated time series of rockfalls.
 
     Attributes
     ----------
     time_h : float
         Hours since the first epoch.
     base : TriangleMesh
-        The wall with all niches, wall frame.
+        The wall with the niches of all rocks cut out so far, wall frame.
     loose : tuple of Loose
         All rocks cut out so far, fallen or not, in the order of the rockfalls' numbers.
     deposits : tuple of Deposit
@@ -122,18 +122,19 @@ class WallState:
 
     @property
     def fallen(self) -> tuple[Loose, ...]:
-        """The rocks that have fallen by the time of this state."""
+        """The rocks that have fallen off the wall by the time of this state."""
         return tuple(each for each in self.loose if each.rockfall.falls_h <= self.time_h)
 
     @property
     def hanging(self) -> tuple[Loose, ...]:
-        """The rocks that have moved by the time of this state but not fallen."""
+        """The rocks that have begun to move out of the wall by the time of this state but have not fallen."""
         return tuple(each for each in self.loose if each.rockfall.falls_h > self.time_h)
 
     def mesh(self, rules: Rules) -> TriangleMesh:
-        """Return the wall with its moving blocks and fallen fragments, as a sensor meets it.
+        """Return the wall with its moving blocks and fallen fragments as one mesh, as a sensor meets it.
 
-        `face_block` of the mesh tells them apart: 0 for rock in its place, else the label that `rules` gives (`Rules.label`).
+        The label of a face (`face_block`) tells what it is: 0 for rock in its place, else what `rules.label` gives. rules: the
+        rockfalls of the time series.
         """
         parts = [self.base]
         for each in self.hanging:
@@ -146,10 +147,9 @@ class WallState:
 
 
 def advanced(state: WallState, time_h: float, rules: Rules) -> WallState:
-    """Return the wall at a later time of a time series: rocks begin to move, others fall.
+    """Follow the wall from one time of a simulated time series to a later one: rocks begin to move, others fall.
 
-    If no rock has been cut out of `state` yet, it is taken for the untouched first wall: rockfalls before its time leave no
-    trace.
+    If no rock has been cut out of `state` yet, it is the untouched wall, and rocks that fell before its time are still in it.
 
     Parameters
     ----------
@@ -158,12 +158,17 @@ def advanced(state: WallState, time_h: float, rules: Rules) -> WallState:
     time_h : float
         The later time, h since the first epoch.
     rules : Rules
-        What happens in the series.
+        All rockfalls of the series, and how their blocks are shaped and placed.
+
+    Returns
+    -------
+    WallState
+        The wall at the later time.
 
     Raises
     ------
     InputError
-        If a rock finds no room.
+        If the block of a rockfall finds no room on the wall.
     """
     known = {each.rockfall.number for each in state.loose}
     begun = [
@@ -194,7 +199,7 @@ def advanced(state: WallState, time_h: float, rules: Rules) -> WallState:
 
 
 def joined_meshes(parts: Sequence[TriangleMesh]) -> TriangleMesh:
-    """Join meshes, such as the wall and fallen fragments, into one, with their labels and albedo."""
+    """Join meshes, such as the wall and fallen fragments, into one, which keeps their block labels and albedo."""
     at = np.concatenate([[0], np.cumsum([len(each.vertices) for each in parts])[:-1]]).astype(np.int32)
 
     def column(name: str, size: str, default: float, kind: type) -> NDArray[Any]:

@@ -11,8 +11,9 @@ from scipy.stats import ncx2
 from threadpoolctl import threadpool_limits
 
 from pipeline.formats.measurements.measurement import read_measurement
-from pipeline.gap.mean.candidates import Candidate, SineGrid, nonparametric_terms, spatial_null_candidates
+from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.mean.detection_power import DetectableSize, noncentrality
+from pipeline.gap.mean.nonparametric_terms import nonparametric_terms, spatial_null_candidates
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.residuals import wall_blocks

@@ -16,7 +16,8 @@ import pytest
 from gap_cases import Array, Scan, smooth_noise, write_scan
 
 from pipeline.formats.measurements.measurement import read_measurement
-from pipeline.gap.mean.candidates import SPATIAL_NULL, Candidate
+from pipeline.gap.mean.candidates import Candidate
+from pipeline.gap.mean.nonparametric_terms import SPATIAL_NULL
 from pipeline.gap.mean.selection import EffectSet, FamilyScore, ForwardSelection
 from pipeline.gap.naming.named_effects import NamedEffect
 from pipeline.gap.naming.selection_passes import subsample

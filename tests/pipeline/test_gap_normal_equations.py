@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from test_gap_shared_noise import NOISE, SIGMA, noisy, raster
 
-from pipeline.gap.mean.candidates import Candidate, SineGrid, nonparametric_terms
+from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.mean_model import MeanFit, MeanModel, _NormalEquations
+from pipeline.gap.mean.nonparametric_terms import nonparametric_terms
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.residuals import wall_blocks
 from pipeline.gap.residuals.alignment import fit_pose

@@ -12,7 +12,7 @@ from scipy.spatial.distance import cdist
 from scipy.stats import kstest
 from threadpoolctl import threadpool_limits
 
-from pipeline.gap.mean.candidates import nonparametric_terms
+from pipeline.gap.mean.nonparametric_terms import nonparametric_terms
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.noise_and_edges.grid_noise import _variogram
 from pipeline.gap.noise_and_edges.sign_flips import null_p_value

@@ -11,11 +11,10 @@ from gap_cases import write_scan
 
 from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.formats.measurements.measurement import read_measurement
-from pipeline.gap.mean.candidates import (
+from pipeline.gap.mean.candidates import Candidate, SineGrid
+from pipeline.gap.mean.nonparametric_terms import (
     HARMONIC_SERIES,
     LINE_PATTERN,
-    Candidate,
-    SineGrid,
     half_pixel_sine,
     line_pattern_terms,
     nonparametric_terms,

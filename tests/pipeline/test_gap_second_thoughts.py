@@ -17,7 +17,7 @@ from gap_cases import write_scan
 
 from benchmarks.gap_closed_form.cases import Case, make
 from pipeline.formats.measurements.measurement import StereoMeasurement, read_measurement
-from pipeline.gap.mean.candidates import SPATIAL_NULL
+from pipeline.gap.mean.nonparametric_terms import SPATIAL_NULL
 from pipeline.gap.naming import workflow
 from pipeline.gap.naming.effect_selection import NONPARAMETRIC_TERMS, _note_most_similar
 from pipeline.gap.naming.gap_score import simulate_errors

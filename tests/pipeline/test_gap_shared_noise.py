@@ -9,8 +9,8 @@ import pytest
 from scipy.stats import kstest, multivariate_normal
 from threadpoolctl import threadpool_limits
 
-from pipeline.gap.mean.candidates import nonparametric_terms
 from pipeline.gap.mean.mean_model import MeanModel
+from pipeline.gap.mean.nonparametric_terms import nonparametric_terms
 from pipeline.gap.mean.normal_equations import NoiseDraws
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.naming.validation_scores import _RegisteredResiduals

@@ -11,7 +11,8 @@ from surfaces import heightfield
 
 from pipeline.cli.main import main
 from pipeline.icp_study.report import write_icp_study
-from pipeline.icp_study.study import EpochSurfaces, Recommendation, StudyRow, recommend, study, true_pose
+from pipeline.icp_study.results import Recommendation, StudyRow
+from pipeline.icp_study.study import EpochSurfaces, recommend, study, true_pose
 from pipeline.registration.register import IcpConfig
 from pipeline.registration.rigid import RigidTransform
 from scene.common.keyed_random import KeyedRandom

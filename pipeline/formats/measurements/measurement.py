@@ -267,7 +267,7 @@ class SurfaceMeasurement(MeasurementBase):
 
     @property
     def surface_fit(self) -> SurfaceFit:
-        """How well the measured points fit the reference surface, by their distance from it."""
+        """How well the measured points fit the reference surface, by the distances of a subsample to its nearest vertices."""
         return SurfaceFit.of(self.cloud.points, self.reference)
 
     def check_near(self, where: str) -> None:

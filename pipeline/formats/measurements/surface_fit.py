@@ -21,13 +21,15 @@ NEAR_SHARE = 0.05
 
 @dataclass(frozen=True)
 class SurfaceFit:
-    """How well a sample of measured points fits the reference surface, by their distances from it.
+    """How well measured points fit a reference surface, to see whether both show the same wall in the same coordinate system.
+
+    Distances are those from a subsample of the points, evenly spaced in their order, to the nearest vertex of the reference.
 
     Attributes
     ----------
-    near : Share of the points that are near.
+    near : Share of the subsample whose distance is at most `reach_m`.
     off_m : Median distance, m.
-    reach_m : Distance up to which a point is near, m.
+    reach_m : Largest distance at which a point counts as near, m.
     """
 
     near: float
@@ -36,7 +38,15 @@ class SurfaceFit:
 
     @classmethod
     def of(cls, points: FloatArray, reference: TriangleMesh) -> SurfaceFit:
-        """Compare measured points (n, 3) with the reference surface, in the same frame, m."""
+        """Measure how well points fit a reference surface, by their distances from its nearest vertices.
+
+        Up to about 40,000 points are all used. Of more, a subsample is used, evenly spaced in their order, of 20,000 to 30,000.
+
+        Parameters
+        ----------
+        points : (n, 3) measured points, in the frame of the reference, m.
+        reference : mesh of the reference surface.
+        """
         from scipy.spatial import cKDTree
 
         reach = near_m(reference)
@@ -46,13 +56,14 @@ class SurfaceFit:
 
     @property
     def good(self) -> bool:
-        """Whether so many of the measured points are near the reference surface that they belong to it."""
+        """Whether measured points can belong to a reference surface: 25 % or more of a subsample are near a vertex of it."""
         return self.near >= _FEWEST_NEAR
 
     def check(self, where: str) -> None:
-        """Raise InputError if the measured points do not belong to the reference surface.
+        """Raise InputError unless measured points can belong to a reference surface: 25 % or more are near a vertex of it.
 
-        where: name of the points' file, for the error.
+        If they do not, points and reference show different walls, or have different coordinate systems or units. where: name of
+        the points' file, for the error.
         """
         if self.good:
             return
@@ -64,16 +75,20 @@ class SurfaceFit:
 
 
 def near_m(reference: TriangleMesh) -> float:
-    """Return the distance from the nearest vertex of the reference up to which a measured point belongs to its surface, m."""
+    """Return the largest distance from a reference surface's nearest vertex at which a point still belongs to it, m.
+
+    It is 5 % of the diagonal of the mesh's bounding box, plus the median length of an edge.
+    """
     extent = float(np.linalg.norm(np.ptp(reference.bounds, axis=0)))
     corners = reference.corners()
     return NEAR_SHARE * extent + float(np.median(np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)))
 
 
 def air_side(mesh: TriangleMesh) -> FloatArray:
-    """Return a place in front of the middle of a rock surface, (3,) in its frame, m, to know which side is air.
+    """Return a place in front of the middle of a rock surface, to know which side of the mesh is air and which is rock.
 
-    It is on the side that the triangles face.
+    mesh: the surface; its triangles face the air. Returns (3,) coordinates in the frame of the mesh, m, two diagonals of its
+    bounding box away.
     """
     local = mesh.vertices - mesh.vertices.mean(axis=0)
     normal = np.linalg.eigh(np.einsum("ni,nj->ij", local, local))[1][:, 0]
@@ -85,9 +100,9 @@ def air_side(mesh: TriangleMesh) -> FloatArray:
 
 
 def check_in_metres(model: StereoModel, where: str) -> None:
-    """Raise InputError if a stereo model cannot be used for a surface from unknown cameras.
+    """Raise InputError if a stereo model cannot be used for a surface whose cameras are unknown.
 
-    That is so if it has no noise in metres, or has effects of cameras. where: name of the file, for the error.
+    Such a model must state noise in metres, and no errors of cameras. where: name of the file, for the error.
     """
     of_cameras = [effect.name for effect in model.effects if effect.stage != Stage.POINT]
     if of_cameras:

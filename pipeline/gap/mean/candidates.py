@@ -1,7 +1,8 @@
-"""Define the candidate explanations of the residuals: effects of the catalogue and non-parametric terms, as design columns.
+"""Define the candidate explanations of the residuals as design columns of a regression.
 
-A candidate is linear in its coefficients. A sine of unknown period is linear in sine and cosine; its period is searched on a
-grid.
+A candidate is an effect of the catalogue (`signatures.py` makes them) or a term that names no cause
+(`nonparametric_terms.py`). It is linear in its coefficients. A sine of unknown period is linear in sine and cosine; its period
+is searched on a grid.
 """
 
 from __future__ import annotations
@@ -18,50 +19,25 @@ from scene.geometry.mesh import FloatArray
 Rows = NDArray[np.int64]
 ExplanationKey = tuple[str, bool]
 """Identifies an effect, or all non-parametric terms of a covariate: its name, and whether it is empirical."""
-_KNOTS = 5
-"""Knots of the spline, both ends included."""
-_STEPS = 13
-"""Places at which a step in a covariate is tried: quantiles of its values."""
-MOST_CYCLES = 12.0
-"""Most cycles of a wave over the extent of a covariate."""
-MOST_CYCLES_OF_A_SENSOR = 40.0
-"""The same for errors that only a sensor can have: graduation errors of a circle, or column read-out, repeat tens of times in
-a field of view; properties of a wall do not.
-"""
 _CHUNK = 32
 """Frequencies whose columns are computed together."""
-SPATIAL_NULL = "spatial null"
-"""Start of the names of spatial null candidates."""
-HARMONICS, HARMONIC_SERIES, POLYNOMIAL = "harmonics", "wave with overtones", "polynomial"
-"""Forms of candidates: overtones beside a sine of the catalogue, a wave with its overtones, and a polynomial of two covariates.
-"""
-LINE_PATTERN = "repeating every"
-"""Start of the form of patterns that repeat after `fixed["lines"]` scan lines, columns or rows."""
-_DEGREE = 4
-"""Degree of the polynomial of two covariates."""
-HARMONIC_ORDERS = 5, 11
-"""Highest overtones that are tried beside a sine: few for a smooth periodic error, more for one that jumps."""
-_PATTERN_LINES = range(2, 9)
-"""Numbers of lines after which a pattern may repeat."""
 _SCALE_UNKNOWN = 0.03
 """Relative uncertainty of the principal distance in which disparities were computed."""
 _MOST_SCALES = 80
 """Most frequencies of a sine of the disparity."""
-_DIRECTIONS = (30, 60, 120, 150)
-"""Oblique directions on the wall, degrees from x, along which no sensor has an axis."""
 
 
 @dataclass(frozen=True)
 class Wave:
-    """A sinusoidal effect along one quantity x, whose period has to be searched.
+    """A sinusoidal error along one quantity x, such as a wobble along the azimuth, whose period is not known in advance.
 
-    Its two design columns are factor * sin(2 pi x / period) and factor * cos(2 pi x / period), so that amplitude and phase are
-    linear coefficients.
+    In a regression it has two design columns, factor * sin(2 pi x / period) and factor * cos(2 pi x / period). Amplitude and
+    phase follow from their two coefficients; the period has to be searched.
 
     Attributes
     ----------
     key : Name of the effect's parameter that holds the period, such as `period_px`.
-    factor : (n,) change of the observable (range, disparity or distance) for a sine of amplitude 1.
+    factor : (n,) change of the observable (range in m, disparity in px, or distance in m) at n points for a sine of value 1.
     x : (n,) quantity along which the sine runs, such as an angle in rad.
     least : Lowest frequency 1 / period to try; a slower sine cannot be distinguished from a linear trend.
     """
@@ -72,69 +48,77 @@ class Wave:
     least: float = 0.0
 
     def columns(self, period: float) -> FloatArray:
-        """Return the (n, 2) sine and cosine columns for one period, which is in the unit of x."""
+        """Return the two design columns of a sinusoidal error at n points for one trial period: sine and cosine, (n, 2).
+
+        period: period in the unit of the quantity x along which the sine runs.
+        """
         angle = 2 * np.pi / period * self.x
         return self.factor[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=1)
 
     def stepped_period(self, period: float, change: float) -> float:
-        """Take one step of the period search: add `change` to the frequency and return the new period.
+        """Take one step of the search for a sine's period: add `change` to the frequency 1 / period and return the new period.
 
-        The step is limited to 0.3 / (extent of x), the resolution of the frequency, so that the search cannot jump past a
-        maximum.
+        The step is limited to 0.3 cycles over the extent of x, the quantity along which the sine runs. The search then cannot
+        jump past a maximum of the likelihood.
 
         Parameters
         ----------
         period : Present period, unit of x.
-        change : Wanted change of the frequency 1 / period.
+        change : Wanted change of the frequency 1 / period, from a Gauss-Newton fit.
 
         Returns
         -------
-        The new period, unit of x. Its frequency is at least `least`.
+        The new period, unit of x. Its frequency is at least the lowest one to try, the attribute `least`.
         """
         step = 0.3 / float(np.ptp(self.x))
         return 1 / max(1 / period + float(np.clip(change, -step, step)), self.least)
 
     def with_frequency_derivative(self, period: float, coefficients: FloatArray) -> FloatArray:
-        """Return the sine and cosine columns, and a third column with which a fit can correct the frequency.
+        """Return the design columns of a sinusoidal error for one Gauss-Newton step, which also corrects the frequency.
 
-        The third column is the derivative of the fitted wave with respect to its frequency 1 / period.
+        The first two columns are the sine and the cosine at the present period. The third one is the derivative of the fitted
+        wave with respect to the frequency 1 / period; its coefficient is the correction.
 
         Parameters
         ----------
-        period : Period, unit of x.
+        period : Present period, in the unit of the quantity along which the sine runs.
         coefficients : (2,) present coefficients of the sine and the cosine column.
 
         Returns
         -------
-        (n, 3) columns.
+        (n, 3) columns at the n points.
         """
         sine, cosine = self.columns(period).T
         derivative = 2 * np.pi * self.x * (coefficients[0] * cosine - coefficients[1] * sine)
         return np.stack([sine, cosine, derivative], axis=1)
 
     def part(self, rows: Rows) -> Wave:
-        """Return the wave at a subset of the n points, given as row numbers, a mask or a slice."""
+        """Return the sinusoidal error at a subset of its n points.
+
+        rows: numbers of the points to keep, from 0, as an int64 array.
+        """
         return Wave(self.key, self.factor[rows], self.x[rows], self.least)
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One possible explanation of the residuals at n points: a regression term with k linear coefficients.
+    """One possible explanation of the residuals at n points: a regression term with k coefficients to fit.
 
-    It is an effect of the catalogue, such as a range offset, or a non-parametric term of a covariate. Residuals are explained as
-    `columns` times coefficients.
+    It is either an effect, a sensor error of the catalogue such as a range offset, or a non-parametric term: a line, spline or
+    wave along a covariate that names no cause. It explains the residuals as its design columns (n, k) times the coefficients.
 
     Attributes
     ----------
-    name : Tag of the effect, such as "range_offset", or name of the covariate of a non-parametric term.
-    matrix : (n, k) change of the observable (range, disparity or distance) per unit of each coefficient; None for a sine, whose
-        columns follow from its period.
-    parameters : Function from the (k,) coefficients to the effect's parameter values by name.
-    names : Parameters that the coefficients stand for.
-    fixed : Parameter values of this variant of the effect that are not fitted linearly, such as the camera or a period.
+    name : Tag of the effect, such as "range_offset", or name of the covariate of a non-parametric term, such as "azimuth".
+    matrix : (n, k) design columns: change of the observable (range in m, disparity in px, or distance in m) per unit of each
+        coefficient. None for a sine, whose columns follow from `wave` and `period`.
+    parameters : Function from the (k,) coefficients to the effect's parameter values by name, such as amplitude and phase.
+    names : Names of the parameters that are fitted.
+    fixed : Parameter values by name that are not fitted, such as the camera or a trial period. They tell the variants of one
+        effect apart.
     empirical : True for a non-parametric term, false for an effect of the catalogue.
-    form : Form of a non-parametric term, such as "line" or "wave".
-    wave, period : For a sine, its wave and its period; overtones have a period too.
+    form : Form of a non-parametric term, such as "line" or "wave"; "" for an effect.
+    wave, period : For a sine, the quantity along which it runs with its scale, and its period; overtones have a period too.
     prior_precision : (k,) prior inverse variances of the coefficients, from typical sizes of the effect; None without a prior.
     angle : For a non-parametric term that is an error of a recorded angle, the name of that angle; else "".
     """
@@ -153,43 +137,57 @@ class Candidate:
 
     @cached_property
     def columns(self) -> FloatArray:
-        """(n, k) design columns: change of the observable per unit of each coefficient."""
+        """(n, k) design columns of a candidate error at n points, for a regression with k coefficients.
+
+        A column is the change of the observable (range, disparity or distance) per unit of a coefficient.
+        """
         if self.matrix is not None:
             return self.matrix
         return self.sine.columns(self.period)
 
     @property
     def sine(self) -> Wave:
-        """The wave of a sinusoidal candidate. Raises TypeError if the candidate is not a sine."""
+        """The sine of a candidate that is a sinusoidal error: the quantity along which it runs, and its scale at each point.
+
+        Raises TypeError if the candidate is not sinusoidal.
+        """
         if self.wave is None:
             raise TypeError(f"candidate {self.name} is not a sine")
         return self.wave
 
     def part(self, rows: Rows) -> Candidate:
-        """Return the candidate at a subset of the n points, given as row numbers, a mask or a slice."""
+        """Return the candidate at a subset of its n points.
+
+        rows: numbers of the points to keep, from 0, as an int64 array.
+        """
         matrix = None if self.matrix is None else self.matrix[rows]
         return replace(self, matrix=matrix, wave=None if self.wave is None else self.wave.part(rows))
 
     @property
     def family(self) -> str:
-        """Name that all variants of one explanation share.
+        """Name that all variants of one explanation share, by which the search groups them.
 
-        Variants differ only in searched or chosen values, such as the period or the camera. The search compares families by their
-        best variants.
+        Variants of one effect differ only in values that are tried, such as the period or the camera. The search represents
+        each family by its best variant. For a non-parametric term the name is made of covariate, form and angle.
         """
         return f"free {self.name} {self.form} {self.angle}" if self.empirical else self.name
 
 
 @dataclass(frozen=True, eq=False)
 class SineGrid:
-    """A sinusoidal effect that is tried at f evenly spaced frequencies; each frequency is a candidate.
+    """A sinusoidal error of unknown period that is tried at f evenly spaced frequencies.
+
+    Each frequency gives one candidate: a regression term with a sine and a cosine column at n points.
 
     Attributes
     ----------
-    name, fixed, empirical, angle : As in `Candidate`, the same for all frequencies.
+    name : Tag of the effect, or name of the covariate of a non-parametric wave.
     amplitude : Name of the effect's parameter that holds the amplitude.
-    wave : The sine, with its values at n points.
-    frequencies : (f,) frequencies to try, cycles per unit of the wave's x.
+    wave : The quantity x along which the sine runs, and the change of the observable for a sine of value 1, at n points.
+    frequencies : (f,) frequencies to try, cycles per unit of x.
+    fixed : Parameter values by name that are not fitted, such as the camera.
+    empirical : True for a non-parametric wave, which names no cause; false for an effect of the catalogue.
+    angle : For a non-parametric wave that is an error of a recorded angle, the name of that angle; else "".
     """
 
     name: str
@@ -201,13 +199,20 @@ class SineGrid:
     angle: str = ""
 
     def candidate(self, index: int) -> Candidate:
-        """Return the candidate at the frequency with this index, from 0."""
+        """Return the sinusoidal error at one of its trial frequencies as a candidate for a regression.
+
+        index: index into `frequencies`, from 0.
+        """
         return self.at_period(1 / float(self.frequencies[index]))
 
     def at_period(self, period: float) -> Candidate:
-        """Return the candidate with the given period, which need not lie on the grid.
+        """Return the sinusoidal error with a given period, which need not be one of the trial periods, as a candidate.
 
-        Its coefficients are those of the sine and the cosine. A third coefficient, if present, is a change of the frequency.
+        Two coefficients are fitted, of a sine and a cosine column. The candidate's function `parameters` converts them to
+        amplitude and phase; if a third value is given, it is a correction of the frequency 1 / period, which changes the
+        period.
+
+        period: period in the unit of the quantity along which the sine runs.
         """
         amplitude, key = self.amplitude, self.wave.key
 
@@ -222,18 +227,19 @@ class SineGrid:
 
     @property
     def chunks(self) -> list[SineGrid]:
-        """The grid divided into grids of at most 32 frequencies, so that their columns fit into memory."""
+        """The trial frequencies divided into grids of at most 32, so that the design columns of one grid fit into memory."""
         starts = range(0, len(self.frequencies), _CHUNK)
         return [replace(self, frequencies=self.frequencies[start : start + _CHUNK]) for start in starts]
 
     def columns(self, rows: FloatArray) -> FloatArray:
-        """Compute the design columns of all frequencies at once, each multiplied by a weight per point.
+        """Compute the sine and cosine design columns of all f trial frequencies at once, each row multiplied by a weight.
 
-        Frequencies are evenly spaced, so each pair of columns is the preceding pair rotated by the same phase angle.
+        This is quicker than one frequency at a time: the frequencies are evenly spaced, so each pair of columns is the
+        preceding pair rotated by the same phase angle at each point.
 
         Parameters
         ----------
-        rows : (n,) factor for each row, such as the inverse standard deviation.
+        rows : (n,) weight of each point, such as the inverse of its standard deviation.
 
         Returns
         -------
@@ -250,12 +256,18 @@ class SineGrid:
         return columns.T
 
     def part(self, rows: Rows) -> SineGrid:
-        """Return the grid at a subset of the n points, given as row numbers, a mask or a slice."""
+        """Return the grid of sines at a subset of its n points.
+
+        rows: numbers of the points to keep, from 0, as an int64 array.
+        """
         return replace(self, wave=self.wave.part(rows))
 
 
 def expand_grids(families: list[Candidate | SineGrid]) -> list[Candidate]:
-    """Return a flat list of candidates, in which each sine grid is replaced by one candidate per frequency."""
+    """Return a flat list of candidate errors, in which a sine of unknown period becomes one candidate per trial frequency.
+
+    families: candidates with known design columns, and sines with their grids of trial frequencies.
+    """
     return [
         candidate
         for family in families
@@ -266,132 +278,58 @@ def expand_grids(families: list[Candidate | SineGrid]) -> list[Candidate]:
 
 
 def amplitude_and_phase(values: FloatArray, amplitude: str) -> dict[str, float]:
-    """Convert the coefficients of sine and cosine to amplitude and phase: a sin x + b cos x = A sin(x + phase).
+    """Convert the fitted coefficients of a sine and a cosine to amplitude and phase: a sin x + b cos x = A sin(x + phase).
 
     Parameters
     ----------
-    values : (2,) coefficients a and b.
-    amplitude : Name under which A is returned.
+    values : (2,) coefficients a and b, in any unit.
+    amplitude : Name under which A is returned, such as "amplitude_px".
 
     Returns
     -------
-    A under the given name, and `phase_rad`.
+    The amplitude A under the given name, in the unit of a and b, and `phase_rad`, the phase in rad.
     """
     return {amplitude: float(np.hypot(*values)), "phase_rad": float(np.arctan2(values[1], values[0]))}
 
 
 def frequency_grid(low: float, high: float, step: float, most: int = 200) -> FloatArray:
-    """Return evenly spaced frequencies from `low` to `high`, for a search of a period.
+    """Return evenly spaced trial frequencies from `low` to `high`, with which the period of a sinusoidal error is searched.
 
     Parameters
     ----------
     low, high : First and last frequency, in any unit.
-    step : Approximate spacing, same unit.
-    most : Largest number of frequencies; the spacing is widened to keep it.
+    step : Approximate spacing, same unit; the spacing is wider where `most` requires it.
+    most : Largest number of frequencies.
     """
     return np.linspace(low, high, int(np.clip(np.ceil((high - low) / step), 2, most)))
 
 
 def disparity_frequencies(cycles: float, reach: float) -> FloatArray:
-    """Return the frequencies at which pixel locking is searched, in cycles per pixel of disparity.
+    """Return trial frequencies for pixel locking, the error of a stereo matcher that repeats with the pixels of the disparity.
 
-    The matcher's rectification may have another scale than the nominal one. The nominal frequency is therefore known only to
-    about 3 %.
+    The matcher may have worked in a rectification of another scale than the nominal one. The frequencies therefore reach from
+    3 % below the nominal one to 3 % above it.
 
     Parameters
     ----------
-    cycles : Nominal frequency, cycles per pixel.
+    cycles : Nominal frequency, cycles per pixel of disparity.
     reach : Difference of the largest and smallest disparity, px; it determines the spacing of the frequencies.
+
+    Returns
+    -------
+    (f,) frequencies, cycles per pixel of disparity; at most 80.
     """
     return frequency_grid(cycles * (1 - _SCALE_UNKNOWN), cycles * (1 + _SCALE_UNKNOWN), 0.3 / max(reach, 1.0), _MOST_SCALES)
 
 
-def nonparametric_terms(
-    covariate: str, values: FloatArray, highest: float = np.inf, most_cycles: float = MOST_CYCLES
-) -> list[Candidate | SineGrid]:
-    """Make regression terms of one covariate that name no cause: line, parabola, spline, steps and waves.
-
-    They describe errors for which the catalogue has no effect.
-
-    Parameters
-    ----------
-    covariate : Name of the covariate.
-    values : (n,) covariate of each point.
-    highest : Waves from this frequency on, in cycles per unit of the values, are left out because an effect of the catalogue has
-        them.
-    most_cycles : Largest number of cycles of a wave over the extent of the values.
-    """
-    x = _standardised(values)
-    smooth = _spline_columns(x)
-    steps = np.unique(np.quantile(x, np.linspace(0, 1, _STEPS + 2)[1:-1]))
-    waves = _wave_frequencies(x, most_cycles, highest * float(values.std()))
-    return [
-        _nonparametric(covariate, "line", smooth[:, :1]),
-        _nonparametric(covariate, "parabola", smooth[:, :2]),
-        _nonparametric(covariate, "spline", smooth),
-        *(_nonparametric(covariate, "step", (x > place).astype(np.float64)[:, None]) for place in steps),
-        *(SineGrid(covariate, "amplitude", _wave(np.ones_like(x), x, tried), tried, {}, True) for tried in waves),
-    ]
-
-
-def angle_error_terms(angle: str, covariate: str, values: FloatArray, lever: FloatArray) -> list[Candidate | SineGrid]:
-    """Make regression terms for an error of a recorded angle that varies with a covariate: line, spline and waves.
-
-    Waves are made only along the angle itself: an unevenly divided circle may have many cycles in a field of view. Waves of the
-    zenith angle along the azimuth are left out, because the catalogue's wobble effect has them.
-
-    Parameters
-    ----------
-    angle : Name of the recorded angle that has the error.
-    covariate : Name of the covariate along which the error varies.
-    values : (n,) covariate of each point.
-    lever : (n,) change of the observable per radian of the angle.
-    """
-    x = _standardised(values)
-    smooth = _spline_columns(x) * lever[:, None]
-    forms = [_nonparametric(covariate, "line", smooth[:, :1]), _nonparametric(covariate, "spline", smooth)]
-    waves = _wave_frequencies(x, MOST_CYCLES_OF_A_SENSOR) if angle == covariate else []
-    found = [SineGrid(covariate, "amplitude", _wave(lever, x, tried), tried, {}, True, angle) for tried in waves]
-    return [*(replace(form, angle=angle) for form in forms), *found]
-
-
-def _standardised(values: FloatArray) -> FloatArray:
-    """Values with mean 0 and standard deviation 1."""
-    return np.asarray((values - values.mean()) / (float(values.std()) or 1.0))
-
-
-def _spline_columns(x: FloatArray) -> FloatArray:
-    """(n, k) columns of a cubic spline."""
-    knots = np.quantile(x, np.linspace(0, 1, _KNOTS)[1:-1])
-    columns = [x, x**2, x**3, *(np.maximum(x - knot, 0) ** 3 for knot in knots)]
-    return np.stack([column / max(float(column.std()), 1e-12) for column in columns], axis=1)
-
-
-def robust_extent(x: FloatArray) -> float:
-    """Return the extent of values (n,), without the outermost 0.5 % at either end.
-
-    The cycles of a wave are counted over this extent.
-    """
-    return float(np.ptp(np.quantile(x, [0.005, 0.995])))
-
-
-def _wave_frequencies(x: FloatArray, most_cycles: float, highest: float = np.inf) -> list[FloatArray]:
-    """Frequencies of waves to try, as a list of one array; empty if there are fewer than two."""
-    reach = robust_extent(x)
-    if reach <= 0:
-        return []
-    tried = frequency_grid(0.8 / reach, most_cycles / reach, 0.5 / reach)
-    tried = tried[tried < highest]
-    return [tried] if len(tried) > 1 else []
-
-
-def _wave(factor: FloatArray, x: FloatArray, tried: FloatArray) -> Wave:
-    """Make a wave for a non-parametric term in x, starting at the lowest of the frequencies `tried`."""
-    return Wave("period", factor, x, float(tried[0]))
-
-
 def with_period(candidate: Candidate, period: float) -> Candidate:
-    """Return the same sinusoidal candidate with another period, in the unit of the wave's x."""
+    """Return a copy of a sinusoidal candidate with another period, as a search for the best period needs it.
+
+    Parameters
+    ----------
+    candidate : Candidate error that is a sine. TypeError is raised for another one.
+    period : New period, in the unit of the quantity along which the sine runs.
+    """
     sine, fixed = candidate.sine, candidate.fixed
     return SineGrid(candidate.name, candidate.names[0], sine, np.empty(0), fixed, candidate.empirical, candidate.angle).at_period(
         period
@@ -399,98 +337,15 @@ def with_period(candidate: Candidate, period: float) -> Candidate:
 
 
 def prior_precision(candidate: Candidate, width: int) -> FloatArray:
-    """Return the prior inverse variances of a candidate's coefficients, padded with 0 (no prior) to `width`.
+    """Return the prior inverse variances of a candidate's coefficients for a regression; 0 (no prior) where none are stated.
 
     Parameters
     ----------
-    candidate : The candidate.
-    width : Number of columns that are fitted; one more than the candidate's own if its frequency is fitted too.
+    candidate : The candidate error.
+    width : Number of columns that are fitted; for a sine one more than its own two if its frequency is fitted too.
 
     Returns
     -------
-    (width,) prior inverse variances.
+    (width,) prior inverse variances; all 0 for a candidate without a prior. Sines have no prior.
     """
     return np.zeros(width) if candidate.prior_precision is None else candidate.prior_precision
-
-
-def harmonics(covariate: str, sine: Candidate, last: int) -> Candidate:
-    """Make one candidate of all overtones of a sine, which describe a periodic error that is not sinusoidal.
-
-    Parameters
-    ----------
-    covariate : Covariate along which the error repeats.
-    sine : The fundamental.
-    last : Order of the highest overtone, such as 5 for a fifth of the period.
-    """
-    columns = np.concatenate([sine.sine.columns(sine.period / overtone) for overtone in range(2, last + 1)], axis=1)
-    return replace(_nonparametric(covariate, HARMONICS, columns), period=sine.period, angle=sine.angle)
-
-
-def line_pattern_terms(covariate: str, number: FloatArray, step: float) -> list[Candidate]:
-    """Make regression terms for errors that repeat every 2 to 8 scan lines, columns or rows, with a free value for each line.
-
-    Such patterns come from the facets of a mirror, or from a sensor that is read out in blocks.
-
-    Parameters
-    ----------
-    covariate : Name of the covariate that counts the lines.
-    number : (n,) number of the line on which each point lies.
-    step : Difference of the covariate from one line to the next.
-    """
-    found = []
-    for lines in _PATTERN_LINES:
-        place = np.mod(np.rint(number), lines)
-        columns = (place[:, None] == np.arange(1, lines)) - 1 / lines
-        if all(np.ptp(column) > 0 for column in columns.T):
-            form = _nonparametric(covariate, f"{LINE_PATTERN} {lines}", columns)
-            found.append(replace(form, fixed={"lines": lines}, period=lines * abs(step)))
-    return found
-
-
-def half_pixel_sine(covariate: str, disparity: FloatArray) -> list[SineGrid]:
-    """Make a sine with two cycles per pixel of disparity, for interpolation errors that repeat every half pixel.
-
-    One cycle per pixel is an effect of the catalogue (pixel locking).
-
-    Parameters
-    ----------
-    covariate : Name of the covariate.
-    disparity : (n,) disparities, px.
-    """
-    x, reach, unit = _standardised(disparity), robust_extent(disparity), float(disparity.std())
-    tried = unit * disparity_frequencies(2.0, reach)
-    return [SineGrid(covariate, "amplitude", _wave(np.ones_like(x), x, tried), tried, {}, True)] if unit else []
-
-
-def polynomial_term(first: str, second: str, x: FloatArray, y: FloatArray) -> Candidate:
-    """Make a polynomial of degree 4 in two covariates, as a non-parametric term.
-
-    Parameters
-    ----------
-    first, second : Names of the covariates.
-    x, y : (n,) values of the first and of the second covariate.
-    """
-    s, t = _standardised(x), _standardised(y)
-    powers = [(a, degree - a) for degree in range(1, _DEGREE + 1) for a in range(degree + 1)]
-    columns = np.stack([s**a * t**b for a, b in powers], axis=1)
-    return _nonparametric(f"{first} and {second}", POLYNOMIAL, columns / columns.std(axis=0))
-
-
-def spatial_null_candidates(at: FloatArray) -> list[Candidate | SineGrid]:
-    """Make regression terms along oblique directions on the wall, as a control for errors of the reference surface.
-
-    No sensor has an axis along these directions, so what the terms explain is most likely the reference's error. A term of a
-    covariate that varies along the wall must explain more than they do.
-
-    Parameters
-    ----------
-    at : (n, 2) points, wall frame, m.
-    """
-    turned = [(angle, at @ np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])) for angle in _DIRECTIONS]
-    return [form for angle, x in turned for form in nonparametric_terms(f"{SPATIAL_NULL} {angle}", x)]
-
-
-def _nonparametric(covariate: str, form: str, matrix: FloatArray) -> Candidate:
-    """Make the candidate of a non-parametric term of a covariate. form: its kind, such as "spline"; matrix: (n, k) columns."""
-    names = tuple(f"c{index}" for index in range(matrix.shape[1]))
-    return Candidate(covariate, matrix, lambda c: dict(zip(names, map(float, c), strict=True)), names, {}, True, form)

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.gap.mean.candidates import Candidate, SineGrid, prior_precision, with_period
-from pipeline.gap.mean.mean_model import CellCovariance, MeanFit, MeanModel, ProjectedColumns, column_chunks, fit_reml
+from pipeline.gap.mean.mean_model import CellCovariance, MeanFit, MeanModel, column_chunks, fit_reml
 from pipeline.gap.mean.normal_equations import NoiseDraws, NormalEquations, SineProducts, assemble, extend, sine_products
+from pipeline.gap.mean.projected_columns import ProjectedColumns
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.wall_blocks import WallCells
 from pipeline.gap.thresholds import thresholds
@@ -31,14 +32,15 @@ _NULL_ROWS = 8_000
 
 @dataclass(frozen=True, eq=False)
 class CandidateFamilies:
-    """All candidates of a search, divided into those with fixed design columns and sines whose period is searched.
+    """All candidate explanations of the residuals, divided into those with known design columns and sines of unknown period.
 
-    A family is the set of all variants of one explanation, such as an effect with different cameras or periods.
+    A family is the set of all variants of one explanation, such as an effect with different cameras or periods. The search
+    compares families by their best variants.
 
     Attributes
     ----------
-    plain : Candidates with fixed columns; effects of the catalogue come before non-parametric terms.
-    grids : Sines, each with a grid of frequencies.
+    plain : Candidates with known columns; effects of the catalogue come before non-parametric terms.
+    grids : Sines of unknown period, each with its grid of trial frequencies.
     """
 
     plain: list[Candidate]
@@ -46,13 +48,20 @@ class CandidateFamilies:
 
     @classmethod
     def of(cls, families: list[Candidate | SineGrid]) -> CandidateFamilies:
-        """Divide a list of candidates and sine grids into the two kinds."""
+        """Divide a list of candidate explanations of residuals into those with known columns and sines of unknown period.
+
+        families: the candidates, in any order; a sine of unknown period is one `SineGrid` with all its trial frequencies.
+        """
         plain = sorted((family for family in families if isinstance(family, Candidate)), key=lambda each: each.empirical)
         return cls(plain, [family for family in families if isinstance(family, SineGrid)])
 
     @cached_property
     def by_name(self) -> dict[str, tuple[list[int], list[int]]]:
-        """For the name of each family, two lists of indices: its candidates in `plain`, and its sines as `sine` counts them."""
+        """For the name of each family (all variants of one explanation), which candidates belong to it: two lists of indices.
+
+        The first list has indices into `plain`. The second one has the numbers of its sines, counted through the trial
+        frequencies of all `grids` one after the other, from 0, as the method `sine` takes them.
+        """
         families: dict[str, tuple[list[int], list[int]]] = {}
         for row, candidate in enumerate(self.plain):
             families.setdefault(candidate.family, ([], []))[0].append(row)
@@ -64,10 +73,10 @@ class CandidateFamilies:
         return families
 
     def sine(self, number: int) -> Candidate:
-        """Return one sine as a candidate.
+        """Return the sine at one trial frequency as a candidate.
 
-        `number` counts through the frequencies of the first element of `grids`, then through those of the next, from 0. Raises
-        IndexError if there are fewer.
+        number: counts through the trial frequencies of the first element of `grids`, then through those of the next, from 0.
+        Raises IndexError if there are fewer.
         """
         for grid in self.grids:
             if number < len(grid.frequencies):
@@ -78,28 +87,30 @@ class CandidateFamilies:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """The regression problem of one search: residuals at n points, with the columns of the pose and of all candidates.
+    """The regression problem of one search for systematic errors: n residuals, and the columns of pose and all candidates.
 
-    Columns are divided by the predicted standard deviation and projected into two parts: deviations within cells of the
-    wall, and cell means (see `ProjectedColumns`). Designs are immutable.
+    A candidate is a possible sensor error, or a term that names no cause. Residuals and columns are divided by the predicted
+    standard deviation sigma of each point. They are then split into the means of square cells of the wall, and deviations
+    within these cells (see `ProjectedColumns`). Designs are immutable.
 
     Attributes
     ----------
-    residuals : The residuals.
+    residuals : Residuals of the n points, with the derivatives by the pose (position and orientation of the sensor).
     families : The candidates.
-    cells : The cells into which the wall is divided.
-    model : The mean model, with the covariances of reference error and noise.
-    pose_basis : (n, p) orthonormal basis of the pose Jacobian over sigma; rows as in `model.rows`.
-    pose_transform : (p, p) matrix R with pose Jacobian over sigma = pose_basis R.
-    pose_precision : (p,) prior inverse variances of the pose parameters.
-    grids : The sine grids; rows as in `model.rows`.
-    value : The residuals over sigma, projected.
-    fixed : The columns of the pose, then of the candidates with fixed columns, projected.
-    sine_columns : Projected columns of sines that are held at one period, numbered after those of `fixed`; None without any.
+    cells : The square cells of the wall, with the points in each.
+    model : Generalised least squares with the covariances of the reference surface's error and of the noise.
+    pose_basis : (n, p) orthonormal basis of the p pose columns over sigma; rows as in `model.rows`.
+    pose_transform : (p, p) matrix R with pose columns over sigma = pose_basis R.
+    pose_precision : (p,) prior inverse variances of the pose parameters; 0: no prior.
+    grids : Sines of unknown period with their trial frequencies; rows as in `model.rows`.
+    value : The residuals over sigma, split.
+    fixed : The columns of the pose, then of the candidates with known columns, split.
+    sine_columns : Split columns of sines that stay in the model at one period, numbered after those of `fixed`; None without
+        any.
     column_numbers : For each candidate the numbers of its columns.
-    sine_products : Inner products of the columns of the searched sines.
-    noise_products : (k, NULL_DRAWS) inner products of the fixed columns with simulated noise within cells.
-    equations : Normal equations under each covariance that the residuals allow.
+    sine_products : Inner products of the columns of all trial sines with the other columns.
+    noise_products : (k, d) inner products of the k columns in `fixed` with d = NULL_DRAWS draws of simulated noise within cells.
+    equations : Normal equations of all columns, under each covariance of the reference error that the residuals allow.
     """
 
     residuals: Residuals
@@ -126,14 +137,14 @@ class Design:
         random: KeyedRandom,
         pose_precision: FloatArray | None = None,
     ) -> Design:
-        """Build the design of a search.
+        """Build the regression problem in which all candidate explanations of some residuals are compared.
 
         Parameters
         ----------
-        residuals : Residuals of the points.
-        families : Candidates and sine grids to try.
+        residuals : Residuals of the points, with their standard deviations and derivatives by the pose.
+        families : Candidates to compare; a sine of unknown period is one `SineGrid`.
         random : Source of the random numbers for the simulated noise.
-        pose_precision : (p,) prior inverse variances of the pose parameters; None: no prior.
+        pose_precision : (p,) prior inverse variances of the coefficients of `residuals.pose_jacobian`; None: no prior.
         """
         chosen = CandidateFamilies.of(families)
         cells = WallCells.over(residuals.wall_xy)
@@ -164,28 +175,43 @@ class Design:
 
     @cached_property
     def pose_columns(self) -> list[int]:
-        """Numbers of the columns of the pose, which come first."""
+        """Numbers of the design columns of the sensor's pose, which come before those of the candidates."""
         return list(range(self.pose_basis.shape[1]))
 
     @cached_property
     def ranked_covariances(self) -> list[int]:
-        """Indices into `equations.covariances`, by the likelihood of a fit of the pose alone, the most likely first."""
+        """Trial covariances of the reference surface's error, as indices into `equations.covariances`, the most likely first.
+
+        They are ranked by the likelihood of a fit of the sensor's pose alone, without any candidate error.
+        """
         return [int(row) for row in np.argsort(-self.equations.log_likelihood(self.pose_columns)[:, 0], kind="stable")]
 
     @property
     def null_covariance(self) -> CellCovariance:
-        """The covariance of the cell means that is most likely if only the pose is fitted."""
+        """The covariance of the cell means that is most likely if only the sensor's pose is fitted, without any candidate error.
+
+        It is the sum of the reference surface's error, correlated between the cells of the wall, and noise. Simulations
+        without a sensor error are drawn under it.
+        """
         return self.equations.covariances[self.ranked_covariances[0]]
 
     @property
     def plain_columns(self) -> list[list[int]]:
-        """For each candidate of `families.plain`, the numbers of its columns."""
+        """The numbers of the design columns of each candidate that has known columns, in the order of `families.plain`.
+
+        Sines of unknown period are not included.
+        """
         return [self.column_numbers[candidate] for candidate in self.families.plain]
 
     def conditioned_on(self, candidate: Candidate) -> Design:
-        """Return the design in which further candidates can be scored in addition to the given one.
+        """Return the regression problem with one candidate error in the model, so that further ones can be scored beside it.
 
-        A sine is held at its period, refined to the maximum of the likelihood.
+        Its coefficients are then fitted together with those of each further candidate. The period of a sine is first refined
+        from the trial frequency to the maximum of the likelihood, and stays fixed from then on.
+
+        Parameters
+        ----------
+        candidate : The candidate to put into the model, at the same n points. It need not be one of `families`.
         """
         design = self if candidate in self.column_numbers else self._with_sine(candidate)
         return design._with_products(design.column_numbers[candidate])
@@ -220,33 +246,41 @@ class Design:
         )
 
     def columns(self, candidates: Sequence[Candidate]) -> list[int]:
-        """Return the column numbers of the pose and of candidates on which this design is conditioned."""
+        """Return the numbers of the design columns of a model: those of the sensor's pose, then those of some candidate errors.
+
+        candidates: members of the model. A sine must have been put into this design by `conditioned_on`.
+        """
         return [*self.pose_columns, *(column for each in candidates for column in self.column_numbers[each])]
 
     def log_likelihood(self, value: FloatArray, candidate: Candidate) -> float:
-        """Return the log-likelihood of a fit of the pose and one candidate to other residuals of the same points.
+        """Return the log-likelihood of a fit of the pose and one candidate error to other residuals of the same points.
+
+        With it the residuals before and after a refit of an effect without linearisation are compared.
 
         Parameters
         ----------
-        value : (n,) residuals, in the unit of the observable.
-        candidate : The candidate.
+        value : (n,) residuals, in the unit of the observable (m, or px of disparity).
+        candidate : The candidate error.
         """
         columns = self._projected_pose.append(self.model.project(_projected(self.pose_basis, self._matrix([candidate], None))))
         projected = self.model.project(value[self.model.rows, None] * self.model.inverse_sigma[:, None])
         return fit_reml(self.model.covariances, columns, projected).log_likelihood
 
     def fit(self, candidates: list[Candidate], wave_coefficients: list[FloatArray | None] | None = None) -> MeanFit:
-        """Fit the pose and some candidates jointly, under the covariance of the reference error that is most likely for them.
+        """Fit the sensor's pose and some candidate errors jointly to the residuals by generalised least squares.
+
+        The covariance of the reference surface's error is the one that is most likely for this model.
 
         Parameters
         ----------
-        candidates : Candidates to fit.
-        wave_coefficients : For each candidate, the present (2,) coefficients of its sine, if a change of its frequency is to be
-            fitted too, else None. None altogether: no frequency is fitted.
+        candidates : Candidate errors to fit; none: the pose alone.
+        wave_coefficients : For each candidate, the present (2,) sine and cosine coefficients of a sine whose frequency shall
+            be corrected too, else None. None instead of a list: no frequency is corrected.
 
         Returns
         -------
-        The fit. Its coefficients are those of `Residuals.pose_jacobian`, then those of each candidate.
+        The fit. Its coefficients are those of `residuals.pose_jacobian`, then those of each candidate in order; a corrected
+        frequency is a third coefficient of its sine.
         """
         turned = np.linalg.inv(self.pose_transform)
         if not candidates:
@@ -272,19 +306,19 @@ class Design:
         return replace(found, coefficients=back @ found.coefficients, covariance=back @ found.covariance @ back.T)
 
     def fit_refined(self, candidates: list[Candidate], rounds: int = 4) -> tuple[list[Candidate], MeanFit]:
-        """Fit the pose and some candidates jointly, with the periods of sines refined to the maximum of the likelihood.
+        """Fit the sensor's pose and some candidate errors jointly, and refine the periods of sines.
 
-        Periods are refined by Gauss-Newton.
+        Periods are refined by Gauss-Newton from a trial value to the maximum of the likelihood.
 
         Parameters
         ----------
-        candidates : Candidates to fit; sines have a period from the search grid.
+        candidates : Candidate errors to fit.
         rounds : Largest number of Gauss-Newton steps.
 
         Returns
         -------
-        The candidates with refined periods, and the joint fit. In it each sine has three coefficients: sine, cosine and change of
-        the frequency.
+        The candidates with refined periods, and the joint fit. In it each sine has three coefficients: sine, cosine, and a
+        remaining correction of the frequency.
         """
         found = list(candidates)
         wave_coefficients: list[FloatArray | None] = [None] * len(found)
@@ -303,25 +337,33 @@ class Design:
         return found, self.fit(found, wave_coefficients)
 
     def split_coefficients(self, values: NDArray[Any], candidates: list[Candidate]) -> list[NDArray[Any]]:
-        """Divide the coefficients of `fit_refined` by candidate, and drop those of the pose.
+        """Divide the coefficients that `fit_refined` returns into one array per candidate error, without those of the pose.
 
         Parameters
         ----------
-        values : (k,) coefficients, or any other array with one value for each coefficient.
-        candidates : The fitted candidates, in their order.
+        values : (k,) coefficients of the joint fit, or any other array with one value for each coefficient.
+        candidates : The fitted candidates, in the order of the fit. A sine has three coefficients.
         """
         widths = [candidate.columns.shape[1] + (candidate.wave is not None) for candidate in candidates]
         return np.split(values[len(self.pose_columns) :], np.cumsum(widths)[:-1]) if candidates else []
 
     def reference_sigma(self, candidates: list[Candidate]) -> float:
-        """Return the standard deviation of the reference's correlated error, estimated with some candidates in the model.
+        """Estimate the standard deviation of the reference surface's spatially correlated error.
 
         It is in the unit of the observable (m, or px of disparity).
+
+        candidates: candidate sensor errors that are fitted jointly with the pose, so that they do not count as reference
+        error.
         """
         return float(np.sqrt(self.fit(candidates).cell_covariance.variance_ratio)) * self.model.typical_sigma
 
     def residuals_after(self, chosen: list[Candidate]) -> FloatArray:
-        """Return the (n,) residuals minus the fitted pose and the fitted candidates, in the unit of the observable."""
+        """Return the (n,) residuals minus the fitted pose and some fitted errors.
+
+        They are in the unit of the observable (m, or px of disparity).
+
+        chosen: candidate errors to fit jointly with the pose; the periods of sines are refined.
+        """
         candidates, fit = self.fit_refined(chosen)
         value = self.residuals.value - self.residuals.pose_jacobian @ fit.coefficients[: len(self.pose_columns)]
         for candidate, coefficients in zip(candidates, self.split_coefficients(fit.coefficients, candidates), strict=True):
@@ -329,15 +371,16 @@ class Design:
         return np.asarray(value)
 
     def identifiability(self) -> tuple[list[str], FloatArray, FloatArray]:
-        """Compare the signatures of the effects with each other and with the pose.
+        """Compare the signatures of all effects (the residuals that each one makes) with each other and with those of the pose.
 
-        Two effects with a cosine near 1 in magnitude cannot be told apart; an effect with a share near 0 cannot be told
-        from the pose.
+        It shows which sensor errors this measurement cannot tell apart. Two effects with a cosine near 1 in magnitude cannot
+        be distinguished. An effect of whose signature little is left beside the pose cannot be told from a wrong pose.
 
         Returns
         -------
-        Names (f) of the families; (f, f) cosines between their signatures after the pose is projected out; and (f,) the share of
-        each signature that is left then.
+        The names of the f effects, each represented by its first variant and first coefficient; (f, f) cosines between their
+        signatures after the pose is fitted to each; and (f,) the share of each signature's norm that is left then, from 0 to
+        1.
         """
         row = self.ranked_covariances[0]
         names, matrices = [], []

@@ -22,8 +22,9 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import ncx2
 
-from pipeline.gap.mean.candidates import Candidate, robust_extent
+from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.mean.design import NULL_DRAWS, Design
+from pipeline.gap.mean.nonparametric_terms import robust_extent
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 
@@ -40,14 +41,14 @@ _PHASE, _BOTH = "phase_rad", "both"
 
 @dataclass(frozen=True)
 class DetectableSize:
-    """The size of an effect that a measurement would have shown with a probability of 95 %.
+    """The size of an effect (a sensor error) that a measurement would have shown with a probability of 95 %.
 
     Attributes
     ----------
-    name : Name of the effect, or what an error outside the catalogue depends on.
-    parameter : Name of the parameter that holds the size; "" for the unit of the observable.
-    size : Value of that parameter; infinite if no size shows, NaN if it was not computed.
-    at : Choices for which the size holds and that are not fitted, such as the period of a wave or the camera.
+    name : Name of the effect; for an error that is not in the catalogue, what it depends on.
+    parameter : Name of the effect's parameter that states the size; "" if the size is in the unit of the observable.
+    size : Value of that parameter, in its unit; infinite if no size shows, NaN if it was not computed.
+    at : Values that are not fitted and for which the size holds, by name, such as the period of a wave or the camera.
     note : Condition or reason, in words.
     """
 
@@ -58,22 +59,28 @@ class DetectableSize:
     note: str = ""
 
     def to_dict(self) -> dict[str, object]:
-        """Return the size as one entry of the list `detectable` in gap.json, by attribute."""
+        """Return the detectable size of one effect as an entry of the list `detectable` in gap.json, one key per attribute.
+
+        A size that is infinite or not computed becomes None.
+        """
         size = self.size if np.isfinite(self.size) else None
         return {"name": self.name, "parameter": self.parameter, "size": size, "at": dict(self.at), "note": self.note}
 
 
 @dataclass(frozen=True, eq=False)
 class Signature:
-    """One way in which a candidate effect may show, whose detectable size is wanted: one parameter, or a wave of any phase.
+    """The pattern of residuals of one candidate error, of which the smallest detectable size is to be computed.
+
+    It belongs to one parameter of the error, or to a wave whose phase is free.
 
     Attributes
     ----------
-    candidate : The candidate.
-    parameter : Name of the parameter that holds the size.
-    columns : Numbers of the candidate's design columns among all columns that are examined.
+    candidate : The candidate error.
+    parameter : Name of the parameter whose detectable size is wanted.
+    columns : Numbers of the candidate's design columns among those of all candidates that are examined.
     sine : Whether the candidate has a phase; the phase that is hardest to detect is then taken.
-    needed : Function from the numbers of the covariances, the most likely first, to the log-likelihood ratio from which it shows.
+    needed : Function that returns the log-likelihood ratio from which the error shows. Its argument is the indices of the
+        trial covariances of the reference surface's error, the most likely first.
     """
 
     candidate: Candidate
@@ -83,9 +90,15 @@ class Signature:
     needed: Callable[[Sequence[int]], float]
 
     def direction(self, information: FloatArray) -> FloatArray:
-        """Return the (k,) unit vector of coefficients whose size is computed: one parameter alone, or the least visible phase.
+        """Return the unit vector of coefficients along which the detectable size is computed.
 
-        information: (k, k) Fisher information of the coefficients.
+        It is the coefficient of the parameter alone; for a wave it is the phase that is hardest to detect.
+
+        information: (k, k) Fisher information of the candidate's k coefficients.
+
+        Returns
+        -------
+        (k,) unit vector.
         """
         if self.sine:
             return np.asarray(np.linalg.eigh(information)[1][:, 0])
@@ -93,20 +106,21 @@ class Signature:
 
     @property
     def at(self) -> dict[str, float | str]:
-        """Choices that are not fitted, by name: the period of a wave, or the camera."""
+        """Values for which the detectable size holds and that are not fitted, by name, such as the period or the camera."""
         return dict(self.candidate.fixed)
 
 
 def noncentrality(needed: float, columns: int, power: float = POWER) -> float:
-    """Return the noncentrality of a chi-square variable that exceeds twice a log-likelihood ratio with a given probability.
+    """Return how far an effect must stand out of the noise for a likelihood-ratio test to detect it with a given probability.
 
-    The detectable size follows from it: the noncentrality grows with the square of the size.
+    The measure is the noncentrality of a chi-square variable that exceeds twice the needed log-likelihood ratio with that
+    probability. It grows with the square of the effect's size, so that the detectable size follows from it.
 
     Parameters
     ----------
-    needed : Value that the log-likelihood ratio has to reach.
-    columns : Number of columns, the degrees of freedom.
-    power : The probability.
+    needed : Log-likelihood ratio from which the test is passed.
+    columns : Number of design columns of the effect, the degrees of freedom.
+    power : The probability, from 0 to 1.
     """
     at, rare = 2 * needed, 1e-9
     return float(brentq(lambda x: ncx2.sf(at, columns, x) - power, rare, 4 * (at + 10 * columns + 10)))
@@ -114,18 +128,19 @@ def noncentrality(needed: float, columns: int, power: float = POWER) -> float:
 
 @dataclass(frozen=True, eq=False)
 class DetectionPower:
-    """Simulated measurements without further effects, from which the detectable size of any examined effect follows.
+    """Simulated measurements without further effects, from which the detectable size of any examined sensor error follows.
 
-    These are inner products under each of C covariances of the residuals. Nuisance columns are those that every model has, such
-    as the pose.
+    They are kept as inner products of d simulations with the k design columns of the examined errors, under each of C trial
+    covariances of the reference surface's error. Columns that every model has, of the pose and of the effects found, are
+    projected out; they are called nuisance columns.
 
     Attributes
     ----------
-    likely : Number of the most likely covariance, under which the simulations were drawn.
-    plain : (C, d) log-likelihood of the nuisance columns alone.
-    right : (C, k, d) products of the columns with the simulations, beside the nuisance columns.
-    matrix : (C, k, k) products of the columns with each other, beside the nuisance columns.
-    whole : (C, k) squared norms of the columns before the nuisance columns are projected out.
+    likely : Index of the most likely covariance, under which the simulations were drawn.
+    plain : (C, d) log-likelihood of each simulation with the nuisance columns alone fitted.
+    right : (C, k, d) products of the examined columns with the simulations, nuisance columns projected out.
+    matrix : (C, k, k) products of the examined columns with each other, nuisance columns projected out, plus priors.
+    whole : (C, k) squared norms of the examined columns before the nuisance columns are projected out.
     """
 
     likely: int
@@ -138,13 +153,15 @@ class DetectionPower:
     def of(
         cls, design: Design, members: Sequence[Candidate], plain: list[int], sines: list[int], random: KeyedRandom
     ) -> DetectionPower:
-        """Simulate measurements without further effects, and return their products with the columns to examine.
+        """Simulate measurements without further effects, and compute what the detectable sizes of the examined errors need.
 
         Parameters
         ----------
-        design : Design that is conditioned on the members.
-        members : Effects that are fitted beside each candidate. Sines among them only count for the covariance.
-        plain, sines : Numbers of the fixed columns and of the sines to examine; the latter follow the former.
+        design : The regression problem with the found effects in the model (`Design.conditioned_on`).
+        members : The found effects, fitted beside each examined error. Sines among them only determine the most likely
+            covariance.
+        plain : Numbers of the design columns to examine, of candidates that have known columns.
+        sines : Numbers of the trial sines to examine; their two columns each follow the columns `plain`.
         random : Source of the random numbers.
         """
         equations, known = design.equations, design.columns(members)
@@ -172,10 +189,16 @@ class DetectionPower:
         return cls(likely, alone, drawn[:, count:] - cross @ fitted, own - cross @ beside, np.einsum("ckk->ck", own))
 
     def size(self, signature: Signature) -> float:
-        """Return the detectable size of a signature; infinite if no size shows.
+        """Return the size of an error that the measurement would have shown with a probability of 95 %.
 
-        An effect of that size also makes the estimated error of the reference larger, and with it the log-likelihood ratio that
-        the effect needs. The size is therefore computed a second time, with that larger error.
+        An error of that size also raises the estimate of the reference surface's error, and with it the log-likelihood ratio
+        that is needed. The size is therefore computed a second time, with that larger reference error.
+
+        signature: the pattern of the error, and the parameter whose size is wanted.
+
+        Returns
+        -------
+        The size in the unit of the parameter; infinite if no size shows.
         """
         rows = signature.columns
         precision = signature.candidate.prior_precision
@@ -237,18 +260,22 @@ def detectable_sizes(
     needed: Callable[[Candidate, Sequence[int]], float],
     random: KeyedRandom,
 ) -> list[DetectableSize]:
-    """Compute the detectable size of every systematic effect of the catalogue, and of smooth errors outside it.
+    """Compute how large each systematic sensor error must be to show, and how large smooth errors outside the catalogue.
 
-    The smooth errors are waves with one cycle over the field of view. Of an effect with a camera the camera in which it is harder
-    to see counts, and of a searched period the one in the middle of the grid.
+    The smooth errors are waves with one cycle over the field of view. For an effect that either camera can have, the size of
+    the camera in which it is harder to see is stated. An unknown period is set to the middle trial period.
 
     Parameters
     ----------
-    design : Design that is conditioned on the members.
-    members : Effects that were found; they are fitted beside each candidate and not listed.
-    needed : Function from a candidate, and the numbers of the covariances with the most likely first, to the log-likelihood ratio
-        from which it shows.
-    random : Source of the random numbers.
+    design : The regression problem with the found effects in the model (`Design.conditioned_on`).
+    members : The found effects; they are fitted beside each other error, and no size is computed for them.
+    needed : Function that returns the log-likelihood ratio from which a candidate error shows. Its arguments are the
+        candidate, and the indices of the trial covariances of the reference surface's error, the most likely first.
+    random : Source of the random numbers of the simulations.
+
+    Returns
+    -------
+    One size for each parameter of each error.
     """
     names = {each.name for each in members if not each.empirical}
     plain = [each for each in design.families.plain if not each.empirical and each.name not in names and not _both(each)]

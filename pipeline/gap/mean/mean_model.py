@@ -27,6 +27,7 @@ from scipy.linalg.lapack import dsysv
 from scipy.spatial.distance import pdist, squareform
 from scipy.special import j0
 
+from pipeline.gap.mean.projected_columns import ProjectedColumns
 from pipeline.gap.mean.within_cell_noise import WithinCellNoise
 from pipeline.gap.residuals.correlated_noise import NO_CORRELATED_NOISE, GridCorrelatedNoise
 from pipeline.gap.residuals.wall_blocks import WallCells
@@ -58,17 +59,15 @@ _NOTHING = 1e-14
 
 @dataclass(frozen=True, eq=False)
 class CellCovariance:
-    """One of the covariances that are tried for the mean residuals of m cells of the wall.
+    """A trial covariance of the mean residuals in m square cells of the wall, given by its eigenvectors and eigenvalues.
 
-    It is the sum of two parts: the error of the reference surface, which is correlated between cells, and the sensor's
-    noise. Cell means are divided by the standard deviations of their noise, so that the noise is the unit matrix. The
-    covariance is given by its eigenvectors and eigenvalues.
+    It is the sum of two parts: the error of the reference surface, which is correlated between cells, and the sensor's noise.
+    Cell means are divided by the standard deviations of their noise, so that the noise is the unit matrix.
 
     Attributes
     ----------
-    basis : Index of the correlation function of the reference error among those tried, and so of the eigenvectors.
-    variance_ratio : Variance of the reference error divided by the median noise variance of a cell mean, both in the square of
-        the observable's unit.
+    basis : Index of the correlation function of the reference's error among those tried, and so of the eigenvectors.
+    variance_ratio : Variance of the reference's error divided by the median noise variance of a cell mean.
     weight : (m,) inverse eigenvalues.
     """
 
@@ -79,14 +78,15 @@ class CellCovariance:
 
 @dataclass(frozen=True)
 class MeanFit:
-    """Result of a generalised least-squares fit of k design columns.
+    """Result of a generalised least-squares fit of k design columns to residuals.
 
     Attributes
     ----------
     coefficients : (k,) estimates.
     covariance : (k, k) covariance of the estimates.
-    log_likelihood : Log-likelihood at the estimates.
-    cell_covariance : The most likely covariance of the cell means.
+    log_likelihood : Log-likelihood of the residuals at the estimates.
+    cell_covariance : The most likely trial covariance of the mean residuals in the cells of the wall: reference error plus
+        noise.
     """
 
     coefficients: FloatArray
@@ -98,15 +98,17 @@ class MeanFit:
 class MeanModel:
     """Generalised least squares for residuals with independent noise and a reference error that is correlated over metres.
 
-    Points are gathered in m cells of the wall. The class divides any column over the points into cell means, which follow the
-    correlated error, and deviations within cells, which are nearly independent. Arrays over points are in the order of `rows`.
+    Points are gathered in m square cells of the wall. The class divides any design column over the points into cell means,
+    which follow the correlated error, and deviations within cells, which are nearly independent. Columns are given "over
+    sigma": each row is divided by the standard deviation of its point.
 
     Attributes
     ----------
-    rows : (n,) rows of the points that lie in cells, cell by cell.
+    rows : (n,) numbers of the points that lie in cells, cell by cell; all arrays over n points are in this order.
     inverse_sigma : (n,) inverse predicted standard deviations.
-    within_noise : Covariance of the deviations within cells.
-    typical_sigma : Median standard deviation of a cell mean, in the unit of the observable.
+    within_noise : Covariance of the noise in deviations within cells.
+    typical_sigma : Median standard deviation of the noise of a cell mean, in the unit of the observable (m, or px of
+        disparity).
     """
 
     def __init__(
@@ -154,7 +156,7 @@ class MeanModel:
 
     @property
     def cells(self) -> int:
-        """Number m of cells."""
+        """Number of square cells of the wall into which the points are gathered."""
         return len(self._total)
 
     def _covariance(self, length: int, ratio: float) -> CellCovariance:
@@ -164,20 +166,22 @@ class MeanModel:
     def restrict(
         self, designs: list[ProjectedColumns], value: ProjectedColumns, most_sigma: float = np.inf
     ) -> tuple[MeanModel, list[CellCovariance], list[int]]:
-        """Drop trial covariances of the reference error under which the residuals are unlikely, to save time later.
+        """Drop trial covariances of the reference surface's error under which the residuals are unlikely, to save time later.
 
-        A covariance is kept if the residuals are likely under it with at least one of the given sets of columns fitted.
+        A correlation function is kept if the residuals are likely under it with at least one of the given sets of columns
+        fitted. Of each, only amplitudes near the most likely ones are returned.
 
         Parameters
         ----------
-        designs : Sets of columns to fit: the smallest and the largest one.
+        designs : Sets of design columns to fit: the smallest model (the pose) and the largest one (all candidates).
         value : The residuals, as one column.
-        most_sigma : Largest standard deviation of the reference's error, in the unit of the observable.
+        most_sigma : Largest standard deviation of the reference's error, in the unit of the observable (m, or px of
+            disparity).
 
         Returns
         -------
-        The model with the remaining correlation functions, the remaining covariances, and the indices of the remaining
-        correlation functions (for `ProjectedColumns.in_bases`).
+        The model with the remaining correlation functions; the remaining covariances; and the indices of the remaining
+        correlation functions among the present ones, with which `ProjectedColumns.in_bases` reduces columns.
         """
         ratios = [ratio for ratio in self._ratios if ratio <= (most_sigma / self.typical_sigma) ** 2]
         normals = [_NormalEquations.of(design, value) for design in designs]
@@ -201,7 +205,10 @@ class MeanModel:
 
     @property
     def covariances(self) -> list[CellCovariance]:
-        """Every combination of a remaining correlation function of the reference error and a trial amplitude."""
+        """The trial covariances of the reference surface's error plus noise, for the mean residuals in the cells of the wall.
+
+        There is one for each remaining correlation function of the reference's error and each trial amplitude of it.
+        """
         return [self._covariance(basis, float(ratio)) for basis in range(len(self._bases)) for ratio in self._ratios]
 
     def _orthonormal_planes(self, offsets: list[FloatArray]) -> sparse.csr_array:
@@ -224,41 +231,50 @@ class MeanModel:
         return np.asarray(np.add.reduceat(column, self._starts))
 
     def plane_coefficients(self, weighted: FloatArray, rows: slice = slice(None)) -> FloatArray:
-        """Fit a plane in each cell to some columns.
+        """Fit a plane to each design column in each cell of the wall, by weighted least squares.
+
+        A plane takes up the reference surface's error within a cell, so that the deviations from it are nearly independent. If
+        neighbouring points share noise, a constant is fitted instead.
 
         Parameters
         ----------
-        weighted : (n', k) columns over sigma.
-        rows : Slice of the n points to which they belong.
+        weighted : (n', k) columns at n' points, divided by the standard deviation of each point.
+        rows : Slice that selects these n' points from all n.
 
         Returns
         -------
-        (3 m, k) mean and two slopes of each cell, over their standard deviations; only (m, k) means if neighbouring points share
-        noise.
+        (3 m, k) the m means, then two slopes of each of the m cells, divided by their standard deviations; only (m, k) means
+        if neighbouring points share noise.
         """
         return np.asarray((self._planes if rows == slice(None) else self._planes[:, rows]) @ weighted)
 
     def deviations(self, weighted: FloatArray, planes: FloatArray, rows: slice = slice(None)) -> FloatArray:
-        """Subtract the planes (or means) of the cells from some columns.
+        """Return the deviations of design columns from their fitted plane (or mean) in each cell of the wall.
 
         Parameters
         ----------
-        weighted : (n, k) columns over sigma.
-        planes : Coefficients from `plane_coefficients`.
-        rows : Slice of the n points to return.
+        weighted : (n, k) columns, divided by the standard deviation of each point.
+        planes : Coefficients of the planes, as `plane_coefficients` returns them for these columns.
+        rows : Slice of the n points for which deviations are returned.
+
+        Returns
+        -------
+        (n', k) deviations at the n' points of the slice, divided by the standard deviation of each point.
         """
         return np.asarray(weighted[rows] - self._across[rows] @ planes)
 
     def in_bases(self, means: FloatArray) -> list[FloatArray]:
-        """Transform cell means to the eigenvectors of each trial correlation function, in which their covariance is diagonal.
+        """Transform cell means of design columns to the eigenvectors of each trial covariance, in which they are uncorrelated.
+
+        A fit then only needs the eigenvalues, whatever the amplitude of the reference surface's error.
 
         Parameters
         ----------
-        means : (m, k) cell means over their standard deviations.
+        means : (m, k) means of k columns in the m cells of the wall, divided by their standard deviations.
 
         Returns
         -------
-        One (m, k) array for each correlation function.
+        One (m, k) array for each trial correlation function of the reference's error.
         """
         white = self._whitened(means)
         return [vectors.T @ white for _, vectors in self._bases]
@@ -268,7 +284,10 @@ class MeanModel:
         return means if self.within_noise.is_white else np.asarray(solve_triangular(self._root, means, lower=True))
 
     def project(self, weighted: FloatArray) -> ProjectedColumns:
-        """Divide columns (n, k) over sigma into deviations within cells and transformed cell means, for fits."""
+        """Divide design columns into cell means and deviations within cells, in the form that all fits use.
+
+        weighted: (n, k) columns at the n points in `rows`, divided by the standard deviation of each point.
+        """
         within = np.empty(weighted.shape)
         weighed = within if self.within_noise.is_white else np.empty(weighted.shape)
         between = [np.empty((self.cells, weighted.shape[1])) for _ in self._bases]
@@ -292,17 +311,19 @@ class MeanModel:
         return np.asarray((within - self.deviations(shared, self.plane_coefficients(shared))) / self.within_noise.white)
 
     def null_draws(self, at: CellCovariance, count: int, random: KeyedRandom) -> list[FloatArray]:
-        """Simulate cell means that contain only noise and the reference's error.
+        """Simulate mean residuals in the m cells of the wall that contain only noise and the reference surface's error.
+
+        They show how well candidate errors explain residuals by chance.
 
         Parameters
         ----------
-        at : Covariance of the cell means.
+        at : Covariance of the cell means from which the draws come.
         count : Number of draws.
         random : Source of the random numbers.
 
         Returns
         -------
-        For each correlation function, the (m, count) draws in its eigenvectors.
+        For each trial correlation function, the (m, count) draws in coordinates of its eigenvectors.
         """
         draws = random.generator().standard_normal((len(self._total), count)) / np.sqrt(at.weight)[:, None]
         vectors = self._bases[at.basis][1]
@@ -310,7 +331,7 @@ class MeanModel:
 
 
 def column_chunks(count: int) -> list[slice]:
-    """Divide `count` columns into slices of 32, the number that is processed at once."""
+    """Divide `count` design columns into slices of 32, which are processed one after the other to limit memory."""
     return [slice(start, start + _AT_ONCE) for start in range(0, count, _AT_ONCE)]
 
 
@@ -337,52 +358,6 @@ _CORRELATIONS: list[Callable[[FloatArray], FloatArray]] = [
     *(partial(_wavy, length) for length in _WAVY),
 ]
 """Correlations of two cells as functions of their distance in cells."""
-
-
-@dataclass(frozen=True)
-class ProjectedColumns:
-    """k design columns (or residuals) at n points, divided into their parts within and between the m cells of the wall.
-
-    The wall is divided into at most about 800 square cells (`WallCells`), each with several points. The part between cells is
-    the mean of a column in each cell, the part within cells the deviation from it. The reference's error varies little within a
-    cell, so only the part between cells depends on its covariance.
-
-    Attributes
-    ----------
-    within : (n, k) deviations within cells.
-    within_weighted : (n, k) deviations times the inverse covariance of their noise, so that a.within.T @ b.within_weighted are
-        the inner products of two sets of columns.
-    between : For each trial correlation function of the reference error, the (m, k) cell means in its eigenvectors.
-    """
-
-    within: FloatArray
-    within_weighted: FloatArray
-    between: list[FloatArray]
-
-    @classmethod
-    def concatenate(cls, parts: Sequence[ProjectedColumns]) -> ProjectedColumns:
-        """Join the design columns of several sets of effects for the same n points, in the order of the sets."""
-        if len(parts) == 1:
-            return parts[0]
-        within = np.concatenate([each.within for each in parts], axis=1)
-        white = all(each.within_weighted is each.within for each in parts)
-        weighed = within if white else np.concatenate([each.within_weighted for each in parts], axis=1)
-        bases = zip(*(each.between for each in parts), strict=True)
-        return cls(within, weighed, [np.concatenate(basis, axis=1) for basis in bases])
-
-    def select(self, columns: list[int]) -> ProjectedColumns:
-        """Return the columns with the given numbers, from 0, in that order."""
-        within = self.within[:, columns]
-        weighed = within if self.within_weighted is self.within else self.within_weighted[:, columns]
-        return ProjectedColumns(within, weighed, [part[:, columns] for part in self.between])
-
-    def in_bases(self, bases: list[int]) -> ProjectedColumns:
-        """Return the same columns, with `between` only for the trial correlation functions that have these indices."""
-        return ProjectedColumns(self.within, self.within_weighted, [self.between[basis] for basis in bases])
-
-    def append(self, other: ProjectedColumns) -> ProjectedColumns:
-        """Return these design columns followed by those of another set of effects for the same n points."""
-        return ProjectedColumns.concatenate([self, other])
 
 
 @dataclass(frozen=True)
@@ -434,16 +409,16 @@ class _NormalEquations:
 def fit_reml(
     covariances: list[CellCovariance], columns: ProjectedColumns, value: ProjectedColumns, precision: FloatArray | None = None
 ) -> MeanFit:
-    """Fit design columns to residuals by generalised least squares, under the most likely covariance of the cell means.
+    """Fit design columns to residuals by generalised least squares, under the most likely trial covariance.
 
-    Covariances are compared by their restricted likelihood (REML, Patterson & Thompson 1971). The covariance of the
-    coefficients is an average over all of them, weighted by that likelihood. It includes the differences of the estimates,
-    because the true covariance is not known.
+    The covariances of the reference surface's error plus noise are compared by their restricted likelihood (REML, Patterson &
+    Thompson 1971). The returned covariance of the coefficients is an average over all of them, weighted by that likelihood. It
+    includes the differences between their estimates, because the true covariance is not known.
 
     Parameters
     ----------
-    covariances : Covariances of the cell means to compare.
-    columns : The k design columns.
+    covariances : Trial covariances of the mean residuals in the cells of the wall.
+    columns : The k design columns to fit.
     value : The residuals, as one column.
     precision : (k, k) prior inverse covariance of the coefficients; None: no prior.
     """

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.gap.mean.candidates import SineGrid
-from pipeline.gap.mean.mean_model import CellCovariance, MeanModel, ProjectedColumns
+from pipeline.gap.mean.mean_model import CellCovariance, MeanModel
+from pipeline.gap.mean.projected_columns import ProjectedColumns
 from scene.common.keyed_random import KeyedRandom
 from scene.common.threads import map_in_threads
 from scene.geometry.mesh import FloatArray
@@ -31,19 +32,20 @@ _AT_ONCE = 8
 
 @dataclass(frozen=True)
 class SineProducts:
-    """Inner products of the columns of w searched sines with other columns, from which normal equations are built.
+    """Inner products of the design columns of w trial sines with other columns, from which normal equations are built.
 
-    Each sine has two columns. The part within cells of the wall is weighted by the inverse covariance of the noise. The part
-    between cells depends on the covariance of the cell means and is added by `at`.
+    A trial sine is a sinusoidal error at one trial frequency; it has two columns, sine and cosine. Columns are divided into
+    deviations within m cells of the wall, weighted by the inverse covariance of the noise, and cell means. The products of the
+    means depend on the covariance of the reference surface's error, and are added by the method `at`.
 
     Attributes
     ----------
-    fixed : (2 w, k) products with the first k fixed columns, within cells.
+    fixed : (2 w, k) products with the first k columns of pose and candidates that have known columns, within cells.
     own : (w, 2, 2) products of each sine's two columns with each other, within cells.
     right : (2 w, v) products with v columns of residuals, within cells.
-    noise : (2 w, d) products with d draws of noise, within cells.
-    between : For each trial correlation function of the reference error, the (m, 2 w) means of the sines in m cells, in its
-        eigenvectors.
+    noise : (2 w, d) products with d draws of simulated noise, within cells.
+    between : For each trial correlation function of the reference's error, the (m, 2 w) cell means of the sines in coordinates
+        of its eigenvectors.
     """
 
     fixed: FloatArray
@@ -56,15 +58,15 @@ class SineProducts:
     def of(
         cls, model: MeanModel, grids: list[SineGrid], fixed: FloatArray, value: ProjectedColumns, noise: NoiseDraws
     ) -> SineProducts:
-        """Compute the inner products of all searched sines with other columns.
+        """Compute the inner products of the columns of all trial sines with other design columns, residuals and noise.
 
         Parameters
         ----------
-        model : The mean model.
-        grids : Grids with w sines in all.
-        fixed : (n, k) columns of other candidates: their deviations within cells, times the inverse covariance of the noise.
+        model : The mean model: division into cells of the wall, and covariances.
+        grids : Sines of unknown period, each with its trial frequencies; w sines in all.
+        fixed : (n, k) other columns at n points: deviations within cells, times the inverse covariance of the noise.
         value : v columns of residuals.
-        noise : d draws of the noise within cells.
+        noise : d draws of simulated noise within cells.
         """
         beside = np.concatenate([fixed, value.within_weighted], axis=1)
 
@@ -88,13 +90,15 @@ class SineProducts:
         return cls(products[:, :count], own, products[:, count:], drawn, model.in_bases(means.T))
 
     def at(self, covariances: list[CellCovariance], within: FloatArray, between: list[FloatArray]) -> FloatArray:
-        """Return inner products with other columns under each of C covariances: within cells plus between cells.
+        """Return the inner products of the sines with other columns under each of C trial covariances of the reference's error.
+
+        They are the sum of the products of deviations within the cells of the wall and of those of the cell means.
 
         Parameters
         ----------
         covariances : The C covariances of the cell means.
-        within : (2 w, a) products with a other columns within cells.
-        between : For each correlation function, the (m, a) cell means of the other columns.
+        within : (2 w, a) products of the w sines with the `a` other columns, within cells.
+        between : For each correlation function, the (m, a) cell means of the other columns in coordinates of its eigenvectors.
 
         Returns
         -------
@@ -108,7 +112,14 @@ class SineProducts:
         return found
 
     def own_at(self, covariances: list[CellCovariance]) -> FloatArray:
-        """Return the (C, w, 2, 2) inner products of each sine's two columns with each other, under each of C covariances."""
+        """Return the inner products of each sine's two columns with each other under each of C trial covariances.
+
+        covariances: the C covariances of the mean residuals in the cells of the wall.
+
+        Returns
+        -------
+        (C, w, 2, 2) products for w sines.
+        """
         found = np.empty((len(covariances), *self.own.shape))
         for basis, rows in _by_basis(covariances).items():
             weights = np.stack([covariances[row].weight for row in rows])
@@ -128,13 +139,14 @@ def _by_basis(covariances: list[CellCovariance]) -> dict[int, list[int]]:
 
 @dataclass(frozen=True, eq=False)
 class NoiseDraws:
-    """Simulated noise, from which the noise of the coefficient of any design column is computed.
+    """Simulated noise of n points, from which the random error of the coefficient of any design column is computed.
 
-    The noise consists of white noise and of noise at q grid nodes that neighbouring points share.
+    The noise consists of white noise and of noise that neighbouring points share: random values at q nodes of a pixel grid,
+    interpolated between them.
 
     Attributes
     ----------
-    rows : Slice of n' of the points on which white noise is drawn.
+    rows : Slice that selects the n' points on which white noise is drawn, a subsample that saves time.
     white : (n', d) white noise of d draws (realisations), in single precision, which is enough here.
     on_nodes : (q, d) contribution of the noise at the nodes (see `WithinCellNoise.draw`).
     """
@@ -145,16 +157,16 @@ class NoiseDraws:
 
     @classmethod
     def of(cls, model: MeanModel, count: int, most_rows: int, random: KeyedRandom) -> NoiseDraws:
-        """Draw d independent realisations of the noise at all points.
+        """Draw d independent realisations of the noise of n points, as the null simulations need it.
 
         To save time, white noise is drawn at n' of the n points only and multiplied by sqrt(n / n'). The inner product of a
         design column with it then has the same variance as over all points.
 
         Parameters
         ----------
-        model : The mean model, which has the covariance of the noise.
+        model : The mean model, which has the points and the covariance of the noise.
         count : Number d of draws.
-        most_rows : Approximate largest number n' of points in the subsample.
+        most_rows : Approximate largest number n' of points on which white noise is drawn.
         random : Source of the random numbers.
         """
         rows = slice(None, None, max(len(model) // most_rows, 1))
@@ -166,14 +178,20 @@ class NoiseDraws:
         return cls(rows, (white / np.sqrt(model.within_noise.white)).astype(np.float32), on_nodes)
 
     def products(self, within: FloatArray, on_nodes: FloatArray) -> FloatArray:
-        """Return what noise alone adds to the right-hand side of the normal equations: (k, d) for k design columns and d draws.
+        """Return the inner products of k design columns with the d draws of noise.
 
-        These are inner products of the columns with the drawn noise, weighted by the inverse covariance of the noise.
+        They are weighted by the inverse covariance of the noise, and are what noise alone adds to the right-hand side of the
+        normal equations.
 
         Parameters
         ----------
-        within : (n', k) columns minus their mean in each wall cell, at the n' points on which white noise is drawn (`rows`).
+        within : (n', k) columns minus their mean (or plane) in each cell of the wall, at the n' points on which white noise is
+            drawn.
         on_nodes : (q, k) columns projected on the q nodes of the grid-correlated noise (`WithinCellNoise.to_nodes`).
+
+        Returns
+        -------
+        (k, d) products.
         """
         return np.asarray(within.astype(np.float32).T @ self.white + on_nodes.T @ self.on_nodes)
 
@@ -185,12 +203,12 @@ def _squares(columns: FloatArray) -> FloatArray:
 
 
 def sine_products(grids: list[SineGrid], weighed: FloatArray, root: FloatArray) -> FloatArray:
-    """Compute the inner products of all searched sines with other columns, for the part within cells of the wall.
+    """Compute the inner products of the columns of w trial sines with other columns, for the part within cells of the wall.
 
     Parameters
     ----------
-    grids : Grids with w sines in all.
-    weighed : (n, k) deviations of the other columns within cells, times the inverse covariance of the noise.
+    grids : Sines of unknown period, each with its trial frequencies; w sines in all.
+    weighed : (n, k) other columns at n points: deviations within cells, times the inverse covariance of the noise.
     root : (n,) inverse standard deviations of the points.
 
     Returns
@@ -203,22 +221,23 @@ def sine_products(grids: list[SineGrid], weighed: FloatArray, root: FloatArray) 
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Normal equations X' V^-1 X b = X' V^-1 y of pose and all candidates, under each of C covariances V.
+    """Normal equations X' V^-1 X b = X' V^-1 y of pose and all candidate errors, under each of C trial covariances V.
 
-    From them, any set of candidates is scored without returning to the points. Searched sines have products only with
-    themselves and with the h held columns. These belong to the pose and to effects that stay in the model while others are
-    scored.
+    X are design columns and y residuals. From the equations, any set of candidates is scored without returning to the points.
+    There are k columns of the pose and of candidates with known columns, called fixed, and w sines at trial frequencies. Sines
+    only have products with themselves and with the h held columns: those of the pose and of effects that stay in the model
+    while others are scored.
 
     Attributes
     ----------
-    covariances : The C covariances of the cell means.
+    covariances : The C trial covariances of the mean residuals in the cells of the wall: reference error plus noise.
     fixed : (C, k, k) inner products of the k fixed columns.
-    right : (C, k, v) inner products of the fixed columns with v columns of residuals.
+    right : (C, k, v) inner products of the fixed columns with v columns of residuals, measured or simulated.
     constant : (C, v) log-likelihood of the residuals without any column.
     wave_fixed : (C, 2 w, h) inner products of w sines with the held columns.
     wave_own : (C, w, 2, 2) inner products of each sine's two columns with each other.
     wave_right : (C, 2 w, v) inner products of the sines with the residuals.
-    held_columns : Numbers of the held columns.
+    held_columns : Numbers of the h held columns among the fixed ones.
     """
 
     covariances: list[CellCovariance]
@@ -231,34 +250,41 @@ class NormalEquations:
     held_columns: tuple[int, ...] = ()
 
     def with_precision(self, precision: FloatArray) -> NormalEquations:
-        """Add a Gaussian prior with mean 0 for the coefficients of the k fixed columns, given its (k,) inverse variances."""
+        """Return the normal equations with a Gaussian prior of mean 0 for the coefficients of the k design columns.
+
+        precision: (k,) prior inverse variances of the coefficients; 0: no prior.
+        """
         return replace(self, fixed=self.fixed + np.diag(precision))
 
     def with_values(self, right: FloatArray, constant: FloatArray, wave_right: FloatArray) -> NormalEquations:
-        """Replace the residuals by other ones, such as simulated ones.
+        """Return the normal equations for v other columns of residuals, such as simulated ones, with the same design columns.
 
         Parameters
         ----------
-        right : (C, k, v) inner products of the new residuals with the fixed columns.
-        constant : (C, v) their log-likelihood without any column.
-        wave_right : (C, 2 w, v) their inner products with the sines.
+        right : (C, k, v) inner products of the new residuals with the k columns of pose and candidates, under C covariances.
+        constant : (C, v) log-likelihood of the new residuals without any column.
+        wave_right : (C, 2 w, v) inner products of the new residuals with the sine and cosine columns of w trial sines.
         """
         return replace(self, right=right, constant=constant, wave_right=wave_right)
 
     def with_sine_products(self, columns: list[int], products: FloatArray) -> NormalEquations:
-        """Hold `a` more fixed columns, so that sines can be scored in addition to them.
+        """Return the normal equations in which more design columns can stay in the model while sines are scored beside them.
 
         Parameters
         ----------
-        columns : Numbers of the columns.
-        products : (C, 2 w, a) their inner products with the sines.
+        columns : Numbers of these `a` columns, such as those of a selected effect.
+        products : (C, 2 w, a) inner products of the columns with the sine and cosine columns of w trial sines, under C
+            covariances.
         """
         return replace(
             self, wave_fixed=np.concatenate([self.wave_fixed, products], axis=2), held_columns=(*self.held_columns, *columns)
         )
 
     def at_covariances(self, chosen: list[int]) -> NormalEquations:
-        """Return the equations under only some of the covariances, given by their indices."""
+        """Return the normal equations under only some of the trial covariances, such as the most likely ones, to save time.
+
+        chosen: indices into `covariances`, in the wanted order.
+        """
         return self._of([self.covariances[index] for index in chosen], chosen)
 
     def _part(self, rows: slice) -> NormalEquations:
@@ -271,37 +297,51 @@ class NormalEquations:
         return replace(self, covariances=at, **{name: getattr(self, name)[rows] for name in names})
 
     def log_likelihood(self, base: list[int]) -> FloatArray:
-        """Return the log-likelihoods of fits of some fixed columns.
+        """Return the log-likelihoods of the model that consists of some design columns, with fitted coefficients.
 
         Parameters
         ----------
-        base : Numbers of the columns to fit.
+        base : Numbers of the columns of the model.
 
         Returns
         -------
-        (C, v) log-likelihoods under each of C covariances, for each of v columns of residuals.
+        (C, v) log-likelihoods under each of C trial covariances, for each of v columns of residuals.
         """
         right = self.right[:, base]
         return np.asarray(self.constant + 0.5 * np.einsum("ckv,ckv->cv", right, self.solved(base, right)))
 
     def solved(self, base: list[int], right: FloatArray) -> FloatArray:
-        """Return the (C, b, a) coefficients of the b fixed columns `base` for right sides (C, b, a)."""
+        """Solve the normal equations of some design columns under each of C trial covariances.
+
+        Parameters
+        ----------
+        base : Numbers of the b columns to fit.
+        right : (C, b, a) right-hand sides: inner products of these columns with `a` columns of residuals, or with other
+            columns.
+
+        Returns
+        -------
+        (C, b, a) fitted coefficients.
+        """
         matrix = self.fixed[:, base][:, :, base]
         scale = 1 / np.sqrt(np.maximum(np.einsum("ckk->ck", matrix), 1e-300))
         regular = matrix * scale[:, :, None] * scale[:, None, :] + _RIDGE * np.eye(len(base))
         return np.asarray(np.linalg.solve(regular, right * scale[:, :, None]) * scale[:, :, None])
 
     def profile_log_likelihood(self, base: list[int], fixed: list[list[int]]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Compute the profile log-likelihood with each candidate added to a base model: the maximum over the C covariances.
+        """Compute how likely the residuals are with each candidate error added to a base model, to score the candidates.
+
+        The profile log-likelihood is the maximum over the coefficients and over the C trial covariances.
 
         Parameters
         ----------
-        base : Numbers of the columns of the base model; they must be held.
-        fixed : For each of f candidates the numbers of its columns.
+        base : Numbers of the design columns of the base model, such as those of the pose; they must be in `held_columns`.
+        fixed : For each of f candidates with known columns, the numbers of its columns.
 
         Returns
         -------
-        (v,) values for the base alone, (f, v) with each candidate added, and (w, v) with each sine added.
+        (v,) values of the base model alone for v columns of residuals; (f, v) with each candidate added; and (w, v) with each
+        of the w trial sines added.
         """
         parts = [self._part(slice(start, start + _AT_ONCE)) for start in range(0, len(self.covariances), _AT_ONCE)]
         found = map_in_threads(lambda part: part._profile_chunk(base, fixed), parts)
@@ -356,19 +396,19 @@ def _explained(rest: FloatArray, own: FloatArray, left: FloatArray) -> FloatArra
 def assemble(
     model: MeanModel, at: list[CellCovariance], fixed: ProjectedColumns, value: ProjectedColumns, waves: SineProducts
 ) -> NormalEquations:
-    """Build the normal equations of pose and candidates under each of C covariances, before any effect is in the model.
+    """Build the normal equations of pose and candidate errors under each of C trial covariances.
 
     Parameters
     ----------
     model : The mean model.
-    at : The C covariances of the cell means that are tried.
-    fixed : The k columns of the pose and of all candidates but the sines whose period is searched.
+    at : The C trial covariances of the mean residuals in the cells of the wall.
+    fixed : The k design columns of the pose and of all candidates but the sines of unknown period.
     value : v columns of residuals: one of measured residuals, or several of simulated ones.
-    waves : Inner products of the w sines whose period is searched.
+    waves : Inner products of the sines at w trial frequencies.
 
     Returns
     -------
-    Equations whose list `held_columns`, the columns that stay in the model while others are scored, is empty.
+    The equations. Their list `held_columns`, the columns beside which sines can be scored, is still empty.
     """
     gram, right = fixed.within.T @ fixed.within_weighted, fixed.within.T @ value.within_weighted
     square = np.einsum("nv,nv->v", value.within, value.within_weighted)
@@ -387,14 +427,14 @@ def assemble(
 def extend(
     equations: NormalEquations, had: list[ProjectedColumns], value: ProjectedColumns, added: ProjectedColumns
 ) -> NormalEquations:
-    """Return normal equations with further fixed columns appended.
+    """Return normal equations with further design columns appended, such as those of a sine whose period is now known.
 
     Parameters
     ----------
-    equations : The equations.
-    had : The present fixed columns, as one or more sets.
-    value : Columns of residuals.
-    added : Columns to append.
+    equations : The present equations.
+    had : Their columns of pose and candidates, as one or more sets, in order.
+    value : The columns of residuals of the equations.
+    added : Columns to append. The products of trial sines with them are not computed.
     """
     cross, own = np.concatenate([each.within.T @ added.within_weighted for each in had]), added.within.T @ added.within_weighted
     right = added.within.T @ value.within_weighted

@@ -19,29 +19,32 @@ _NEAR_NULL = 8
 
 @dataclass(frozen=True)
 class NullDistribution:
-    """Distribution of the log-likelihood ratios if there is no effect, from simulations.
+    """Distribution of the log-likelihood ratios that candidate errors reach by chance, from simulations without any effect.
 
-    The simulations contain pose, correlated reference error and noise only. Penalties and p-values are taken from them.
+    The simulations contain pose, correlated error of the reference surface and noise only. Penalties and p-values are taken
+    from them. A family is the set of all variants of one candidate, such as an effect with all trial periods.
 
     Attributes
     ----------
-    log_likelihood_ratios : For each family, the (NULL_DRAWS,) ratio of its best variant in each simulation.
+    log_likelihood_ratios : For each family by name, the (NULL_DRAWS,) ratio of its best variant in each of the 499
+        simulations.
     """
 
     log_likelihood_ratios: Mapping[str, FloatArray]
 
     @classmethod
     def of(cls, design: Design, random: KeyedRandom, ranked: Sequence[int] | None = None) -> NullDistribution:
-        """Simulate the null distribution of a search.
+        """Simulate the null distribution of a search: measurements without any sensor error, on which all candidates are tried.
 
-        Simulations are drawn under the most likely covariance and fitted under the eight most likely ones. Each family is
-        represented by its best variant in each simulation.
+        To save time, simulations are drawn under the most likely trial covariance of the reference error and fitted under the
+        eight most likely ones.
 
         Parameters
         ----------
         design : The regression problem of the search.
         random : Source of the random numbers.
-        ranked : Numbers of the covariances, the most likely first; by default those of the measured residuals.
+        ranked : Indices of the trial covariances in `design.equations`, the most likely first. None: as the measured residuals
+            rank them.
         """
         likely = (design.ranked_covariances if ranked is None else list(ranked))[:_NEAR_NULL]
         near = design.equations.at_covariances(likely)
@@ -64,29 +67,38 @@ class NullDistribution:
         )
 
     def penalty(self, family: str) -> float:
-        """Return what is subtracted from a family's log-likelihood ratio to give its score.
+        """Return a family's penalty, which is subtracted from its log-likelihood ratio to give its score.
 
-        It is twice the mean ratio of the family under the null: k for k linear coefficients, as in AIC, and more for a searched
-        period.
+        It is twice the mean ratio that the family reaches by chance. That is k for k linear coefficients, as in Akaike's
+        criterion (AIC), and more for a searched period.
+
+        family: name of the family, which is all variants of one candidate, such as an effect with all trial periods.
         """
         return 2 * float(self.log_likelihood_ratios[family].mean())
 
     def p_value(self, score: float, larger: Mapping[str, float] | None = None) -> float:
-        """Return the p-value of a score under the null.
+        """Return the p-value of a candidate's score: the probability that chance alone gives a score as large.
 
-        It is (1 + b) / (1 + N), if the largest score over all families reaches the given one in b of N simulations. The maximum
-        over all families is the test statistic, which corrects for multiple testing.
+        The test statistic is the largest score over all families of candidates, which corrects for multiple testing. If it
+        reaches the given score in b of N simulations without effects, the p-value is (1 + b) / (1 + N).
 
         Parameters
         ----------
-        score : Penalised log-likelihood ratio.
-        larger : Families over which the maximum is taken, each with a factor that multiplies its simulated ratios; None: all
-            families, with factor 1.
+        score : Penalised log-likelihood ratio of the candidate.
+        larger : Names of the families over which the maximum is taken, each with a factor by which its simulated ratios are
+            multiplied. None: all families, with factor 1. Factors above 1 make the test stricter.
         """
         return float((1 + np.sum(self._largest_scores(larger) >= score)) / (1 + NULL_DRAWS))
 
     def critical_score(self, significance: float, larger: Mapping[str, float] | None = None) -> float:
-        """Return the score that must be exceeded for a p-value of at most `significance`; `larger` is that of `p_value`."""
+        """Return the score that a candidate must exceed for its p-value to be at most `significance`.
+
+        Parameters
+        ----------
+        significance : Largest p-value, such as 0.01.
+        larger : Names of the families of candidates over which the largest simulated score is taken, each with a factor by
+            which its simulated log-likelihood ratios are multiplied. None: all families, with factor 1.
+        """
         allowed = max(int(significance * (1 + NULL_DRAWS) + 1e-9) - 1, 0)
         return float(np.sort(self._largest_scores(larger))[-1 - allowed])
 

@@ -7,19 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.gap.mean.candidates import (
-    HARMONIC_ORDERS,
-    HARMONIC_SERIES,
-    LINE_PATTERN,
-    SPATIAL_NULL,
-    Candidate,
-    ExplanationKey,
-    SineGrid,
-    harmonics,
-)
+from pipeline.gap.mean.candidates import Candidate, ExplanationKey, SineGrid
 from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.detection_power import DetectableSize, detectable_sizes
 from pipeline.gap.mean.mean_model import MeanFit
+from pipeline.gap.mean.nonparametric_terms import HARMONIC_ORDERS, HARMONIC_SERIES, LINE_PATTERN, SPATIAL_NULL, harmonics
 from pipeline.gap.mean.null_distribution import NullDistribution
 from pipeline.gap.mean.selection import EffectSet, FamilyScore, ForwardSelection, SelectedEffect
 from pipeline.gap.residuals.residuals import Residuals
@@ -34,14 +26,17 @@ _ALIKE = 100.0
 
 
 class MeanSearch:
-    """Scores every candidate explanation of some residuals, alone or in addition to effects that are already selected.
+    """Scores every candidate error as an explanation of some residuals, alone or beside errors that are already selected.
 
-    `select` runs the forward selection with these scores.
+    Candidates are the sensor errors of the catalogue (effects) and terms that name no cause. A score is a penalised
+    log-likelihood ratio; its p-value comes from simulations without any effect. `select` runs the forward selection with these
+    scores.
 
     Attributes
     ----------
-    design : The regression problem, with the columns of all candidates.
-    single_effect_ratios : Log-likelihood ratio of each explanation alone, by its name and whether it is empirical.
+    design : The regression problem, with the residuals and the design columns of all candidates.
+    single_effect_ratios : Log-likelihood ratio of each explanation alone. The key is its name, and whether it is a term that
+        names no cause.
     """
 
     def __init__(
@@ -77,22 +72,25 @@ class MeanSearch:
         }
 
     def select(self) -> tuple[list[SelectedEffect], tuple[FamilyScore, ...]]:
-        """Run the forward selection.
+        """Find the errors that explain the residuals, by forward selection.
 
         Returns
         -------
-        The selected effects, and the scores of all families in addition to them.
+        The selected errors; and the scores of all families of candidates beside them, best first. A family is all variants of
+        one candidate, such as an effect with all trial periods.
         """
         found = ForwardSelection(self).select()
         self._designs = {(): self.design}  # frees memory: each conditioned design is as large as the search itself
         return found
 
     def score_families(self, members: EffectSet) -> tuple[FamilyScore, ...]:
-        """Score every family as an addition to some effects.
+        """Score every family of candidate errors as an addition to a model.
+
+        A family is the set of all variants of one candidate, such as an effect with all trial periods.
 
         Parameters
         ----------
-        members : The effects that are in the model already.
+        members : The errors that are in the model already; may be empty.
 
         Returns
         -------
@@ -129,19 +127,24 @@ class MeanSearch:
         return self._designs[candidates]
 
     def p_value(self, score: float) -> float:
-        """Return the p-value of a score, under the simulated null distribution of the largest score over all families."""
+        """Return the p-value of a score: the probability that the best of all candidate errors scores as much by chance.
+
+        It comes from simulations without any sensor error, in which all candidates are tried.
+
+        score: penalised log-likelihood ratio of the candidate.
+        """
         return self._null.p_value(score)
 
     def goodness_of_fit_p_value(self, family_scores: Sequence[FamilyScore]) -> float | None:
-        """Test whether the selected effects leave anything to explain, by the p-value of the best score of a further candidate.
+        """Test whether the selected errors leave anything to explain, by the p-value of the best score of a further candidate.
 
-        The null simulations draw the reference's error from a Gaussian process. A real reference may have larger single waves.
-        How much larger is estimated along oblique directions on the wall, where no sensor has an axis, and all sines are
-        discounted by that factor. This is genomic control (Devlin & Roeder 1999).
+        The simulations behind the p-value draw the reference surface's error from a Gaussian process. A real reference may
+        have larger single waves. How much larger is estimated along oblique directions on the wall, where no sensor has an
+        axis, and all sines are discounted by that factor. This is genomic control (Devlin & Roeder 1999).
 
         Parameters
         ----------
-        family_scores : Scores of all families in addition to the selected effects.
+        family_scores : Scores of all families of candidates beside the selected errors, as `select` returns them.
 
         Returns
         -------
@@ -161,16 +164,16 @@ class MeanSearch:
     def detectable_sizes(
         self, members: Sequence[Candidate], family_scores: tuple[FamilyScore, ...], random: KeyedRandom
     ) -> list[DetectableSize]:
-        """Compute the detectable sizes of the effects that were not found, and of smooth errors outside the catalogue.
+        """Compute how large each sensor error that was not found must be to show in this measurement.
 
-        An effect shows if the model is rejected. The null distribution is that of the covariance that would be estimated with it
-        in the residuals.
+        Sizes of smooth errors that are not in the catalogue are computed too. An error shows if the goodness-of-fit test
+        rejects the model without it. The size at which it does so with a probability of 95 % is computed.
 
         Parameters
         ----------
-        members : Effects that were found in this search.
-        family_scores : Scores of all families beside them.
-        random : Source of the random numbers.
+        members : Errors that were found in this search; they stay in the model.
+        family_scores : Scores of all families of candidates beside them, as `select` returns them.
+        random : Source of the random numbers of the simulations.
         """
         discounts = self._discounts(family_scores)
         nulls: dict[int, NullDistribution] = {}
@@ -185,24 +188,29 @@ class MeanSearch:
         return detectable_sizes(self._conditioned_on(tuple(members)), members, needed, random)
 
     def spatial_null_p_value(self, family_scores: Sequence[FamilyScore]) -> float | None:
-        """Return the p-value of the best score among the spatial null candidates, which only the reference's error can explain.
+        """Test whether the reference surface errs more than its error model allows.
+
+        The test uses the spatial null candidates: lines, waves and other terms along oblique directions on the wall. No sensor
+        has an axis there, so only the reference's error can explain them.
 
         Parameters
         ----------
-        family_scores : Scores of all families in addition to the selected effects.
+        family_scores : Scores of all families of candidates beside the selected errors, as `select` returns them.
 
         Returns
         -------
-        The p-value; None if there are no such candidates.
+        The p-value of their best score; None if there are no such candidates.
         """
         scores = [item.score for item in family_scores if item.name.startswith(SPATIAL_NULL)]
         places = [name for name in self.design.families.by_name if name.startswith(f"free {SPATIAL_NULL}")]
         return self._null.p_value(max(scores), dict.fromkeys(places, 1.0)) if scores else None
 
     def joint_score(self, members: EffectSet) -> float:
-        """Return the score of some effects together.
+        """Return the score of several errors together: their joint log-likelihood ratio minus the penalty of each.
 
-        The periods of their sines are refined, because a strong sine loses likelihood on the search grid.
+        The periods of their sines are refined first, because a strong sine loses likelihood on the grid of trial periods.
+
+        members: the errors, each with its own score and ratio, from which its penalty follows.
         """
         candidates = tuple(member.candidate for member in members)
         design = self._conditioned_on(candidates)
@@ -211,11 +219,15 @@ class MeanSearch:
         return float(with_them - without - sum(member.log_likelihood_ratio - member.score for member in members))
 
     def correlated_covariates(self, form: FamilyScore) -> set[str]:
-        """Return the covariates that are so highly correlated with that of a non-parametric term that they could replace it.
+        """Return the covariates that could replace that of a non-parametric term because they are so highly correlated with it.
 
-        Parameters
-        ----------
-        form : The non-parametric term with its score.
+        The limit is the threshold `mean.same_covariate`, an absolute correlation.
+
+        form: the term (a line, spline or wave along a covariate, or a polynomial of two) with its score.
+
+        Returns
+        -------
+        Names of the covariates, among them the term's own.
         """
         found = self.design.residuals.covariates
         covariates = {name: values for name, values in found.items() if np.ptp(values) > 0}
@@ -224,16 +236,16 @@ class MeanSearch:
         return {name for name, row in zip(covariates, correlation, strict=False) if row.max() > thresholds().mean.same_covariate}
 
     def with_harmonics(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
-        """Return the form of a periodic non-parametric term that fits best in addition to some effects.
+        """Return the form of a periodic non-parametric term that fits best, with some other errors in the model.
 
-        A wave gets overtones if they fit clearly better, because a periodic error need not be a sine. A spline becomes a wave if
-        that fits as well. Among patterns that repeat every few lines, the one with the fewest lines is taken, because multiples
-        of it fit as well. Other terms are returned unchanged.
+        A wave gets overtones if they fit clearly better, because a periodic error need not be a sine. A spline becomes a wave
+        if that fits as well. Among patterns that repeat every few scan lines, columns or rows, the one with the fewest lines
+        is taken, because multiples of it fit as well. Other terms are returned unchanged.
 
         Parameters
         ----------
-        members : Effects in the model.
-        form : The non-parametric term with its score.
+        members : The other errors in the model.
+        form : The term, such as a wave along a covariate, with its score.
         """
         if form.candidate.form.startswith(LINE_PATTERN):
             return self._of_fewest_lines(members, form)
@@ -281,14 +293,15 @@ class MeanSearch:
         return best if best.score >= form.score + thresholds().mean.nonparametric_margin else form
 
     def may_be_reference_error(self, members: EffectSet, form: FamilyScore) -> bool:
-        """Tell whether a wave is so small that it may be part of the reference's error, which can contain such waves.
+        """Tell whether a wave in the residuals is so small that it may be part of the reference surface's error.
 
-        The size of the reference's error is estimated by a fit, and limited by the threshold `grid_noise.reference_error`.
+        The wave's standard deviation is compared with that of the reference's error, which is estimated in the same fit and
+        limited by the threshold `grid_noise.reference_error`.
 
         Parameters
         ----------
-        members : Effects in the model.
-        form : A non-parametric term with its score; false for one that is no wave.
+        members : Other errors in the model, fitted jointly.
+        form : The non-parametric term with its score; the answer is false for one that is no wave.
         """
         if form.candidate.form != "wave":
             return False
@@ -298,9 +311,12 @@ class MeanSearch:
         return size < thresholds().mean.least_wave_sigmas * error
 
     def fitted_std(self, item: FamilyScore) -> float:
-        """Fit one explanation alone and return the standard deviation of its fitted values over the points.
+        """Return how large a candidate error is: the standard deviation of its fitted values over the points.
 
-        It is in the unit of the observable (m, or px of disparity).
+        The candidate is fitted alone with the sensor's pose. The result is in the unit of the observable (m, or px of
+        disparity).
+
+        item: the candidate with its score.
         """
         return self._fitted_std_and_fit(item, ())[0]
 
@@ -312,9 +328,14 @@ class MeanSearch:
         return float(np.std(columns @ values)), fit
 
     def leading_effects(self) -> list[Candidate]:
-        """List the effects of the catalogue that explain the most on their own, best first, at most eight.
+        """List the sensor errors that explain the most on their own, which are worth refitting without linearisation.
 
-        These are worth refitting without linearisation.
+        These are effects of the catalogue. They reach a share (`mean.refit_share`) of the largest log-likelihood ratio and a
+        least ratio (`mean.refit_gain`). Sines of unknown period are not included.
+
+        Returns
+        -------
+        At most eight candidates, best first.
         """
         plain, fixed, _ = self._profile(())
         ratios = fixed[:, 0] - plain[0]
@@ -324,9 +345,11 @@ class MeanSearch:
         return [each for ratio, each in ranked if ratio >= least][:_MOST_LEADING]
 
     def selected_alone(self, candidate: Candidate) -> SelectedEffect:
-        """Describe a candidate as the only selected effect.
+        """Describe a candidate effect as if it were the only selected one, with its p-value.
 
-        The result has its p-value and the effects that cannot be distinguished from it.
+        The result also names the effects that cannot be distinguished from it.
+
+        candidate: the effect, with the parameter values that are kept, such as its camera.
         """
         best = next(item for item in self.score_families(()) if item.name == candidate.name and not item.empirical)
         item = replace(best, candidate=candidate)

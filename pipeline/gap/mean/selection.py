@@ -12,7 +12,8 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
-from pipeline.gap.mean.candidates import POLYNOMIAL, SPATIAL_NULL, Candidate
+from pipeline.gap.mean.candidates import Candidate
+from pipeline.gap.mean.nonparametric_terms import POLYNOMIAL, SPATIAL_NULL
 from pipeline.gap.thresholds import thresholds
 from sensors.effects.range_offset import RangeOffset
 
@@ -24,18 +25,20 @@ _NOT_SPATIAL = ("intensity", "disparity_fraction")
 
 @dataclass(frozen=True)
 class FamilyScore:
-    """How well one family of candidates (the variants of one explanation) explains residuals in addition to given effects.
+    """How well one family of candidate errors explains residuals in addition to the errors that are already in a model.
 
-    The best variant represents the family.
+    A family is the set of all variants of one candidate, such as an effect with all trial periods. Its best variant represents
+    it.
 
     Attributes
     ----------
-    name, empirical : As in `Candidate`.
-    score : Penalised log-likelihood ratio, an estimate of the ratio on new data.
+    name : Tag of the effect, or name of the covariate of a non-parametric term, which names no cause.
+    empirical : True for a non-parametric term, false for an effect of the catalogue.
+    score : Log-likelihood ratio minus a penalty for what is fitted: an estimate of the ratio on new data.
     log_likelihood_ratio : Log-likelihood with the candidate minus that without it.
     candidate : The best variant.
-    negligible : Whether the ratio is tiny relative to that of the candidate alone. It may then only absorb the linearisation
-        error of the given effects.
+    negligible : Whether the ratio is tiny relative to that of the candidate alone. The candidate may then only absorb what the
+        linearised columns of the errors in the model miss.
     """
 
     name: str
@@ -54,16 +57,18 @@ SetScores = dict[frozenset[str], float]
 
 @dataclass(frozen=True)
 class SelectedEffect:
-    """An explanation that the forward selection chose.
+    """An error that the forward selection chose as an explanation of the residuals.
 
     Attributes
     ----------
-    candidate : The best variant of the effect.
-    indistinguishable : Names of the other effects in its equivalence class, which would score as well in its place.
-    p_value : p-value of the score, corrected for multiple testing over all families.
-    log_likelihood_ratio : Log-likelihood with it minus that without it; the other selected effects are in the model both times.
-    score : Penalised log-likelihood ratio.
-    family_scores : Scores of all families in addition to the other selected effects.
+    candidate : The best variant of the error, for example with its best period.
+    indistinguishable : Names of the effects that would score as well in its place.
+    p_value : Probability that the best of all candidates scores as much by chance; so it is corrected for multiple testing.
+    log_likelihood_ratio : Log-likelihood with the error minus that without it; the other selected effects are in the model
+        both times.
+    score : Log-likelihood ratio minus a penalty for what is fitted.
+    family_scores : Scores of all candidates with the other selected effects in the model; for a non-parametric term, with
+        none.
     """
 
     candidate: Candidate
@@ -125,10 +130,12 @@ class _Set:
 
 
 def equivalence_margin(log_likelihood_ratio: float) -> float:
-    """Return the difference of scores within which two effects count as indistinguishable.
+    """Return the difference of scores within which two effects count as indistinguishable, so that both are reported.
 
-    It is the threshold `mean.class_margin`, or the share `mean.class_share` of the log-likelihood ratio if that is larger,
-    because linearised signatures are inexact by such a share.
+    It is the threshold `mean.class_margin`, or the share `mean.class_share` of the log-likelihood ratio if that is larger. The
+    pattern of residuals of an effect is linearised, and is inexact by such a share.
+
+    log_likelihood_ratio: log-likelihood with the chosen effect minus that without it.
     """
     return max(thresholds().mean.class_margin, thresholds().mean.class_share * log_likelihood_ratio)
 
@@ -155,48 +162,87 @@ def _beats_spatial_null(item: FamilyScore, null_score: float) -> bool:
 
 
 class CandidateScorer(Protocol):
-    """The scores that `ForwardSelection` needs. `MeanSearch` computes them; tests may use a simple stand-in."""
+    """Interface of what the forward selection of errors needs: scores of candidates and their p-values.
+
+    The class `MeanSearch` computes them from residuals; tests may use a simple stand-in.
+    """
 
     def score_families(self, members: EffectSet) -> tuple[FamilyScore, ...]:
-        """Score each family of candidates by its best variant, when that is added to the effects `members` of a model.
+        """Score each family of candidate errors by its best variant, in addition to errors that are in a model already.
 
-        A family is the set of all variants of one explanation, such as an effect with different cameras or periods. Scores are
-        penalised log-likelihood ratios (see `FamilyScore`); the best family is first.
+        A family is the set of all variants of one candidate, such as an effect with different cameras or periods.
+
+        members: the errors in the model; may be empty.
+
+        Returns
+        -------
+        Penalised log-likelihood ratios (see `FamilyScore`), the best family first.
         """
 
     def p_value(self, score: float) -> float:
-        """Return the p-value of a penalised log-likelihood ratio under the null distribution of the largest of all families."""
+        """Return the p-value of a score: the probability that the best of all candidate errors scores as much by chance.
+
+        score: penalised log-likelihood ratio of the candidate.
+        """
 
     def joint_score(self, members: EffectSet) -> float:
-        """Return the penalised log-likelihood ratio of the effects `members` together, sine periods refined."""
+        """Return the score of several errors together: their joint log-likelihood ratio minus the penalty of each.
+
+        members: the errors; the periods of sines among them are refined first.
+        """
 
     def correlated_covariates(self, form: FamilyScore) -> set[str]:
-        """Return the covariates that are so highly correlated with that of a non-parametric term that they could replace it."""
+        """Return the covariates that could replace that of a non-parametric term because they are so highly correlated with it.
+
+        form: the term (a line, spline or wave along a covariate, or a polynomial of two) with its score.
+
+        Returns
+        -------
+        Names of the covariates, among them the term's own.
+        """
 
     def with_harmonics(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
-        """Return the form of a periodic term that fits best in addition to the effects `members`; other terms stay unchanged."""
+        """Return the form of a periodic non-parametric term that fits best.
+
+        For example, a spline along a covariate becomes a wave with overtones.
+
+        Parameters
+        ----------
+        members : Other errors in the model.
+        form : The term with its score; one that is not periodic is returned unchanged.
+        """
 
     def may_be_reference_error(self, members: EffectSet, form: FamilyScore) -> bool:
-        """Tell whether a wave, with the effects `members` in the model, is small enough to be part of the reference's error."""
+        """Tell whether a wave in the residuals is so small that it may be part of the reference surface's error.
+
+        Parameters
+        ----------
+        members : Other errors in the model, fitted jointly.
+        form : The non-parametric term with its score; the answer is false for one that is no wave.
+        """
 
 
 @dataclass(frozen=True)
 class ForwardSelection:
-    """Forward selection of effects by their scores. The five best sets of each size are extended (beam search).
+    """Forward selection of the errors that explain residuals: sets of errors grow by the one that improves the score most.
+
+    The five best sets of each size are extended (beam search), so that two errors are also found if neither is the best one
+    alone.
 
     Attributes
     ----------
-    search : Provides the scores of the candidates.
+    search : Provides the scores of the candidate errors and their p-values.
     """
 
     search: CandidateScorer
 
     def select(self) -> tuple[list[SelectedEffect], tuple[FamilyScore, ...]]:
-        """Select the effects that explain the residuals.
+        """Select the errors that explain the residuals. An error is added only if the score rises significantly.
 
         Returns
         -------
-        The selected effects, among them at most one non-parametric term, and the scores of all families in addition to them.
+        The selected errors, among them at most one non-parametric term (which names no cause); and the scores of all families
+        of candidates beside them.
         """
         empty = _Set((), 0.0, self.search.score_families(()))
         levels, scores = [[empty]], SetScores()
@@ -303,13 +349,14 @@ class ForwardSelection:
         return score > len(state.members) * max([0.0, *second])
 
     def with_equivalents(self, among: EffectSet, item: FamilyScore, scores: SetScores) -> SelectedEffect:
-        """Describe one effect of a selected set, with the effects that cannot be distinguished from it.
+        """Describe one effect of a selected set, with its p-value and the effects that cannot be distinguished from it.
 
         Parameters
         ----------
         among : The selected set.
         item : The effect, a member of the set.
-        scores : Scores of other sets of effects. They may contain other variants of the other members, such as another camera.
+        scores : Joint scores of other sets of effects, by the names of their effects. A set that scores nearly as well tells
+            which effect could replace `item`.
         """
         others = tuple(member for member in among if member is not item)
         beside = [

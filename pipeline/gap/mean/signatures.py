@@ -44,27 +44,30 @@ _REDUCTIONS = (1.0, 2.0, 4.0, 8.0)
 
 
 def systematic_candidates(residuals: Residuals, measurement: Measurement) -> list[Candidate]:
-    """List every systematic effect of the catalogue that this kind of measurement can have, as regression terms.
+    """List every systematic sensor error of the catalogue that this kind of measurement can have, as regression terms.
 
-    Each camera and each searched period is a candidate of its own. Effects that need fields which were not recorded are left out.
+    An error's design columns are the change of the residuals per unit of its parameters. Each camera and each trial period is
+    a candidate of its own. Errors that depend on data which were not recorded, such as the intensity, are left out.
 
     Parameters
     ----------
-    residuals : Residuals with the geometry of their rays or pixels.
-    measurement : The measurement, whose model must be in the state for which the residuals were computed.
+    residuals : Residuals of the points, with the geometry of their rays or pixels.
+    measurement : The measurement. Its sensor model must be the one with which the residuals were computed.
     """
     return expand_grids(systematic_families(residuals, measurement))
 
 
 def systematic_families(residuals: Residuals, measurement: Measurement) -> list[Candidate | SineGrid]:
-    """List the same effects as `systematic_candidates`, but with all periods of a sine as one grid.
+    """List every systematic sensor error of the catalogue that this kind of measurement can have, with its periods as one grid.
 
-    These are the systematic effects of the catalogue that this kind of measurement can have and whose fields were recorded.
+    An error's design columns are the change of the residuals per unit of its parameters. Each camera is a candidate of its
+    own, and a sine of unknown period is one `SineGrid` of trial frequencies. Errors that depend on data which were not
+    recorded, such as the intensity, are left out.
 
     Parameters
     ----------
-    residuals : Residuals with the geometry of their rays or pixels.
-    measurement : The measurement, whose model must be in the state for which the residuals were computed.
+    residuals : Residuals of the points, with the geometry of their rays or pixels.
+    measurement : The measurement. Its sensor model must be the one with which the residuals were computed.
     """
     geometry = residuals.geometry
     possible = [effect for effect in residuals.candidates if effect is not TileShift]  # its seams are found before, by themselves

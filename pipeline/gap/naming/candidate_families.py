@@ -10,11 +10,10 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.formats.measurements.measurement import Measurement
-from pipeline.gap.mean.candidates import (
+from pipeline.gap.mean.candidates import Candidate, SineGrid
+from pipeline.gap.mean.nonparametric_terms import (
     MOST_CYCLES,
     MOST_CYCLES_OF_A_SENSOR,
-    Candidate,
-    SineGrid,
     angle_error_terms,
     half_pixel_sine,
     line_pattern_terms,
@@ -41,33 +40,48 @@ _MOST_POINTS = 5_000
 
 
 def model_has(measurement: Measurement, name: str) -> bool:
-    """Whether the measurement's model already contains the effect with this tag, such as "range_offset"."""
+    """Tell whether a measurement's sensor model already contains an effect, so that it is not searched again.
+
+    name: the effect's name in a config, without the sensor's prefix, such as "range_offset".
+    """
     return any(effect.name == name for effect in measurement.model.effects)
 
 
 def catalogue_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
-    """List the systematic effects of the catalogue that the recorded fields allow and the model lacks.
+    """List the systematic sensor errors to try as explanations of residuals: all of the catalogue that can be tried.
 
-    Each has a Gaussian prior of its size, from the typical sizes in the catalogue.
+    Left out are errors that the sensor model already contains, and those that need data which were not recorded (intensity,
+    time). Each error gets a Gaussian prior of its size with mean 0, so that two similar errors cannot grow large and cancel.
 
     Parameters
     ----------
-    measurement : measurement with its model.
-    part : residuals of its points.
+    measurement : the measured points with the sensor model that is tested.
+    part : residuals of n of its points, measured minus predicted.
+
+    Returns
+    -------
+    list : design columns (change of the observable per unit of a parameter, n rows) of each error; a grid of trial frequencies
+        for an error that is a sine.
     """
     return [_with_prior(each) for each in systematic_families(part, measurement)]
 
 
 def candidate_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
-    """List everything that may explain the mean of the residuals, as candidates for the search.
+    """List all regression terms that a forward selection tries as explanations of the systematic part of residuals.
 
-    These are effects of the catalogue that the model lacks, non-parametric terms of the covariates, and spatial null candidates
-    as a control.
+    They are the sensor errors of the catalogue that the sensor model lacks; non-parametric terms of each covariate (line,
+    spline, steps, waves), for errors that the catalogue lacks; and non-parametric terms along oblique directions on the wall.
+    No sensor causes the latter, so they show what an error of the reference surface can imitate.
 
     Parameters
     ----------
-    measurement : measurement with its model.
-    part : residuals of its points.
+    measurement : the measured points with the sensor model that is tested.
+    part : residuals of n of its points, measured minus predicted.
+
+    Returns
+    -------
+    list : design columns (change of the observable per unit of a coefficient, n rows) of each term; a grid of trial frequencies
+        for a wave.
     """
     named = catalogue_families(measurement, part)
     lowest = {PERIODIC[each.name]: each.frequencies[0] for each in named if isinstance(each, SineGrid) and each.name in PERIODIC}

@@ -10,8 +10,8 @@ import numpy as np
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement
-from pipeline.gap.mean.candidates import LINE_PATTERN, SPATIAL_NULL
 from pipeline.gap.mean.detection_power import DetectableSize
+from pipeline.gap.mean.nonparametric_terms import LINE_PATTERN, SPATIAL_NULL
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
 from pipeline.gap.naming.candidate_families import candidate_families, model_has
@@ -63,22 +63,23 @@ NONPARAMETRIC_TERMS = ("", True)
 
 @dataclass(frozen=True)
 class SelectionResult:
-    """Result of selecting effects, apart from the effects themselves.
+    """What a selection of sensor errors (effects) leaves beside the effects themselves: scores, tests and notes.
 
     Attributes
     ----------
     tried, variance_tried : scores of all systematic effects and of all noise terms that were tried.
-    systematic : names of the selected systematic effects, empirical ones included.
-    p_value : p-value of the misfit that remains with all of these in the model; None if nothing was left to try.
-    p_without_effects : p-value of the misfit without any of them; None if nothing was tried.
+    systematic : names of the selected systematic effects, such as "tls.range_offset", empirical ones included.
+    p_value : p-value of the misfit that remains with all selected systematic effects in the model; None if nothing was left to
+        try.
+    p_without_effects : p-value of the misfit without any systematic effect in the model; None if nothing was tried.
     unexplained_noise : observed over predicted standard deviation within small squares of the wall; 1 if a noise term explains
         it.
     notes : notes for the report.
-    identifiability : names of the effects, cosines between their signatures, and the share of each signature that the pose fit
-        leaves.
-    reference_sigma : standard deviation of the reference error, in the observable's unit.
+    identifiability : `names` of the effects, `cosines` between their signatures (the patterns of residuals that they make), and
+        `survival`, the share of each signature that is left after the sensor's pose is fitted.
+    reference_sigma : standard deviation of the error of the reference surface, in the unit of the observable (m or px).
     noise_ratio : observed over predicted standard deviation of the residuals after the systematic effects.
-    detectable : sizes that the effects that were not found would need to show.
+    detectable : for each effect that was not found, the size from which it would have been found.
     """
 
     tried: tuple[FamilyScore, ...]
@@ -94,7 +95,9 @@ class SelectionResult:
     detectable: tuple[DetectableSize, ...]
 
     def p_value_given(self, named: Sequence[NamedEffect]) -> float | None:
-        """Return the p-value of the misfit that remains if only some of the selected effects are kept in the model.
+        """Look up the p-value of the misfit that remains if only some of the selected effects are kept in the sensor model.
+
+        It is known if all selected systematic effects are kept, or none of them.
 
         Parameters
         ----------
@@ -118,26 +121,28 @@ def select_effects(
     excluded: frozenset[tuple[str, bool]] = frozenset(),
     grid_noise: VarianceTerm | None = None,
 ) -> tuple[list[NamedEffect], SelectionResult]:
-    """Select the systematic effects and noise terms that explain the residuals.
+    """Find the systematic sensor errors and noise terms that explain the residuals of a measurement (forward selection).
 
-    The effects that a linearised search finds are put into the model, residuals are computed again, and further effects are
-    searched. Strong effects are refitted without linearising (`nonlinear_refit`). Noise terms are fitted to the remaining
-    residuals and weight the next search.
+    A linearised search finds systematic effects. They are put into the sensor model, residuals are computed again, and further
+    effects are searched. Strong effects are refitted without linearising. Noise terms are fitted to the remaining residuals and
+    weight the next search.
 
     Parameters
     ----------
-    measurement : measurement of the training points.
-    part : residuals of the training points.
-    noise_ratio : observed over predicted standard deviation of these.
+    measurement : the training points (those that are not kept for validation), with their sensor model.
+    part : residuals of these points, measured minus predicted.
+    noise_ratio : observed over predicted standard deviation of these residuals.
     random : source of random numbers for the null distributions.
-    excluded : families (name, empirical) that are not tried, or `NONPARAMETRIC_TERMS` for all empirical ones. A family whose best
-        value is out of bounds is added, and the selection is repeated.
-    grid_noise : grid-correlated noise that an earlier selection left. The selection is repeated with it in the model, because
-        such noise imitates non-parametric terms and errors of the reference.
+    excluded : effects that are not tried, as pairs (name, whether it is an empirical term); `NONPARAMETRIC_TERMS` stands for
+        all empirical terms. If the fitted value of an effect is out of bounds, the effect is excluded too, and the selection is
+        repeated.
+    grid_noise : noise that neighbouring points share, as a preceding selection found it in its residuals. It is then part of
+        the model from the start, because it imitates non-parametric terms and errors of the reference. None in a first
+        selection.
 
     Returns
     -------
-    tuple : the named effects, and the rest of the result.
+    tuple : the effects that were found, and the scores and tests of the selection.
     """
     named: list[NamedEffect] = []
     all_residuals, initial_noise_ratio, added = part, noise_ratio, 0.0
@@ -265,21 +270,22 @@ def _explains_everything(found: SearchOutcome) -> bool:
 def keep_implausible_in_class(
     named: list[NamedEffect], chosen: list[SelectedEffect], before: frozenset[str], excluded: frozenset[tuple[str, bool]]
 ) -> list[NamedEffect]:
-    """Report implausibly large effects as alternatives to the effects that were named in their place.
+    """Report implausibly large effects as alternatives to the effects that a selection named in their place.
 
-    The search selected the implausible effects first and was then repeated without them. An implausible effect joins the
-    equivalence class of an effect that the search could not distinguish from it, or that was named only after its exclusion.
+    A first selection chose effects of implausible size, and was repeated without them. An implausible effect may still be the
+    true one. It is therefore added to the list `indistinguishable` of each effect that the first selection could not tell from
+    it, or that was named only because it had been excluded.
 
     Parameters
     ----------
-    named : effects of the repeated selection.
-    chosen : explanations of the first selection.
-    before : names of the systematic effects of the first selection.
-    excluded : families (name, empirical) that were excluded as implausible.
+    named : effects that the repeated selection named.
+    chosen : effects that the first selection chose, with those that it could not tell from each.
+    before : names of the systematic effects of the first selection, without the sensor's prefix.
+    excluded : the implausible effects, as pairs (name, whether it is an empirical term).
 
     Returns
     -------
-    list : the named effects with extended classes.
+    list : the effects of the repeated selection, with the alternatives added.
     """
     implausible = [each for each in chosen if (each.candidate.name, False) in excluded]
     found = []

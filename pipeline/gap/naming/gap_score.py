@@ -45,12 +45,14 @@ _FEWEST_POINTS = 8
 
 @dataclass(frozen=True)
 class Gap:
-    """How far model and measurement are apart on validation points, before and after the named effects enter the model.
+    """How much worse a measurement fits its sensor model than noise explains, without and with the named sensor errors.
+
+    The score is measured on validation points, which no fit used; smaller is better. The gap is the score minus the floor.
 
     Attributes
     ----------
-    before, after : mean score of the model without and with the named effects; smaller is better.
-    floor : mean score of simulated data of the model with the effects: what noise alone leaves.
+    before, after : mean score of the model without and with the named effects (sensor errors).
+    floor : mean score of data that the model with the effects has simulated: what noise alone leaves.
     error : standard error of before - after.
     floor_error : standard error of before - floor.
     points : number of points that were scored.
@@ -69,39 +71,52 @@ class Gap:
 
     @property
     def scores(self) -> dict[str, float]:
-        """The scores of input model, model with the named effects and noise floor, as `before`, `after` and `floor`."""
+        """Scores by name: `before` and `after` (model without and with named effects), and `floor` (noise alone)."""
         return {"before": self.before, "after": self.after, "floor": self.floor}
 
     @property
     def display_unit(self) -> tuple[float, str]:
-        """Factor by which reports multiply a score, and the unit of the product."""
+        """Factor that converts a score to the unit in which reports show it, and that unit: 1000 and "mm", or 1 and "Brier"."""
         return (1e3, "mm") if self.unit == "m" else (1.0, "Brier")
 
     @property
     def closed(self) -> float | None:
-        """Share of the gap that the named effects close: (before - after) / (before - floor).
+        """Share of the gap between model and measurement that the named effects close: (before - after) / (before - floor).
 
-        None if the gap is within its uncertainty.
+        `before` and `after` are the scores of the model without and with these effects, and `floor` is the score that noise
+        alone leaves. 1 if only noise is left; None if the gap is within its uncertainty.
         """
         return None if self.uncertain else (self.before - self.after) / (self.before - self.floor)
 
     @property
     def above_floor(self) -> bool:
-        """Whether the score of the input model (`before`) exceeds the noise floor by more than its uncertainty, `floor_error`."""
+        """Whether the model without named effects fits worse than noise explains.
+
+        That is so if its score (`before`) exceeds the score that noise alone leaves (`floor`) by more than the uncertainty of
+        their difference: 2.6 standard errors `floor_error` by default.
+        """
         return self.before - self.floor > thresholds().verdict.floor_sigmas * self.floor_error
 
     @property
     def left_open(self) -> bool:
-        """Whether the score with the named effects (`after`) exceeds the floor by more than the uncertainty `floor_error`."""
+        """Whether the model fits worse than noise explains even with the named effects.
+
+        That is so if its score (`after`) exceeds the score that noise alone leaves (`floor`) by more than the uncertainty: 2.6
+        standard errors `floor_error` by default.
+        """
         return self.after - self.floor > thresholds().verdict.floor_sigmas * self.floor_error
 
     @property
     def uncertain(self) -> bool:
-        """Whether scores cannot tell the models apart: before - floor and before - after are both within their uncertainties."""
+        """Whether the gap is too small to be measured, so that no closed share is stated.
+
+        That is so if the score without the named effects exceeds neither the score that noise alone leaves (`floor`) nor the
+        score with the effects by more than the uncertainty of the difference.
+        """
         return not self.above_floor and self.before - self.after <= thresholds().verdict.gap_sigmas * self.error
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the entry `gap` of gap.json."""
+        """Return the entry `gap` of gap.json: scores without and with the named effects, closed share, and standard errors."""
         note = "before - floor is within its own uncertainty" if self.uncertain else ""
         return {
             "measure": self.measure,
@@ -119,12 +134,14 @@ class Gap:
 
 @dataclass(frozen=True)
 class RegisteredModel:
-    """A sensor model with the pose that registers its predictions to the measurement.
+    """A sensor model, and the sensor's pose with which its predictions fit the measurement best.
 
     Attributes
     ----------
     model : the sensor model.
-    pose : (6,) shift (m) and rotation (rad) of the sensor against the surveyed pose, wall frame.
+    pose : (6 k,) shift (m) and small rotation (rad) of each of k set-ups from the pose in the measurement, wall frame. For a
+        surface without cameras: amounts of the combinations of shift, rotation and scale that can be determined (columns of
+        `datum`).
     """
 
     model: TlsModel | StereoModel
@@ -134,18 +151,20 @@ class RegisteredModel:
 def simulate_errors(
     measurement: Measurement, model: TlsModel | StereoModel, residuals: Residuals, randoms: Sequence[KeyedRandom]
 ) -> FloatArray:
-    """Simulate the sensor's errors at measured points: simulated minus geometric observable (range, disparity or distance).
+    """Simulate the sensor's errors at measured points, to see which residuals a sensor model makes.
+
+    An error is the simulated observable minus the one that geometry gives: range (m), disparity (px) or distance (m).
 
     Parameters
     ----------
-    measurement : measurement with its sensor at the pose to simulate from; `residuals` may be those of another pose.
-    model : sensor model to simulate.
-    residuals : residuals of the n points.
+    measurement : the measured points, with the sensor at the pose to simulate from.
+    model : sensor model to simulate; that of the measurement is not used.
+    residuals : residuals of the n points, which tell where rays meet the reference; they may belong to another pose.
     randoms : d sources of random numbers, one for each simulation.
 
     Returns
     -------
-    FloatArray : (d, n) errors in the observable's unit, NaN without a return.
+    FloatArray : (d, n) errors in the unit of the observable; NaN where a simulated pulse does not return.
 
     Raises
     ------
@@ -170,23 +189,25 @@ def measure_gap(
     most_sigmas: float,
     random: KeyedRandom,
 ) -> Gap | None:
-    """Score two sensor models on validation points by simulating the measurement with each.
+    """Compare how well two sensor models, without and with the named sensor errors, predict validation points.
 
-    The score is the continuous ranked probability score (CRPS) of the mean and standard deviation of patches of the wall. Both
-    models are simulated with the same random numbers, so that their difference is less noisy.
+    The measurement is simulated with each model. The score is the continuous ranked probability score (CRPS) of the mean and
+    the standard deviation of the residuals in patches of the wall. Both models use the same random numbers, so that their
+    difference is less noisy.
 
     Parameters
     ----------
-    measurement : measurement at its aligned pose.
-    before, after : the models without and with the named effects.
-    residuals : residuals of the validation points.
-    reference_sigma : standard deviation of the reference error, in the observable's unit; it is added to every simulation.
+    measurement : the measured points, with the sensor at its aligned pose.
+    before, after : the models without and with the named effects (sensor errors).
+    residuals : residuals of the validation points, which no fit used.
+    reference_sigma : standard deviation of the error of the reference surface, in the unit of the observable (m or px); such an
+        error is added to every patch of a simulation.
     most_sigmas : points farther than this many predicted standard deviations from both models are left out.
     random : source of random numbers.
 
     Returns
     -------
-    Gap or None : the scores; None if too few points remain.
+    Gap or None : the scores, and that of noise alone; None if too few points remain.
     """
     patch = wall_blocks_by_points(residuals.wall_xy, _POINTS_PER_PATCH)
     versions = [_draw_ensemble(measurement, version, residuals, random.child("ensemble")) for version in (before, after)]
@@ -226,16 +247,17 @@ def measure_gap(
 
 
 def measure_losses(missing: ExpectedPulses, chance: FloatArray, held_out: BoolArray) -> Gap | None:
-    """Score a predicted probability of losing laser pulses on validation pulses (Brier score).
+    """Score how well an explanation of missing laser returns predicts which validation pulses are lost (Brier score).
 
-    The score before is that of one probability for all pulses, taken from the other pulses. The floor is the expected score if
-    pulses are lost with exactly the predicted probability.
+    The score `before` is that of one probability for all pulses: the share that is lost of the pulses not kept for validation.
+    The score `after` is that of the explanation. The floor is the score to expect if pulses are lost with exactly its
+    probability.
 
     Parameters
     ----------
-    missing : m pulses that should have returned, and whether they did.
-    chance : (m,) predicted probability of loss.
-    held_out : (m,) true for validation pulses.
+    missing : m pulses that should have hit the wall, and whether each returned.
+    chance : (m,) probability of losing each pulse that the explanation predicts.
+    held_out : (m,) true for validation pulses, to which the explanation was not fitted.
 
     Returns
     -------
@@ -301,5 +323,8 @@ def _crps(draws: FloatArray, value: FloatArray) -> FloatArray:
 
 
 def subsampling(count: int) -> slice:
-    """Return a slice that keeps at most about 30,000 of `count` points, evenly spaced, so that scoring stays quick."""
+    """Return a slice that keeps evenly spaced ones of n points, so that scoring stays quick.
+
+    count: n. All are kept if they are fewer than 60,000, else 30,000 to 45,000.
+    """
     return slice(None, None, max(count // _MOST_POINTS, 1))

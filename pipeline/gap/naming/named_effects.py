@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import Measurement
-from pipeline.gap.mean.candidates import POLYNOMIAL, Candidate
+from pipeline.gap.mean.candidates import Candidate
+from pipeline.gap.mean.nonparametric_terms import POLYNOMIAL
 from pipeline.gap.mean.selection import SelectedEffect
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
 from pipeline.gap.noise_and_edges.missing_returns import LossExplanation
@@ -47,18 +48,18 @@ _WEAKEST_POWERS = 20
 
 @dataclass(frozen=True)
 class NamedEffect:
-    """One effect that the diagnosis names, as an entry of `effects` in gap.json.
+    """One sensor error (effect) that a diagnosis names as an explanation of residuals; an entry of `effects` in gap.json.
 
     Attributes
     ----------
     name : name with the sensor's prefix, such as `tls.range_offset`.
     kind : "physical" for an effect of the catalogue, "empirical" for a term without a physical cause.
-    entry : entry for the model's `effects`: name and parameter values.
-    std : standard deviations of the parameters, by key.
+    entry : entry for the list `effects` of a sensor model's config: name and parameter values.
+    std : standard deviations of the parameters, by key of `entry`.
     indistinguishable : names of the other effects that this measurement cannot distinguish from it.
     p_value : p-value from the simulated null distribution; None if none was simulated.
-    gain : log-likelihood ratio of the models with and without it; on validation blocks once it was validated.
-    split_by : further measurement that would tell it from those in `indistinguishable`; "" without any.
+    gain : log-likelihood ratio of the models with and without it, on validation points once it was validated.
+    split_by : further measurement that would tell it from those in `indistinguishable`, in words; "" if there are none.
     """
 
     name: str
@@ -72,16 +73,16 @@ class NamedEffect:
 
     @property
     def effect(self) -> type[Effect]:
-        """Class of the effect. For an empirical term it is the class that represents the term in a model."""
+        """Class that implements this sensor error in a model. Empirical terms, which name no cause, have a class too."""
         return effect_of(self.name)
 
     @property
     def adds_variance(self) -> bool:
-        """Whether it is a noise term: it changes the standard deviation of the residuals and not their mean."""
+        """Whether this sensor error is noise: it changes the standard deviation of the residuals and not their mean."""
         return self.effect.shows_in == ShowsIn.SPREAD
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the effect as an entry of `effects` in gap.json."""
+        """Return this sensor error as an entry of `effects` in gap.json, with its parameters and the alternatives to it."""
         parameters = {key: {"value": value, "std": self.std.get(key)} for key, value in self.entry.items() if key != "name"}
         return {
             "name": self.name,
@@ -97,13 +98,13 @@ class NamedEffect:
 def with_effects(
     model: TlsModel | StereoModel, entries: list[dict[str, Any]], noise: dict[str, float] | None = None
 ) -> TlsModel | StereoModel:
-    """Return a sensor model with further effects and other noise values, validated like a config.
+    """Return a copy of a sensor model with further errors (effects) and other noise values, validated like a config file.
 
     Parameters
     ----------
     model : model to extend.
-    entries : entries of the effects to append: name and parameter values.
-    noise : new values of the model's noise, by key; None: unchanged.
+    entries : effects to append, each as an entry of a config: name and parameter values.
+    noise : new values of the model's noise, by key such as `range_sigma_m`; None: unchanged.
 
     Raises
     ------
@@ -120,25 +121,28 @@ def aligned_with(
     registration_rows: NDArray[np.int64] | None = None,
     noise: dict[str, float] | None = None,
 ) -> AlignedMeasurement:
-    """Put effects into the model of a measurement, compute its residuals, and estimate the pose again.
+    """Put sensor errors (effects) into the model of a measurement, estimate the pose again, and compute residuals there.
 
     Parameters
     ----------
-    measurement : measurement to start from.
-    effects : effects to append to its model.
+    measurement : the measured points with the model to extend, and the pose to start from.
+    effects : effects to append to the model.
     registration_rows : rows of the measurement's points from which the pose is estimated; None: all.
-    noise : new values of the model's noise, by key; None: unchanged.
+    noise : new values of the model's noise, by key such as `range_sigma_m`; None: unchanged.
 
     Returns
     -------
-    AlignedMeasurement : the measurement at the estimated pose, its residuals and the pose.
+    AlignedMeasurement : the measurement at the estimated pose, its residuals, and the shift and rotation to that pose.
     """
     model = with_effects(measurement.model, [item.entry for item in effects], noise)
     return align(measurement.changed(model=model), registration_rows)
 
 
 def within_bounds(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
-    """Whether the parameter values of an effect's entry are allowed in a config of the model."""
+    """Tell whether the config of a sensor model accepts a sensor error (effect) with certain parameter values.
+
+    entry: the effect as in the config's list `effects`: name and parameter values.
+    """
     try:
         with_effects(model, [entry])
     except InputError:
@@ -147,11 +151,9 @@ def within_bounds(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
 
 
 def only_within_bounds(model: TlsModel | StereoModel, named: list[NamedEffect]) -> tuple[list[NamedEffect], list[str]]:
-    """Keep the effects whose parameter values are allowed in a config.
+    """Keep the sensor errors (effects) whose fitted parameter values a config of the sensor model accepts.
 
-    Returns
-    -------
-    tuple : the effects that are kept, and a note for the report on each of the others.
+    named: effects with their fitted values. Returns those that are kept, and a note for the report on each of the others.
     """
     kept = [item for item in named if within_bounds(model, item.entry)]
     return kept, [
@@ -160,12 +162,10 @@ def only_within_bounds(model: TlsModel | StereoModel, named: list[NamedEffect]) 
 
 
 def is_plausible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
-    """Whether an effect's parameter values are allowed in a config and below the largest plausible size of the effect.
+    """Tell whether a fitted sensor error (effect) is plausible: a config accepts its values, and it is not absurdly large.
 
-    Parameters
-    ----------
-    model : model to which the effect would be added.
-    entry : entry of the effect: name and parameter values.
+    Too large is more than 100 times the effect's typical size in the catalogue, by default. model: the sensor model that would
+    contain it; entry: the effect as in the model's config: name and parameter values.
     """
     if not within_bounds(model, entry):
         return False
@@ -173,11 +173,10 @@ def is_plausible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
 
 
 def relative_size(entry: dict[str, Any]) -> float:
-    """Return the size of an effect relative to its typical size in the catalogue; 0 for an effect that is not in the catalogue.
+    """Return how many times its typical size in the catalogue a sensor error (effect) has, to judge its plausibility.
 
-    Parameters
-    ----------
-    entry : entry of the effect: name and parameter values.
+    entry: the effect as in a model's config: name and parameter values. Of several parameters, the largest ratio is returned;
+    for an effect that is not in the catalogue, 0.
     """
     effect = effect_of(entry["name"])
     sizes = effect.typical_sizes() if effect.catalogue else {}
@@ -185,14 +184,13 @@ def relative_size(entry: dict[str, Any]) -> float:
 
 
 def effect_from_range_step(comb: RangeStep, part: Residuals) -> NamedEffect:
-    """Convert the rounding of ranges to a named effect (range quantisation), as an entry of gap.json.
+    """Convert the rounding of a scanner's ranges to the named effect "range quantisation", as an entry of gap.json.
 
-    Its log-likelihood ratio is set to at least 1 for each range, because rounded ranges leave no doubt.
+    Its log-likelihood ratio is set to the number of ranges times the strength of the rounding, because rounded ranges leave no
+    doubt.
 
-    Parameters
-    ----------
-    comb : the step that was found.
-    part : residuals of the scan.
+    comb: the step, such as 1 mm, to which ranges are rounded, and its strength from 0 to 1; part: residuals, one for each
+    range.
     """
     entry = {"name": RangeQuantization.tag(), "step_m": comb.step_m}
     name, gain = f"tls.{RangeQuantization.tag()}", float(len(part)) * comb.strength
@@ -200,7 +198,11 @@ def effect_from_range_step(comb: RangeStep, part: Residuals) -> NamedEffect:
 
 
 def effect_from_locking(found: Locking) -> NamedEffect:
-    """Convert pixel locking that was found in measured disparities to a named effect, as an entry of gap.json."""
+    """Convert pixel locking that was found in measured disparities to a named effect, as an entry of gap.json.
+
+    found: amplitude, period (px) and phase of the locking. It is a matching error that repeats with each pixel of the
+    disparity.
+    """
     entry = {
         "name": PixelLocking.tag(),
         "amplitude_px": found.amplitude_px,
@@ -212,19 +214,21 @@ def effect_from_locking(found: Locking) -> NamedEffect:
 
 
 def effect_from_seams(found: TileSeams) -> NamedEffect:
-    """Return tiles that are shifted against each other, as found from their seams, as a named effect."""
+    """Convert shifted image tiles to the named effect "tile shift", as an entry of gap.json.
+
+    found: side and shift (px) of square tiles that a stereo matcher shifted against each other, from the jumps of the
+    disparities at their seams.
+    """
     entry = {"name": TileShift.tag(), "amplitude_px": found.amplitude_px, "tile_px": found.tile_px}
     std = {"amplitude_px": found.amplitude_std_px, "tile_px": found.tile_std_px}
     return NamedEffect(f"stereo.{TileShift.tag()}", "physical", entry, std, (), found.p_value, found.gain)
 
 
 def effect_from_variance(found: VarianceTerm, sensor: str) -> NamedEffect:
-    """Convert a fitted noise term to a named effect, as an entry of gap.json.
+    """Convert a fitted noise term to a named effect (sensor error), as an entry of gap.json.
 
-    Parameters
-    ----------
-    found : the noise term.
-    sensor : "tls" or "stereo".
+    found: the noise term, which explains variance of the residuals that the sensor model does not predict; sensor: "tls" or
+    "stereo", the prefix of the name.
     """
     alike = tuple(f"{sensor}.{name}" for name in found.indistinguishable)
     empirical = found.empirical or effect_of(found.effect).empirical
@@ -234,31 +238,37 @@ def effect_from_variance(found: VarianceTerm, sensor: str) -> NamedEffect:
 
 
 def effect_from_edges(found: EdgeEffect) -> NamedEffect:
-    """Convert an effect that was found at depth steps to a named effect, as an entry of gap.json."""
+    """Convert an effect that was found at depth steps, such as edge fattening, to a named effect, as an entry of gap.json.
+
+    found: the effect with its estimated parameters and their standard deviations.
+    """
     entry = {"name": found.name, **found.effect.model_dump(mode="json", exclude_unset=True)}
     return NamedEffect(f"{found.effect.sensor}.{found.name}", "physical", entry, found.std, (), None, found.gain)
 
 
 def effect_from_tails(part: Residuals, sigma: float, gain: float) -> NamedEffect:
-    """Describe heavy tails as additional white noise marked empirical, because the catalogue has no effect for them.
+    """Convert heavy tails of the residuals to a named effect: additional white noise, marked empirical.
+
+    The catalogue of sensor errors has no effect for an excess of outliers.
 
     Parameters
     ----------
     part : residuals with the heavy tails.
-    sigma : standard deviation of the additional noise, in the observable's unit.
-    gain : log-likelihood ratio of the models with and without the tails.
+    sigma : standard deviation of the additional noise, in the unit of the observable (m or px).
+    gain : log-likelihood ratio of the noise models with and without heavy tails.
     """
     noise, key = part.white_noise
     return NamedEffect(f"{part.sensor}.{noise.tag()}", "empirical", {"name": noise.tag(), key: sigma}, {}, (), None, gain)
 
 
 def effect_from_losses(found: LossExplanation, intensity: FloatArray | None) -> NamedEffect:
-    """Convert an explanation of missing laser returns to a named effect, as an entry of gap.json.
+    """Convert an explanation of missing laser returns, such as a detection limit, to a named effect, as an entry of gap.json.
 
     Parameters
     ----------
-    found : the explanation.
-    intensity : (n,) recorded powers, from the weakest of which a detection limit is taken; None if no powers were recorded.
+    found : the explanation, with its parameters and their standard deviations.
+    intensity : (n,) received powers of the recorded points. The detection limit is taken from the weakest ones. None if no
+        powers were recorded.
     """
     parameters, std = dict(found.parameters), dict(found.std)
     kind = "empirical" if found.covariate else "physical"
@@ -272,13 +282,13 @@ def effect_from_losses(found: LossExplanation, intensity: FloatArray | None) -> 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A selected systematic effect with its fitted coefficients.
+    """A systematic sensor error (effect) that a selection chose, with its fitted coefficients.
 
     Attributes
     ----------
-    chosen : the effect as selected, with its score and its equivalence class.
-    candidate : its design columns at the fitted model.
-    values : (k,) coefficients.
+    chosen : the effect as selected, with its score and with the effects that it cannot be distinguished from.
+    candidate : the effect as a regression term: design columns, linearised at the fitted model.
+    values : (k,) coefficients of the design columns.
     covariance : (k, k) covariance of the coefficients.
     """
 
@@ -289,12 +299,11 @@ class Estimate:
 
 
 def effect_from_estimate(found: Estimate, part: Residuals) -> NamedEffect:
-    """Convert a fitted systematic effect to a named effect with parameter values and standard deviations.
+    """Convert a fitted systematic error to a named effect, as an entry of gap.json, with standard deviations.
 
-    Parameters
-    ----------
-    found : the fitted effect.
-    part : residuals of the points at which its design columns are given.
+    A non-parametric term is described by its values at evenly spaced places along its covariate.
+
+    found: the error as a regression term with fitted coefficients; part: residuals of the points that are its rows.
     """
     if found.candidate.empirical:
         return _empirical_effect(found.candidate, found.values, found.chosen, part)
@@ -358,17 +367,20 @@ def _angle_term(candidate: Candidate, error: FloatArray, item: SelectedEffect, p
 def merge_angle_curves(
     angles: list[NamedEffect], later: list[NamedEffect], part: Residuals
 ) -> tuple[list[NamedEffect], list[NamedEffect]]:
-    """Add up error curves of a recorded angle that two successive selections found for the same angle and covariate.
+    """Add up error curves of a scanner's angle that two successive selections found, so that each is reported once.
+
+    A curve gives the error (rad) of an angle along a covariate. The first curves are in the model of the second selection, so
+    what that finds for the same angle and covariate is a correction of them.
 
     Parameters
     ----------
     angles : curves of the first selection.
-    later : effects that the second selection found with those curves in the model.
+    later : curves that the second selection found in addition.
     part : residuals, which give the range of each covariate.
 
     Returns
     -------
-    tuple : the first curves with the later ones added, and the later effects that were not merged.
+    tuple : the first curves with their corrections added, and the later curves that belong to none of them.
     """
     joined, others = [], list(later)
     for term in angles:
@@ -440,17 +452,17 @@ def _plain_numbers(entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def out_of_bounds(measurement: Measurement, estimates: list[Estimate], part: Residuals) -> frozenset[tuple[str, bool]]:
-    """Return the families whose fitted values a config would not accept, or that are implausibly large.
+    """Find the fitted effects (sensor errors) to exclude: a config does not accept their values, or they are far too large.
 
     Parameters
     ----------
-    measurement : measurement to whose model the effects would be added.
-    estimates : fitted effects.
-    part : residuals of the points at which their design columns are given.
+    measurement : measurement to whose sensor model the effects would be added.
+    estimates : effects with fitted coefficients.
+    part : residuals of the points to which the rows of their design columns belong.
 
     Returns
     -------
-    frozenset : families (name, empirical).
+    frozenset : effects to exclude, as pairs (name, whether it is an empirical term).
     """
     wrong = [each for each in estimates if not is_plausible(measurement.model, effect_from_estimate(each, part).entry)]
     return frozenset((each.candidate.name, each.candidate.empirical) for each in wrong)
@@ -459,19 +471,21 @@ def out_of_bounds(measurement: Measurement, estimates: list[Estimate], part: Res
 def absorbed_by_registration(
     estimates: list[Estimate], part: Residuals, survival: Mapping[str, float]
 ) -> frozenset[tuple[str, bool]]:
-    """Return the families that are implausibly large and that a fit of the pose absorbs almost completely.
+    """Find the fitted effects (sensor errors) that are implausibly large because the measurement hardly determines their size.
 
-    Their size is hardly determined by the measurement.
+    A shift and rotation of the sensor imitates such an effect almost completely, so the pose fit absorbs it. By default, less
+    than 10 % of its signature is left, and its size is more than 10 times the typical one.
 
     Parameters
     ----------
-    estimates : fitted effects.
-    part : residuals of the points at which their design columns are given.
-    survival : by effect name, the share of the signature that a fit of the pose leaves.
+    estimates : effects with fitted coefficients.
+    part : residuals of the points to which the rows of their design columns belong.
+    survival : by effect name, the share of the effect's signature (the pattern of residuals that it makes) that is left after
+        the pose is fitted.
 
     Returns
     -------
-    frozenset : families (name, empirical).
+    frozenset : these effects, as pairs (name, False); empirical terms are not considered.
     """
     by = thresholds().mean
     doubtful = [each for each in estimates if not each.candidate.empirical and survival[each.candidate.name] < by.absorbed_share]

@@ -8,15 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.formats.measurements.measurement import Measurement
-from pipeline.gap.mean.candidates import (
-    HARMONIC_ORDERS,
-    HARMONICS,
-    Candidate,
-    ExplanationKey,
-    SineGrid,
-    harmonics,
-    prior_precision,
-)
+from pipeline.gap.mean.candidates import Candidate, ExplanationKey, SineGrid, prior_precision
+from pipeline.gap.mean.nonparametric_terms import HARMONIC_ORDERS, HARMONICS, harmonics
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.mean.selection import FamilyScore, SelectedEffect, equivalence_margin
 from pipeline.gap.naming.candidate_families import PERIODIC, candidate_families, catalogue_families
@@ -39,15 +32,17 @@ _MOST_FITS, _CONVERGED_DECREASE = 10, 0.005
 
 @dataclass(frozen=True)
 class SearchInput:
-    """Input that all searches for systematic effects in one measurement share.
+    """Input that all searches for systematic sensor errors (effects) in one measurement share.
 
     Attributes
     ----------
-    measurement : measurement of the training points.
-    part : their residuals.
-    families : candidate effects to search, one entry for each effect, and one grid of frequencies for each kind of wave.
-    variance_at : function from residuals, computed with some systematic effects in the model, to their noise terms.
-    added : variance to add to the predicted one, in squared units of the observable.
+    measurement : the training points (those that are not kept for validation), with their sensor model.
+    part : residuals of these points, measured minus predicted.
+    families : effects to search, as regression terms; one grid of trial frequencies for each kind of wave.
+    variance_at : function that fits noise terms to residuals. It is called with residuals that were computed with some of the
+        effects in the model.
+    added : variance to add to the predicted one, squared unit of the observable; it covers errors found before, such as
+        rounding.
     random : source of random numbers for the null distributions.
     """
 
@@ -61,18 +56,18 @@ class SearchInput:
 
 @dataclass(frozen=True)
 class SearchOutcome:
-    """An explanation of the residuals: the effects of one search, and those that a second search adds.
+    """One explanation of the residuals: systematic sensor errors (effects) of a search, and those that a second one adds.
 
-    In the second search the effects of the first are in the model without linearisation.
+    In the second search the effects of the first are in the sensor model without linearisation.
 
     Attributes
     ----------
     chosen : effects that the first search selected.
     estimates : effects of both searches with their coefficients.
-    search : the second search.
-    residuals : residuals of the second search.
-    further : effects that the second search selected.
-    tried : scores of all candidates in addition to all selected effects.
+    search : the second search; the first one if there was no second.
+    residuals : residuals that this search explains.
+    further : effects that this search selected.
+    tried : scores of all candidate effects beside the selected ones.
     """
 
     chosen: list[SelectedEffect]
@@ -84,7 +79,7 @@ class SearchOutcome:
 
     @property
     def complexity(self) -> tuple[int, int]:
-        """Number of empirical terms, and number of all effects; the smaller pair is the simpler explanation."""
+        """Numbers of empirical terms and of all effects in this explanation of residuals; the smaller pair is preferred."""
         return sum(each.candidate.empirical for each in self.estimates), len(self.estimates)
 
 
@@ -160,21 +155,18 @@ def _gain_over(later: _SingleFit, earlier: _SingleFit, first: MeanSearch) -> flo
 
 
 def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
-    """Select systematic effects and refit the strong ones without linearising.
+    """Select the systematic sensor errors (effects) that explain residuals, and refit the strong ones without linearising.
 
     The linearised model is inexact for a large effect, and forward selection then adds spurious effects that absorb the
     linearisation error. The strongest effects are therefore refitted alone without linearising, and the selection is repeated
-    with the best one in the model. It is also repeated with the model linearised where all effects of the catalogue, fitted
-    together, put it. The explanation with the fewest effects is kept.
+    with the best one in the model. If that leaves several effects, it is also repeated with the model linearised where all
+    effects of the catalogue, fitted together, put it. Of the explanations, the one with the fewest empirical terms is returned,
+    then the one with the fewest effects.
 
     Parameters
     ----------
-    given : input of the searches.
-    first : the linearised search.
-
-    Returns
-    -------
-    SearchOutcome : the explanation with the fewest empirical terms, then the fewest effects.
+    given : points, residuals and candidate effects.
+    first : the search with the model linearised at the given residuals.
     """
     together, tried = first.select()
     linear = SearchOutcome(together, _estimates_of(first, together), first, given.part, together, tried)
@@ -200,18 +192,19 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
 
 
 def search_at_joint_fit(given: SearchInput) -> SearchOutcome | None:
-    """Search for effects with the model linearised at the joint fit of all effects of the catalogue.
+    """Search for systematic sensor errors (effects) with the model linearised at the joint fit of all effects of the catalogue.
 
-    With these effects in the model, rays meet the reference where the real rays did, so the Jacobian is right even if an effect
-    is large. The fitted part of all effects is added back to the residuals before the search.
+    It serves measurements with several large errors. With all effects in the model, rays meet the reference where the real rays
+    did, so the Jacobian is right even if an error is large. What the fitted effects explain is added back to the residuals
+    before the search.
 
     Parameters
     ----------
-    given : input of the searches.
+    given : points, residuals and candidate effects.
 
     Returns
     -------
-    SearchOutcome or None : the result; None if a fitted effect is out of bounds.
+    SearchOutcome or None : the selected effects; None if a fitted effect is out of bounds or too few points remain.
     """
     plain = [each for each in given.families if isinstance(each, Candidate) and not each.empirical]
     fitted = fit_jointly(given, plain)
@@ -228,17 +221,18 @@ def search_at_joint_fit(given: SearchInput) -> SearchOutcome | None:
 
 
 def fit_jointly(given: SearchInput, candidates: list[Candidate]) -> tuple[Measurement, Residuals, FloatArray] | None:
-    """Fit the sizes of some effects together by Gauss-Newton.
+    """Fit the sizes of several systematic sensor errors (effects) together by Gauss-Newton, with the sensor's pose free.
 
     Parameters
     ----------
-    given : input of the searches.
-    candidates : the effects to fit.
+    given : points, residuals and candidate effects.
+    candidates : the effects to fit, as regression terms.
 
     Returns
     -------
     tuple or None : the measurement with the effects in its model, its residuals of n points, and the (n,) part of the
-    observations that the effects explain to first order. None if an effect is out of bounds or too few points remain.
+        observations that the effects explain to first order, in the unit of the observable. None if an effect is out of bounds
+        or too few points remain.
     """
     measurement, at, before = given.measurement, given.part, np.inf
     widths = [each.columns.shape[1] for each in candidates]
@@ -339,7 +333,7 @@ def _single_fit(given: SearchInput, first: MeanSearch, candidate: Candidate) -> 
 def _best_variants(given: SearchInput, first: MeanSearch, found: list[_SingleFit]) -> list[_SingleFit]:
     """The best effects, refitted to convergence, best first.
 
-    Of the best effect further variants are refitted too, because which camera it belongs to may not show before.
+    The best effect is also refitted for other cameras or periods, because which one it is may not show before.
     """
     ranked = sorted(found, key=lambda each: -each.log_likelihood)
     variants = {each.name: each for each in reversed(ranked)}

@@ -13,20 +13,27 @@ from sensors.effects.matching_noise import MatchingNoise
 
 
 def with_added_variance(part: Residuals, variance: float) -> Residuals:
-    """Return residuals whose predicted variance is increased by `variance`, in squared units of the observable."""
+    """Return a copy of residuals with more predicted noise, to account for an error found before, such as rounded ranges.
+
+    Parameters
+    ----------
+    part : residuals with their predicted standard deviations.
+    variance : variance to add at every point, squared unit of the observable (m² or px²).
+    """
     return replace(part, sigma=np.sqrt(part.sigma**2 + variance)) if variance else part
 
 
 def with_fitted_variance(part: Residuals, noise_terms: list[VarianceTerm], noise_ratio: float) -> Residuals:
-    """Return residuals with fitted noise instead of the predicted one, for weights in a search.
+    """Return a copy of residuals with fitted noise in place of the predicted one, to weight a search for sensor errors.
 
-    The standard deviations are those that count for means over many neighbours.
+    Its standard deviations hold for means over many neighbours: they are larger than those of single points if neighbours share
+    noise.
 
     Parameters
     ----------
-    part : residuals.
-    noise_terms : fitted noise terms; without any, the predicted standard deviations are multiplied by `noise_ratio`.
-    noise_ratio : observed over predicted standard deviation.
+    part : residuals with their predicted standard deviations.
+    noise_terms : noise terms that were fitted, each with the variance that it adds; if empty, `noise_ratio` is used instead.
+    noise_ratio : observed over predicted standard deviation, by which the predicted ones are then multiplied.
     """
     part = part.with_sigma_of_means
     if not noise_terms:

@@ -36,23 +36,23 @@ _MOST_POINTS = 60_000
 
 @dataclass(frozen=True)
 class PassInput:
-    """Input of one run of the selection of effects: the measurement and its residuals with edge effects in the model.
+    """Input of one run of the search for sensor errors: the measurement and its residuals, with edge effects in the model.
 
-    Edge effects act at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint.
+    Edge effects are errors at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint.
 
     Attributes
     ----------
     edge_effects : edge effects that are in the model.
     measurement : the measurement with these effects in its model.
-    residuals : residuals of n points against that model.
+    residuals : residuals of n points against that model, measured minus predicted.
     touched : (n,) true for points that edge effects move by an amount that cannot be predicted as well as the noise allows.
-    changes : regions where the scene itself changed.
+    changes : regions where the rock itself changed since the reference.
     changed : (n,) true for points in these regions.
-    registered_residuals : (n,) residuals after a robust pose fit, in the observable's unit.
-    noise_ratio : standard deviation of these over the predicted one.
-    cells : small squares of the wall, over whose residuals the search for systematic effects averages.
+    registered_residuals : (n,) residuals after a robust pose fit, in the unit of the observable (m or px).
+    noise_ratio : observed over predicted standard deviation of these, at least 1.
+    cells : small squares of the wall; the search for systematic errors averages the residuals in each.
     held_out : (n,) true for points that are kept for validation.
-    training_rows : (k,) rows of the residuals that the selection may use.
+    training_rows : (k,) rows of the residuals that the search may use.
     """
 
     edge_effects: list[EdgeEffect]
@@ -76,16 +76,18 @@ class PassInput:
         edge_effects: list[EdgeEffect],
         realigned: bool = True,
     ) -> PassInput:
-        """Build the input of one run of the selection: put edge effects into the model, register, and find scene changes.
+        """Build the input of one run of the search for sensor errors, with edge effects in the sensor model.
 
-        Edge effects act at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint.
+        The sensor's pose is estimated, and regions where the rock changed are found and set aside.
+
+        Edge effects are errors at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint.
 
         Parameters
         ----------
-        aligned : measurement of N points at its aligned pose.
+        aligned : measurement of N points, with the sensor at its aligned pose.
         plain : its residuals without edge effects.
         held_out_points : (N,) true for points that are kept for validation.
-        edge_effects : effects to put into the model; their `touched` are (N,).
+        edge_effects : edge effects to put into the model; the `touched` of each is (N,).
         realigned : whether the pose is estimated again with the edge effects in the model.
         """
         touched = np.any([np.zeros(len(plain), dtype=bool), *(each.touched[plain.index] for each in edge_effects)], axis=0)
@@ -123,19 +125,24 @@ class PassInput:
 
     @property
     def stable(self) -> BoolArray:
-        """(n,) true for points on smooth surface that did not change."""
+        """(n,) true for points on smooth surface, and outside of the regions where the rock changed."""
         return np.asarray(self.residuals.usable & ~self.changed)
 
     @property
     def measurable(self) -> BoolArray:
-        """(n,) true for points at which the gap may be measured: unchanged, and on smooth surface or moved by an edge effect."""
+        """(n,) true for points at which the fit of model and measurement may be scored.
+
+        The rock did not change there, and the surface is smooth or an effect at depth steps moves the point.
+        """
         return np.asarray((self.residuals.usable | self.touched) & ~self.changed)
 
     @property
     def training_part(self) -> tuple[Measurement, Residuals]:
-        """The measurement and the residuals of the training points alone.
+        """The measurement and the residuals of the training points alone, from which sensor errors are selected.
 
-        What edge effects do at these points is kept fixed while the pose is fitted: a move by millimetres hardly changes it.
+        Training points are a subsample of the points on smooth, unchanged surface that are no outliers and not kept for
+        validation. What edge effects do at these points is kept fixed while the pose is fitted: a move by millimetres hardly
+        changes it.
         """
         measurement, residuals = self.measurement, self.residuals
         if isinstance(measurement, StereoMeasurement) and isinstance(residuals, StereoResiduals):
@@ -147,13 +154,13 @@ class PassInput:
 
 @dataclass(frozen=True)
 class SelectionPass:
-    """One run of the selection of effects, with its input and its result.
+    """One run of the search for sensor errors, with its input and its result; several runs with different inputs are compared.
 
     Attributes
     ----------
-    pass_input : the measurement and its residuals, with certain effects at depth steps (edge effects) in the model.
-    named : effects that were selected.
-    selection : the rest of the result.
+    pass_input : the measurement and its residuals, with certain effects at depth steps (edge effects) in the sensor model.
+    named : sensor errors that were selected.
+    selection : scores and tests of the search.
     """
 
     pass_input: PassInput
@@ -162,24 +169,28 @@ class SelectionPass:
 
     @classmethod
     def of(cls, pass_input: PassInput, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]) -> SelectionPass:
-        """Run the selection of effects on one input.
+        """Run the search for sensor errors (effects) on one input.
 
         Parameters
         ----------
-        pass_input : the input.
+        pass_input : the measurement and its residuals, with certain effects at depth steps in the sensor model.
         random : source of random numbers for the null distributions.
-        excluded : families that are not tried, as in `select_effects`.
+        excluded : effects that are not tried, as pairs (name, whether it is an empirical term).
         """
         return cls(pass_input, *select_effects(*pass_input.training_part, pass_input.noise_ratio, random, excluded))
 
     @property
     def edge_effect_names(self) -> set[str]:
-        """Names of the effects at depth steps (edge fattening, smoothing, beam footprint) in the model at the pass's start."""
+        """Names of the effects at depth steps (such as edge fattening) in the model when the search for errors began."""
         return {each.name for each in self.pass_input.edge_effects}
 
     @property
     def complexity(self) -> tuple[int, int]:
-        """Number of empirical terms, and number of all effects and scene changes; the smaller pair is the simpler result."""
+        """How complex the result of a search for sensor errors is: two numbers, to prefer the simplest of several results.
+
+        The first is the number of empirical terms (which name no cause), and the second that of all sensor errors and scene
+        changes. The smaller pair, compared in this order, is the simpler result.
+        """
         given = self.pass_input
         return sum(item.kind == "empirical" for item in self.named), len(self.named) + len(given.edge_effects) + len(
             given.changes
@@ -188,13 +199,14 @@ class SelectionPass:
 
 @dataclass(frozen=True, eq=False)
 class PassInputs:
-    """Builds the inputs that a run of the selection of effects may have: with all edge effects found, with some, or with none.
+    """Makes alternative inputs of a search for sensor errors: with all edge effects that were found, with some, or none.
 
-    Edge effects act at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint.
+    Edge effects are errors at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint. Other errors
+    can hide or imitate them, so the search is run with several of these inputs.
 
     Attributes
     ----------
-    measurement : measurement of N points at its aligned pose.
+    measurement : measurement of N points, with the sensor at its aligned pose.
     plain : its residuals without edge effects.
     held_out_points : (N,) true for points that are kept for validation.
     """
@@ -210,51 +222,59 @@ class PassInputs:
 
     @cached_property
     def with_edge_effects(self) -> PassInput:
-        """Input of the selection with the edge effects that the residuals show, and the pose estimated again with them."""
+        """Input of the search for sensor errors with all effects at depth steps (edge effects) that the residuals show.
+
+        The sensor's pose is estimated again with these in the model.
+        """
         return self.with_these(self._edge_effects)
 
     @cached_property
     def at_initial_pose(self) -> PassInput:
-        """Input of the selection with the edge effects that the residuals show, at the pose that was estimated without them.
+        """Input of the search for sensor errors with all edge effects that the residuals show, at the initial pose.
 
-        It is for smoothing, which can shift a pose that is estimated with it.
+        Edge effects are errors at depth steps. The initial pose was estimated without them. It is tried too because one of
+        them, smoothing by the stereo matcher, can shift a pose that is estimated with it.
         """
         return PassInput.of(self.measurement, self.plain, self.held_out_points, self._edge_effects, realigned=False)
 
     @cached_property
     def without_edge_effects(self) -> PassInput:
-        """Input of the selection without any effect at depth steps (edge fattening, smoothing, beam footprint)."""
+        """Input of the search for sensor errors without any effect at depth steps (such as edge fattening) in the model."""
         return self.with_these([])
 
     def edge_effects_given(self, named: list[NamedEffect]) -> list[EdgeEffect]:
-        """Search effects at depth steps (edge effects) again after some effects were named; return those that the residuals show.
+        """Search effects at depth steps (edge effects) again, with other errors in the model that can hide or imitate them.
 
-        named: the named effects, which are put into the model before.
+        named: sensor errors that a search found, to put into the model first. Returns the edge effects that the residuals then
+        show.
         """
         seen = aligned_with(self.measurement, named, self.plain.index[~self.held_out_points[self.plain.index]])
         return _find_edge_effects(seen.measurement, seen.residuals, self.held_out_points)
 
     def with_these(self, edge_effects: list[EdgeEffect]) -> PassInput:
-        """Return the input of the selection with the given edge effects in the model, and the pose estimated again with them."""
+        """Return the input of a search for sensor errors with the given effects at depth steps in the sensor model.
+
+        The sensor's pose is estimated again with these in the model. edge_effects: the effects, such as edge fattening.
+        """
         return PassInput.of(self.measurement, self.plain, self.held_out_points, edge_effects)
 
 
 def best_pass(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]) -> SelectionPass:
-    """Run the selection with several inputs and return the simplest pass that explains the residuals.
+    """Run the search for sensor errors with several inputs and return the simplest run that explains the residuals.
 
-    An effect that moves all rays can hide or imitate an edge effect. Edge effects are therefore searched again with the named
-    effects in the model. If there are some, a run without them is tried too, and they are searched again with what that run
-    names. Smoothing can shift the estimated pose, so a pass at the initial pose is tried too if the first pass needs an
-    empirical term and no single effect explains everything.
+    The inputs differ in the edge effects (errors at depth steps) in the sensor model. An error that moves all rays can hide or
+    imitate an edge effect. Edge effects are therefore searched again with the named errors in the model. If there are some, a
+    run without them is tried too, and they are searched again with what that run names. Smoothing can shift the estimated pose,
+    so a run at the initial pose is tried too if the first run needs an empirical term and no single error explains everything.
 
-    Among the passes whose noise is close to the lowest, the one of least complexity wins. The noise is compared because enough
-    noise can take the place of any effect.
+    Among the runs whose noise is close to the lowest, the one with the fewest empirical terms wins, then the one with the
+    fewest errors. The noise is compared because enough noise can take the place of any error.
 
     Parameters
     ----------
     inputs : inputs to choose from.
     random : source of random numbers for the null distributions.
-    excluded : families that are not tried, as in `select_effects`.
+    excluded : sensor errors that are not tried, as pairs (name, whether it is an empirical term).
     """
 
     def search_edges_again(found: SelectionPass) -> SelectionPass:
@@ -282,7 +302,10 @@ def best_pass(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple
 
 
 def subsample_rows(rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return at most about 60,000 of the given row numbers (k,), evenly spaced."""
+    """Return evenly spaced ones of the row numbers (k,) of points, so that a search stays quick.
+
+    All are returned if they are fewer than 120,000, else 60,000 to 90,000.
+    """
     return rows[:: max(len(rows) // _MOST_POINTS, 1)]
 
 
@@ -334,13 +357,17 @@ def _with_edge_effects(
 
 
 def subsample(measurement: Measurement, residuals: Residuals, rows: NDArray[np.int64]) -> tuple[Measurement, Residuals]:
-    """Restrict a measurement and its residuals to the same points.
+    """Restrict a measurement and its residuals to the same points, so that a fit uses these alone.
 
     Parameters
     ----------
-    measurement : measurement.
-    residuals : its residuals.
+    measurement : the measured points with their sensor model.
+    residuals : residuals of n of its points, measured minus predicted.
     rows : (k,) rows of the residuals to keep.
+
+    Returns
+    -------
+    tuple : measurement and residuals of k points.
     """
     part = residuals.part(rows)
     return measurement.part(part.index), replace(part, index=np.arange(len(rows)), expected_pulses=None)

@@ -18,18 +18,19 @@ _IN_GENERAL = {
 
 
 def with_separating_measurements(measurement: Measurement, named: list[NamedEffect]) -> list[NamedEffect]:
-    """Fill in, for each effect that cannot be told from others, which further measurement would tell them apart.
+    """Fill in, for each named effect (sensor error) that has alternatives, which further measurement would tell it from these.
 
-    Each of several additional measurements is tried: the signatures of the effects must then differ enough.
+    Several additional measurements, such as a second station, are tried by computation. One tells two effects apart if their
+    signatures (the patterns of residuals that they make) are no longer alike with it.
 
     Parameters
     ----------
     measurement : measurement as it was taken.
-    named : named effects.
+    named : named effects; each knows the effects from which this measurement cannot tell it.
 
     Returns
     -------
-    list : the effects with `split_by` filled in.
+    list : the effects; `split_by` says which measurement separates each from its alternatives.
     """
     if not any(item.indistinguishable for item in named):
         return named
@@ -38,11 +39,13 @@ def with_separating_measurements(measurement: Measurement, named: list[NamedEffe
 
 
 def measurement_separating_noises(item: NamedEffect, sensor: str) -> str:
-    """Return in words what would separate noise terms that cannot be told apart, by the covariates on which they depend.
+    """Say which further measurement would tell noise effects apart that explain the same variance.
+
+    The answer follows from the quantities, such as range or intensity, on which each noise depends.
 
     Parameters
     ----------
-    item : a named noise term with its equivalence class.
+    item : a named noise effect, with the effects that it cannot be told from.
     sensor : "tls" or "stereo".
     """
     told = (effect_of(name).told_by for name in (item.name, *item.indistinguishable))

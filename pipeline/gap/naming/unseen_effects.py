@@ -24,12 +24,15 @@ _NO_SIZE = "no plausible size of it would have shown"
 
 
 def unseen_effects(residuals: Residuals, computed: Iterable[DetectableSize], named: Sequence[str]) -> tuple[DetectableSize, ...]:
-    """List every effect of the catalogue that was not named, and the smooth errors outside it.
+    """List the sensor errors that a diagnosis did not name but that may be there, each with the size that would have shown.
+
+    These are all effects of the catalogue that were not named, and smooth errors outside the catalogue. If there is no such
+    size, a note says why.
 
     Parameters
     ----------
     residuals : The residuals, which tell the catalogue and the recorded fields.
-    computed : The detectable sizes that were computed.
+    computed : The sizes that were computed: an effect this large is found with a probability of 95 %.
     named : Names of the effects that were named, without the sensor's prefix.
     """
     effects = {effect.tag(): effect for effect in residuals.candidates if not effect.empirical and effect.tag() not in named}

@@ -24,16 +24,21 @@ _FEWEST_POINTS = 100
 
 @dataclass(frozen=True)
 class ValidationResult:
-    """A sensor model with some effects, and how well it predicts the validation points.
+    """A sensor model with certain sensor errors (effects) in it, and how well it predicts validation points.
+
+    Validation points are those that no fit used.
 
     Attributes
     ----------
     named : effects in the model.
     reduced_noise : noise values of the model that were lowered, by key; empty if its noise was kept.
     model : the model.
-    value : (n,) residuals against it after registration, in the observable's unit.
-    pose : (6,) pose of that registration: shift (m) and rotation (rad), wall frame.
-    gap : scores before and after; None if too few points can be scored.
+    value : (n,) residuals against it after registration, in the unit of the observable (m or px); NaN where a ray misses the
+        reference.
+    pose : (6 k,) pose of that registration: shift (m) and small rotation (rad) of each of k set-ups from the pose in the
+        measurement, wall frame. For a surface without cameras: amounts of the combinations of shift, rotation and scale that
+        can be determined (columns of `datum`).
+    gap : scores of the model without and with the effects; None if too few points can be scored.
     """
 
     named: list[NamedEffect]
@@ -45,17 +50,20 @@ class ValidationResult:
 
     @property
     def is_worse(self) -> bool:
-        """Whether the model predicts the validation points worse with the effects than without.
+        """Whether the sensor model predicts validation points worse with the named sensor errors in it than without them.
 
-        Effects on missing returns are not judged in this way, because a shrub in front of the validation blocks outweighs a few
-        drops.
+        False if the scores are those of missing returns: there, one shrub in front of the validation points outweighs a few
+        lost pulses.
         """
         gap = self.gap
         return gap is not None and gap.measure != LOSS_MEASURE and gap.after > gap.before
 
     @property
     def is_clearly_worse(self) -> bool:
-        """Whether the model predicts worse with the effects by more than the uncertainty of the scores."""
+        """Whether the sensor model predicts validation points worse with the named sensor errors than without, beyond chance.
+
+        The difference of the scores must exceed its uncertainty, 2 standard errors by default.
+        """
         return (
             self.is_worse
             and self.gap is not None
@@ -65,17 +73,17 @@ class ValidationResult:
 
 @dataclass(frozen=True)
 class Validation:
-    """Measures how well the sensor model predicts validation points with any set of effects in it.
+    """Measures how well a sensor model predicts validation points with any choice of sensor errors (effects) in it.
 
     Attributes
     ----------
-    measurement : measurement at its aligned pose.
+    measurement : the measured points, with the sensor at its aligned pose.
     residuals : residuals of n points against its model.
     registration_rows : rows of the residuals from which the pose is estimated.
     tested : (n,) true for validation points, which no earlier step has used.
-    training : (n,) true for points that the selection may use.
-    losses : explanation of the missing returns, with a mask of the pulses that it was not fitted to; or None.
-    reference_sigma : standard deviation of the reference error, in the observable's unit.
+    training : (n,) true for points that the selection of effects may use.
+    losses : explanation of the missing laser returns, with a mask of the pulses that it was not fitted to; or None.
+    reference_sigma : standard deviation of the error of the reference surface, in the unit of the observable (m or px).
     most_sigmas : points farther than this many predicted standard deviations from the models are not scored.
     random : source of random numbers.
     reduced_noise : lower noise values to propose, by key; empty if the model's noise is not too large.
@@ -94,23 +102,28 @@ class Validation:
 
     @property
     def pose(self) -> FloatArray:
-        """(6,) pose that registers the model without effects: shift (m) and rotation (rad), wall frame."""
+        """Pose that registers the measurement to the model without named effects, relative to the pose in the measurement.
+
+        (6 k,) shift (m) and small rotation (rad) of each of k set-ups, wall frame. For a surface without cameras: amounts of
+        the combinations of shift, rotation and scale that can be determined (columns of `datum`).
+        """
         return fit_pose(self.residuals, self.registration_rows)
 
     def validate(self, named: list[NamedEffect]) -> tuple[ValidationResult, list[str]]:
-        """Measure the gap on validation points, and drop effects that make the predictions worse.
+        """Score the sensor model without and with the named effects on validation points, and drop effects that do harm.
 
         While the score is worse with the effects than without, the effect that does most harm on training points is dropped, if
-        that harm exceeds its uncertainty. Empirical terms on the mean are dropped only if the validation score is worse by more
-        than its uncertainty. Lower noise values are proposed only if they predict better.
+        that harm exceeds its uncertainty. Some effects are dropped only if the validation score is worse by more than its
+        uncertainty: those that were found in the distribution of the values, and empirical terms that are no noise. Lower noise
+        values are proposed only if they predict better.
 
         Parameters
         ----------
-        named : effects that passed the selection.
+        named : effects (sensor errors) that passed the selection.
 
         Returns
         -------
-        tuple : the result, and a note for each effect that was dropped.
+        tuple : the result with the effects that are kept, and a note for each effect that was dropped.
         """
         result, words = self._result_of(named, self.tested), []
         if self.reduced_noise and result.is_worse:

@@ -28,13 +28,13 @@ _LEAST_WHITE_SHARE = 0.02
 
 @dataclass(frozen=True)
 class ValidatedEffects:
-    """Named effects, divided by whether they improve the predictions for the validation blocks.
+    """Named effects (sensor errors), sorted by whether they improve the predictions on parts of the wall that no fit used.
 
     Attributes
     ----------
-    named : effects that improve them, with their log-likelihood ratio on validation blocks.
+    named : effects that do, with their log-likelihood ratio on these validation blocks.
     failed : effects that do not.
-    weak : effects that improve them in addition to the others, but by too little to be named.
+    weak : effects that do, beside the others, but by too little to be named.
     """
 
     named: list[NamedEffect]
@@ -45,24 +45,24 @@ class ValidatedEffects:
 def validate_effects(
     measurement: Measurement, residuals: Residuals, named: list[NamedEffect], training: BoolArray, reference_sigma: float
 ) -> ValidatedEffects:
-    """Test on the validation blocks whether each effect improves the likelihood, with all other effects in the model.
+    """Test whether each named effect (sensor error) improves the likelihood of parts of the wall that no fit used.
 
-    Two systematic effects may only compensate each other, and then each seems to be needed. The log-likelihood ratio of all of
-    them together is therefore tested first. If it fails, the effect with the smallest ratio of its own is removed, an empirical
-    term before any other, and the remaining effects are tested again in the same way.
+    All other effects are in the model. Two systematic effects may only compensate each other, and then each seems to be needed.
+    The log-likelihood ratio of all of them together is therefore tested first. If it fails, the effect with the smallest ratio
+    of its own is removed, an empirical term before any other, and the remaining effects are tested again in the same way.
 
     Parameters
     ----------
-    measurement : measurement at its aligned pose.
+    measurement : the measured points, with the sensor at its aligned pose.
     residuals : its residuals of n points.
     named : effects to validate.
-    training : (n,) points from which the pose is estimated; the other points are scored.
-    reference_sigma : standard deviation of the reference error, in the observable's unit.
+    training : (n,) true for points from which the pose is estimated; the other points, the validation points, are scored.
+    reference_sigma : standard deviation of the error of the reference surface, in the unit of the observable (m or px).
 
     Returns
     -------
     ValidatedEffects : accepted effects; failed ones, which do not improve the likelihood; and weak ones, which improve it, but
-        not significantly (their ratio is within its standard error, or their size within its standard deviation of zero).
+        not significantly (their ratio is within its standard error, or their size within its uncertainty of zero).
     """
     scorable = [item for item in named if item.effect.scored()]
     if not scorable or (~training).sum() < 100:
@@ -110,7 +110,10 @@ def _is_weak(item: NamedEffect) -> bool:
 
 
 def describe_weakness(item: NamedEffect) -> str:
-    """Return in words why an effect of `ValidatedEffects.weak` is mentioned in the report but not named."""
+    """Say in the report why an effect (sensor error) is mentioned but not named, although it improves the predictions.
+
+    item: an effect whose size is consistent with zero, or whose log-likelihood ratio on validation blocks is too small.
+    """
     if _is_consistent_with_zero(item):
         return "its value is within its uncertainty of zero"
     return f"it gains only {item.gain:.1f} in log-likelihood on validation blocks"

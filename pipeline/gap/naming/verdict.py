@@ -46,16 +46,16 @@ TOO_NOISY = "No missing effect was found, but the model's noise is too large."
 
 @dataclass(frozen=True)
 class Evidence:
-    """The numbers that decide the verdict of a diagnosis.
+    """The numbers that decide the verdict of a diagnosis, such as "no_gap" (the measurement agrees with the sensor model).
 
     Attributes
     ----------
-    gap : scores on validation points; None if too few could be scored.
-    p_value : p-value of the remaining misfit (goodness of fit); None if it was not computed.
+    gap : scores of the model without and with the named effects on validation points; None if too few could be scored.
+    p_value : p-value of the misfit that the named effects leave (goodness of fit); None if it was not computed.
     noise_ratio : observed over predicted standard deviation if it is clearly below 1, else 1.
     outlier_share : share of outliers if they lie all over the wall and are more than normal noise makes, else 0.
     moved_share : share of points that lie off the reference together with their neighbours; 0 if it was not computed.
-    overdispersion : observed over predicted standard deviation that no noise term explains, else 1.
+    overdispersion : observed over predicted standard deviation if no noise term explains it, else 1.
     """
 
     gap: Gap | None
@@ -67,35 +67,45 @@ class Evidence:
 
     @property
     def much_moved(self) -> bool:
-        """Whether so much of the wall moved that nothing can be said about the sensor."""
+        """Whether so much of the wall moved that nothing can be said about the sensor.
+
+        By default, 30 % of the points must lie off the reference together with their neighbours.
+        """
         return self.moved_share >= thresholds().changes.moved_share
 
     @property
     def misfit_is_significant(self) -> bool:
-        """Whether the remaining misfit is larger than chance would make it."""
+        """Whether the misfit that the named effects leave is larger than chance makes it.
+
+        Its p-value must be at most 0.01 by default.
+        """
         return self.p_value is not None and self.p_value <= thresholds().verdict.rejection_p
 
     @property
     def is_overdispersed(self) -> bool:
-        """Whether the residuals have so much more variance than predicted that the model is rejected in any case."""
+        """Whether the residuals have so much more variance than predicted that the model is rejected for this alone.
+
+        Their standard deviation must be at least 1.5 times the predicted one by default, and no noise term may explain it.
+        """
         return self.overdispersion >= thresholds().verdict.overdispersion
 
     @property
     def model_is_accepted(self) -> bool:
-        """Whether the model without any further effect is accepted.
+        """Whether the sensor model agrees with the measurement without any further sensor error (effect).
 
-        Its score must be within its uncertainty of the score that noise alone leaves, and neither misfit, outliers nor variance
-        may be significant.
+        Its score on validation points must be within its uncertainty of the score that noise alone leaves. The misfit must have
+        been tested, and neither misfit nor variance may be significantly large. There may be no excess of outliers.
         """
         measured = self.gap is not None and not self.gap.above_floor and self.p_value is not None
         return measured and not (self.misfit_is_significant or self.outlier_share or self.is_overdispersed)
 
     @property
     def gap_stays_open(self) -> bool:
-        """Whether the named effects leave most of the gap open.
+        """Whether the named effects leave most of the gap open: the model still fits much worse than noise explains.
 
         The score with the effects must exceed the score that noise alone leaves, and most of the gap must be left, both by more
-        than their uncertainty. The gap also stays open if the score is worse with the effects and the misfit is significant.
+        than their uncertainty. The gap also stays open if the score is worse with the effects than without and the misfit is
+        significant.
         """
         gap = self.gap
         if gap is not None and gap.after > gap.before and self.misfit_is_significant:
@@ -104,19 +114,23 @@ class Evidence:
 
     @property
     def misfit_stays(self) -> bool:
-        """Whether the misfit stays significant with the named effects, and the gap is too uncertain to show that they help."""
+        """Whether nothing shows that the named effects help: the misfit stays significant, and the gap is too uncertain.
+
+        The gap is how much worse than noise explains the model predicts validation points.
+        """
         return self.misfit_is_significant and self.gap is not None and self.gap.closed is None
 
     @property
     def effects_unsupported(self) -> bool:
-        """Whether the named effects enlarge the gap on validation points, and no goodness-of-fit test could be computed."""
+        """Whether nothing supports the named effects: validation scores are worse with them, and no misfit was tested."""
         return self.gap is not None and self.gap.after > self.gap.before and self.p_value is None
 
     @property
     def closes_little(self) -> bool:
-        """Whether the named effects close clearly less of the gap than a diagnosis must, or the gap is uncertain.
+        """Whether the named effects close clearly less of the gap between model and measurement than a diagnosis must.
 
-        The required share is the threshold `least_closed`.
+        The required share is the threshold `least_closed`, one half by default. Also true if the gap is too small to be
+        measured.
         """
         gap = self.gap
         by = thresholds().verdict
@@ -125,11 +139,9 @@ class Evidence:
         return gap.before - gap.after + by.gap_sigmas * gap.error < by.least_closed * (gap.before - gap.floor)
 
     def only_noise_too_large(self, named: Sequence[NamedEffect]) -> bool:
-        """Whether the only fault of the model is that its noise is too large.
+        """Tell whether the only fault of the sensor model is that its noise is too large, so that lower noise can be proposed.
 
-        Parameters
-        ----------
-        named : named effects; with any, the answer is false.
+        named: sensor errors that the diagnosis names; if there are any, the answer is false.
         """
         still_open = self.gap is not None and self.gap.left_open and not self.model_is_accepted
         return self.noise_ratio < 1.0 and not (
@@ -138,9 +150,18 @@ class Evidence:
 
 
 def verdict_of(named: Sequence[NamedEffect], evidence: Evidence) -> str:
-    """Decide the verdict of a diagnosis, a key of `VERDICTS` such as "no_gap", "named" or "unknown".
+    """Decide the verdict of a diagnosis: whether the sensor model agrees with the measurement, and if not, what explains it.
 
-    named: the named effects. evidence: scores and p-values that decide.
+    Parameters
+    ----------
+    named : sensor errors (effects) that the diagnosis names.
+    evidence : scores and p-values that decide.
+
+    Returns
+    -------
+    str : "no_gap" if they agree; "named" or "several" if one or more effects explain the misfit; "ambiguous" if the one effect
+        cannot be told from others; "unknown" if no effect of the catalogue explains it; "insufficient_data" if nothing can be
+        said.
     """
     if evidence.much_moved:
         return "insufficient_data"
@@ -157,13 +178,13 @@ def verdict_of(named: Sequence[NamedEffect], evidence: Evidence) -> str:
 
 
 def verdict_sentence(verdict: str, named: Sequence[NamedEffect], evidence: Evidence) -> str:
-    """Return the verdict as a sentence for the report.
+    """Return the verdict of a diagnosis as a sentence for the report, which says more than the verdict where it can.
 
     Parameters
     ----------
-    verdict : key of `VERDICTS`.
-    named : named effects.
-    evidence : the numbers that decided the verdict.
+    verdict : the verdict, a key of `VERDICTS` such as "no_gap" or "unknown".
+    named : sensor errors that the diagnosis names.
+    evidence : the scores and p-values that decided the verdict.
     """
     if evidence.much_moved:
         return MUCH_MOVED
@@ -184,19 +205,22 @@ def verdict_sentence(verdict: str, named: Sequence[NamedEffect], evidence: Evide
 
 
 def describe_misfit(named: Sequence[NamedEffect], evidence: Evidence) -> str:
-    """Return a sentence on the misfit that the named effects leave; "" if it may be chance."""
+    """Return a sentence for the report on the misfit that the named effects (sensor errors) leave; "" if it may be chance.
+
+    named: the effects; without any, the sentence is "". evidence: numbers that decide the verdict, with the misfit's p-value.
+    """
     if not named or not evidence.misfit_is_significant:
         return ""
     return f"That does not explain everything: the remaining misfit has a p-value of {evidence.p_value:.2g}."
 
 
 def describe_closing(gap: Gap, model_changed: bool) -> str:
-    """Return in words how much of the gap the named effects close.
+    """Say in words how much of the gap between model and measurement the named effects (sensor errors) close.
 
     Parameters
     ----------
-    gap : scores of the model without and with the named effects, and the score that noise alone leaves (floor).
-    model_changed : whether the model after differs from the model before.
+    gap : scores of the model without and with the effects, and the score that noise alone leaves.
+    model_changed : whether the diagnosis changed the model at all, by effects or by lower noise.
     """
     if gap.closed is None:
         return "before and floor differ by no more than their uncertainty"
@@ -207,16 +231,16 @@ def describe_closing(gap: Gap, model_changed: bool) -> str:
 
 
 def reduced_noise(model: TlsModel | StereoModel, noise_ratio: float) -> dict[str, float]:
-    """Return the model's noise values, all lowered by the same factor to fit the residuals; empty if they are not too large.
+    """Return noise values that fit the residuals, if a sensor model's noise is too large: all are lowered by the same factor.
 
     Parameters
     ----------
-    model : sensor model.
-    noise_ratio : observed over predicted standard deviation of the residuals.
+    model : the sensor model.
+    noise_ratio : observed over predicted standard deviation of the residuals; below 1 if the noise is too large.
 
     Returns
     -------
-    dict : lowered values by key.
+    dict : lowered values by key, such as `range_sigma_m`; empty if the noise is not too large.
     """
     if noise_ratio >= 1.0:
         return {}
@@ -225,12 +249,16 @@ def reduced_noise(model: TlsModel | StereoModel, noise_ratio: float) -> dict[str
 
 
 def note_moved_wall(evidence: Evidence, stable_areas: bool) -> list[str]:
-    """Return a note for the report if much of the wall moved, with what to do about it; else no note.
+    """Make the note for the report that much of the wall moved since the reference, with what to do about it.
 
     Parameters
     ----------
-    evidence : the numbers that decide the verdict.
-    stable_areas : whether the measurement names stable areas.
+    evidence : numbers that decide the verdict, with the share of points that moved.
+    stable_areas : whether the measurement states areas where nothing moved.
+
+    Returns
+    -------
+    list : the note; empty if not much moved.
     """
     if not evidence.much_moved:
         return []
@@ -245,12 +273,16 @@ def note_moved_wall(evidence: Evidence, stable_areas: bool) -> list[str]:
 
 
 def note_overdispersion(evidence: Evidence, notes: Sequence[str]) -> list[str]:
-    """Return a note for the report if the residuals have much more variance than predicted and no other note says so.
+    """Make the note for the report that the residuals have much more variance than the sensor model predicts.
 
     Parameters
     ----------
-    evidence : the numbers that decide the verdict.
+    evidence : numbers that decide the verdict, with the observed over the predicted standard deviation.
     notes : the other notes.
+
+    Returns
+    -------
+    list : the note; empty if the variance is not that large, or if another note says so already.
     """
     if not evidence.is_overdispersed or any("the predicted standard deviation" in note for note in notes):
         return []
@@ -261,12 +293,16 @@ def note_overdispersion(evidence: Evidence, notes: Sequence[str]) -> list[str]:
 
 
 def note_excess_noise(noise_ratio: float, lower: dict[str, float]) -> list[str]:
-    """Return a note for the report if the model's noise is too large; else no note.
+    """Make the note for the report that the sensor model's noise is too large.
 
     Parameters
     ----------
     noise_ratio : observed over predicted standard deviation of the residuals.
-    lower : noise values that would fit, by key.
+    lower : noise values that would fit, by key such as `range_sigma_m`.
+
+    Returns
+    -------
+    list : the note; empty if the ratio is not below 1.
     """
     if noise_ratio >= 1.0:
         return []

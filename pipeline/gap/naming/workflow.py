@@ -71,26 +71,30 @@ _LEAST_MODEL_SHARE = 0.1
 
 @dataclass(frozen=True)
 class GapDiagnosis:
-    """Result of a diagnosis: what is wrong with the sensor model, and how much of the disagreement that explains.
+    """Result of a diagnosis: which sensor errors (effects) the sensor model lacks, and how much of its misfit they explain.
 
     Attributes
     ----------
-    verdict : key of `naming.verdict.VERDICTS`.
-    effects : named effects, sorted by gain.
-    changes : regions where the scene itself changed.
-    residuals : residuals of the n points that were compared.
-    held_out : (n,) true for validation points.
-    before, after : (n,) residuals after registration, without and with the named effects, in the observable's unit.
-    pose : (6 k,) shift (m) and rotation (rad) of the sensor in k set-ups against the surveyed poses, wall frame.
-    model_after : model with the named effects.
-    gap : scores before and after; None if too few points could be scored.
+    verdict : "no_gap" (model and measurement agree), "named", "several", "ambiguous", "unknown" (no effect explains the misfit)
+        or "insufficient_data".
+    effects : named effects, in the order of gap.json.
+    changes : regions where the rock itself changed since the reference.
+    residuals : residuals of the n points that were compared with the reference, measured minus predicted.
+    held_out : (n,) true for validation points, which no fit used.
+    before, after : (n,) residuals after registration, without and with the named effects in the model, in the unit of the
+        observable: m for ranges and distances, px for disparities.
+    pose : (6 k,) shift (m) and rotation (rad) of each of k set-ups from its surveyed pose, wall frame. For a surface without
+        cameras: amounts of the combinations of shift, rotation and scale that can be determined (columns of `datum`).
+    model_after : sensor model with the named effects.
+    gap : scores of the model without and with these; None if too few points could be scored.
     tried, variance_tried : scores of all systematic effects and of all noise terms that were tried.
-    remaining : entry `remaining` of gap.json.
-    identifiability : names of the effects, cosines between their signatures, and the share of each that the pose fit leaves.
+    remaining : what the effects leave unexplained, as in the entry `remaining` of gap.json.
+    identifiability : `names` of systematic effects, `cosines` between their signatures (the patterns of residuals that they
+        make), and `survival`, the share of each signature that is left after the pose is fitted.
     seconds, timings : duration of the whole diagnosis and of each step, s.
     unseen : effects that were not named, each with the size that would have shown with a probability of 95 %.
-    reference_sigma : estimated standard deviation of the reference's correlated error, in the observable's unit.
-    thresholds : thresholds that were used.
+    reference_sigma : estimated standard deviation of the reference's correlated error, in the unit of the observable.
+    thresholds : thresholds of the tests.
     """
 
     verdict: str
@@ -115,13 +119,13 @@ class GapDiagnosis:
 
     @property
     def evidence(self) -> Evidence:
-        """The numbers that decided the verdict."""
+        """The numbers that decided the verdict: scores on validation points, p-value, noise, and share of points that moved."""
         keys = ("p_value", "spread", "far", "moved", "wide")  # in the order of the fields of Evidence
         return Evidence(self.gap, *(self.remaining[key] for key in keys))
 
     @property
     def model_changed(self) -> bool:
-        """Whether the model after the diagnosis differs from the given one, in its effects or its noise."""
+        """Whether the diagnosis proposes another sensor model than the given one, with further effects or lower noise."""
         return bool(self.effects or self.remaining["lower_noise"])
 
 
@@ -131,18 +135,20 @@ def diagnose(
     progress: Callable[[str], None] | None = None,
     thresholds: Thresholds = _DEFAULTS,
 ) -> GapDiagnosis:
-    """Find where a measurement disagrees with its sensor model, name the effects that explain it, and measure the gap.
+    """Find where a measurement disagrees with its sensor model, and name the sensor errors (effects) that explain it.
+
+    It also measures the gap: how much worse than noise explains the model fits, without and with these effects.
 
     Parameters
     ----------
-    measurement : measurement to diagnose, with its model.
-    seed : seed of all random numbers.
-    progress : called with the name of each step of `STEPS` that is done.
+    measurement : the measured points, with the reference surface and the sensor model to test.
+    seed : start value of all random numbers.
+    progress : called with the name of each step ("residuals", "naming", "validation") when it is done.
     thresholds : thresholds of the tests.
 
     Returns
     -------
-    GapDiagnosis : verdict, effects and everything that the report shows.
+    GapDiagnosis : verdict, effects, scores and everything else that the report shows.
     """
     clock, random = _Clock(progress), KeyedRandom(seed, ("gap",))
     # one BLAS thread: results do not depend on the number of threads, and no threads wait for each other

@@ -371,7 +371,7 @@ def _expected_mean_square(residuals: Residuals, cells: WallCells, random: KeyedR
 
 
 def _best_variants(tried: list[VarianceScore]) -> list[VarianceScore]:
-    """The best variant of each effect."""
+    """Return the best score of each noise effect; some effects were tried with several values of a parameter."""
     best: dict[str, VarianceScore] = {}
     for item in tried:
         if item.name not in best or item.score > best[item.name].score:

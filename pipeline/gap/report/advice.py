@@ -13,7 +13,7 @@ _ROOT = Path(__file__).parents[3]
 
 @dataclass(frozen=True)
 class Advice:
-    """What a named effect means and what to do about it, in whole sentences.
+    """What a named effect (sensor error) means and what to do about it, in whole sentences for the report.
 
     Attributes
     ----------
@@ -40,9 +40,10 @@ _ABOUT_POINT_NOISE = Advice(
 
 
 def advice_on(named: NamedEffect) -> Advice:
-    """Return what a named effect means and what to do about it.
+    """Return the sentences of the report on what a named effect (sensor error) means and what to do about it.
 
-    The text belongs to the effect's class, or is the first paragraph of its docstring. Empirical terms have a general text.
+    The texts are those of the effect's class. An effect without such a text is explained by the first paragraph of its
+    docstring. Empirical terms, which name no cause, have a general text.
     """
     if named.effect.stage == Stage.POINT:
         return _ABOUT_POINT_NOISE if named.adds_variance else _ABOUT_A_SURFACE_TERM
@@ -60,7 +61,7 @@ def advice_on(named: NamedEffect) -> Advice:
 
 
 def page_of(name: str) -> str:
-    """Return the address (file URI) of a page of the documentation on this machine; "" if it is not installed.
+    """Return the address (file URI) of a documentation page on this machine, to link it in the report; "" without one.
 
     Parameters
     ----------

@@ -14,19 +14,20 @@ from scene.geometry.mesh import FloatArray
 
 
 def contributions(found: GapDiagnosis, measurement: Measurement) -> FloatArray:
-    """Return by how much each named effect, alone in the model, reduces the residuals.
+    """Return which part of the residuals each named effect (sensor error) explains, for viewers that switch effects on and off.
 
-    Each model is registered separately. The sum over the effects is `before - after`, except for what the registration absorbs of
-    several effects in common. Each effect costs one simulation.
+    It is the residual without any effect minus that with this effect alone in the model, each after a pose fit of its own. The
+    sum over the effects is nearly `before - after` of the diagnosis. What the pose fit absorbs of several effects together
+    differs.
 
     Parameters
     ----------
-    found : diagnosis with k effects and n points.
+    found : diagnosis with k named effects and n points.
     measurement : measurement that was diagnosed.
 
     Returns
     -------
-    FloatArray : (k, n) reductions in the observable's unit; 0 where a ray misses the reference.
+    FloatArray : (k, n) parts in the unit of the observable (m or px); 0 where a ray misses the reference.
     """
     if len(found.effects) < 2:
         return np.array([found.before - found.after for _ in found.effects]).reshape(-1, len(found.before))

@@ -28,10 +28,17 @@ _MARGIN_M = 0.3
 
 
 def rank_disagreements(found: GapDiagnosis) -> list[dict[str, Any]]:
-    """Return the entry `where` of gap.json: along which covariates, and at which values, measurement and model differ.
+    """Find along which covariates (such as range or incidence angle), and at which values, measurement and model differ most.
 
-    For each covariate and statistic (mean, standard deviation, shape, missing returns) it holds the bin that differs most. The
-    most significant entry comes first. The `size_m` of a mean is positive if the measured surface lies deeper than predicted.
+    The values of each covariate are divided into bins. For each covariate and statistic of the residuals, the bin that differs
+    most from the model is kept.
+
+    Returns
+    -------
+    list : at most ten entries of `where` in gap.json, the most significant first. Each has `covariate`; `statistic` ("mean",
+        "spread" for standard deviation, "shape" for outliers, "missing" for lost returns); `p_value`; `region`, the bin's
+        limits; and `size_m`, the difference in m, which for a mean is positive if the measured surface lies deeper than
+        predicted. Lost returns have the share of lost pulses, `share_lost`, instead.
     """
     residuals = found.residuals
     rows = [row for name, x, z in standardised_by_covariate(found) for row in _rank_statistics(name, x, z, residuals)]
@@ -46,9 +53,14 @@ def rank_disagreements(found: GapDiagnosis) -> list[dict[str, Any]]:
 
 
 def standardised_by_covariate(found: GapDiagnosis) -> list[tuple[str, FloatArray, FloatArray]]:
-    """Return, for each covariate, its name, the (m,) values at the inliers, and the (m,) standardised residuals there.
+    """Return the standardised residuals of a diagnosis against each covariate, such as range, to plot or rank them.
 
-    The residuals are those before effects are named, over their predicted standard deviation.
+    They are the residuals without named effects over their predicted standard deviation.
+
+    Returns
+    -------
+    list : for each covariate its name, its (m,) values at the m points that are no outliers, and the (m,) standardised
+        residuals.
     """
     residuals = found.residuals
     used = inliers(found)
@@ -57,9 +69,10 @@ def standardised_by_covariate(found: GapDiagnosis) -> list[tuple[str, FloatArray
 
 
 def inliers(found: GapDiagnosis) -> Any:
-    """Return (n,) true for points on smooth surface and outside of scene changes that are no outliers.
+    """Return which of the n points of a diagnosis count in profiles and rankings, as an (n,) mask.
 
-    Outliers are judged by the residuals before effects are named.
+    They lie on smooth surface, not within 0.3 m of the box around a scene change, and their residual without named effects is
+    below 6 predicted standard deviations.
     """
     residuals = found.residuals
     used = residuals.usable & (np.abs(found.before) < _OUTLIER_SIGMAS * residuals.sigma)
@@ -70,7 +83,7 @@ def inliers(found: GapDiagnosis) -> Any:
 
 
 def quantile_bins(x: FloatArray, count: int) -> tuple[FloatArray, Any]:
-    """Divide values (n,) into bins with about equally many values.
+    """Divide values into bins with about equally many values, for profiles of residuals along a covariate.
 
     Parameters
     ----------
@@ -79,7 +92,7 @@ def quantile_bins(x: FloatArray, count: int) -> tuple[FloatArray, Any]:
 
     Returns
     -------
-    tuple : edges of the bins, fewer than three if x hardly varies; and the (n,) number of each value's bin.
+    tuple : edges of the bins, fewer than three if x hardly varies; and the (n,) number of each value's bin, from 0.
     """
     edges = np.unique(np.quantile(x, np.linspace(0, 1, count + 1)))
     return edges, np.clip(np.searchsorted(edges, x, side="right") - 1, 0, max(len(edges) - 2, 0))

@@ -17,7 +17,7 @@ _SIGNIFICANT_SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class DatumScale:
-    """How much larger a cloud is than the reference.
+    """How much larger a cloud from unknown cameras is than the reference. If significant, one of them has a wrong scale.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class DatumScale:
 
     @property
     def words(self) -> str:
-        """The result as a sentence for the report."""
+        """The scale of a cloud from unknown cameras relative to the reference, as a sentence for the report."""
         std = f"\N{PLUS-MINUS SIGN} {self.std_ppm:.0f} ppm"
         if abs(self.ppm) < _SIGNIFICANT_SIGMAS * self.std_ppm:
             return f"Its scale agrees with that of the reference, as far as the relief shows ({self.ppm:+.0f} {std})."
@@ -41,17 +41,15 @@ class DatumScale:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the entry `scale_ppm` of gap.json."""
+        """Return the entry `scale_ppm` of gap.json: relative scale of a cloud and its standard deviation, ppm."""
         return {"value": self.ppm, "std": self.std_ppm}
 
 
 def estimate_scale(found: GapDiagnosis) -> DatumScale | None:
-    """Estimate the scale of a cloud without cameras relative to the reference.
+    """Estimate how much larger a cloud from unknown cameras is than the reference, from the datum that was fitted to it.
 
-    Returns
-    -------
-    DatumScale or None : the scale; None for other measurements, if the relief does not show a scale, and for fewer than 100
-    points.
+    found: diagnosis of the cloud. Returns None for measurements with known cameras or of a laser scanner, if the wall has too
+    little relief to show a scale, and for fewer than 100 points.
     """
     residuals = found.residuals
     if not isinstance(residuals, SurfaceResiduals) or not residuals.datum[6].any():

@@ -42,9 +42,9 @@ _MANY_DECADES = 300.0
 
 
 def maps_figure(found: GapDiagnosis) -> bytes:
-    """Draw maps of the residuals without and with the named effects, as PNG.
+    """Draw maps of the wall for the report: the mean residual without and with the named effects, as PNG.
 
-    They show means over small pixels on one colour scale, and below them the standard deviation over the predicted one.
+    Below them are maps of the standard deviation over the predicted one. A pixel of a map has about eight points.
     """
     unit, pixels = 1e3 * found.residuals.depth_m, _PixelGrid(found)
     left, right, low, high = pixels.extent
@@ -89,7 +89,16 @@ def _colour_bar(figure: Figure, image: AxesImage, panels: NDArray[np.object_], l
 
 
 def sigma_after(found: GapDiagnosis) -> FloatArray:
-    """Return (n,) the standard deviation that the model with the named effects predicts, in the observable's unit."""
+    """Return the standard deviation of each point's noise that the sensor model with the named effects predicts.
+
+    Returns
+    -------
+    FloatArray : (n,) standard deviations, in the unit of the observable (m or px).
+
+    Raises
+    ------
+    TypeError : model and residuals are of different sensors.
+    """
     match found.model_after, found.residuals:
         case TlsModel() as model, TlsResiduals(geometry=rays) as ranges:
             return np.asarray(np.sqrt(model.variance(rays) + ranges.reference_variance))
@@ -101,9 +110,10 @@ def sigma_after(found: GapDiagnosis) -> FloatArray:
 
 
 def profiles_figure(found: GapDiagnosis) -> bytes:
-    """Draw mean and standard deviation of the residuals against each covariate, as PNG.
+    """Draw mean and standard deviation of the residuals against each covariate (such as range) for the report, as PNG.
 
-    Bars are two standard errors; a line shows what the named effects explain.
+    Two colours show the residuals without and with the named effects, with bands of two standard errors. A black line shows
+    what the effects explain, and dashed lines the predicted standard deviation.
     """
     names = [name for name, _, _ in standardised_by_covariate(found)]
     rows = max((len(names) + _COLUMNS - 1) // _COLUMNS, 1)
@@ -158,7 +168,10 @@ def _log_axis(panel: Axes) -> None:
 
 
 def gap_figure(gap: Gap) -> bytes:
-    """Draw the gap as one bar from the floor over the score after to the score before, as PNG."""
+    """Draw how much of the gap between model and measurement the named effects close, as one bar, as PNG.
+
+    The bar runs from the score that noise alone leaves (floor) over the score with the effects to that without them.
+    """
     factor, unit = gap.display_unit
     floor, after, before = (factor * value for value in (gap.floor, gap.after, gap.before))
     figure = Figure(figsize=(9.0, 2.0), layout="constrained")
@@ -184,13 +197,16 @@ def gap_figure(gap: Gap) -> bytes:
 
 
 def matrix_figure(names: list[str], cosines: FloatArray, survival: FloatArray) -> bytes:
-    """Draw how similar the effects' signatures are after the pose fit, and how much of each it leaves, as PNG.
+    """Draw which sensor errors a measurement can tell apart, as PNG: a matrix of similarities, and bars.
+
+    A signature is the pattern of residuals that an error makes. A bar shows how much of it is left after the sensor's pose is
+    fitted.
 
     Parameters
     ----------
-    names : names of m effects.
-    cosines : (m, m) absolute cosines of the signatures.
-    survival : (m,) share of each signature that the pose fit leaves.
+    names : names of m sensor errors.
+    cosines : (m, m) absolute cosines between the signatures after the pose fit; 1: indistinguishable.
+    survival : (m,) share of each signature that is left after the pose fit, from 0 to 1.
     """
     short, count = [name.partition(".")[2] for name in names], len(names)
     figure = Figure(figsize=(2.8 + 0.62 * count, 1.9 + 0.44 * count), layout="constrained")

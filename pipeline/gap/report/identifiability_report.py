@@ -40,12 +40,14 @@ class _Row:
 
 
 def write_identifiability(out: Path, found: Sequence[Identifiability]) -> Path:
-    """Write report.html, identifiability.json and the figures into a folder.
+    """Write the report on which sensor errors a planned survey can detect and tell apart.
+
+    Its files are report.html, identifiability.json and a figure for each sensor.
 
     Parameters
     ----------
     out : folder to write.
-    found : one analysis for each sensor.
+    found : one analysis of the survey for each sensor.
 
     Returns
     -------
@@ -69,7 +71,11 @@ def write_identifiability(out: Path, found: Sequence[Identifiability]) -> Path:
 
 
 def summarise(found: Identifiability) -> str:
-    """Return the result of an analysis as a paragraph: which effects the pose hides, and which pairs look alike."""
+    """Return a paragraph on which sensor errors a planned survey can tell apart, for the terminal.
+
+    It names the errors that a shift or rotation of the sensor imitates, the pairs that look alike, and the further measurement
+    that separates most pairs. found: the analysis of the survey for one sensor.
+    """
     weak = [name for name, share in zip(found.names, found.survival, strict=True) if share < 0.1]
     pairs = found.similar_pairs()
     parts = [f"{_INSTRUMENTS[found.sensor]}, {found.points:,} points on smooth parts of the wall."]

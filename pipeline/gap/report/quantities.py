@@ -19,14 +19,14 @@ _DIGITS = 5
 
 
 def format_with_std(key: str, value: float, std: float | None = None) -> str:
-    """Format a parameter with its standard deviation, such as `4.02 ± 0.05 mm`.
+    """Format a parameter of a sensor error with its standard deviation for the report, such as `4.02 ± 0.05 mm`.
 
     The standard deviation has one significant digit, two if the first is 1, and the value ends at the same digit. A standard
     deviation below the smallest step that is printed becomes `< 0.001 mm`. Without one, the value has four significant digits.
 
     Parameters
     ----------
-    key : key of the parameter, whose suffix names its unit.
+    key : key of the parameter, whose suffix names its unit, such as `amplitude_m`.
     value : value in that unit.
     std : standard deviation in that unit; None if it is not known.
     """

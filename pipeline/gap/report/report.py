@@ -44,7 +44,10 @@ _MOST_TRIED = 25
 
 
 def to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
-    """Return the content of gap.json for a diagnosis of a measurement."""
+    """Return the content of gap.json, the machine-readable result of a diagnosis.
+
+    found: the diagnosis; measurement: the measurement that was diagnosed, with its world frame.
+    """
     with use_thresholds(found.thresholds):
         return _to_dict(found, measurement)
 
@@ -86,10 +89,12 @@ def _registration(pose: FloatArray, measurement: Measurement) -> dict[str, Any]:
 
 
 def write_report(out: Path, found: GapDiagnosis, measurement: Measurement) -> Path:
-    """Write all files of a diagnosis into a folder. Nothing is written if a figure fails.
+    """Write the files of a diagnosis: gap.json, model_after.yaml, before.laz and after.laz, report.html and its figures.
 
-    before.laz and after.laz hold `residual_m`, positive where the measured surface lies deeper than the predicted one. With
-    several effects, before.laz also holds what each removes alone, `effect_1_m`, ..., in the order of gap.json.
+    before.laz and after.laz hold the points (world frame) with their residual without and with the named effects, `residual_m`.
+    It is positive where the measured surface lies deeper than the predicted one. With several effects, before.laz also holds
+    what each explains alone, `effect_1_m`, `effect_2_m` and so on, in the order of gap.json. Nothing is written if a figure
+    fails.
 
     Parameters
     ----------
@@ -121,7 +126,7 @@ def write_report(out: Path, found: GapDiagnosis, measurement: Measurement) -> Pa
 
 
 def summarise(found: GapDiagnosis) -> str:
-    """Return the verdict and the main numbers as a few lines of text for the terminal."""
+    """Return the result of a diagnosis as lines for the terminal: verdict, named effects, scores, and what may be hidden."""
     with use_thresholds(found.thresholds):
         return _summary(found)
 

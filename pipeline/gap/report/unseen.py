@@ -21,14 +21,15 @@ _OBSERVABLE = {"tls": "smooth_m", "stereo": "smooth_px"}
 
 
 def unseen_entry(found: GapDiagnosis) -> list[dict[str, Any]]:
-    """Return the entry `detectable` of gap.json: sizes from which effects that were not found would have shown."""
+    """Return the entry `detectable` of gap.json: sensor errors that were not found, and the size that would have shown."""
     return [{**each.to_dict(), "name": _full_name(each, found.residuals.sensor)} for each in found.unseen]
 
 
 def unseen_rows(found: GapDiagnosis) -> list[dict[str, str]]:
-    """Return the rows of the report's table of effects that may be there unseen.
+    """Return the rows of the report's table of sensor errors that may be there although the diagnosis did not name them.
 
-    Columns: name, the size that would have shown, and the choice (period, camera) for which it holds or why there is no size.
+    Columns: `name`; `size`, from which the error would have shown with a probability of 95 %; and `note`: the choice (period,
+    camera) for which the size holds, or why there is no size.
     """
     return [
         {
@@ -41,7 +42,10 @@ def unseen_rows(found: GapDiagnosis) -> list[dict[str, str]]:
 
 
 def unseen_line(found: GapDiagnosis) -> str:
-    """Return one line for the terminal that names the effects that could be largest without having shown; "" without any."""
+    """Return a line for the terminal on sensor errors that may be there unseen, with the size that would have shown.
+
+    It names the four whose size is largest relative to the typical one; "" if no such size is known.
+    """
     sensor = found.residuals.sensor
     known = [each for each in found.unseen if np.isfinite(each.size) and each.parameter]
     largest = sorted(known, key=lambda each: -each.size / _typical(each))[:_MOST_NAMED]
@@ -53,7 +57,10 @@ def unseen_line(found: GapDiagnosis) -> str:
 
 
 def reference_line(found: GapDiagnosis) -> str:
-    """Return a sentence on a reference whose estimated error is larger than is usual; else ""."""
+    """Return a sentence that warns of a reference surface whose estimated error is over three times the usual; else "".
+
+    Sensor errors that look like an error of the reference stay hidden then.
+    """
     if not len(found.residuals) or not found.reference_sigma:
         return ""
     error_m = found.reference_sigma * float(np.median(found.residuals.unit_m))
@@ -85,5 +92,5 @@ def _format(item: DetectableSize, sensor: str) -> str:
 
 
 def _short(value: float | str) -> str:
-    """A value of the variant."""
+    """Format a period, or name a camera, for which a detectable size holds."""
     return value if isinstance(value, str) else f"{value:.3g}"

@@ -40,7 +40,7 @@ _COVARIATES = {
 
 
 def title(found: GapDiagnosis) -> str:
-    """Return the outcome of a diagnosis as a headline."""
+    """Return the outcome of a diagnosis as the headline of the report, such as "Missing: tls.range_offset"."""
     names = [" or ".join([effect.name, *effect.indistinguishable]) for effect in found.effects if effect.kind == "physical"]
     match found.verdict:
         case "no_gap" | "unknown" if found.evidence.only_noise_too_large(found.effects):
@@ -70,29 +70,34 @@ def title(found: GapDiagnosis) -> str:
 
 
 def paragraph(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
-    """Return the outcome of a diagnosis as a paragraph, with the scores before and after.
+    """Return the outcome of a diagnosis as a paragraph: verdict, named effects, and scores of the model without and with them.
 
     Parameters
     ----------
     found : diagnosis.
-    rows : where measurement and model differ, from `rank_disagreements`.
+    rows : where measurement and model differ most, from `rank_disagreements`.
     """
     return " ".join(each for each in (*_findings(found, rows), describe_gap(found), *_side_notes(found)) if each)
 
 
 def answer(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
-    """Return the outcome of a diagnosis as a paragraph without scores, for the top of the report.
+    """Return the outcome of a diagnosis as a paragraph for the top of the report, with the share of the gap that closes.
+
+    It leaves out the scores, which the report shows further below.
 
     Parameters
     ----------
     found : diagnosis.
-    rows : where measurement and model differ, from `rank_disagreements`.
+    rows : where measurement and model differ most, from `rank_disagreements`.
     """
     return " ".join(each for each in (*_findings(found, rows), _describe_closed_gap(found), *_side_notes(found)) if each)
 
 
 def verdict_in_words(found: GapDiagnosis) -> str:
-    """Return the verdict of a diagnosis as a sentence. A surface without cameras has sentences of its own."""
+    """Return the verdict of a diagnosis as a sentence for the report and the terminal.
+
+    A surface from unknown cameras has sentences of its own, because no camera error can be tried for it.
+    """
     said = verdict_sentence(found.verdict, found.effects, found.evidence)
     return _SURFACE_SENTENCES.get(said, said) if isinstance(found.residuals, SurfaceResiduals) else said
 
@@ -150,13 +155,17 @@ def _largest_disagreement(found: GapDiagnosis, rows: list[dict[str, Any]]) -> st
 
 
 def outcome(found: GapDiagnosis, tried: Sequence[FamilyScore], item: FamilyScore) -> str:
-    """Return what became of an explanation of the mean: named, in the class of a named one, added as empirical, or rejected.
+    """Say what became of one explanation of the residuals' mean that the diagnosis tried, for the report's table.
 
     Parameters
     ----------
     found : diagnosis.
-    tried : all explanations that were tried, best first.
+    tried : all explanations of the mean (systematic sensor errors and empirical terms) that were tried, best first.
     item : one of these.
+
+    Returns
+    -------
+    str : "named", "cannot be told from the named one", "added as empirical" or "rejected".
     """
     if item.empirical:
         added = {effect.entry.get("covariate") for effect in found.effects if effect.kind == "empirical"}
@@ -166,12 +175,10 @@ def outcome(found: GapDiagnosis, tried: Sequence[FamilyScore], item: FamilyScore
 
 
 def variance_outcome(found: GapDiagnosis, item: VarianceScore) -> str:
-    """Return what became of an explanation of the variance: named, in the class of a named one, added as empirical, or rejected.
+    """Say what became of one explanation of the residuals' variance that the diagnosis tried, for the report's table.
 
-    Parameters
-    ----------
-    found : diagnosis.
-    item : one of the explanations that were tried.
+    found: diagnosis; item: one of the noise terms that were tried. Returns "named", "cannot be told from the named one", "added
+    as empirical" or "rejected".
     """
     if item.empirical:
         added = any(effect.kind == "empirical" and effect.adds_variance for effect in found.effects)
@@ -190,39 +197,42 @@ def _outcome_of_effect(found: GapDiagnosis, effect: str) -> str:
 
 
 def join_words(words: Sequence[str]) -> str:
-    """Join words as in "a, b and c"."""
+    """Join one or more words or names for a sentence, as in "a, b and c"."""
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def covariate_with_unit(covariate: str, sensor: str) -> str:
-    """Return a covariate in words with its unit, for a table.
+    """Return a covariate (a quantity on which an error may depend) in words with its unit, such as "range, m".
 
     Parameters
     ----------
-    covariate : name of the covariate.
-    sensor : "tls" or "stereo", for covariates in the unit of the observable.
+    covariate : name of the covariate, such as "range".
+    sensor : "tls" or "stereo"; a covariate without a unit of its own has that of the observable, m or px.
     """
     _, unit = _COVARIATES.get(covariate, ("", ""))
     return f"{covariate_name(covariate)}, {unit or ('m' if sensor == 'tls' else 'px')}"
 
 
 def covariate_name(covariate: str) -> str:
-    """Return a covariate in words, such as "zenith angle" for "zenith"."""
+    """Return a covariate (a quantity on which an error may depend) in words, such as "scan line" for "line"."""
     return _COVARIATES[covariate][0] if covariate in _COVARIATES else covariate.replace("_", " ")
 
 
 def format_number(value: float, digits: int = 4) -> str:
-    """Format a number with at most `digits` significant digits, without an exponent from 0.0001 to a million."""
+    """Format a number for the report with at most `digits` significant digits, without an exponent from 0.0001 to a million."""
     return f"{float(f'{value:.{digits}g}'):g}"
 
 
 def format_decimal(value: float) -> str:
-    """Format a number with one decimal, or without decimals from ten thousand on."""
+    """Format a number for the report with one decimal, or without decimals from ten thousand on."""
     return with_minus_sign(value, 1) if abs(value) < 9999.95 else format_number(value, 5)
 
 
 def round_entry(value: Any) -> Any:
-    """Return an effect's entry of the model with all numbers rounded to five significant digits."""
+    """Round all numbers in an effect's entry of a sensor model to five significant digits, so that the report can show it.
+
+    value: the entry (a dictionary) or a part of it, such as a list or a number.
+    """
     if isinstance(value, dict):
         return {key: round_entry(each) for key, each in value.items()}
     if isinstance(value, list):
@@ -231,20 +241,20 @@ def round_entry(value: Any) -> Any:
 
 
 def format_parameters(effect: NamedEffect) -> str:
-    """Format the parameters of an effect with their standard deviations, separated by commas."""
+    """Format the parameters of a named effect (sensor error) with their standard deviations, separated by commas."""
     return ", ".join(
         f"{key} {format_value(key, value, effect.std.get(key))}" for key, value in effect.entry.items() if key != "name"
     )
 
 
 def format_value(key: str, value: Any, std: float | None) -> str:
-    """Format one value of an effect's entry of the model.
+    """Format one parameter of a named effect (sensor error) for the report.
 
     Parameters
     ----------
-    key : key of the value, whose suffix names its unit.
-    value : a number, a text, an axis (dictionary with low and high) or a table (list of lists). Axis and table are given by their
-        range.
+    key : key of the parameter, whose suffix names its unit, such as `amplitude_m`.
+    value : a number, a text, an axis (dictionary with low and high) or a table (list of lists). Of axis and table only the
+        range of values is given.
     std : standard deviation of a number; None if it is not known.
     """
     if isinstance(value, dict):
@@ -288,7 +298,10 @@ def _describe_range(effect: NamedEffect) -> str:
 
 
 def describe_gap(found: GapDiagnosis) -> str:
-    """Return a sentence with the scores before and after and the floor; "" if they were not measured."""
+    """Return a sentence for the report with the scores of the sensor model without and with the named effects.
+
+    It also states the score that noise alone leaves; "" if nothing was scored.
+    """
     if found.gap is None:
         return ""
     gap, model_changed = found.gap, found.model_changed

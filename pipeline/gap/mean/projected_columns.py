@@ -1,0 +1,69 @@
+"""Divide design columns into their parts within and between the cells of the wall, in the form in which the fits use them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from scene.geometry.mesh import FloatArray
+
+
+@dataclass(frozen=True)
+class ProjectedColumns:
+    """k design columns (or residuals) at n points, divided into their parts within and between the m cells of the wall.
+
+    The wall is divided into at most about 800 square cells, each with several points. The part between cells is the mean of a
+    column in each cell; the part within cells is the deviation from the mean, or from a plane. The error of the reference
+    surface varies little within a cell, so only the part between cells depends on its covariance. Columns are divided by the
+    standard deviation of each point.
+
+    Attributes
+    ----------
+    within : (n, k) deviations within cells.
+    within_weighted : (n, k) deviations times the inverse covariance of their noise, so that a.within.T @ b.within_weighted are
+        the inner products of two sets of columns.
+    between : For each trial correlation function of the reference's error, the (m, k) cell means in coordinates of its
+        eigenvectors.
+    """
+
+    within: FloatArray
+    within_weighted: FloatArray
+    between: list[FloatArray]
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[ProjectedColumns]) -> ProjectedColumns:
+        """Join several sets of design columns for the same n points to one, in the given order.
+
+        parts: the sets, such as the columns of the pose and those of each candidate error; at least one.
+        """
+        if len(parts) == 1:
+            return parts[0]
+        within = np.concatenate([each.within for each in parts], axis=1)
+        white = all(each.within_weighted is each.within for each in parts)
+        weighed = within if white else np.concatenate([each.within_weighted for each in parts], axis=1)
+        bases = zip(*(each.between for each in parts), strict=True)
+        return cls(within, weighed, [np.concatenate(basis, axis=1) for basis in bases])
+
+    def select(self, columns: list[int]) -> ProjectedColumns:
+        """Return some of the k design columns, such as those of one candidate error.
+
+        columns: their numbers, from 0, in the wanted order.
+        """
+        within = self.within[:, columns]
+        weighed = within if self.within_weighted is self.within else self.within_weighted[:, columns]
+        return ProjectedColumns(within, weighed, [part[:, columns] for part in self.between])
+
+    def in_bases(self, bases: list[int]) -> ProjectedColumns:
+        """Return the same design columns for only some trial correlation functions of the reference surface's error.
+
+        It saves time after unlikely functions have been dropped (`MeanModel.restrict`).
+
+        bases: indices of these functions in the list `between`, which holds the cell means for each of them.
+        """
+        return ProjectedColumns(self.within, self.within_weighted, [self.between[basis] for basis in bases])
+
+    def append(self, other: ProjectedColumns) -> ProjectedColumns:
+        """Return these design columns followed by those of `other`, another set of columns at the same n points."""
+        return ProjectedColumns.concatenate([self, other])
