@@ -262,11 +262,6 @@ def plan_series(config: SimulationConfig, sensor: SensorName, progress: Progress
     progress : Progress, optional
         Object that is told which stage is running, to show it to the user.
 
-    Returns
-    -------
-    SeriesPlan
-        The prediction.
-
     Raises
     ------
     InputError
@@ -338,10 +333,10 @@ class _Sample:
         size = 3 if self._moved else 2
         if len(used) < _FEWEST:
             raise InputError(
-                f"the sensor sees enough of only {len(used)} of {len(rows)} blocks that were placed on the wall as a trial",
+                f"of {len(rows)} simulated blocks on the wall, the sensor sees at least half of only {len(used)}",
                 where="inspect --series",
                 allowed=f"{_FEWEST} blocks or more",
-                remedy="move or turn the sensor so that it sees more of the wall; the map of scarpsim inspect shows what it sees",
+                remedy="move or turn the sensor so that it sees more of the wall; a map of `scarpsim inspect` shows what it sees",
             )
         design, listed = _design(used[:, 0], used[:, 1], size), used[:, 3]
         best = _fit(design, listed)
