@@ -50,16 +50,18 @@ _GREEDY_OBSERVATIONS = 300
 
 @dataclass(frozen=True)
 class OrientationPatterns:
-    """Difference maps that errors of the left camera's orientation cause, after registration.
+    """Size and similarity of the difference maps that errors of single orientation parameters of a camera cause.
 
-    They show which orientation parameters can be told apart. If the sensor model moves both cameras alike, the maps are those of
-    both cameras.
+    Two parameters (angles or coordinates of the camera) with similar maps cannot be told apart by a calibration. Each map is
+    that of an error of the left camera, or of both cameras if the sensor model moves them alike, after registration of the
+    epoch.
 
     Attributes
     ----------
-    names : (k,) names of the orientation parameters with a non-zero sigma.
-    size_m : (k,) RMS of the map that an error of one sigma causes, m.
-    cosines : (k, k) cosines of the angles between the maps; near 1 in magnitude, two parameters make the same pattern.
+    names : (k,) names of the orientation parameters with a non-zero standard deviation (sigma) in the sensor model.
+    size_m : (k,) RMS of the difference map that an error of one sigma causes, m.
+    cosines : (k, k) cosines of the angles between the maps as vectors; near 1 in magnitude, two parameters make the same
+        pattern.
     """
 
     names: tuple[str, ...]
@@ -67,20 +69,23 @@ class OrientationPatterns:
     cosines: FloatArray
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as a dictionary, as `calibration.json` holds them."""
+        """Return parameter names, RMS of their difference maps in m, and cosines between the maps, for `calibration.json`."""
         return {"names": self.names, "rms_m": self.size_m, "cosines": self.cosines}
 
 
 @dataclass(frozen=True)
 class GreedyComparison:
-    """Result of a simple search that changes one parameter at a time, on the same maps, for comparison with `NoiseSearch`.
+    """How well a greedy search, which changes one noise parameter at a time, fits beside the calibration's own search.
+
+    Costs are squared Mahalanobis distances of the measured summary statistics (of size and pattern of the noise) from those of
+    newly simulated maps; lower is better.
 
     Attributes
     ----------
-    result : End point of the simple (greedy) search.
-    cost : Cost of that end point, from newly simulated maps.
-    costs : For each round of `NoiseSearch`, the number of maps simulated so far and the cost of its estimate.
-    overtaken : Number of simulated maps after which `NoiseSearch` first had a simulation nearer to the measurement than `cost`;
+    result : End point of the greedy search.
+    cost : Cost of that end point.
+    costs : For each round of the calibration's search, the number of maps simulated so far and the cost of its estimate.
+    overtaken : Number of simulated maps after which the calibration's search first had a simulation with a cost below `cost`;
         None: never.
     """
 
@@ -92,26 +97,26 @@ class GreedyComparison:
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """The fitted noise parameters of a sensor model, with all that the report and `calibration.json` need.
+    """Result of a calibration: the fitted noise parameters of a sensor model, with all that its report needs.
 
     Attributes
     ----------
-    config : The resolved config of the calibration.
-    sensor : "stereo" or "tls".
-    inputs : The measured maps, their stable ground and the simulated site.
-    windows : Windows of the wall in which measured and simulated maps were compared.
+    config : The config of the calibration, with all defaults filled in.
+    sensor : "stereo" or "tls" (laser scanner).
+    inputs : The measured difference maps, their stable ground and the simulated site.
+    windows : The k square parts of the maps, n x n pixels each, in which measured and simulated maps were compared.
     epochs : Noise statistics of each measured map.
-    median_trend, std_trend : Trends of the maps' median and standard deviation over the epochs.
+    median_trend, std_trend : Linear trends of the maps' median and standard deviation over the epochs.
     systematic : (h, w) mean of the measured maps, m; NaN outside stable ground.
-    parameters : The fitted parameters and their bounds.
+    parameters : Names and bounds of the fitted parameters.
     found : Estimate, intervals and goodness of fit.
-    statistics : (m,) names of the summary statistics that were compared.
-    observed : (m,) summary statistics of the measurement (logarithms of lengths in m).
-    patterns : Maps of the orientation errors; None for a laser scanner or a model without such errors.
-    baseline : Comparison with the greedy search; None if it was not asked for.
-    predicted : (k, n, n) windows of one map simulated with the fitted noise, m.
-    rate : Simulated observations per second.
-    cells : Number of cells of the sensor that each simulated observation traces.
+    statistics : (m,) names of the summary statistics of the noise that were compared, such as "size.nmad".
+    observed : (m,) summary statistics of the measurement (natural logarithms of lengths in m).
+    patterns : Similarity of the maps of orientation errors; None for a laser scanner or a model without such errors.
+    baseline : Comparison with a search that changes one parameter at a time; None if it was not asked for.
+    predicted : (k, n, n) windows of one difference map simulated with the fitted noise, m.
+    rate : Simulated measurements of the wall (observations) per second.
+    cells : Number of depth-map pixels or laser pulses that each simulated observation traces.
     seconds : Duration of the whole calibration, s.
     """
 
@@ -136,25 +141,25 @@ class CalibrationResult:
 
     @property
     def confidence(self) -> float:
-        """Confidence level of the intervals, 0 to 1."""
+        """Confidence level of the intervals of the fitted noise parameters, 0 to 1."""
         return self.config.calibration.confidence
 
     def simulated_site(self) -> SensorSite:
-        """Return the simulated site, the sensor in front of the wall, with the calibrated sensor model."""
+        """Return the wall with the sensor in front of it, where the sensor has the fitted noise, to simulate further maps."""
         sensor: Any = self.inputs.site.sensor
         return replace(self.inputs.site, sensor=replace(sensor, model=self.model))
 
     @property
     def model(self) -> Model:
-        """The sensor model with the fitted noise."""
+        """The sensor model (noise and effects of the stereo pair or scanner) with the fitted values of its noise parameters."""
         return self.parameters.model(np.exp(self.found.x))
 
     def inseparable(self) -> list[tuple[str, str, float]]:
-        """Return pairs of parameters of which the maps determine only a combination.
+        """Return the pairs of noise parameters that the maps cannot separate: they determine only a combination of both.
 
         Returns
         -------
-        For each pair both names and the correlation of their errors, over 0.9 in magnitude.
+        For each pair, both names and the correlation of the errors of their estimates, which exceeds 0.9 in magnitude.
         """
         names, matrix = self.parameters.names, self.found.correlation
         rows, columns = np.nonzero(np.triu(np.abs(matrix) > _ALIKE, 1))
@@ -164,15 +169,15 @@ class CalibrationResult:
 def calibrate(
     config: SimulationConfig, sensor: SensorName, paths: Sequence[Path], progress: Progress, *, with_greedy: bool = True
 ) -> CalibrationResult:
-    """Fit the noise parameters of a sensor model to measured difference maps.
+    """Fit the noise parameters of a sensor model to measured difference maps, so that simulated maps have the same noise.
 
     Parameters
     ----------
     config : Config of the simulated site; `config.seed` determines all random numbers.
-    sensor : "stereo" or "tls".
-    paths : A folder of results or measurements, or difference maps as GeoTIFFs (see `read_inputs`).
-    progress : Receives the stages and their progress.
-    with_greedy : Whether to run the greedy search too, for comparison.
+    sensor : "stereo" or "tls" (laser scanner).
+    paths : One folder of a simulation or a measurement, or difference maps as GeoTIFFs.
+    progress : Display of the progress, which is told each stage and how much of it is done.
+    with_greedy : Whether to also run a search that changes one parameter at a time, for comparison.
 
     Returns
     -------
@@ -204,16 +209,20 @@ def calibrate_inputs(
     Parameters
     ----------
     config : Config of the simulated site; `config.seed` determines all random numbers.
-    sensor : "stereo" or "tls".
-    inputs : The measured maps, their stable ground and the site to simulate.
-    progress : Receives the stages and their progress.
-    with_greedy : Whether to run the greedy search too, for comparison.
-    began : Start of the calibration on the clock of `time.perf_counter`, s; None: now.
+    sensor : "stereo" or "tls" (laser scanner).
+    inputs : The measured difference maps, their stable ground and the site to simulate.
+    progress : Display of the progress, which is told each stage and how much of it is done.
+    with_greedy : Whether to also run a search that changes one parameter at a time, for comparison.
+    began : Time when the calibration began, from `time.perf_counter`, s, for its duration; None: now.
+
+    Returns
+    -------
+    The fitted noise with its intervals and diagnostics.
 
     Raises
     ------
     InputError
-        If the site cannot be simulated window by window.
+        If no stable part of the maps is large enough to compare, or the sensor cannot be simulated in parts of the wall.
     """
     began = time.perf_counter() if began is None else began
     random, settings = KeyedRandom(config.seed).child("calibrate"), config.calibration

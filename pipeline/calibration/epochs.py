@@ -22,16 +22,16 @@ from scene.geometry.mesh import FloatArray
 
 @dataclass(frozen=True)
 class EpochNoise:
-    """Noise statistics of one measured difference map over stable ground.
+    """Noise statistics of one measured difference map over stable ground, where nothing fell.
 
     Attributes
     ----------
     name : Name of the map.
     size : Median, standard deviation, RMSE and NMAD, m.
     tails : Quantiles, skewness and excess kurtosis.
-    normality : Test for a normal distribution, on only as many values as are independent.
-    variogram, model : Empirical variogram and the model fitted to it.
-    independent : Number of independent values in all windows together (effective sample size).
+    normality : Test for a normal distribution, on a random subsample of as many values as are independent.
+    variogram, model : Empirical variogram and the variogram model fitted to it.
+    independent : Number of independent values (effective sample size) in all compared windows (square parts) of the map.
     """
 
     name: str
@@ -43,7 +43,7 @@ class EpochNoise:
     independent: float
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as a dictionary, as `calibration.json` holds them."""
+        """Return the noise statistics of one difference map as a dictionary for `calibration.json`; lengths in m."""
         return {
             "name": self.name,
             **self.size.to_dict(),
@@ -56,7 +56,7 @@ class EpochNoise:
 
 @dataclass(frozen=True)
 class Trend:
-    """Linear trend of a statistic over the epochs.
+    """Linear trend over the epochs of one statistic of the measured difference maps, such as their median.
 
     Attributes
     ----------
@@ -68,18 +68,18 @@ class Trend:
     p_value: float | None
 
     def to_dict(self) -> dict[str, float | None]:
-        """Return the fields as a dictionary, as `calibration.json` holds them."""
+        """Return slope (m per epoch) and p-value of a trend over the epochs as a dictionary for `calibration.json`."""
         return {"per_epoch_m": self.per_epoch_m, "p_value": self.p_value}
 
 
 def epoch_noise(name: str, stable: NDArray[np.floating], windows: FloatArray, gsd_m: float, random: KeyedRandom) -> EpochNoise:
-    """Compute the noise statistics of one difference map.
+    """Compute the noise statistics of one measured difference map: size, tails, normality and variogram.
 
     Parameters
     ----------
     name : Name of the map.
     stable : (h, w) differences, m; NaN outside stable ground.
-    windows : (k, n, n) windows of that map, m, for the variogram.
+    windows : (k, n, n) square parts of the same map, m, NaN outside stable ground; variogram and normality are computed there.
     gsd_m : Pixel size, m.
     random : Source of the random subsample for the normality test.
     """
@@ -95,7 +95,10 @@ def epoch_noise(name: str, stable: NDArray[np.floating], windows: FloatArray, gs
 
 
 def trend(values: Sequence[float]) -> Trend:
-    """Fit a line to one value per epoch, m, in the order of the epochs, and test whether its slope differs from 0."""
+    """Fit a line to one value per epoch, and test whether its slope differs from 0, to see whether noise changes over time.
+
+    values: one value per epoch, m, in the order of the epochs. With fewer than 4, slope and p-value are None.
+    """
     if len(values) < 4:
         return Trend(None, None)
     line = stats.linregress(np.arange(len(values)), values)
@@ -103,11 +106,11 @@ def trend(values: Sequence[float]) -> Trend:
 
 
 def systematic(maps: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return the mean of the difference maps over the epochs: what all epochs share, such as errors of the reference.
+    """Return the mean of several difference maps, which shows errors that all epochs share, such as the reference's.
 
     Parameters
     ----------
-    maps : (e, h, w) difference maps, m.
+    maps : (e, h, w) difference maps of e epochs, m.
 
     Returns
     -------

@@ -26,13 +26,13 @@ _START_FACTOR = 4.0
 
 @dataclass(frozen=True)
 class GreedyResult:
-    """End point of a search that changes one parameter at a time.
+    """End point of a greedy search for noise parameters, which changes one parameter at a time.
 
     Attributes
     ----------
-    x : (k,) natural logarithms of the parameters.
-    tests : Number of simulated maps.
-    relative_error : Simulated standard deviation over the measured one, minus 1.
+    x : (k,) natural logarithms of the noise parameters.
+    tests : Number of simulated difference maps.
+    relative_error : Standard deviation of the last simulated map over the measured one, minus 1.
     """
 
     x: FloatArray
@@ -45,16 +45,21 @@ def greedy_search(
 ) -> GreedyResult:
     """Lower one noise parameter at a time until the simulated standard deviation equals the measured one.
 
-    This is the method of the thesis (section 4.1.5), run as a baseline for `NoiseSearch`.
+    This is the method of the thesis that the noise models follow (section 4.1.5). It is a baseline for the calibration's
+    search.
 
     Parameters
     ----------
-    simulate : Function that simulates epochs and returns the logarithms of their summary statistics.
-    parameters : Names and bounds of the k parameters.
+    simulate : Function that simulates epochs and returns the logarithms of summary statistics of their noise.
+    parameters : Names and bounds of the k noise parameters.
     start : (k,) parameter values. The search begins at a multiple of them that gives four times the measured noise.
     std : Index of the standard deviation among the summary statistics.
-    target : Logarithm of the measured standard deviation, m.
+    target : Natural logarithm of the measured standard deviation in m.
     random : Source of the simulations' random numbers.
+
+    Returns
+    -------
+    The parameters at which the standard deviations agree to 2 %, or no further step brings them nearer.
     """
 
     def error(values: FloatArray, test: int) -> float:

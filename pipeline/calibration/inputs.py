@@ -41,16 +41,16 @@ _REACH_PX = 2
 
 @dataclass(frozen=True)
 class CalibrationInputs:
-    """Measured difference maps on one grid, with their stable ground and the site to simulate.
+    """Input of a calibration: measured difference maps on one grid, their stable ground, and the site to simulate.
 
     Attributes
     ----------
     names : (e,) names of the maps.
     grid : Raster that all maps share.
     maps : (e, h, w) differences, m; NaN without data.
-    stable : (h, w) true on stable ground that has data in every map.
-    drawn : Whether the user drew the stable areas; otherwise they were detected.
-    site : The sensor in front of the reference surface.
+    stable : (h, w) true on stable ground (where nothing fell) that has data in every map.
+    drawn : Whether the config or the measurement gives the stable areas; otherwise they were detected in the maps.
+    site : The wall or reference surface, with the sensor in front of it.
     of_points : Whether a pixel is the mean distance of its points from the reference; otherwise maps compare two surfaces.
     reference_error : Error of a reference surface that is made of points; None if it is unknown or zero.
     """
@@ -65,26 +65,36 @@ class CalibrationInputs:
     reference_error: ReferenceError | None = None
 
     def windows(self, config: SimulationConfig) -> Windows:
-        """Choose the windows of the wall in which measured and simulated maps are compared, by the config's number and size."""
+        """Choose the windows, square parts of the maps on stable ground, in which measured and simulated maps are compared.
+
+        config: its section `calibration` gives the number and the size of the windows.
+        """
         return choose_windows(self.stable, self.grid, config.calibration)
 
     def on_stable(self, number: int) -> NDArray[np.floating]:
-        """Return the map with the index `number`, (h, w), m, with NaN outside stable ground."""
+        """Return one measured difference map, (h, w) in m, with NaN outside stable ground.
+
+        number: index of the map, from 0.
+        """
         return np.where(self.stable, self.maps[number], np.float32(np.nan))
 
 
 def config_of(paths: Sequence[Path]) -> Path | None:
-    """Return the path of the first `run.json` in the input folders, which serves as the config; None if no folder has one."""
+    """Find a config among the inputs of a calibration, for a user who gives none.
+
+    Returns the path of the first `run.json` in the input folders, the record of a simulation, which contains its config; None
+    if no folder has one.
+    """
     return next((path / RUN_FILE for path in paths if (path / RUN_FILE).is_file()), None)
 
 
 def sensor_of(paths: Sequence[Path], config: SimulationConfig, wanted: SensorName | None) -> SensorName:
-    """Return the sensor that measured the inputs: "stereo" or "tls".
+    """Return which sensor measured the difference maps of a calibration: "stereo" or "tls" (laser scanner).
 
     Parameters
     ----------
-    paths : The input folders or files.
-    config : Consulted if neither the inputs nor `wanted` say which sensor it was.
+    paths : The input folders or files. A folder of a simulation or a measurement states its sensor.
+    config : If neither the inputs nor `wanted` say which sensor it was, and the config has only one sensor, it is that one.
     wanted : The sensor that the user named; None if the user named none.
 
     Raises
@@ -113,25 +123,27 @@ def _matching_sensor(found: SensorName, wanted: SensorName | None, path: Path) -
     """Return the sensor found in the input, or raise InputError if the user named the other one."""
     if wanted not in (None, found):
         raise InputError(
-            f"the maps were measured by {found}, but --sensor is {wanted}", where=str(path), remedy="leave --sensor out"
+            f"the maps were measured by the sensor {found}, but --sensor is {wanted}",
+            where=str(path),
+            remedy="leave --sensor out, or give maps of the other sensor",
         )
     return found
 
 
 def read_inputs(paths: Sequence[Path], config: SimulationConfig, sensor: SensorName, random: KeyedRandom) -> CalibrationInputs:
-    """Read the measured maps, find their stable ground and prepare the site to simulate.
+    """Read the measured difference maps of a calibration, find their stable ground and prepare the site to simulate.
 
     Parameters
     ----------
-    paths : One folder (a run or a measurement), or GeoTIFFs of one grid.
+    paths : One folder (of a simulation or a measurement), or GeoTIFFs that share a grid.
     config : Gives the site, and the stable areas if the user drew them.
-    sensor : "stereo" or "tls".
-    random : Source of the random numbers for preparing the site.
+    sensor : "stereo" or "tls" (laser scanner).
+    random : Source of the random numbers for building the wall and registering points.
 
     Raises
     ------
     InputError
-        If the maps differ in their grids, contain no noise, or are given twice.
+        If an input is not a difference map, the maps differ in their grids or contain no noise, or one is given twice.
     """
     measured, names = _maps(paths, config, random)
     _check_noise(measured.maps, names)
@@ -164,9 +176,9 @@ def _maps(paths: Sequence[Path], config: SimulationConfig, random: KeyedRandom) 
     for path, grid in zip(paths, grids, strict=True):
         if grid != grids[0]:
             raise InputError(
-                f"the grid {grid} differs from {grids[0]} of {paths[0].name}",
+                f"the raster of the map ({grid}) differs from that of {paths[0].name} ({grids[0]})",
                 where=str(path),
-                remedy="resample the maps to one grid",
+                remedy="resample all maps to the same origin, pixel size and shape",
             )
     return MeasuredMaps("maps", grids[0], np.stack(rasters), None), tuple(path.stem for path in paths)
 

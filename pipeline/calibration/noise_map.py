@@ -23,9 +23,10 @@ from sensors.stereo.stereo_pair import StereoPair
 
 
 def with_model(site: SensorSite, model: StereoModel) -> SensorSite:
-    """Return the site with another sensor model of its stereo pair.
+    """Return a site whose stereo pair has another sensor model, to simulate how noise changes with the model.
 
-    Raises InputError if its sensor is not a stereo pair with simulated matching.
+    site: the wall and its sensor. model: noise and effects of the pair from now on. Raises InputError if the sensor is not a
+    stereo pair with simulated matching.
     """
     if not isinstance(site.sensor, StereoPair):
         raise InputError(
@@ -51,14 +52,14 @@ def noise_map(
     Parameters
     ----------
     config : Settings of surface, registration and difference map.
-    before, after : The same site, with the sensor as it is at the first and at the second observation.
+    before, after : The same site at the first and at the second observation; their sensors may differ in model or pose.
     caster : The wall, for ray casting.
     random : Source of the random numbers.
     grid : Grid of the map; None: a grid over the first observation's surface.
 
     Returns
     -------
-    (h, w) differences, m; NaN without data.
+    (h, w) differences, first minus second observation along the wall frame's z axis, m; NaN without data.
     """
     surface = _surface(config, before, caster, random.child("reference"))
     reference, target = reference_and_target(config, surface, caster.mesh, random.child("register", "reference"))

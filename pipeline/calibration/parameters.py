@@ -45,8 +45,8 @@ class NoiseParameters:
     Attributes
     ----------
     base : The sensor model before the calibration.
-    names : (k,) names of the parameters.
-    low, high : (k,) bounds, in the parameters' units. The search itself works on natural logarithms.
+    names : (k,) names of the parameters, such as "range_sigma_m".
+    low, high : (k,) bounds, in the unit at the end of each name; "orientation" is a factor of the model's standard deviations.
     """
 
     base: Model
@@ -55,7 +55,10 @@ class NoiseParameters:
     high: FloatArray
 
     def model(self, values: Sequence[float] | FloatArray) -> Model:
-        """Return the sensor model with these (k,) parameter values; everything else, effects included, stays unchanged."""
+        """Return the sensor model with given values of the fitted noise parameters; its effects stay unchanged.
+
+        values: (k,) in the order of `names`, each in the unit at the end of its name.
+        """
         found = dict(zip(self.names, (float(value) for value in values), strict=True))
         noise = self.base.noise
         plain: dict[str, Any] = {name: value for name, value in found.items() if not name.startswith(ORIENTATION)}
@@ -64,7 +67,10 @@ class NoiseParameters:
         return self.base.model_copy(update={"noise": noise.model_copy(update=plain)})
 
     def meaning(self, name: str) -> str:
-        """Describe a parameter in words, as the config's documentation does, without its unit."""
+        """Describe a noise parameter in words for a report, as the config's documentation does, without its unit.
+
+        name: name of the parameter, such as "range_sigma_m".
+        """
         if name == ORIENTATION:
             return "all sigmas of the orientation, as a multiple of the config's"
         section, _, key = name.rpartition(".")
@@ -73,7 +79,10 @@ class NoiseParameters:
         return f"standard deviation: {words}" if section else words
 
     def values(self, logarithms: FloatArray) -> FloatArray:
-        """Convert natural logarithms of the parameters (..., k) to parameter values, clipped to the bounds."""
+        """Convert natural logarithms of the noise parameters, on which the search works, to parameter values within the bounds.
+
+        logarithms: (..., k), any number of parameter sets. Returns an array of the same shape.
+        """
         return np.clip(np.exp(logarithms), self.low, self.high)
 
 
@@ -89,17 +98,18 @@ def _orientation(base: OrientationNoise, found: dict[str, float]) -> Orientation
 
 
 def noise_parameters(base: Model, names: Sequence[str]) -> NoiseParameters:
-    """Select the noise parameters of a sensor model to fit, and choose their bounds.
+    """Select the noise parameters of a sensor model that a calibration fits, and set the bounds of each.
 
     Parameters
     ----------
-    base : The sensor model.
-    names : Names from the config key `calibration.fit`; empty: the default ones of the sensor.
+    base : The sensor model before the calibration.
+    names : Names from the config key `calibration.fit`; empty: the default parameters of the sensor.
 
     Raises
     ------
     InputError
-        If a name is unknown or repeated, or the model gives a parameter no scale (its sigma is 0).
+        If a name is unknown or repeated, or an orientation parameter's standard deviation (sigma) is 0 in the model, so that
+        the bounds, which are multiples of it, would be 0 too.
     """
     chosen = tuple(names) or _default_names(base)
     for name in chosen:
@@ -109,7 +119,9 @@ def noise_parameters(base: Model, names: Sequence[str]) -> NoiseParameters:
                 f"'{name}' is not a noise parameter of the {base.sensor} sensor", where="calibration.fit", remedy=hint
             )
     if twice := sorted({name for name in chosen if chosen.count(name) > 1}):
-        raise InputError(f"{twice[0]} is listed twice", where="calibration.fit", remedy="list each parameter once")
+        raise InputError(
+            f"the noise parameter {twice[0]} is listed twice", where="calibration.fit", remedy="list each parameter once"
+        )
     bounds = np.array([_bounds(base, name) for name in chosen])
     return NoiseParameters(base, chosen, bounds[:, 0], bounds[:, 1])
 
@@ -136,16 +148,16 @@ def _bounds(base: Model, name: str) -> tuple[float, float]:
     if name in _BOUNDS:
         if name == ORIENTATION and not _has_orientation_noise(base):
             raise InputError(
-                "the model has no orientation noise to scale: the sigmas of all angles and positions of the cameras are 0",
+                "the model has no orientation noise to scale: the standard deviations of all camera angles and positions are 0",
                 where="calibration.fit",
-                remedy="take it out of calibration.fit, or use a model with such noise, for example --set sensor=glendale_high",
+                remedy="remove orientation there, or use a model with such noise, for example --set sensor=glendale_high",
             )
         return _BOUNDS[name]
     sigma = getattr(base.noise.orientation, name.removeprefix(f"{ORIENTATION}.")).sigma
     if not sigma > 0:
         raise InputError(
-            f"the sigma of {name} is 0 in the model, so its scale is unknown",
+            f"the sigma of {name} is 0 in the model, so the bounds for fitting it are unknown",
             where="calibration.fit",
-            remedy="give it a sigma in the model, or leave it out",
+            remedy="give it a sigma in the sensor model, or remove it from calibration.fit",
         )
     return _OF_SIGMA[0] * sigma, _OF_SIGMA[1] * sigma

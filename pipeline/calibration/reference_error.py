@@ -14,12 +14,13 @@ from scene.ray_casting.raycast import RayCaster
 
 @dataclass(frozen=True)
 class ReferenceError:
-    """Random error of the vertices of a reference surface that is made of points.
+    """Random error of a reference surface that is a mesh of measured points; it adds to the differences from the surface.
 
     Attributes
     ----------
-    sigma_m : Standard deviation of each vertex along the sensor's rays, m.
-    shared : Whether points in one triangle share the vertices' errors: true for noise, false for relief between the vertices.
+    sigma_m : Standard deviation of a vertex's error along the ray from the sensor, m.
+    shared : True if all points in a triangle share its three vertices' errors, as for measuring noise. False if each point has
+        an error of its own, as for relief of the rock that the mesh misses between its vertices.
     eye : (3,) position of the sensor, wall frame, m.
     """
 
@@ -29,17 +30,20 @@ class ReferenceError:
 
     @classmethod
     def of(cls, measurement: Measurement) -> ReferenceError | None:
-        """Return the error of a measurement's reference; None if it is unknown or zero."""
+        """Return the error of the reference surface of a measurement, for a calibration to simulate.
+
+        Returns None if it is unknown or zero, or the measurement is not of a laser scanner.
+        """
         if not isinstance(measurement, TlsMeasurement) or not measurement.reference_error_m:
             return None
         planes = measurement.planes
         return cls(measurement.reference_error_m, planes is None or planes.noise_dominates, measurement.viewpoint)
 
     def moved(self, points: FloatArray, wall: RayCaster, random: KeyedRandom) -> FloatArray:
-        """Shift points along their rays so that their distances from the given wall contain errors of the wall's vertices.
+        """Shift points along their rays so that their distances from a surface contain simulated errors of its vertices.
 
-        With barycentric weights w of a point in its triangle, vertex errors e change the range to the triangle by sum w e, as in
-        `pipeline/gap`. The point is shifted by the opposite amount.
+        In a triangle whose vertices have the errors e, the surface has the error sum(w e), with the barycentric weights w of
+        the point. The point is shifted by the opposite amount, which changes its distance as the erroneous surface would.
 
         Parameters
         ----------
@@ -49,7 +53,7 @@ class ReferenceError:
 
         Returns
         -------
-        (n, 3) shifted points, m.
+        (n, 3) shifted points, wall frame, m.
         """
         ray = points - self.eye
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)

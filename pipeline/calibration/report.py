@@ -42,7 +42,7 @@ class _Table:
 
 
 def summary(result: CalibrationResult) -> str:
-    """Return the fitted parameters with their intervals, and warnings, as a few lines of text for the terminal."""
+    """Summarise a calibration for the terminal, line by line: noise parameters with intervals, warnings, and duration."""
     found = result.found
     lines = [f"{_maps(len(result.epochs))} of a {_INSTRUMENTS[result.sensor]}"]
     lines += [f"  {name:<26}{text}" for name, text in _values(result)]
@@ -52,7 +52,7 @@ def summary(result: CalibrationResult) -> str:
 
 
 def warnings(result: CalibrationResult) -> list[str]:
-    """Return what a reader must know before using the values, as sentences, such as inseparable parameters or a misfit."""
+    """Return what a user must know before using the fitted noise, as sentences, such as that the model does not fit."""
     found, error = result.found, result.inputs.reference_error
     texts = []
     if error is not None:
@@ -83,17 +83,20 @@ def warnings(result: CalibrationResult) -> list[str]:
 
 
 def scale_m(result: CalibrationResult) -> float:
-    """Return the noise that scales the colours of all maps of a report, m: the NMAD of the last measured map in the windows."""
+    """Return the size of the noise from which the colour scale of all maps of a calibration's report is derived, m.
+
+    It is the NMAD of the last measured map in the compared windows.
+    """
     return max(statistics(result.windows.cut(result.inputs.maps[-1])).nmad, 1e-6)
 
 
 def pictures(result: CalibrationResult, simulated: FloatArray | None) -> Pictures:
-    """Draw all pictures of the report of a calibration.
+    """Draw all pictures of the report of a calibration: measured beside simulated maps, distributions, statistics and epochs.
 
     Parameters
     ----------
     result : The calibration.
-    simulated : (h, w) simulated map of the whole wall, m; None if there is none.
+    simulated : (h, w) difference map of the whole wall, simulated with the fitted noise, m; None if there is none.
 
     Returns
     -------
@@ -138,14 +141,14 @@ def pictures(result: CalibrationResult, simulated: FloatArray | None) -> Picture
 
 
 def write_calibration_report(path: Path, result: CalibrationResult, shown: Pictures, config: Mapping[str, Any]) -> None:
-    """Write report.html of a calibration, or nothing if it fails.
+    """Write the report of a calibration as an HTML page; if that fails, no file is left.
 
     Parameters
     ----------
     path : File to write.
     result : The calibration.
-    shown : Pictures from `pictures`.
-    config : The resolved config, which the page lists.
+    shown : Pictures of the page: file name without ending, caption and PNG of each.
+    config : The config with all defaults filled in, which the page lists.
     """
     page = template("calibration/report.html.jinja").render(
         title=f"Noise of a {_INSTRUMENTS[result.sensor]}, calibrated",

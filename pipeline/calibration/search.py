@@ -74,37 +74,41 @@ simulated maps.
 
 @dataclass(frozen=True)
 class Simulations:
-    """Parameters of n simulations and the summary statistics that each gave.
+    """Noise parameters of n simulations, and the summary statistics of the simulated difference maps.
 
     Attributes
     ----------
-    x : (n, k) natural logarithms of the parameters.
-    s : (n, m) summary statistics.
+    x : (n, k) natural logarithms of the noise parameters.
+    s : (n, m) summary statistics of size and spatial pattern of the noise (logarithms of lengths in m).
     """
 
     x: FloatArray
     s: FloatArray
 
     def with_more(self, other: Simulations) -> Simulations:
-        """Return these simulations followed by those of another set."""
+        """Return the simulations of this set followed by those of another, to fit a response surface to both."""
         return Simulations(np.concatenate([self.x, other.x]), np.concatenate([self.s, other.s]))
 
     def at(self, rows: NDArray[Any]) -> Simulations:
-        """Return a subset of the simulations, given as indices or a mask."""
+        """Return a subset of the simulations.
+
+        rows: their indices, or an (n,) mask that is true for those to keep.
+        """
         return Simulations(self.x[rows], self.s[rows])
 
 
 @dataclass(frozen=True)
 class ResponseSurface:
-    """Response surface: how the summary statistics depend on the noise parameters, and how they scatter.
+    """Response surface: predicts the summary statistics of simulated difference maps from noise parameters.
 
-    The mean of the statistics is a quadratic polynomial of z = (x - centre) / scale, with x the logarithms of the
-    parameters. The cost of parameters is the squared Mahalanobis distance of the measured statistics from that mean.
+    The statistics describe size and spatial pattern of the noise. Their mean is a quadratic polynomial of z = (x - centre) /
+    scale, where x are the natural logarithms of the parameters. The cost of parameters is the squared Mahalanobis distance of
+    the measured statistics from that mean.
 
     Attributes
     ----------
-    centre, scale : (k,) mean and standard deviation of the logarithmic parameters to which it was fitted.
-    coefficients : (terms, m) coefficients of the polynomial.
+    centre, scale : (k,) mean and standard deviation of x over the simulations to which the polynomial was fitted.
+    coefficients : (terms, m) coefficients of the polynomial, by term (1, z_i, z_i z_j) and statistic.
     covariance : (m, m) covariance of the statistics of one simulation.
     whitening : (m, m) L^-1 with L L^T = covariance.
     """
@@ -117,15 +121,16 @@ class ResponseSurface:
 
     @classmethod
     def fit(cls, sample: Simulations) -> ResponseSurface:
-        """Fit the mean of the summary statistics, as a quadratic function of the logarithmic parameters, by least squares.
+        """Fit a response surface, which predicts the summary statistics of simulated maps from noise parameters.
 
-        The covariance (m, m) of the statistics is that of their residuals from the fit, with off-diagonal elements reduced
-        (shrinkage).
+        The mean of the statistics is a quadratic function of the logarithmic parameters, fitted by least squares. Their
+        covariance (m, m) is that of the residuals, with off-diagonal elements reduced (shrinkage), as few simulations
+        determine them poorly.
 
         Parameters
         ----------
         sample : Simulations
-            Parameters of n simulations and the m statistics that each gave.
+            Logarithmic parameters of n simulations and the m statistics that each gave.
         """
         centre, scale = np.mean(sample.x, axis=0), np.maximum(np.std(sample.x, axis=0), 1e-6)
         design = _design((sample.x - centre) / scale)
@@ -139,39 +144,48 @@ class ResponseSurface:
         return cls(centre, scale, coefficients, covariance, linalg.solve_triangular(factor, np.eye(len(factor)), lower=True))
 
     def mean(self, x: FloatArray) -> FloatArray:
-        """Return the (m,) summary statistics that are expected for logarithmic noise parameters (k,)."""
+        """Predict the (m,) summary statistics of difference maps that are simulated with given noise parameters.
+
+        x: (k,) natural logarithms of the parameters.
+        """
         return _design(((x - self.centre) / self.scale)[None])[0] @ self.coefficients
 
     def misfit(self, x: FloatArray, observed: FloatArray) -> FloatArray:
-        """Return the whitened difference of observed and expected statistics, whose squares add up to the cost.
+        """Return the whitened difference of measured and predicted statistics, whose squares add up to the cost of parameters.
 
         Parameters
         ----------
-        x : (k,) logarithmic parameters.
+        x : (k,) natural logarithms of the noise parameters.
         observed : (m,) statistics of the measurement.
 
         Returns
         -------
-        (m,) differences, in standard deviations.
+        (m,) uncorrelated differences, in standard deviations.
         """
         return self.whitening @ (observed - self.mean(x))
 
     def jacobian(self, x: FloatArray) -> FloatArray:
-        """Return the (m, k) derivatives of `misfit` by the logarithmic noise parameters, at (k,) values of these."""
+        """Return the derivatives of the whitened misfit of the summary statistics by the logarithmic noise parameters.
+
+        The search for the parameters of least misfit uses them. x: (k,) natural logarithms of the parameters at which to
+        differentiate. Returns (m, k): statistics by parameters.
+        """
         return -self.whitening @ (_gradient((x - self.centre) / self.scale) @ self.coefficients).T / self.scale
 
     def minimum(self, observed: FloatArray, start: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-        """Find the parameters of least cost within bounds; the cost is the sum of the squares of `misfit`.
+        """Find the noise parameters within bounds whose predicted summary statistics are nearest to the measured ones.
+
+        They have the least cost: the sum of squares of the whitened misfit.
 
         Parameters
         ----------
         observed : (m,) statistics of the measurement.
-        start : (k,) logarithmic parameters to start at.
+        start : (k,) natural logarithms of the parameters at which to start.
         low, high : (k,) bounds of the logarithmic parameters.
 
         Returns
         -------
-        (k,) logarithmic parameters of least cost.
+        (k,) natural logarithms of the parameters of least cost.
         """
         found = optimize.least_squares(
             lambda x: self.misfit(x, observed), np.clip(start, low + 1e-9, high - 1e-9), lambda x: self.jacobian(x), (low, high)
@@ -179,25 +193,30 @@ class ResponseSurface:
         return found.x
 
     def covariance_at(self, x: FloatArray) -> FloatArray:
-        """Return the (k, k) covariance of logarithmic parameters estimated at the minimum x (k,), to first order."""
+        """Return the covariance of the estimated noise parameters at the minimum of the cost, to first order.
+
+        x: (k,) natural logarithms of the parameters at the minimum. Returns (k, k), for the logarithms.
+        """
         jacobian = self.jacobian(x)
         return np.asarray(np.linalg.pinv(jacobian.T @ jacobian + 1e-6 * np.eye(len(x))), dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Result of a search for noise parameters. All parameters are natural logarithms.
+    """Result of a search for noise parameters with which simulated maps are like the measured ones.
+
+    All parameters are natural logarithms.
 
     Attributes
     ----------
     x : (k,) estimate, corrected for bias.
     low, high : (k,) ends of its confidence interval.
     errors : (n, k) errors of the estimates when n simulations are treated like the measurement (parametric bootstrap).
-    surface : Response surface of the last round.
+    surface : Response surface (summary statistics as a function of the parameters) of the last round of simulations.
     cost : Squared Mahalanobis distance of the measured from the expected statistics at the minimum.
     misfit_p : Share of simulations that fit worse than the measurement: a p-value of the goodness of fit.
     misfit : (m,) measured minus expected statistics, in standard deviations.
-    history : After each round, the number of maps simulated so far and the minimum.
+    history : After each round, the number of maps simulated so far and the minimum, (k,).
     maps : Number of simulated maps.
     converged : Whether the minimum lies among the simulations of the last round.
     """
@@ -216,26 +235,27 @@ class SearchResult:
 
     @property
     def correlation(self) -> FloatArray:
-        """(k, k) correlation of the errors of the estimates."""
+        """(k, k) correlation of the errors of the estimated noise parameters; near 1 in magnitude, two cannot be separated."""
         return np.atleast_2d(np.corrcoef(self.errors.T))
 
 
 class NoiseSearch:
-    """Searches for the noise parameters with which simulated maps have the same summary statistics as the measured ones.
+    """Search for the noise parameters with which simulated maps have the same summary statistics as the measured ones.
 
     Parameters
     ----------
-    simulate : Function that simulates epochs and returns their statistics, see `Simulate`.
-    parameters : The k parameters and their bounds.
+    simulate : Function of (k,) parameter values, a number of epochs and a random source; it returns the (m,) summary
+        statistics of the difference maps that it simulates.
+    parameters : The k noise parameters and their bounds.
     epochs : Number of measured epochs.
-    random : Source of random numbers; the simulations are keyed by their number.
-    progress : Receives the progress.
+    random : Source of random numbers; each simulation draws its own, by its number.
+    progress : Display of the progress.
 
     Attributes
     ----------
     simulated, maps : Number of simulations, and of the maps in them, so far.
     approached : For every simulation in order, the number of maps simulated so far and its (m,) statistics.
-    terms : Number of coefficients of the quadratic polynomial.
+    terms : Number of coefficients of the quadratic polynomial that predicts each statistic from the parameters.
     """
 
     def __init__(
@@ -250,15 +270,16 @@ class NoiseSearch:
         self.terms = 1 + count + count * (count + 1) // 2
 
     def run(self, observed: FloatArray, simulations: int, confidence: float) -> SearchResult:
-        """Find the parameters of least cost and their confidence intervals.
+        """Find the noise parameters of least cost and their confidence intervals.
 
-        The cost is the squared Mahalanobis distance of the measured from the expected statistics. If the misfit of the
-        first minimum is significant, a second search with more starting points follows, and the better one counts.
+        The cost is the squared Mahalanobis distance of the measured summary statistics from those expected for the parameters.
+        If the fit is rejected (p-value below 0.01), a second search with more starting points follows, and the better one
+        counts.
 
         Parameters
         ----------
         observed : (m,) statistics of the measurement.
-        simulations : Number of simulations in the last round.
+        simulations : Number of simulations in the last round, near the minimum, which gives the intervals.
         confidence : Confidence level of the intervals, 0 to 1.
         """
         found = self._run_once(observed, simulations, confidence, _DENSITIES[0])
@@ -352,9 +373,9 @@ class NoiseSearch:
             self.progress.advance((number + 1) / len(points))
         if len(found) < len(points) / 2:
             raise InputError(
-                f"{len(points) - len(found)} of {len(points)} simulations failed",
+                f"{len(points) - len(found)} of {len(points)} simulated measurements failed, more than half",
                 where="calibration",
-                remedy="run scarpsim simulate with the same config to see the error",
+                remedy="run scarpsim simulate with the same config to see the error, and correct the config",
             )
         return Simulations(np.array(used), np.array(found))
 
@@ -393,15 +414,15 @@ class NoiseSearch:
 def cost_of_new_simulations(
     search: NoiseSearch, surface: ResponseSurface, observed: FloatArray, x: FloatArray, sets: int = 4
 ) -> float:
-    """Compute the misfit of noise parameters from new simulations instead of the response surface.
+    """Compute the cost of noise parameters from new simulations, to compare the results of two searches; lower is better.
 
-    The cost is the squared Mahalanobis distance of the measured statistics from the mean statistics of the simulations, divided
-    by 1 + 1 / sets for the scatter of that mean.
+    The cost is the squared Mahalanobis distance of the measured summary statistics from the mean statistics of the
+    simulations, divided by 1 + 1 / sets for the scatter of that mean.
 
     Parameters
     ----------
-    search : Provides the simulator and the number of epochs.
-    surface : Provides the covariance of the statistics.
+    search : Provides the simulator and the number of measured epochs.
+    surface : Response surface, which provides the covariance of the statistics.
     observed : (m,) statistics of the measurement.
     x : (k,) natural logarithms of the parameters.
     sets : Number of simulations; each has as many epochs as the measurement.

@@ -38,12 +38,12 @@ _LEAST_IN_CLASS = 10
 
 @dataclass(frozen=True)
 class SummaryStatistics:
-    """Computes the summary statistics of difference maps by which measured and simulated noise are compared.
+    """Summarises the noise of difference maps by a few statistics, in which a calibration compares measured and simulated maps.
 
     Attributes
     ----------
-    windows : k windows of n by n pixels in which maps are compared.
-    heights : (k, n, n) heights of the wall's surface without noise, m.
+    windows : The k square parts of the maps, n by n pixels each, in which maps are compared.
+    heights : (k, n, n) heights (z) of the wall's surface without noise in these windows, wall frame, m.
     sight : (3,) unit vector from the wall to the sensor, wall frame.
     """
 
@@ -53,7 +53,7 @@ class SummaryStatistics:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(m,) names of the statistics, as group.statistic, such as "size.nmad"."""
+        """(m,) names of the summary statistics of noise, as group.statistic, such as "size.nmad" or "variogram.8px"."""
         return (
             "size.std", "size.nmad", "size.quantiles",
             *(f"variogram.{lag}px" for lag in self.lags),
@@ -63,15 +63,15 @@ class SummaryStatistics:
         )  # fmt: skip
 
     def compute(self, maps: FloatArray) -> FloatArray:
-        """Compute the statistics of e difference maps together: size, variogram and spatial pattern of the noise.
+        """Compute the summary statistics of e difference maps together: size, variogram and spatial pattern of the noise.
 
         Parameters
         ----------
-        maps : (e, k, n, n) windows of the maps, m; NaN where unknown.
+        maps : (e, k, n, n) k windows of each map with n x n pixels, m; NaN where unknown.
 
         Returns
         -------
-        (m,) logarithms of lengths in m, in the order of `names`.
+        (m,) natural logarithms of lengths in m, in the order of `names`.
         """
         middle = np.nanmedian(maps, axis=(2, 3))
         rest = maps - middle[..., None, None]
@@ -86,7 +86,7 @@ class SummaryStatistics:
 
     @cached_property
     def lags(self) -> tuple[int, ...]:
-        """Distances at which the variogram is computed, pixels, up to three quarters of a window."""
+        """Distances at which the variogram of the noise is computed, pixels, up to three quarters of a window's side."""
         return tuple(lag for lag in _LAGS_PX if lag <= 0.75 * self.windows.side)
 
     def _size(self, rest: FloatArray) -> list[float]:

@@ -59,26 +59,30 @@ class _Patch:
 
 
 class WindowSimulator:
-    """Simulates difference maps that contain only noise, in windows of the wall, which is much faster than whole maps.
+    """Simulates difference maps that contain only noise, in a few square windows of the wall, much faster than whole maps.
+
+    A calibration needs hundreds of such maps. Only the sensor's cells (depth-map pixels or laser pulses) around the windows
+    are traced, and some over the whole view for the registration.
 
     Parameters
     ----------
-    config, site : Config and site as for a whole simulation.
-    windows : The k windows of n x n pixels, on the grid of the measured maps, in which measured and simulated maps are compared.
+    config, site : Config, and wall with its sensor, as for a whole simulation.
+    windows : The k windows of n x n pixels, on the grid of the measured maps, in which measured and simulated maps are
+        compared.
     of_points : Whether a pixel is the mean distance of its points from the wall; otherwise two surfaces are compared.
     reference_error : Error of the surface that the points are compared with; None for none.
 
     Attributes
     ----------
-    observations : Number of observations simulated so far.
-    cells : Flat indices of the sensor cells that each observation traces.
+    observations : Number of observations (measurements of the wall) simulated so far.
+    cells : Indices of the traced cells, counted row by row over the sensor's whole view.
     caster : The wall, for ray casting.
     noiseless_model : The sensor model with its effects but without noise.
 
     Raises
     ------
     InputError
-        If the sensor cannot be simulated cell by cell.
+        If the sensor cannot be simulated in parts of its view, or does not see one of the windows.
     """
 
     def __init__(
@@ -106,14 +110,14 @@ class WindowSimulator:
 
     @cached_property
     def target(self) -> ReferenceSurface:
-        """The wall without noise, to which observations are registered."""
+        """The wall's surface without noise, with its normals, to which simulated observations are registered by ICP."""
         return ReferenceSurface.build(self.site.mesh.vertices, self.site.mesh.vertex_normals())
 
     def maps(self, model: Model, epochs: int, random: KeyedRandom) -> FloatArray:
-        """Simulate difference maps of an unchanged wall in the windows.
+        """Simulate difference maps of an unchanged wall in the k windows (square parts) in which a calibration compares maps.
 
-        Each map subtracts a later epoch from the same noisy reference epoch. Maps of points instead measure the distance to the
-        known wall; the simulated error of that wall is then the same in all epochs.
+        Each map subtracts a later epoch from the same noisy reference epoch. If the measured maps are distances of points from
+        a known wall, so are the simulated ones; the simulated error of that wall is then the same in all epochs.
 
         Parameters
         ----------
@@ -123,7 +127,7 @@ class WindowSimulator:
 
         Returns
         -------
-        (epochs, k, n, n) differences, m; NaN outside stable ground.
+        (epochs, k, n, n) differences in windows of n x n pixels, m; NaN outside stable ground.
         """
         sources = [random.child("epoch", number) for number in range(1, epochs + 1)]
         if self.of_points:
@@ -141,7 +145,7 @@ class WindowSimulator:
         return self.windows.cut(values)
 
     def heights(self, model: Model, random: KeyedRandom) -> FloatArray:
-        """Simulate one observation and return the heights of its surface in the windows given at construction.
+        """Simulate one noisy measurement of the wall, and return its surface in k windows, square parts of the wall.
 
         Parameters
         ----------
@@ -150,7 +154,7 @@ class WindowSimulator:
 
         Returns
         -------
-        (k, n, n) heights in k windows of n x n pixels, wall frame, m; NaN without data.
+        (k, n, n) heights (z) in windows of n x n pixels, wall frame, m; NaN without data.
         """
         return self._raster(self._surface(self._registered(model, random)))
 
@@ -164,7 +168,10 @@ class WindowSimulator:
 
     @cached_property
     def noiseless_heights(self) -> FloatArray:
-        """(k, n, n) heights in the k windows, m, of the surface that the sensor would give without noise."""
+        """(k, n, n) heights of the surface that the sensor would measure without noise, in k windows of n x n pixels.
+
+        They are z in the wall frame, m.
+        """
         return self._raster(self._surface(self._observe(self.noiseless_model, KeyedRandom(0))))
 
     def _observe(self, model: Model, random: KeyedRandom) -> FloatArray:
@@ -271,7 +278,9 @@ def _supported_sensor(config: SimulationConfig, site: SensorSite) -> StereoPair 
         )
     if site.further_stations:
         raise InputError(
-            "cannot calibrate with several scanner stations", where="station", remedy="keep only the one that measured the maps"
+            "a calibration needs a single scanner station, but the config has several",
+            where="station",
+            remedy="keep only the one that measured the maps",
         )
     if config.reconstruction != "direct" or config.surface.method != "grid" or config.surface.holes != "keep":
         raise InputError(
@@ -284,6 +293,6 @@ def _supported_sensor(config: SimulationConfig, site: SensorSite) -> StereoPair 
         raise InputError(
             f"calibration simulates only parts of a picture or scan, and these effects need all of it: {', '.join(names)}",
             where="sensor.effects",
-            remedy="remove them from the model",
+            remedy="remove these effects from the sensor model",
         )
     return site.sensor

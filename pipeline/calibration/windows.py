@@ -30,14 +30,14 @@ _BACKGROUND_CELLS = 15
 
 @dataclass(frozen=True)
 class Windows:
-    """k square windows with n pixels a side on a raster, in which maps are compared.
+    """k square windows of n x n pixels on a raster, in which a calibration compares measured and simulated difference maps.
 
     Attributes
     ----------
     grid : The raster.
     corner : (k, 2) row and column of each window's first pixel.
     side : n, pixels.
-    stable : (k, n, n) true on stable ground.
+    stable : (k, n, n) true on stable ground, where nothing fell.
     """
 
     grid: Grid
@@ -46,12 +46,15 @@ class Windows:
     stable: BoolArray
 
     def cut(self, raster: NDArray[np.floating]) -> FloatArray:
-        """Cut the windows out of a raster (h, w); return (k, n, n) values with NaN outside stable ground."""
+        """Cut the k square windows out of a difference map.
+
+        raster: (h, w) map. Returns (k, n, n) values in windows of n x n pixels; NaN outside stable ground.
+        """
         cut = np.stack([raster[row : row + self.side, column : column + self.side] for row, column in self.corner])
         return np.where(self.stable, cut, np.nan)
 
     def places(self) -> tuple[FloatArray, FloatArray]:
-        """Return the x and the y coordinates of the centres of all pixels, wall frame, m: (k, n, n) each."""
+        """Return the x and the y coordinates of all pixel centres in k windows of n x n pixels: (k, n, n) each, wall frame, m."""
         row = self.corner[:, 0, None, None] + np.arange(self.side)[None, :, None] + 0.5
         column = self.corner[:, 1, None, None] + np.arange(self.side)[None, None, :] + 0.5
         shape = (len(self.corner), self.side, self.side)
@@ -59,22 +62,26 @@ class Windows:
         return np.broadcast_to(x, shape), np.broadcast_to(y, shape)
 
     def centres(self) -> FloatArray:
-        """Return the (k, 2) x and y of the windows' centres, wall frame, m."""
+        """Return x and y of the centre of each of the k square windows: (k, 2), wall frame, m."""
         middle = self.corner + self.side / 2
         return np.stack([self.grid.x_min + middle[:, 1] * self.grid.gsd, self.grid.y_max - middle[:, 0] * self.grid.gsd], axis=1)
 
 
 def stable_ground(maps: Sequence[NDArray[np.floating]]) -> BoolArray:
-    """Detect stable ground: return an (h, w) mask that is true where no map shows a change.
+    """Detect stable ground, where no difference map shows a change of the wall, for a user who drew no stable areas.
 
-    It is used if the user drew no stable areas. Medians of cells of 5 x 5 pixels, minus their median over 15 x 15 cells, are
-    compared with four of their NMADs. Three or more adjacent cells that exceed it are a change, with a margin of one cell. So are
-    compact patches of pixels that exceed four NMADs of all pixels. Single gross errors, and thin strips along edges, count as
+    A change is looked for in the medians of cells of 5 x 5 pixels, after subtraction of their running median over 15 x 15
+    cells. Three or more adjacent cells beyond four NMADs of all cells are a change, with a margin of one cell. So are compact
+    patches of 3 x 3 pixels or more beyond four NMADs of all pixels. Single gross errors, and thin strips along edges, count as
     noise.
 
     Parameters
     ----------
     maps : Difference maps (h, w), m; NaN without data.
+
+    Returns
+    -------
+    (h, w) mask, true on stable ground.
     """
     stable = np.ones(maps[0].shape, dtype=bool)
     for values in maps:
@@ -121,15 +128,16 @@ def _cell_medians(values: NDArray[np.floating]) -> FloatArray:
 
 
 def choose_windows(stable: BoolArray, grid: Grid, settings: CalibrationConfig) -> Windows:
-    """Choose windows spread evenly over the stable ground that has data in all maps.
+    """Choose the square windows in which a calibration compares maps, spread evenly over the stable ground.
 
-    The candidates lie on a lattice of half a window. The first window is the most stable one; each next one is the farthest from
-    those already chosen (Gonzalez 1985). The windows thus reach the ends of the wall, where deformations are largest.
+    Candidates lie half a window apart and are at least 60 % stable. The first window is the most stable one; each next one is
+    the farthest from those already chosen (Gonzalez 1985). The windows thus reach the ends of the wall, where deformations are
+    largest.
 
     Parameters
     ----------
-    stable : (h, w) true on stable ground with data.
-    grid : The raster.
+    stable : (h, w) true on stable ground that has data in all maps.
+    grid : The raster of the maps.
     settings : Number and size of the windows.
 
     Raises
@@ -154,9 +162,9 @@ def choose_windows(stable: BoolArray, grid: Grid, settings: CalibrationConfig) -
     row, column, share = row[good], column[good], share[good]
     if len(row) == 0:
         raise InputError(
-            f"no window of {side} x {side} pixels is stable and has data in all maps",
+            f"no window of {side} x {side} pixels is mostly stable ground with data in all maps",
             where="calibration.stable_areas, calibration.window_px",
-            remedy="draw larger areas, or take smaller windows or fewer maps",
+            remedy="draw larger stable areas, lower window_px, or give fewer maps",
         )
     chosen = [int(np.argmax(share))]
     distance = np.full(len(row), np.inf)

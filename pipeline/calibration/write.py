@@ -25,12 +25,12 @@ MODEL_FILE, RECORD_FILE, REPORT_FILE = "calibrated.yaml", "calibration.json", "r
 
 
 def write(out: Path, config: SimulationConfig, result: CalibrationResult, inputs: Sequence[Path]) -> Path:
-    """Write all files of a calibration into a folder, which appears only when everything is in it.
+    """Write all files of a calibration (model, record, maps, report) into a folder, which appears only when complete.
 
     Parameters
     ----------
     out : Folder to write.
-    config : The resolved config.
+    config : The config with all defaults filled in.
     result : The calibration.
     inputs : Paths from which the maps were read, for the record.
 
@@ -110,7 +110,7 @@ def _rounded(value: Any) -> Any:
 
 
 def to_dict(result: CalibrationResult) -> dict[str, Any]:
-    """Return the result as `calibration.json` holds it."""
+    """Return all results of a calibration as the dictionary that is written to `calibration.json`."""
     found, names = result.found, result.parameters.names
     values = zip(names, *(np.exp(each) for each in (found.x, found.low, found.high)), strict=True)
     scatter = np.sqrt(np.diag(found.surface.covariance))

@@ -58,17 +58,17 @@ _SIZE_CLASSES = 8
 
 @dataclass(frozen=True)
 class MapNoise:
-    """Noise of several difference maps over stable ground.
+    """Noise of several difference maps of one sensor over stable ground, where nothing fell.
 
     Attributes
     ----------
-    stable : Statistics pooled over the epochs.
-    per_epoch : Statistics of each epoch.
-    tails, normality, histogram : Shape of the distribution.
-    variogram, model : Empirical variogram of the differences within five NMAD, and the fitted model.
-    effective : Number of independent pixels on the first map's stable ground, which has `pixels` pixels.
+    stable : Statistics (median, NMAD, ...) of the differences of all epochs together, m.
+    per_epoch : The same statistics of each epoch.
+    tails, normality, histogram : Shape of the distribution: its quantiles and kurtosis, a test for normality, and a histogram.
+    variogram, model : Empirical variogram of the differences within five NMAD of their median, and the model fitted to it.
+    effective : Number of independent pixels (effective sample size) among the stable pixels of the first map.
     pixels : Number of stable pixels of the first map.
-    level : (h, w) level of detection of a pixel, m.
+    level : (h, w) level of detection of each pixel, m: the absolute difference that noise alone exceeds in 5 % of cases.
     """
 
     stable: DifferenceStatistics
@@ -84,12 +84,12 @@ class MapNoise:
 
     @property
     def median_level_m(self) -> float | None:
-        """Median over the map of a pixel's level of detection, m; None if no pixel has one."""
+        """Median of the pixels' levels of detection (difference that noise exceeds in 5 % of cases), m; None without any."""
         known = self.level[~np.isnan(self.level)]
         return float(np.median(known)) if known.size else None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as a dictionary, as `comparison.json` holds them."""
+        """Return statistics, tails, variogram and median level of detection of one sensor's noise for `comparison.json`."""
         return {
             "stable": self.stable.to_dict(),
             "per_epoch": [each.to_dict() for each in self.per_epoch],
@@ -105,14 +105,14 @@ class MapNoise:
 
 @dataclass(frozen=True)
 class DetectionClass:
-    """How many of the fallen blocks in one class of size (or depth) were detected.
+    """How many of the fallen blocks in one class of size (or depth) a sensor detected, and how well it measured their volumes.
 
     Attributes
     ----------
     low_m, high_m : The class [low_m, high_m) of size or depth, m.
-    blocks, seen : Number of blocks, and of those detected.
-    interval : 95 % confidence interval of the share detected.
-    volume_error, volume_spread : Median and NMAD of measured over true volume minus 1; None without blocks.
+    blocks, seen : Number of blocks in the class, and of those detected.
+    interval : 95 % confidence interval of the share detected, from 0 to 1.
+    volume_error, volume_spread : Median and NMAD over the blocks of (measured volume / true volume - 1); None without blocks.
     """
 
     low_m: float
@@ -124,7 +124,7 @@ class DetectionClass:
     volume_spread: float | None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as a dictionary for JSON and CSV."""
+        """Return numbers of blocks, interval and volume error of one class of block sizes as a dictionary for JSON and CSV."""
         return {
             "low_m": self.low_m,
             "high_m": self.high_m,
@@ -141,13 +141,16 @@ class DetectionClass:
 class DetectionSummary:
     """Which of the fallen blocks a sensor detected, and its false alarms.
 
+    A block is in view if the sensor, before the block fell, saw at least half of the wall that its fall changed.
+
     Attributes
     ----------
-    blocks : All blocks.
-    by_size, by_depth : Detection curves of the blocks in view; None for fewer than ten.
-    size_classes, depth_classes : The blocks in view by classes of size and of depth.
-    table : (sizes, depths) share detected by class of both; NaN without blocks.
-    alarms, trials : False alarms: of `trials` footprints placed on stable ground, `alarms` were taken for blocks.
+    blocks : All blocks that fell.
+    by_size, by_depth : Probability of detection of the blocks in view against size and against depth; None for fewer than ten.
+    size_classes, depth_classes : Counts of the blocks in view by classes of size and of depth.
+    table : (size classes, depth classes) share of the blocks detected; NaN where no block is in both classes.
+    alarms, trials : As a check, block outlines were placed on stable ground `trials` times, and `alarms` were taken for
+        blocks.
     """
 
     blocks: list[BlockDetection]
@@ -160,7 +163,7 @@ class DetectionSummary:
     trials: int
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as a dictionary, as `comparison.json` holds them; the blocks themselves are in blocks.csv."""
+        """Return counts, detection curves and false alarms of one sensor for `comparison.json`; blocks.csv has the blocks."""
         return {
             "blocks": len(self.blocks),
             "in_view": sum(block.in_view for block in self.blocks),
@@ -176,18 +179,18 @@ class DetectionSummary:
 
 @dataclass(frozen=True)
 class SensorAssessment:
-    """All results of one sensor in a comparison.
+    """All results of one sensor in a comparison of sensors: noise, errors, detected blocks, completeness and effort.
 
     Attributes
     ----------
-    name, sensor : Name in the comparison; "stereo" or "tls".
-    noise : Noise over stable ground.
-    wall : Errors of the difference maps everywhere, niches of fallen blocks included.
-    by : For each covariate, statistics over stable ground in bins of it.
+    name, sensor : Name in the comparison; "stereo" or "tls" (laser scanner).
+    noise : Noise over stable ground, where nothing fell.
+    wall : Statistics of measured minus true change on the whole wall, places of fallen blocks included, m.
+    by : For each covariate (such as "range_m"), statistics of the differences over stable ground in bins of it.
     detection : Which fallen blocks were detected.
-    visible : Share of the wall that the sensor can see.
-    complete, complete_of_visible, complete_of_hidden : Share of pixels with data, mean over the epochs: of the whole wall, of the
-        part that the sensor can see, and of the part that it cannot, where triangles bridge a gap.
+    visible : Share of the wall that the sensor can see, 0 to 1.
+    complete, complete_of_visible, complete_of_hidden : Share of pixels with data, mean over the epochs: of the whole wall, of
+        the part that the sensor can see, and of the part that it cannot, where triangles bridge a gap.
     points : Number of points of the reference epoch.
     scan_seconds : Duration of the measurement of one epoch, s; None for cameras.
     seconds : Mean computing time of an epoch, s.
@@ -210,7 +213,7 @@ class SensorAssessment:
     registration_rms_m: float | None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as a dictionary, as `comparison.json` holds them."""
+        """Return all results of one sensor as a dictionary for `comparison.json`."""
         return {
             "name": self.name,
             "sensor": self.sensor,
@@ -230,11 +233,11 @@ class SensorAssessment:
 
 
 def map_noise(stable: Raster, gsd_m: float, random: KeyedRandom) -> MapNoise:
-    """Compute the noise of several difference maps.
+    """Compute the noise of several difference maps of one sensor: statistics, distribution, variogram and level of detection.
 
     Parameters
     ----------
-    stable : (e, h, w) differences, m; NaN outside stable ground and without data.
+    stable : (e, h, w) differences of e epochs, m; NaN outside stable ground and without data.
     gsd_m : Pixel size, m.
     random : Source of the random subsample for the normality test.
     """
@@ -264,13 +267,13 @@ def _cell_px(stable: Raster, gsd_m: float) -> int:
 
 
 def assess(trial: Trial, seen: SensorObservations, random: KeyedRandom) -> SensorAssessment:
-    """Compute all results of one sensor in a comparison.
+    """Compute all results of one sensor in a comparison: noise, detected blocks, completeness and effort.
 
     Parameters
     ----------
-    trial : The simulated comparison, with the true changes.
-    seen : What this sensor observed.
-    random : Source of random subsamples, and of the footprints' places for false alarms.
+    trial : The simulated comparison, with the true changes of the wall.
+    seen : The difference maps and other observations of this sensor.
+    random : Source of random subsamples, and of the places on stable ground where false alarms are counted.
     """
     gsd = trial.grid.gsd
     random = random.child("compare", seen.setup.name)
@@ -298,7 +301,10 @@ def assess(trial: Trial, seen: SensorObservations, random: KeyedRandom) -> Senso
 
 
 def assess_measured(found: MeasuredMaps, random: KeyedRandom) -> MapNoise:
-    """Compute the noise of measured epochs over their stable areas; without such areas, over all but gross differences.
+    """Compute the noise of really measured epochs, to compare it with that of simulated sensors.
+
+    It is computed over the measurement's stable areas. Without such areas, it is computed over all differences within five
+    NMADs of their median.
 
     Parameters
     ----------
@@ -367,12 +373,16 @@ def _detection(
 
 
 def class_edges(values: FloatArray, classes: int = _SIZE_CLASSES) -> FloatArray:
-    """Return the edges of classes of equal logarithmic width that cover all values.
+    """Return the edges of classes of equal logarithmic width that cover all values, to count blocks by size or depth.
 
     Parameters
     ----------
-    values : (k,) positive values, such as block sizes.
+    values : (k,) positive values, such as block sizes, m.
     classes : Number of classes.
+
+    Returns
+    -------
+    (classes + 1,) edges, ascending, in the unit of the values; 0.01 and 1 if there are no values.
     """
     if len(values) == 0:
         return np.array([0.01, 1.0])
@@ -381,13 +391,17 @@ def class_edges(values: FloatArray, classes: int = _SIZE_CLASSES) -> FloatArray:
 
 
 def size_classes(blocks: list[BlockDetection], values: FloatArray, edges: FloatArray) -> list[DetectionClass]:
-    """Sort fallen blocks into classes of size or depth and count those detected.
+    """Sort fallen blocks into classes of size or depth, and compute for each class how many were detected.
 
     Parameters
     ----------
     blocks : The k blocks.
-    values : (k,) their size or depth, m.
-    edges : Edges of the classes, m.
+    values : (k,) their sizes or depths, m.
+    edges : Edges of the classes, ascending, m.
+
+    Returns
+    -------
+    One result for each class.
     """
     place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
     return [
@@ -414,10 +428,13 @@ def _table(size: FloatArray, depth: FloatArray, hit: BoolArray) -> FloatArray:
 
 
 def shared_scale_m(noises: list[MapNoise]) -> float:
-    """Return the noise that scales the colours of all maps in a comparison, m: the largest NMAD, so that no map saturates."""
+    """Return the size of the noise from which the colour scale of all maps in a comparison is derived, m.
+
+    It is the largest NMAD of the given sensors, so that the map of none saturates.
+    """
     return max((each.stable.nmad for each in noises if each.stable.count), default=1e-3) or 1e-3
 
 
 def grid_record(grid: Grid) -> dict[str, float]:
-    """Return the origin, pixel size and shape of the raster that all maps share, for `comparison.json`."""
+    """Return the origin (m), pixel size (m) and shape (pixels) of the raster of all difference maps, for `comparison.json`."""
     return {"x_min_m": grid.x_min, "y_max_m": grid.y_max, "gsd_m": grid.gsd, "width_px": grid.width, "height_px": grid.height}

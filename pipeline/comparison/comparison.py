@@ -22,13 +22,13 @@ _FIGURES_S = 3.0
 
 @dataclass(frozen=True)
 class ComparisonResult:
-    """Result of comparing several sensors on one wall.
+    """Result of comparing several sensors on one simulated wall.
 
     Attributes
     ----------
-    trial : What was simulated.
-    found : Results of each sensor, in the order of the sensors.
-    measured : Measured epochs with their noise, for reference.
+    trial : The simulation: wall, true changes and what each sensor observed.
+    found : Noise, detected blocks and other results of each sensor, in the order in which the sensors were given.
+    measured : Difference maps of really measured epochs with their noise, beside the simulated sensors.
     config : The first sensor's config, as JSON types.
     """
 
@@ -38,7 +38,7 @@ class ComparisonResult:
     config: dict[str, Any]
 
     def noises(self) -> dict[str, MapNoise]:
-        """Return the noise of every sensor and of every measured folder, by name, simulated sensors first."""
+        """Return the noise of each simulated sensor and then of each folder of measured epochs, by its name."""
         return {each.name: each.noise for each in self.found} | {
             f"{maps.name} (measured)": noise for maps, noise in self.measured
         }
@@ -51,16 +51,20 @@ def compare_sensors(
     sizes_m: tuple[float, float] | None = (0.05, 0.8),
     progress: Progress | None = None,
 ) -> ComparisonResult:
-    """Simulate several sensors on one wall with the same fallen blocks, and compare their results.
+    """Simulate several sensors in front of one wall from which the same blocks fall, and compare their results.
 
     Parameters
     ----------
-    sensors : The sensors; the wall, blocks and seed are those of the first.
-    measured : Folders of measured epochs as `read_measured` takes them, for reference. They are read first, so that a mistake
-        costs no simulation; the first config gives their pixel size and ICP.
+    sensors : The sensors; the wall, blocks and random numbers are those of the first one's config.
+    measured : Folders of really measured epochs whose noise is shown beside that of the sensors: measurement.yaml with points,
+        or difference maps as GeoTIFFs. The first config gives their pixel size and ICP settings.
     epochs : Number of epochs with rockfall.
     sizes_m : Block sizes in the first and the last epoch, m; None: the blocks of the config.
-    progress : Receives the progress; None: nothing is shown.
+    progress : Display of the progress; None: nothing is shown.
+
+    Returns
+    -------
+    The results of all sensors.
 
     Raises
     ------

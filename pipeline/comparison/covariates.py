@@ -30,15 +30,15 @@ _LEAST_STEP_M = 0.05
 
 @dataclass(frozen=True)
 class UntouchedWall:
-    """The wall before any rockfall, at every pixel of a raster.
+    """The wall before any rockfall, sampled at every pixel of a raster, with properties on which noise may depend.
 
     Attributes
     ----------
     grid : The raster.
     points : (h, w, 3) points on the wall, wall frame, m; NaN without a surface.
     normals : (h, w, 3) unit normals, wall frame.
-    albedo : (h, w) albedo; NaN without a surface.
-    edge_m : (h, w) distance in the wall's plane from the nearest edge, m.
+    albedo : (h, w) albedo (share of light reflected), 0 to 1; NaN without a surface.
+    edge_m : (h, w) distance in the wall's plane from the nearest step of the rock surface, m.
     found : (h, w) true where there is a surface.
     """
 
@@ -51,7 +51,10 @@ class UntouchedWall:
 
 
 def untouched_wall(caster: RayCaster, grid: Grid) -> UntouchedWall:
-    """Cast rays along -z of the wall frame onto the untouched wall at every pixel centre of a raster."""
+    """Sample the wall before any rockfall at every pixel of a raster: points, normals, albedo and distance from edges.
+
+    caster: the wall, for ray casting along -z of the wall frame. grid: the raster, in the wall's plane.
+    """
     hits, point = caster.look_down(grid)
     valid, normal, albedo = hits.valid, hits.normal, hits.albedo
     dr.eval(valid, point, normal, albedo)
@@ -70,18 +73,18 @@ def untouched_wall(caster: RayCaster, grid: Grid) -> UntouchedWall:
 
 
 def edge_distance(heights: NDArray[np.floating], gsd_m: float) -> Raster:
-    """Compute the distance of each pixel from the nearest edge of the rock.
+    """Compute the distance of each pixel from the nearest edge (step) of the rock, near which noise is larger.
 
-    An edge lies between neighbouring pixels whose heights differ by more than four pixel sizes and 5 cm.
+    An edge lies between neighbouring pixels whose heights differ by more than four pixel sizes and by more than 5 cm.
 
     Parameters
     ----------
-    heights : (h, w) heights, m.
+    heights : (h, w) heights above the wall's plane, m.
     gsd_m : Pixel size, m.
 
     Returns
     -------
-    (h, w) distances, m, between pixel centres; infinite if there is no edge.
+    (h, w) distances in the wall's plane between pixel centres, m; infinite if there is no edge.
     """
     limit = max(_EDGE_SLOPE * gsd_m, _LEAST_STEP_M)
     edge = np.zeros(heights.shape, dtype=bool)
@@ -96,16 +99,16 @@ def edge_distance(heights: NDArray[np.floating], gsd_m: float) -> Raster:
 
 
 def range_and_incidence(wall: UntouchedWall, viewpoints: Sequence[FloatArray]) -> tuple[Raster, Raster]:
-    """Compute range and incidence angle at every pixel of a wall, averaged over the viewpoints of a sensor.
+    """Compute range and incidence angle at every pixel of a wall, averaged over the positions from which a sensor observes it.
 
     Parameters
     ----------
-    wall : The wall at every pixel.
-    viewpoints : Positions (3,), wall frame, m: the stations, or the two cameras.
+    wall : The wall before any rockfall, at every pixel.
+    viewpoints : Positions (3,), wall frame, m: the scanner's stations, or the two cameras.
 
     Returns
     -------
-    (h, w) ranges, m, and (h, w) angles between line of sight and normal, rad.
+    (h, w) ranges, m, and (h, w) angles between line of sight and surface normal, rad; NaN without a surface.
     """
     ranges, angles = [], []
     for viewpoint in viewpoints:
@@ -118,14 +121,14 @@ def range_and_incidence(wall: UntouchedWall, viewpoints: Sequence[FloatArray]) -
 
 
 def visible(wall: UntouchedWall, caster: RayCaster, viewpoints: Sequence[FloatArray], *, every: bool) -> BoolArray:
-    """Find the pixels of the wall that a sensor can see.
+    """Find the pixels of the wall that a sensor can see, where no rock is in the way.
 
     Parameters
     ----------
-    wall : The wall at every pixel.
-    caster : The wall, for tests of visibility.
-    viewpoints : Positions (3,), wall frame, m: the stations, or the two cameras.
-    every : Whether a pixel must be visible from every viewpoint, as for a stereo pair, or from any one.
+    wall : The wall before any rockfall, at every pixel.
+    caster : The same wall, for ray casting.
+    viewpoints : Positions (3,), wall frame, m: the scanner's stations, or the two cameras.
+    every : True if a pixel must be visible from every viewpoint, as for a stereo pair; false if one is enough.
 
     Returns
     -------

@@ -46,17 +46,19 @@ _PLACES = 10
 
 
 def level_of_detection(stable: NDArray[np.floating], cell_px: int) -> NDArray[np.float32]:
-    """Compute the level of detection of each pixel: the 95 % quantile of |difference| in its square cell, over all epochs.
+    """Compute the level of detection of each pixel: the difference that noise alone exceeds in 5 % of cases.
+
+    It is the 95 % quantile of the absolute differences on stable ground in the same square cell of the map, over all epochs.
 
     Parameters
     ----------
-    stable : (e, h, w) differences, m; NaN outside stable ground and without data.
+    stable : (e, h, w) differences of e epochs, m; NaN outside stable ground and without data.
     cell_px : Side of a cell, pixels.
 
     Returns
     -------
-    (h, w) level of detection, m. Cells with fewer than 40 differences get the median of the other cells; all NaN if there are
-    none.
+    (h, w) level of detection, m. Cells with fewer than 40 differences get the median of the other cells. If all cells have
+    fewer, it is NaN everywhere.
     """
     _, height, width = stable.shape
     rows, columns = -(-height // cell_px), -(-width // cell_px)
@@ -74,21 +76,20 @@ def level_of_detection(stable: NDArray[np.floating], cell_px: int) -> NDArray[np
 
 @dataclass(frozen=True)
 class BlockDetection:
-    """One fallen block, and what a difference map shows of it.
+    """One fallen block, and whether a sensor's difference map shows it.
 
     Attributes
     ----------
-    epoch, label : Epoch in which it fell, and its label in that epoch.
-    size_m : (2 V)^(1/3) of the fallen volume V, m: the side of a cube that was half embedded in the rock, as in `scarpsim
-        inspect`.
+    epoch, label : Number of the epoch in which it fell, and its label in that epoch.
+    size_m : (2 V)^(1/3) of the fallen volume V, m: the side of a cube that was half embedded in the rock.
     depth_m : True mean depth over its footprint, m.
-    footprint_px : Number of pixels of the map on which it changed the wall (its footprint).
-    data_share : Share of these pixels with data.
-    mean_m : Mean difference on these, m; None with too little data.
-    limit_m : Level of detection of that mean, m; None with too little data.
-    volume_m3, measured_volume_m3 : True volume, and sum of the differences over the footprint, m^3.
+    footprint_px : Number of pixels of the map on which its fall changed the wall (its footprint).
+    data_share : Share of the footprint's pixels with data.
+    mean_m : Mean difference over them, m; None with too little data.
+    limit_m : Level of detection of that mean, m, which noise alone rarely exceeds; None with too little data.
+    volume_m3, measured_volume_m3 : True volume, and sum of the differences over the footprint times the pixel area, m^3.
     in_view : Whether the sensor saw at least half of the footprint before the block fell.
-    seen : Whether the block was detected.
+    seen : Whether the block was detected: the mean exceeds its level of detection.
     """
 
     epoch: int
@@ -105,18 +106,18 @@ class BlockDetection:
     seen: bool
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as a dictionary for JSON and CSV."""
+        """Return all that is known of one fallen block and its detection as a dictionary for JSON and CSV."""
         return dataclasses.asdict(self)
 
 
 @dataclass(frozen=True)
 class BlockMeanTest:
-    """Test whether the mean change over a block's footprint exceeds its level of detection.
+    """Test whether the mean change over the footprint (changed pixels) of a fallen block exceeds what noise alone would give.
 
     Attributes
     ----------
     model : Variogram model of the noise.
-    level : (h, w) level of detection of every pixel, m.
+    level : (h, w) level of detection of every pixel, m: the difference that noise alone exceeds in 5 % of cases.
     gsd_m : Pixel size, m.
     """
 
@@ -125,12 +126,12 @@ class BlockMeanTest:
     gsd_m: float
 
     def limit_m(self, footprint: BoolArray, window: tuple[slice, slice]) -> float:
-        """Return the level of detection of the mean change over a footprint, m.
+        """Return the mean change over a block's footprint that correlated noise alone rarely exceeds (its level of detection), m.
 
         Parameters
         ----------
-        footprint : (n, m) mask of the block's pixels.
-        window : Rows and columns of the map that the mask covers.
+        footprint : (n, m) mask of the block's pixels, true inside.
+        window : The n rows and m columns of the whole map that the mask covers.
         """
         level = self.level[window][footprint].astype(np.float64)
         share = variance_of_mean(self.model, footprint, self.gsd_m) / self.model.sill_m2 if self.model.sill_m2 > 0 else 0.0
@@ -139,17 +140,18 @@ class BlockMeanTest:
     def mean_and_limit(
         self, change: NDArray[np.floating], footprint: BoolArray, window: tuple[slice, slice]
     ) -> tuple[float | None, float | None]:
-        """Compute the mean difference over a footprint, and its level of detection.
+        """Compute the mean difference over a block's footprint, and the level of detection that it must exceed.
 
         Parameters
         ----------
-        change : (h, w) difference map, m.
-        footprint : (n, m) mask of the block's pixels.
-        window : Rows and columns of the map that the mask covers.
+        change : (h, w) difference map, m; NaN without data.
+        footprint : (n, m) mask of the block's pixels, true inside.
+        window : The n rows and m columns of the map that the mask covers.
 
         Returns
         -------
-        Mean and level of detection, m, over the pixels with data; None for both if too few have data.
+        Mean and level of detection over the pixels with data, m. None for both if fewer than half of the pixels, or fewer than
+        four, have data.
         """
         values = change[window]
         known = footprint & ~np.isnan(values)
@@ -160,16 +162,17 @@ class BlockMeanTest:
 
 
 def footprints(block: IntArray, true_change: NDArray[np.floating]) -> Iterator[tuple[int, tuple[slice, slice], BoolArray]]:
-    """Find the footprint of each fallen block: the pixels of its label where the wall receded.
+    """Find the footprint of each fallen block in a true change map: the pixels with its label where the wall receded.
 
     Parameters
     ----------
-    block : (h, w) block labels.
+    block : (h, w) block labels, 0 outside of blocks.
     true_change : (h, w) true change of the wall, reference minus epoch, m.
 
     Yields
     ------
-    Label of the block, rows and columns of the map around it, and the mask of its footprint there.
+    For each block its label, the rows and columns of the map around it, and the mask of its footprint in these rows and
+    columns.
     """
     receded = np.where(true_change > 0, block, WALL)
     for label, window in enumerate(ndimage.find_objects(receded), start=1):
@@ -186,16 +189,20 @@ def detect_blocks(
     visible: BoolArray,
     test: BlockMeanTest,
 ) -> list[BlockDetection]:
-    """Test for each block of an epoch whether a difference map shows its fall.
+    """Test for each block that fell in an epoch whether a sensor's difference map shows its fall.
 
     Parameters
     ----------
     epoch : Number of the epoch.
     change : (h, w) the sensor's difference map, m.
-    block, true_change : (h, w) true block labels and true change of the wall, reference minus epoch, m.
-    records : The blocks as blocks.json holds them.
-    visible : (h, w) true where the sensor sees the untouched wall.
-    test : The test of a mean change.
+    block, true_change : (h, w) true block labels, and true change of the wall (reference minus epoch), m.
+    records : One dictionary for each block with at least its label and its volume, m^3, as in blocks.json.
+    visible : (h, w) true where the sensor sees the wall before the rockfall.
+    test : The test whether a mean change exceeds the noise.
+
+    Returns
+    -------
+    One result for each block, in the order of the records.
     """
     found = {label: (window, footprint) for label, window, footprint in footprints(block, true_change)}
     nowhere = (slice(0, 0), slice(0, 0)), np.zeros((0, 0), dtype=bool)
@@ -228,18 +235,18 @@ def detect_blocks(
 def false_alarms(
     stable: NDArray[np.floating], shapes: Sequence[BoolArray], test: BlockMeanTest, random: KeyedRandom
 ) -> tuple[int, int]:
-    """Place footprints at random on stable ground and count how many would be taken for fallen blocks.
+    """Place block footprints at random on stable ground, and count how many are falsely taken for fallen blocks.
 
     Parameters
     ----------
     stable : (h, w) differences of one map, m; NaN outside stable ground.
-    shapes : Footprints of the blocks, as masks.
-    test : The test of a mean change.
-    random : Source of the places.
+    shapes : Footprints of the blocks as masks; each is placed ten times.
+    test : The test whether a mean change exceeds the noise.
+    random : Source of the random places.
 
     Returns
     -------
-    Number of false alarms, and of footprints with enough data.
+    Number of false alarms, and number of placed footprints that had enough data to be tested.
     """
     generator = random.generator()
     alarms = trials = 0

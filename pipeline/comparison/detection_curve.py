@@ -57,18 +57,22 @@ _LAPSES_OF_NONE = np.array([0.051, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 0.9])
 
 @dataclass(frozen=True)
 class DetectionCurve:
-    """Probability that a fallen block is detected, fitted as P(x) = (1 - lapse) Phi((ln x - ln middle) / width) of its size x.
+    """Probability P that a fallen block of size x (or depth x) is detected, fitted to the detected and missed blocks.
+
+    The curve is P(x) = (1 - lapse) Phi((ln x - ln middle) / width), where Phi is the normal distribution function.
 
     Attributes
     ----------
     count, seen : Number of blocks, and of those detected.
     smallest_m, largest_m : Range of the block sizes, m.
-    middle_m, width, lapse : Parameters of the curve: the size at half of its height, m; the width of its rise, in logarithms; and
-        the share that is missed at any size.
-    smallest_95_m : Size from which 95 % are detected, m; None if the blocks determine it less well than to a factor of 1.5.
-    between_m : Block sizes between which it then lies, m. None at an end: below or above all sizes. None altogether if
-        `smallest_95_m` is given or the curve stays below 95 %.
-    interval_m : 95 % confidence interval of that size, m; an end is None where the blocks do not bound it.
+    middle_m, width, lapse : Parameters of the curve: the size at half of its height, m; the width of its rise, in natural
+        logarithms of size; and the share of blocks that is missed at any size.
+    smallest_95_m : Size from which 95 % are detected, m. None if it is known less well than to a factor of 1.5, or if the
+        curve stays below 95 %.
+    between_m : If `smallest_95_m` is not known well enough, the neighbouring block sizes between which it lies, m. The lower
+        one is None below all sizes, the upper one above all sizes. None in all other cases.
+    interval_m : 95 % confidence interval of the size from which 95 % are detected, m; None for an end that the blocks do not
+        bound.
     """
 
     count: int
@@ -83,11 +87,14 @@ class DetectionCurve:
     interval_m: tuple[float | None, float | None]
 
     def probability(self, size_m: FloatArray) -> FloatArray:
-        """Return the probability of detection of blocks with sizes (any shape), m."""
+        """Return the probability that blocks of given sizes are detected, 0 to 1.
+
+        size_m: sizes (or depths) in m, an array of any shape. Returns an array of the same shape.
+        """
         return (1 - self.lapse) * special.ndtr((np.log(size_m) - np.log(self.middle_m)) / self.width)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as a dictionary for JSON."""
+        """Return all parameters of a detection curve as a dictionary for `comparison.json`."""
         return dataclasses.asdict(self)
 
 
@@ -140,12 +147,12 @@ class _ProfileLikelihood:
 
 
 def detection_curve(size_m: FloatArray, seen: BoolArray) -> DetectionCurve | None:
-    """Fit the probability of detection to fallen blocks.
+    """Fit the probability of detection as a function of block size, to find the smallest block that a sensor detects reliably.
 
     Parameters
     ----------
-    size_m : (k,) sizes of the blocks, m.
-    seen : (k,) whether each was detected.
+    size_m : (k,) sizes (or depths) of the blocks in view, m.
+    seen : (k,) true for the blocks that were detected.
 
     Returns
     -------

@@ -46,14 +46,14 @@ COVARIATES = {
 
 @dataclass(frozen=True)
 class MapPanel:
-    """One map of a figure.
+    """One map in a figure that shows the maps of several sensors side by side.
 
     Attributes
     ----------
-    title : Its title.
+    title : Title above the map.
     values : (h, w) values, m; NaN without data.
-    grid : Its pixels.
-    block : (h, w) block labels whose outlines are drawn; None for none.
+    grid : Raster of the map, for its axes in m.
+    block : (h, w) block labels, 0 outside, whose outlines are drawn; None: no outlines.
     """
 
     title: str
@@ -63,14 +63,18 @@ class MapPanel:
 
 
 def side_by_side(panels: Sequence[MapPanel], limit_m: float, label: str, *, signed: bool) -> bytes:
-    """Draw maps in rows of two on one colour scale, as PNG.
+    """Draw the maps of several sensors in rows of two on one colour scale, so that they can be compared.
 
     Parameters
     ----------
     panels : The maps.
     limit_m : Upper end of the scale, m.
     label : Label of the colour bar.
-    signed : Whether the scale begins at -limit_m, else at 0.
+    signed : Whether the scale begins at -limit_m, as for differences; otherwise at 0.
+
+    Returns
+    -------
+    The figure as PNG.
     """
     columns = min(len(panels), 2)
     rows = -(-len(panels) // columns)
@@ -99,9 +103,9 @@ def side_by_side(panels: Sequence[MapPanel], limit_m: float, label: str, *, sign
 
 
 def noise_figure(noises: Mapping[str, MapNoise]) -> bytes:
-    """Draw histograms of the noise of several sensors, linear and logarithmic, and their variograms with models, as PNG.
+    """Draw the noise of several sensors: histograms, linear and logarithmic, and variograms with fitted models. Returns a PNG.
 
-    Dashed lines are normal distributions with the same median and NMAD.
+    noises: the noise of each sensor, by its name. Dashed lines are normal distributions with the same median and NMAD.
     """
     figure = Figure(figsize=(_WIDTH_IN, 4.4), dpi=DPI, layout="constrained")
     linear, logarithmic, correlation = figure.subplots(1, 3)
@@ -126,7 +130,10 @@ def noise_figure(noises: Mapping[str, MapNoise]) -> bytes:
 
 
 def covariate_figure(found: Sequence[SensorAssessment]) -> bytes:
-    """Draw the NMAD over stable ground against range, incidence angle, distance from edges, and albedo, as PNG."""
+    """Draw how the noise of several sensors depends on range, incidence angle, distance from edges, and albedo. Returns a PNG.
+
+    found: the results of each sensor. The figure shows the NMAD of the differences over stable ground.
+    """
     figure = Figure(figsize=(_WIDTH_IN, 6.4), dpi=DPI, layout="constrained")
     panels = figure.subplots(2, 2, sharey=True).ravel()
     for axes, (key, (label, factor)) in zip(panels, COVARIATES.items(), strict=True):
@@ -152,10 +159,10 @@ def covariate_figure(found: Sequence[SensorAssessment]) -> bytes:
 
 
 def detection_figure(found: Sequence[SensorAssessment]) -> bytes:
-    """Draw the share of fallen blocks detected against size and depth, and the errors of their volumes, as PNG.
+    """Draw which share of the fallen blocks sensors detect, against size and depth, and volume errors. Returns a PNG.
 
-    Points are classes with 95 % intervals, lines the fitted curves. Volume errors are drawn for classes of which at least half
-    are detected; below, the noise is as large as the volume.
+    found: the results of each sensor. Points are size classes with 95 % intervals, lines the fitted curves. Volume errors are
+    drawn for classes of which at least half are detected; below, the noise is as large as the volume.
     """
     figure = Figure(figsize=(_WIDTH_IN, 4.4), dpi=DPI, layout="constrained")
     by_size, by_depth, volume = figure.subplots(1, 3)
@@ -184,7 +191,10 @@ def detection_figure(found: Sequence[SensorAssessment]) -> bytes:
 
 
 def table_figure(found: Sequence[SensorAssessment]) -> bytes:
-    """Draw the share of fallen blocks detected by size and depth, one panel for each sensor, as PNG; white: no such block."""
+    """Draw the share of fallen blocks that each sensor detects, in classes of both size and depth. Returns a PNG.
+
+    found: the results of each sensor, one panel each. Fields without a block stay white.
+    """
     figure = Figure(figsize=(_WIDTH_IN, 4.0), dpi=DPI, layout="constrained")
     row = np.atleast_1d(figure.subplots(1, len(found), sharey=True))
     for axes, each in zip(row, found, strict=True):
@@ -202,12 +212,18 @@ def table_figure(found: Sequence[SensorAssessment]) -> bytes:
 
 
 def scale_limit_m(sigma_m: float) -> float:
-    """Return the upper end of the colour scale of difference maps, m, for noise with the standard deviation sigma_m."""
+    """Return the upper end of the colour scale of difference maps, m, as a fixed multiple of their noise.
+
+    sigma_m: standard deviation of the noise, m.
+    """
     return SCALE_SIGMAS * sigma_m
 
 
 def level_limit_m(noises: Sequence[MapNoise]) -> float:
-    """Return the upper end of the colour scale of levels of detection, m: the 98 % quantile of the noisiest sensor."""
+    """Return the upper end of the colour scale for maps of the level of detection, m.
+
+    noises: the noise of each sensor. The end is the largest of the sensors' 98 % quantiles of the level.
+    """
     tops = [float(np.nanquantile(noise.level, 0.98)) for noise in noises if np.isfinite(noise.level).any()]
     return max(tops, default=1e-3) or 1e-3
 

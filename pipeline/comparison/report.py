@@ -39,9 +39,9 @@ _NOTHING = "\N{EN DASH}"
 
 
 def write_comparison(out: Path, comparison: ComparisonResult) -> Path:
-    """Write all files of a comparison into a folder, and return the path of the report.
+    """Write all files of a comparison of sensors (maps, tables, pictures, record, report) into a folder.
 
-    The folder appears only when everything is in it.
+    The folder `out` appears only when everything is in it. Returns the path of the report.
     """
     with filling(out) as folder:
         _write(folder, comparison)
@@ -87,9 +87,9 @@ def _write(out: Path, comparison: ComparisonResult) -> None:
 
 
 def answer(found: SensorAssessment) -> str:
-    """Return the main result of a sensor as a sentence.
+    """State as a sentence the smallest block that a sensor detects in 95 % of cases, and from which blocks this was estimated.
 
-    It states the smallest block that the sensor detects in 95 % of cases, and from which blocks this was estimated.
+    found: the results of the sensor. With too few blocks for an estimate, the sentence says so.
     """
     curve = found.detection.by_size
     if curve is None:
@@ -134,7 +134,7 @@ def _cm(size_m: float) -> str:
 
 
 def summary(comparison: ComparisonResult) -> str:
-    """Return the main results of a comparison as lines of text for the terminal."""
+    """Summarise a comparison for the terminal: for each sensor its angular step, noise, and smallest block detected."""
     steps = [(seen.setup.name, seen.setup.angular_step_rad) for seen in comparison.trial.seen]
     lines = [f"{name}: angular step {_step(step)}" for name, step in steps if step is not None]
     lines += [f"{name}: stable ground {noise.stable.summary()}" for name, noise in comparison.noises().items()]
@@ -142,7 +142,10 @@ def summary(comparison: ComparisonResult) -> str:
 
 
 def write_csv(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write rows as a CSV file, with the keys of the first row as the header and None as an empty cell; no rows: no file."""
+    """Write a table as a CSV file; without rows, no file is written.
+
+    rows: one dictionary for each row. The keys of the first are the header, and None becomes an empty cell.
+    """
     rows = list(rows)
     if not rows:
         return
@@ -176,7 +179,7 @@ def _shown(trial: Trial) -> int:
 
 
 def pictures(comparison: ComparisonResult) -> dict[str, bytes]:
-    """Draw the pictures of a comparison's report as PNG, by file name."""
+    """Draw all pictures of the report of a comparison, such as maps and detection curves. Returns PNGs by file name."""
     trial, found, noises = comparison.trial, comparison.found, comparison.noises()
     number = _shown(trial)
     epoch = trial.epochs[number - 1]

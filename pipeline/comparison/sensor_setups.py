@@ -32,13 +32,13 @@ _KINDS = ("", "sites", "scanners", "noise")
 
 @dataclass(frozen=True)
 class SensorSetup:
-    """One sensor of a comparison, with its config.
+    """One sensor to compare: a stereo pair or a laser scanner with the config that describes it.
 
     Attributes
     ----------
     name : Name in the comparison.
-    sensor : "stereo" or "tls".
-    config : Its config. The sections that describe wall and blocks are the same for all sensors.
+    sensor : "stereo" or "tls" (laser scanner).
+    config : Its config. The sections that describe wall and blocks are the same for all sensors of the comparison.
     """
 
     name: str
@@ -47,7 +47,7 @@ class SensorSetup:
 
     @property
     def angular_step_rad(self) -> tuple[float, float] | None:
-        """Steps of a laser scanner in azimuth and in zenith angle, rad; None for cameras."""
+        """Angular steps of a laser scanner in azimuth and in zenith angle, rad; None for cameras."""
         scanner = self.config.scanner
         return (scanner.azimuth_step_rad, scanner.zenith_step_rad) if self.sensor == "tls" else None
 
@@ -55,19 +55,23 @@ class SensorSetup:
 def sensor_setups(
     names: Sequence[Given], overrides: Overrides = (), seed: int | None = None, *, own_step: bool = False
 ) -> list[SensorSetup]:
-    """Read the sensors of a comparison, in their order; a config with both sensors gives two.
+    """Read which sensors to compare, and put all of them in front of the first config's wall.
 
-    A name is a config file, a run's folder or its run.json, the file of a sensor model, or a bundled name: a site, a scanner
-    preset (riegl_vz400i) or a noise model (glendale_high). Presets and models are put into the first config, or into the demo's
-    config if there is none. Scanner presets use that config's angular step, so that the comparison is of instruments and not of
-    scan times.
+    A config with two sensors gives two. A name is a config file, a run's folder or its run.json, the file of a sensor model,
+    or the name of a bundled file: a site, a scanner preset (such as riegl_vz400i) or a noise model (such as glendale_high).
+    Presets and models describe only a sensor. They are put into the first config, or into the demo's config if there is none.
 
     Parameters
     ----------
-    names : Names, or configs with a name, to which overrides and seed are already applied.
-    overrides : `--set` options, applied to every config.
-    seed : Seed that replaces those of the configs.
-    own_step : Whether scanner presets use their own angular step instead (or the default, if they have none).
+    names : Names as above, or pairs of a name and a config to which overrides and seed are already applied.
+    overrides : Settings "key=value" that replace those of every config (the `--set` options).
+    seed : Seed of the random numbers, which replaces those of the configs; None: theirs.
+    own_step : Whether scanner presets use their own angular step. By default they use the first config's, so that instruments
+        are compared and not scan times.
+
+    Returns
+    -------
+    The sensors, in the order of the names.
 
     Raises
     ------
@@ -148,7 +152,7 @@ def _whole(name: Given, overrides: Overrides, seed: int | None) -> list[SensorSe
     if path.is_dir():
         path = path / RUN_FILE
         if not path.exists():
-            raise InputError(f"the folder contains no {RUN_FILE}", where=name, remedy="name a run's folder or a config file")
+            raise InputError("the folder contains no run.json", where=name, remedy="name a run's folder or a config file")
         read_run(path, "name a config file")
     elif not path.is_file() and not is_path(name):
         path = _bundled(name)

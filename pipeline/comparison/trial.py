@@ -47,15 +47,15 @@ _SIZE_SPREAD, _SMALLEST_SHARE = 0.15, 0.5
 
 @dataclass(frozen=True)
 class TrueEpoch:
-    """The true change of the wall between the reference and one epoch.
+    """The true change of the wall between the reference epoch, before anything fell, and one later epoch of a simulation.
 
     Attributes
     ----------
     number : Number of the epoch, from 1.
-    records : The fallen blocks as blocks.json holds them.
-    block : (h, w) labels of the blocks.
-    change : (h, w) change, reference minus epoch, m; 0 where nothing fell.
-    stable : (h, w) true on stable ground.
+    records : One dictionary for each fallen block (label, volume, ...), as in blocks.json.
+    block : (h, w) labels of the blocks, 0 outside.
+    change : (h, w) change along z of the wall frame, reference minus epoch, m; 0 where nothing fell.
+    stable : (h, w) true on stable ground, more than 10 cm from any block.
     """
 
     number: int
@@ -67,18 +67,19 @@ class TrueEpoch:
 
 @dataclass(frozen=True)
 class SensorObservations:
-    """What one sensor of a comparison observed.
+    """What one sensor of a comparison observed in the reference epoch and in e epochs with rockfall.
 
     Attributes
     ----------
-    setup : The sensor.
-    site : The simulated site, with the sensor's viewpoints.
-    changes : (e, h, w) difference maps, reference minus epoch, m.
+    setup : The sensor and its config.
+    site : The wall with the sensor in front of it.
+    changes : (e, h, w) difference maps, reference minus epoch, m; NaN without data.
     points : Number of points of the reference and of each epoch.
-    seconds : Computing time of each epoch without carving, s.
+    seconds : Computing time of each epoch, from measurement to difference map, s.
     registration_rms_m : RMS distance of ICP's inliers in each epoch, m; empty without ICP.
     reference : The observation of the reference epoch.
-    range_m, incidence_rad, visible : (h, w) range, m, incidence angle, rad, and visibility of the untouched wall.
+    range_m, incidence_rad, visible : (h, w) range, m, and incidence angle, rad, at each pixel of the wall before any rockfall,
+        and whether the sensor sees it.
     """
 
     setup: SensorSetup
@@ -95,13 +96,13 @@ class SensorObservations:
 
 @dataclass(frozen=True)
 class Trial:
-    """The simulation on which a comparison is based.
+    """The simulation on which a comparison of sensors is based.
 
     Attributes
     ----------
     grid : Raster that all difference maps share.
-    wall : The untouched wall at every pixel.
-    epochs : The true changes.
+    wall : The wall before any rockfall, at every pixel of the raster.
+    epochs : The true change of the wall in each epoch with rockfall.
     seen : What each sensor observed.
     """
 
@@ -114,15 +115,19 @@ class Trial:
 def compare(
     sensors: Sequence[SensorSetup], epochs: int, sizes_m: tuple[float, float] | None, progress: Progress | None = None
 ) -> Trial:
-    """Simulate what every sensor observes of one wall before and after rockfall.
+    """Simulate what several sensors observe of one wall, before rockfall and in each epoch with rockfall.
 
     Parameters
     ----------
-    sensors : The sensors; the first one's config gives wall and blocks.
+    sensors : The sensors; the first one's config gives wall, blocks and random numbers.
     epochs : Number of epochs with rockfall.
-    sizes_m : Block sizes in the first and the last epoch, m. They grow geometrically in between, so that the smallest detectable
-        size is bracketed. None: the blocks of the config.
-    progress : Receives the progress; None: nothing is shown.
+    sizes_m : Block sizes in the first and the last epoch, m. They grow geometrically in between, so that the smallest
+        detectable size lies within them. None: the blocks of the config.
+    progress : Display of the progress; None: nothing is shown.
+
+    Returns
+    -------
+    The true changes, and what each sensor observed.
 
     Raises
     ------
@@ -163,18 +168,18 @@ def compare(
 def rockfalls(
     config: RockfallConfig, bounds: FloatArray, epochs: int, sizes_m: tuple[float, float] | None
 ) -> list[RockfallConfig]:
-    """Return the rockfall settings of each epoch of a comparison.
+    """Set sizes and number of the blocks that fall in each epoch of a comparison; sizes grow from epoch to epoch.
 
     Parameters
     ----------
-    config : The rockfall of the config.
-    bounds : (2, 3) bounding box of the wall, wall frame, m.
+    config : The rockfall section of the config, which gives all other settings.
+    bounds : (2, 3) lowest and highest corner of the wall's bounding box, wall frame, m.
     epochs : Number of epochs.
-    sizes_m : Block sizes of the first and the last epoch, m; None: the config's blocks in each epoch.
+    sizes_m : Mean block sizes of the first and the last epoch, m; None: the config's blocks in each epoch.
 
     Returns
     -------
-    One setting for each epoch, with as many blocks as have room.
+    Rockfall settings of each epoch. The number of blocks is the config's, or fewer if the wall has no room for them.
     """
     if sizes_m is None:
         return [config] * epochs

@@ -51,7 +51,10 @@ def _write(out: Path, study: IcpStudy) -> None:
 
 
 def recommendation_sentence(found: Recommendation) -> str:
-    """State a recommended value of an ICP setting, and the error that remains with it, as a sentence for the report."""
+    """State a recommended value of an ICP setting, and the error that remains with it, as a sentence for the report.
+
+    found: the recommendation.
+    """
     low, high = found.good
     error = f"{millimetres(found.normal_error_m, 2)} of error along the surface's normal remains"
     if found.parameter == "subsample_ratio":

@@ -93,7 +93,7 @@ class EpochSurfaces:
 
 
 def surfaces_of_run(folder: Path, epochs: int) -> tuple[SimulationConfig, str, list[EpochSurfaces]]:
-    """Read from the folder of a run of `simulate` what an ICP study needs.
+    """Read config, measured and true surfaces from the folder of a run of `simulate`, for an ICP study.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def surfaces_of_run(folder: Path, epochs: int) -> tuple[SimulationConfig, str, l
         )
     if epochs >= len(records):
         raise InputError(
-            f"got {epochs}",
+            f"asks for {epochs} epochs",
             where="--epochs",
             allowed=f"1 to {len(records) - 1}, as many epochs as {folder} has",
             remedy="choose a number in this range",
@@ -194,11 +194,11 @@ def study(
     Parameters
     ----------
     sensor : str
-        "stereo" or "tls" (laser scanner), for the record.
+        "stereo" or "tls" (laser scanner), which is stored with the results.
     surfaces : sequence of EpochSurfaces
         The reference, then the epochs.
     config : IcpConfig
-        Settings of ICP; one of the two above is replaced at a time.
+        Settings of ICP; in each registration the subsample ratio or the outlier threshold is replaced.
     random : KeyedRandom
         Source of subsamples and displacements.
     offset_m : float

@@ -44,7 +44,7 @@ def build(request: Request, out: Path) -> Interpretation:
 
     Parameters
     ----------
-    request : The raw files and what the user says of them.
+    request : The raw files, and what the user says of them: reference, scanner, position, units.
     out : Folder to write.
 
     Returns
@@ -96,7 +96,7 @@ def build_stereo(request: Request, cameras: Path, labels: tuple[str, str] | None
 
     Parameters
     ----------
-    request : The raw files and what the user says of them.
+    request : The raw files, and what the user says of them: reference, scanner, position, units.
     cameras : File or folder with the calibration and pose of the cameras.
     labels : Names of the left and right camera, if `cameras` has more than two; else None.
     out : Folder to write.
@@ -121,7 +121,7 @@ def build_stereo(request: Request, cameras: Path, labels: tuple[str, str] | None
     model = StereoModel() if request.model is None else read_model(request.model)
     if not isinstance(model, StereoModel):
         raise InputError(
-            "the model is of a laser scanner",
+            "the model is of a laser scanner, but the points come from a stereo pair",
             where=str(request.model),
             allowed="sensor: stereo",
             remedy="name a model of a stereo pair with --model",
@@ -167,10 +167,10 @@ def _scans(request: Request) -> list[RawScan]:
         if request.number is not None:
             if request.number > len(each):
                 raise InputError(
-                    f"got {request.number}",
+                    f"there is no scan {request.number}",
                     where="--scan",
                     allowed=f"1 to {len(each)} in {path.name}",
-                    remedy="choose a scan of the file",
+                    remedy="choose the number of a scan of this file",
                 )
             each = [each[request.number - 1]]
         for scan in each:
@@ -189,8 +189,8 @@ def _stations(scans: list[RawScan], request: Request) -> list[Station]:
     for scan, station in zip(scans[1:], stations[1:], strict=True):
         if request.reference == HALF and (away := _distance_m(station, stations[0])) > _ONE_PLACE_M:
             raise InputError(
-                f"its station is {away:.3g} m from that of {scans[0].name}, whose half is the reference", where=scan.name,
-                remedy="name a mesh, a cloud or a DEM; --scan N picks one scan of a file",
+                f"its scanner stood {away:.3g} m from that of {scans[0].name}, whose half is the reference", where=scan.name,
+                remedy="name a mesh, a cloud or a DEM with --reference, or pick one scan of the file with --scan N",
             )  # fmt: skip
     return stations
 
@@ -230,14 +230,14 @@ def _model(request: Request) -> tuple[TlsModel, tuple[str, ...]]:
         model = read_model(request.model)
         if not isinstance(model, TlsModel):
             raise InputError(
-                "the model is of a stereo pair",
+                "the model is of a stereo pair, but the points come from a laser scanner",
                 where=str(request.model),
                 allowed="sensor: tls",
                 remedy="name a model of a laser scanner with --model, or a preset with --scanner",
             )
         return model, (f"as in {request.model}",)
     if request.scanner is None:
-        raise InputError("the scanner is unknown", where="--scanner", remedy=_NAME_SCANNER)
+        raise InputError("the scanner, and so its noise, is unknown", where="--scanner", remedy=_NAME_SCANNER)
     preset = read_preset(request.scanner)
     return preset.model(), (f"preset {preset.name}: values of its data sheet, defaults where it states none",)
 

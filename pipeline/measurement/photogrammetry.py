@@ -40,7 +40,7 @@ def read_pair(path: Path, labels: tuple[str, str] | None) -> CameraPair:
     if labels is None and len(found.cameras) != 2:
         raise InputError(
             f"the file has {len(found.cameras)} aligned cameras, but a pair has two", where=str(path),
-            allowed=", ".join(sorted(found.cameras)[:20]), remedy="name them: --pair LEFT,RIGHT",
+            allowed=", ".join(sorted(found.cameras)[:20]), remedy="name two of them with --pair LEFT,RIGHT",
         )  # fmt: skip
     left, right = labels or (None, None)
     return stereo_pair(found, left, right, str(path))

@@ -41,7 +41,7 @@ class Reference:
     Attributes
     ----------
     mesh : The surface, in the frame of the measured points, m.
-    error_m : Standard error of its vertices along the rays, m; 0 if it is taken as exact.
+    error_m : Standard error of its vertices along the lines of sight, m; 0 if it is taken as exact.
     words : Description of the surface for the user.
     limits : What a comparison with it cannot show, for the user.
     rows : (k,) indices of the measured points that are compared with it, if it was made of the other ones; None: all.
@@ -129,7 +129,7 @@ def reference_from_dem(path: Path, unit: str | None = None, option: str = "--uni
     heights, place = raster.values, raster.place
     if place.grid is None:
         raise InputError(
-            "the raster has no pixel scale and tie point",
+            "the raster has no pixel scale and tie point, so its place is unknown",
             where=str(path),
             remedy="export the raster as a GeoTIFF, with its coordinates",
         )

@@ -86,7 +86,10 @@ def _checked(scan: RawScan, where: str) -> RawScan:
         words.append(f"{lost:,} points with coordinates that are not numbers are left out")
     if len(cloud.points) < _FEWEST:
         raise InputError(
-            f"the scan has {len(cloud.points)} points", where=where, allowed=f"{_FEWEST} or more", remedy="use a whole scan"
+            f"the scan has only {len(cloud.points)} points",
+            where=where,
+            allowed=f"{_FEWEST} or more",
+            remedy="export the whole scan",
         )
     if unused := sorted(set(cloud.extra) - _OF_GRID - _OF_RETURNS):
         words.append(f"the file also has {', '.join(unused)}, which {'is' if len(unused) == 1 else 'are'} not used")

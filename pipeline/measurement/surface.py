@@ -37,7 +37,7 @@ def build_surface(request: Request, out: Path) -> Interpretation:
 
     Parameters
     ----------
-    request : The raw files (clouds, meshes or elevation models) and what the user says of them.
+    request : The raw files (clouds, meshes or elevation models), and what the user says of them: reference, units, noise model.
     out : Folder to write.
 
     Returns
@@ -157,7 +157,7 @@ def _model(request: Request, cloud: RawScan, reference: Reference) -> tuple[Ster
         model = read_model(request.model)
         if not isinstance(model, StereoModel):
             raise InputError(
-                "the model is of a laser scanner",
+                "the model is of a laser scanner, but the points come from photographs",
                 where=str(request.model),
                 allowed="sensor: stereo",
                 remedy="name a model of a stereo pair with --model",

@@ -107,12 +107,14 @@ class RasterPair:
 
 @dataclass(frozen=True)
 class Alignment:
-    """Result of registering an epoch on the reference.
+    """Result of registering an epoch finely on the reference, by the rock that did not change.
+
+    ICP or survey targets have brought the epoch near the reference before.
 
     Attributes
     ----------
     transform : RigidTransform
-        Moves the epoch's points to the reference, wall frame.
+        Moves the epoch's points, which are near the reference already, onto it, wall frame.
     covariance : (6, 6) array
         Covariance of shift (m) and rotation (rad) about `centre`, wall frame.
     centre : (3,) array
@@ -142,7 +144,7 @@ class Alignment:
         return np.sqrt(np.maximum(variance, 0.0)).astype(np.float32)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the registration of the epoch, with its standard deviations, as monitor.json stores it."""
+        """Return the fine registration of an epoch, with its standard deviations, by the names that monitor.json has for them."""
         sigma = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         return {
             **self.transform.to_dict(),
@@ -266,7 +268,7 @@ def _compared(pair: RasterPair, areas: Sequence[Area]) -> NDArray[np.bool_]:
 def _check_enough(count: int, given: bool) -> None:
     if count >= _LEAST_PIXELS:
         return
-    place = "in the stable areas" if given else "of the epoch on the reference"
+    place = "in the stable areas" if given else "of the maps"
     remedy = "give larger stable areas" if given else "give epochs of the same wall, or a larger --gsd"
     raise InputError(
         f"only {count:,} pixels {place} have data in both epochs",

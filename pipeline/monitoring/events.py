@@ -119,7 +119,7 @@ class ChangedRegion:
     def numbers(self) -> dict[str, Any]:
         """Return the region's attributes except the mask, as JSON and tables store them.
 
-        They have their own names, but `identity` is called "id".
+        Keys are the names of the attributes, except that `identity` has the key "id".
         """
         names = (
             "kind", "row", "column", "x_m", "y_m", "z_m", "width_m", "height_m", "area_m2", "depth_median_m", "depth_largest_m",

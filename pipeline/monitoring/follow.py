@@ -69,7 +69,7 @@ def follow(
         be used is reported to `told` and left out.
     """
     if not folder.is_dir():
-        raise InputError("is not a folder", where=f"--follow {folder}", remedy="name the folder in which new scans come")
+        raise InputError("is not a folder", where=f"--follow {folder}", remedy="name the folder into which new scans are written")
     if times:
         raise InputError(
             "cannot be combined with --follow, which reads the time of each epoch from its file",

@@ -43,7 +43,7 @@ def predicted_level(model: TlsModel, reference: HeightRaster, epoch: HeightRaste
     model : TlsModel
         The scanner's noise of range and angles.
     reference, epoch : HeightRaster
-        The two epochs: the reference's heights give the ranges, and the points in each pixel how well noise is averaged.
+        The two epochs. The reference's heights give the ranges; the points in each pixel tell how much averaging reduces noise.
     station : (3,) array
         Position of the scanner, wall frame, m.
     """

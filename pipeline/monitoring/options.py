@@ -66,7 +66,7 @@ class MonitorOptions:
     seed: int = 1
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the options as monitor.json stores them: by name, as JSON types."""
+        """Return the options of `scarpsim monitor` as monitor.json stores them: by name, as JSON types."""
         values = {name: getattr(self, name) for name in self.__dataclass_fields__}
         plain = {name: value.tolist() if hasattr(value, "tolist") else value for name, value in values.items()}
         return {name: str(value) if isinstance(value, Path) else value for name, value in plain.items()}
@@ -75,7 +75,8 @@ class MonitorOptions:
 def read_areas(path: Path) -> tuple[Area, ...]:
     """Read stable areas from a YAML or JSON file: a list of boxes [x0, y0, x1, y1] or polygons [[x, y], ...], wall frame, m.
 
-    The list may stand under the key `stable_areas`. Raises InputError for anything else.
+    `monitor` registers epochs on the rock in these areas. The list may stand under the key `stable_areas`. Raises InputError for
+    anything else.
     """
     values = load_yaml(path)
     areas = values.get("stable_areas") if isinstance(values, dict) else values
@@ -90,5 +91,5 @@ def read_areas(path: Path) -> tuple[Area, ...]:
             remedy="write the stable areas in this form, in metres in the wall frame",
         ) from None
     if not found:
-        raise InputError("contains no area", where=str(path), remedy="leave --stable out, or draw an area")
+        raise InputError("contains no area", where=str(path), remedy="add a box or polygon to the file, or leave --stable out")
     return found

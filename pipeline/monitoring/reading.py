@@ -62,11 +62,11 @@ class EpochSource:
 
     @property
     def name(self) -> str:
-        """Name of the epoch in reports and messages."""
+        """Name of the epoch in reports and messages: that of its file or folder."""
         return self.path.name if self.run is None else f"{self.path.parent.name}/{self.path.name}"
 
     def checksums(self) -> dict[str, str]:
-        """SHA-256 of each file, by its path."""
+        """Return the SHA-256 checksum of each file of the epoch, by its path: it tells whether a file was changed."""
         return {str(file): sha256(file) for file in self.files}
 
 
@@ -271,7 +271,11 @@ def _sampled(files: tuple[Path, ...], unit: str | None) -> EpochData:
         highs.append(chunk.max(axis=0))
         count += len(chunk)
     if first is None:
-        raise InputError("contains no point that is in use", where=str(files[0]), remedy="export it again, with its points")
+        raise InputError(
+            "contains no points but those flagged as withheld, synthetic or noise",
+            where=str(files[0]),
+            remedy="export it again, with its points, or clear these flags",
+        )
     bounds = np.array([np.min(lows, axis=0), np.max(highs, axis=0)])
     large = LargeFiles(files, unit, count, first, bounds, tuple(kept))
     note = f"its {count:,} points were read in chunks: memory depends on the maps alone"
@@ -279,7 +283,7 @@ def _sampled(files: tuple[Path, ...], unit: str | None) -> EpochData:
 
 
 def epoch_files(folder: Path) -> list[Path]:
-    """Return the files of a folder that contain scans, clouds, meshes or elevation models, sorted by name."""
+    """Return the files of a folder that, by their suffix, contain scans, clouds, meshes or elevation models, sorted by name."""
     return sorted(each for each in folder.iterdir() if each.suffix.lower() in _ANY and each.is_file())
 
 

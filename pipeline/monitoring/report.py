@@ -27,7 +27,7 @@ _EPOCHS_FOR_LAW = 3
 
 
 def write_report(result: Result) -> None:
-    """Write report.html of a finished `monitor`, its pictures as separate files, and styles of the maps for GIS programs."""
+    """Write report.html of a finished `scarpsim monitor`, its pictures as files, and styles of the maps for GIS programs."""
     pictures: dict[str, bytes] = {}
     for view in result.site.views:
         pictures[f"reference{view.suffix}.png"] = hillshade_figure(view.raster.height, view.grid)

@@ -66,6 +66,11 @@ def monitor_paths(
     progress : Progress, optional
         Receives the progress.
 
+    Returns
+    -------
+    Result
+        The result of all epochs, as it was written.
+
     Raises
     ------
     InputError
@@ -281,10 +286,10 @@ def _check_same_site(data: EpochData, site: ReferenceSite, source: EpochSource) 
         np.abs(wall[:, 1] - grid.y_max + grid.height * grid.gsd / 2) < grid.height * grid.gsd
     )
     if not inside.mean() > _TENTH:
-        unit = " or their units differ" if ratio > _UNLIKE_UNITS or ratio < 1 / _UNLIKE_UNITS else ""
+        unit = " or units" if ratio > _UNLIKE_UNITS or ratio < 1 / _UNLIKE_UNITS else ""
         raise InputError(
             f"lies elsewhere than the reference {site.source.name}: its middle is "
-            f"{np.linalg.norm(np.median(wall, axis=0)):,.0f} m from the wall's corner; the coordinates differ{unit}",
+            f"{np.linalg.norm(np.median(wall, axis=0)):,.0f} m from the wall's corner; their coordinate systems{unit} differ",
             where=source.name,
             allowed="epochs of one coordinate system",
             remedy="export all epochs in one coordinate system, or give the unit of their coordinates with --unit",

@@ -62,7 +62,7 @@ class Significance:
         return np.asarray(self.level / np.float32(NORMAL_95))
 
     def sigma_of_mean(self, pixels: float | NDArray[np.floating]) -> FloatArray:
-        """Return the standard deviation of a mean over a number of neighbouring pixels, whose errors are correlated.
+        """Return the standard deviation of a mean over so many neighbouring `pixels`, whose errors are correlated.
 
         The mean is of differences that are each divided by the standard deviation of their pixel, so it has no unit. The result
         for more pixels than the largest square that was measured on stable rock is that of this square.

@@ -44,7 +44,7 @@ class WallView:
 
     @property
     def grid(self) -> Grid:
-        """Raster of this part's maps."""
+        """Raster of the maps of this part of the wall."""
         return self.raster.grid
 
     @property
@@ -122,7 +122,10 @@ def _frames(data: EpochData, towards: FloatArray, options: MonitorOptions) -> tu
     count = options.views or (None if options.direction is None else 1)
     if count is not None and not 1 <= count <= MOST_VIEWS:
         raise InputError(
-            f"got {count} views", where="--views", allowed=f"1 to {MOST_VIEWS}", remedy="choose a number in this range"
+            f"the wall cannot be divided into {count} views",
+            where="--views",
+            allowed=f"1 to {MOST_VIEWS}",
+            remedy="choose a number in this range",
         )
     found = divided(data.points - single.origin, towards - single.origin, single.rotation[2], count)
     if found is None:

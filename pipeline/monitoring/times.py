@@ -86,7 +86,7 @@ def check_order(times: Sequence[EpochTime], names: Sequence[str]) -> None:
             raise InputError(
                 f"{second} ({after:%Y-%m-%d %H:%M}) is earlier than {first} ({before:%Y-%m-%d %H:%M}), which comes before it",
                 where="EPOCH",
-                remedy="give the epochs in the order of their times, or say them with --times",
+                remedy="give the epochs in the order of their times, or state the times with --times",
             )
 
 

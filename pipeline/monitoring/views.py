@@ -82,7 +82,7 @@ def divided(points: FloatArray, towards: FloatArray, main: FloatArray, count: in
     points : (n, 3) array
         Points of the reference, m; a subset suffices.
     towards : (3,) array
-        A place in front of the wall from which all parts face, same frame, m: it tells rock from air.
+        A place in the air in front of the wall, which all parts of it face, same frame, m.
     main : (3,) array
         Unit vector along which the wall would be mapped with a single view, same frame.
     count : int or None

@@ -32,18 +32,18 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class MeasuredMaps:
-    """Difference maps of real epochs, on one grid.
+    """Difference maps of really measured (not simulated) epochs, on one grid.
 
     Attributes
     ----------
     name : str
-        Name of the folder.
+        Name of the folder that they were read from.
     grid : Grid
-        Pixels of the maps.
+        Raster of the maps.
     maps : (e, h, w) float32 array
-        Differences of e epochs, reference minus epoch, m; NaN without data.
+        Differences of e epochs, reference minus epoch along z of the wall frame, m; NaN without data.
     stable : (h, w) bool array or None
-        True where nothing has changed, if the measurement states it.
+        True in the areas where nothing has changed; None if the measurement does not state any.
     points : tuple of int
         Number of points of each epoch; empty for maps from files.
     registrations : tuple of Registration
@@ -59,18 +59,18 @@ class MeasuredMaps:
 
 
 def read_measured(folder: Path, config: DifferenceConfig, icp: IcpConfig | None, random: KeyedRandom) -> MeasuredMaps:
-    """Read the difference maps of real epochs from a folder.
+    """Read difference maps of really measured epochs from a folder, or compute them from points.
 
-    The folder contains measurement.yaml with points, or GeoTIFFs difference_*.tif (all *.tif if none has such a name) that share
-    a grid.
+    The folder contains measurement.yaml, which names point clouds and their reference, or GeoTIFFs that share a grid:
+    difference_*.tif, or all *.tif if none has such a name.
 
     Parameters
     ----------
     folder : Path
         The folder.
     config : DifferenceConfig
-        Its pixel size is the smallest one that is used. For points, pixels are at least as large as the point spacing, because
-        most would be empty otherwise.
+        Gives the pixel size of maps from points. Pixels are larger if the points are sparser, because most would be empty
+        otherwise.
     icp : IcpConfig or None
         Settings for registering each epoch's points to the reference; None: the points are registered already.
     random : KeyedRandom
@@ -79,7 +79,7 @@ def read_measured(folder: Path, config: DifferenceConfig, icp: IcpConfig | None,
     Raises
     ------
     InputError
-        If the folder contains neither.
+        If the folder contains neither, or its maps differ in their grids.
     """
     if (folder / FILE).is_file():
         return _from_points(folder, config, icp, random)
@@ -88,15 +88,15 @@ def read_measured(folder: Path, config: DifferenceConfig, icp: IcpConfig | None,
         raise InputError(
             "the folder contains no measured epochs",
             where=str(folder),
-            remedy=f"name a folder with {FILE} or with difference maps (*.tif)",
+            remedy="name a folder with measurement.yaml or with difference maps (*.tif)",
         )
     maps, grids = zip(*map(read_geotiff, files), strict=True)
     for file, grid in zip(files, grids, strict=True):
         if grid != grids[0]:
             raise InputError(
-                f"the map's grid {grid} differs from {grids[0]} of {files[0].name}",
+                f"the raster of the map ({grid}) differs from that of {files[0].name} ({grids[0]})",
                 where=str(file),
-                remedy="resample the maps to one grid",
+                remedy="resample all maps to the same origin, pixel size and shape",
             )
     return MeasuredMaps(folder.name, grids[0], np.stack(maps), None)
 
@@ -125,16 +125,18 @@ def _spacing(points: FloatArray) -> float:
 
 
 def point_differences(reference: RayCaster, points: FloatArray, grid: Grid) -> NDArray[np.float32]:
-    """Return the mean distance of points from a reference surface in each pixel: reference minus point, along z.
+    """Return a difference map of points: for each pixel, the mean distance of its points from a reference surface.
+
+    A distance is the surface's z minus the point's z in the wall frame, so missing rock is positive.
 
     Parameters
     ----------
     reference : RayCaster
-        The surface.
+        The reference surface, for ray casting.
     points : (n, 3) array
         Points, wall frame, m.
     grid : Grid
-        The pixels.
+        Raster of the map.
 
     Returns
     -------
@@ -154,7 +156,11 @@ def point_differences(reference: RayCaster, points: FloatArray, grid: Grid) -> N
 
 
 def area_mask(areas: Iterable[Area], grid: Grid) -> BoolArray:
-    """Return (h, w) true for the pixels of a grid whose centre lies in one of the areas (polygons or boxes in the wall frame)."""
+    """Return the pixels of a raster that lie in given areas, for example in stable areas that a user has drawn.
+
+    areas: polygons or boxes in the wall frame, m. grid: the raster. Returns an (h, w) mask, true for pixels with their centre
+    in one of the areas.
+    """
     x = grid.x_min + (np.arange(grid.width) + 0.5) * grid.gsd
     y = grid.y_max - (np.arange(grid.height) + 0.5) * grid.gsd
     return in_areas(areas, *np.meshgrid(x.astype(np.float64), y.astype(np.float64)))

@@ -29,7 +29,7 @@ _MOST_SAMPLE = 5000
 
 @dataclass(frozen=True)
 class TailFigures:
-    """Quantiles, skewness and kurtosis of differences, which describe how far their distribution is from a normal one.
+    """Quantiles, skewness and kurtosis of the differences of a map, which show how far their distribution is from a normal one.
 
     Attributes
     ----------
@@ -53,12 +53,15 @@ class TailFigures:
     largest_m: float
 
     def to_dict(self) -> dict[str, float | None]:
-        """Return the fields as a dictionary for JSON; NaN becomes null."""
+        """Return quantiles (m), skewness and kurtosis of differences as a dictionary for JSON; NaN becomes null."""
         return {name: None if np.isnan(value) else value for name, value in dataclasses.asdict(self).items()}
 
 
 def tail_figures(values: NDArray[np.floating]) -> TailFigures:
-    """Compute quantiles, skewness and kurtosis of values of any shape, m; NaN is ignored. All are NaN if no value is left."""
+    """Compute quantiles, skewness and kurtosis of differences, to see how far they are from normally distributed.
+
+    values: differences, m, any shape; NaN is ignored. All results are NaN if no value is left.
+    """
     known = values[~np.isnan(values)].astype(np.float64)
     if known.size == 0:
         return TailFigures(*[float("nan")] * 8)
@@ -78,7 +81,8 @@ class Normality:
     Attributes
     ----------
     statistic : float or None
-        K2 of skewness and kurtosis, chi-squared with 2 degrees of freedom under normality; None if there are too few values.
+        Test statistic K2, which combines skewness and kurtosis; None if there are too few values. It follows a chi-squared
+        distribution with 2 degrees of freedom if the sample is normally distributed.
     p_value : float or None
         p-value of the test; None if there are too few values.
     sample : int
@@ -90,22 +94,27 @@ class Normality:
     sample: int
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as a dictionary for JSON."""
+        """Return statistic, p-value and sample size of a test for a normal distribution as a dictionary for JSON."""
         return dataclasses.asdict(self)
 
 
 def normality(values: NDArray[np.floating], effective: float, random: KeyedRandom) -> Normality:
-    """Test whether values may be normally distributed.
+    """Test whether values, such as the differences of a map, may be normally distributed (D'Agostino and Pearson 1973).
 
     Parameters
     ----------
     values : array of any shape
         The values; NaN is ignored.
     effective : float
-        Number of independent values (`variogram.effective_sample_size`). At most so many, and at most 5,000, are drawn at random,
-        because neighbours are correlated and a test of all pixels would reject every real map.
+        Number of independent values (`variogram.effective_sample_size`). At most so many, and at most 5,000, are drawn at
+        random, because neighbours are correlated and a test of all pixels would reject every real map.
     random : KeyedRandom
         Source of the random draw.
+
+    Returns
+    -------
+    Normality
+        Statistic and p-value; None for both if fewer than 20 values can be drawn, or all are equal.
     """
     known = values[~np.isnan(values)]
     size = int(min(effective, known.size, _MOST_SAMPLE))
@@ -118,7 +127,7 @@ def normality(values: NDArray[np.floating], effective: float, random: KeyedRando
 
 @dataclass(frozen=True)
 class BinStatistics:
-    """Statistics of the differences in one bin of a covariate.
+    """Statistics of the differences in one bin of a covariate, to see how noise depends on, for example, range.
 
     Attributes
     ----------
@@ -133,7 +142,7 @@ class BinStatistics:
     statistics: DifferenceStatistics
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as a dictionary for JSON; an infinite end becomes null."""
+        """Return a bin's ends and the statistics of its differences as a dictionary for JSON; an infinite end becomes null."""
         low, high = (end if np.isfinite(end) else None for end in (self.low, self.high))
         return {"low": low, "high": high, **self.statistics.to_dict()}
 
@@ -141,14 +150,14 @@ class BinStatistics:
 def statistics_by_bin(
     values: NDArray[np.floating], covariate: NDArray[np.floating], edges: Sequence[float] | FloatArray
 ) -> list[BinStatistics]:
-    """Compute statistics of differences in each bin of a covariate; pixels where either is NaN are ignored.
+    """Compute statistics of differences in each bin of a covariate, to see how noise depends on, for example, range.
 
     Parameters
     ----------
     values, covariate : arrays of equal shape
-        Differences, m, and the covariate of each.
+        Differences, m, and the covariate of each. Pixels where either is NaN are ignored.
     edges : sequence of float
-        Edges of the bins, ascending. The last bin includes its upper edge.
+        Edges of the bins, ascending, in the unit of the covariate. The last bin includes its upper edge.
     """
     if values.shape != covariate.shape:
         raise ValueError(f"expected a covariate of shape {values.shape}, got {covariate.shape}")
@@ -165,14 +174,19 @@ def statistics_by_bin(
 
 
 def quantile_edges(covariate: NDArray[np.floating], bins: int = 8) -> FloatArray:
-    """Return edges of bins that hold equally many values of a covariate; NaN is ignored.
+    """Return edges of bins that hold equally many values of a covariate, such as range, for statistics in each bin.
 
     Parameters
     ----------
     covariate : array of any shape
-        The values.
+        The values; NaN is ignored.
     bins : int
         Number of bins; fewer are made if many values are equal.
+
+    Returns
+    -------
+    (bins + 1,) array
+        Edges, ascending, in the unit of the covariate.
     """
     known = covariate[~np.isnan(covariate)]
     if known.size == 0:
@@ -183,16 +197,16 @@ def quantile_edges(covariate: NDArray[np.floating], bins: int = 8) -> FloatArray
 
 @dataclass(frozen=True)
 class DensityHistogram:
-    """Histogram of differences, with what a normal distribution of the same median and NMAD would give.
+    """Histogram of the differences of a map, with what a normal distribution of the same median and NMAD would give.
 
     Attributes
     ----------
     edges : (k + 1,) array
-        Edges of bins of equal width, m.
+        Edges of k bins of equal width, m.
     counts : (k,) array
-        Counts.
+        Number of differences in each bin.
     normal : (k,) array
-        Expected counts of the normal distribution.
+        Number that the normal distribution gives in each bin.
     """
 
     edges: FloatArray
@@ -201,12 +215,12 @@ class DensityHistogram:
 
 
 def histogram(values: NDArray[np.floating], bins: int = 100, half_width_nmads: float = 6.0) -> DensityHistogram:
-    """Compute the histogram of differences around their median; NaN is ignored.
+    """Compute the histogram of differences around their median, beside that of a normal distribution.
 
     Parameters
     ----------
     values : array of any shape
-        Differences, m.
+        Differences, m; NaN is ignored.
     bins : int
         Number of bins.
     half_width_nmads : float
@@ -221,6 +235,9 @@ def histogram(values: NDArray[np.floating], bins: int = 100, half_width_nmads: f
 
 
 def without_outliers(values: NDArray[np.floating], nmads: float = 5.0) -> NDArray[np.floating]:
-    """Return differences (any shape) with NaN in place of those farther than `nmads` NMADs from their median."""
+    """Remove outliers from differences before statistics that they would dominate, such as a variogram.
+
+    values: differences, any shape, m. Returns them with NaN in place of those farther than `nmads` NMADs from their median.
+    """
     size = statistics(values)
     return np.where(np.abs(values - size.median) <= nmads * size.nmad, values, np.nan)

@@ -50,12 +50,12 @@ _GOOD_ENOUGH = 0.01
 
 @dataclass(frozen=True)
 class Variogram:
-    """An empirical variogram: how different two pixels are on average, by their distance.
+    """Empirical variogram: how much two pixels of a map differ on average by their distance, because noise is correlated.
 
     Attributes
     ----------
     lag_m : (k,) array
-        Mean distance of the pairs in each bin, m.
+        Mean distance of the pairs of pixels in each of k bins of distance, m.
     semivariance_m2 : (k,) array
         Half of the mean squared difference of the pairs in each bin, m2.
     pairs : (k,) array
@@ -67,30 +67,33 @@ class Variogram:
     pairs: FloatArray
 
     def to_dict(self) -> dict[str, list[float]]:
-        """Return the fields as a dictionary for JSON."""
+        """Return distances (m), semivariances (m2) and numbers of pairs of an empirical variogram as a dictionary for JSON."""
         return {field.name: getattr(self, field.name).tolist() for field in dataclasses.fields(self)}
 
 
 def variogram(
     values: NDArray[np.floating], gsd_m: float, *, largest_lag_m: float | None = None, direction: Direction = "all"
 ) -> Variogram:
-    """Compute the empirical variogram of a raster over all its pairs, or of several rasters over the pairs within each.
+    """Compute the empirical variogram of one or several rasters, which shows how their noise is correlated over distance.
+
+    All pairs of pixels within a raster are used; pairs across two rasters are not.
 
     Parameters
     ----------
     values : (h, w) or (e, h, w) array
-        Rasters, m; NaN without data.
+        One raster or e rasters, m; NaN without data.
     gsd_m : float
         Side of a pixel, m.
     largest_lag_m : float, optional
-        Largest distance of a pair, m; by default half of the raster's larger side. Bins grow geometrically from one pixel.
+        Largest distance of a pair, m; by default half of the raster's larger side. Bins of distance grow geometrically from
+        one pixel.
     direction : str
-        "all", or only pairs along "x" (rows) or "y" (columns), within 22.5 degrees.
+        "all", or only pairs whose direction is within 22.5 degrees of "x" (along rows) or "y" (along columns).
 
     Raises
     ------
     InputError
-        If fewer than two pixels have data, or no two of them lie within the largest lag.
+        If fewer than two pixels have data, or no two of them lie within the largest distance.
     """
     rasters = values[None] if values.ndim == 2 else values
     if np.isfinite(rasters).sum(axis=(1, 2)).max(initial=0) < 2:
@@ -142,7 +145,7 @@ def _averaged(
         raise InputError(
             f"no two pixels with data lie within {reach:g} m of each other, which determines no variogram",
             where="variogram",
-            remedy="use a larger lag, or maps with more data",
+            remedy="allow a larger distance (largest_lag_m), or give maps with more data",
         )
     edges = np.geomspace(0.5, max(reach / gsd_m, 1.0) * (1 + 1e-6), _LAGS + 1) * gsd_m
     number = np.clip(np.searchsorted(edges, distance[wanted], side="right") - 1, 0, _LAGS - 1)
@@ -154,14 +157,14 @@ def _averaged(
 
 @dataclass(frozen=True)
 class Structure:
-    """One part of a variogram model, which rises with distance from 0 to its sill.
+    """One correlated part of the noise in a variogram model: a curve that rises with distance from 0 to its sill.
 
     Attributes
     ----------
     family : str
-        Form of the curve, such as spherical or Gaussian.
+        Form of the curve: "spherical", "exponential" or "gaussian".
     sill_m2 : float
-        Semivariance at large distances, m2.
+        Semivariance at large distances, m2, which is the variance of this part of the noise.
     range_m : float
         Effective range, m: distance at which (almost) all of the sill is reached.
     """
@@ -171,7 +174,10 @@ class Structure:
     range_m: float
 
     def share(self, distance: FloatArray) -> FloatArray:
-        """Return the share of the sill that is reached at distances (any shape), m."""
+        """Return which share of its sill one part of a variogram model reaches at given distances, from 0 to 1.
+
+        distance: any shape, m. Returns an array of the same shape.
+        """
         t = np.asarray(distance) / self.range_m
         if self.family == "spherical":
             return np.where(t < 1, 1.5 * t - 0.5 * t**3, 1.0)
@@ -180,16 +186,16 @@ class Structure:
 
 @dataclass(frozen=True)
 class VariogramModel:
-    """A variogram model: uncorrelated noise (nugget) plus nested structures.
+    """Variogram model, how noise is correlated in space: uncorrelated noise (nugget) plus correlated parts (structures).
 
     Attributes
     ----------
     nugget_m2 : float
-        Variance of the uncorrelated noise of single pixels, m2.
+        Variance of the uncorrelated noise, m2.
     structures : tuple of Structure
         The correlated parts, by ascending range.
     relative_misfit : float
-        RMS of model over empirical semivariance minus one; 0 if the model was not fitted.
+        RMS over the bins of (model / empirical semivariance - 1); 0 if the model was not fitted.
     """
 
     nugget_m2: float
@@ -198,36 +204,44 @@ class VariogramModel:
 
     @property
     def sill_m2(self) -> float:
-        """Variance of a pixel, m2: the nugget plus the sills of all structures."""
+        """Variance of the noise of a pixel, m2: the nugget (uncorrelated noise) plus the sills of all correlated parts."""
         return self.nugget_m2 + sum(part.sill_m2 for part in self.structures)
 
     def semivariance(self, distance: FloatArray) -> FloatArray:
-        """Return the semivariance, m2, at distances (any shape), m; it is 0 at distance 0."""
+        """Return the semivariance (half the mean squared difference of two pixels) that the model gives at distances, m2.
+
+        distance: any shape, m. The semivariance is 0 at distance 0. Returns an array of the same shape.
+        """
         total = self.nugget_m2 + sum(
             (part.sill_m2 * part.share(distance) for part in self.structures), np.zeros(np.shape(distance))
         )
         return np.where(np.asarray(distance) > 0, total, 0.0)
 
     def covariance(self, distance: FloatArray) -> FloatArray:
-        """Return the covariance of two pixels, m2, at distances (any shape), m; the nugget only contributes at distance 0."""
+        """Return the covariance of the noise of two pixels at given distances, m2.
+
+        distance: any shape, m. At distance 0 it is the variance of a pixel; elsewhere the nugget (uncorrelated noise) is left
+        out.
+        """
         return self.sill_m2 - self.semivariance(distance)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as a dictionary for JSON."""
+        """Return all parameters of a variogram model as a dictionary for JSON; variances in m2, ranges in m."""
         return {**dataclasses.asdict(self), "sill_m2": self.sill_m2}
 
     def summary(self) -> str:
-        """Describe the model on one line: standard deviations in millimetres, ranges in metres."""
+        """Describe a variogram model on one line for reports, with standard deviations in mm and ranges in m."""
         parts = [f"nugget {np.sqrt(self.nugget_m2) * 1e3:.1f} mm"]
         parts += [f"{part.family} {np.sqrt(part.sill_m2) * 1e3:.1f} mm over {part.range_m:.2g} m" for part in self.structures]
         return ", ".join(parts)
 
 
 def fit_variogram(found: Variogram) -> VariogramModel:
-    """Fit a variogram model with a nugget and up to two structures to an empirical variogram.
+    """Fit a variogram model to an empirical variogram, to describe how far the noise of a map is correlated.
 
-    The model has the smallest relative misfit over all bins. A first or a second structure is only added if it reduces the misfit
-    enough. All bins have equal weight except those with few pairs: the model is assumed accurate to 3 %, and n pairs determine a
+    The model has a nugget (uncorrelated noise) and up to two correlated parts (structures). It has the smallest relative
+    misfit over all bins of distance. Each further structure must reduce the squared misfit by at least 20 %. All bins have
+    equal weight except those with few pairs of pixels: the model is assumed accurate to 3 %, and n pairs determine a
     semivariance to sqrt(2 / n).
     """
     if not found.semivariance_m2.max() > 0:
@@ -272,14 +286,14 @@ def _fitted(found: Variogram, families: tuple[Family, ...]) -> VariogramModel:
 
 
 def variance_of_mean(model: VariogramModel, mask: NDArray[np.bool_], gsd_m: float) -> float:
-    """Return the variance, m2, of the mean of correlated noise over the pixels of a mask.
+    """Return the variance of the mean of correlated noise over some pixels, m2, for example over the place of a fallen block.
 
     Parameters
     ----------
     model : VariogramModel
         Variogram model of the noise.
     mask : (h, w) bool array
-        The pixels.
+        True for the pixels that are averaged.
     gsd_m : float
         Side of a pixel, m.
 
@@ -307,7 +321,7 @@ def effective_sample_size(model: VariogramModel, mask: NDArray[np.bool_], gsd_m:
     model : VariogramModel
         Variogram model of the noise.
     mask : (h, w) bool array
-        The pixels.
+        True for the pixels that are averaged.
     gsd_m : float
         Side of a pixel, m.
 
@@ -315,6 +329,11 @@ def effective_sample_size(model: VariogramModel, mask: NDArray[np.bool_], gsd_m:
     -------
     float
         The number, from 1 to the number of the mask's pixels.
+
+    Raises
+    ------
+    ValueError
+        If the mask is empty.
     """
     variance = variance_of_mean(model, mask, gsd_m)
     return (
