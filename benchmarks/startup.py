@@ -28,6 +28,12 @@ from pipeline.run import simulation
 load_config(bundled_config("", "demo"), [], "tls", None)
 """
 """What `scarpsim simulate` does before it builds the wall."""
+_BARE = """
+import cv2, drjit, manifold3d, mitsuba, numpy, pydantic, tifffile, yaml
+mitsuba.set_variant("llvm_ad_mono")
+pydantic.BaseModel
+"""
+"""The packages that it imports until then, and the variant that it sets, without anything of scarpsim."""
 _IMPORT = re.compile(r"import time:\s*(\d+) \|\s*\d+ \|\s*([\w]+)")
 
 
@@ -63,6 +69,7 @@ def main() -> None:
         program = f"import sys; from pipeline.cli.main import main; sys.exit(main({command.split()}))"
         report(f"scarpsim {command}", program, bare, _LIMIT_S)
     report("scarpsim simulate, until it builds the wall", _SIMULATE, bare, _SIMULATE_LIMIT_S)
+    report("the packages that it imports, alone", _BARE, bare, _SIMULATE_LIMIT_S)
     found = packages(_SIMULATE)
     print("\n| package | own modules, s |\n|---|---|")
     for package, own in list(found.items())[:_ROWS]:

@@ -45,7 +45,10 @@ class WatchedPage:
         self.tally: Counter[str] = Counter()
         self.axe = ""
         self._count_actions()
-        self.page.on("request", lambda _: self._count("files"))
+        self._awaited = 0
+        self.page.on("request", lambda _: self._ask())
+        for ended in ("requestfinished", "requestfailed"):
+            self.page.on(ended, lambda _: self._receive())
         self.page.on("console", lambda said: said.type == "error" and self._complain("console errors", said.text))
         self.page.on("pageerror", lambda error: self._complain("console errors", str(error)))
         self.page.on("requestfailed", lambda asked: self._complain("missing files", f"{asked.url}: {asked.failure}"))
@@ -53,6 +56,13 @@ class WatchedPage:
             "response",
             lambda answer: answer.status >= 400 and self._complain("missing files", f"{answer.url}: {answer.status}"),
         )
+
+    def _ask(self) -> None:
+        self._awaited += 1
+        self._count("files")
+
+    def _receive(self) -> None:
+        self._awaited -= 1
 
     def _count(self, what: str, number: int = 1) -> None:
         self.tally[what] += number
@@ -99,13 +109,29 @@ class WatchedPage:
         """Return by how much the page is wider than its window, px."""
         return int(self.page.evaluate("document.documentElement.scrollWidth - window.innerWidth"))
 
-    def wait_for(self, condition: Callable[[], bool]) -> None:
-        """Wait at most thirty seconds until a condition holds."""
+    def wait_for(self, condition: Callable[[], bool], times: int = 1) -> None:
+        """Wait at most thirty seconds until a condition holds, as often in a row as is said, a tenth of a second apart."""
+        held = 0
         for _ in range(300):
-            if condition():
+            held = held + 1 if condition() else 0
+            if held == times:
                 return
             self.page.wait_for_timeout(100)
         raise AssertionError("the condition did not come true within thirty seconds")
+
+    def says(self, selector: str, text: str) -> None:
+        """Wait until an element contains a text."""
+        found = self.page.locator(selector)
+        try:
+            self.page.locator(selector, has_text=text).wait_for()
+        except Exception as error:
+            focus = self.page.evaluate("document.activeElement.outerHTML.slice(0, 200)")
+            state = f"{selector} says {found.all_inner_texts()}, the focus is on {focus}, {self._awaited} answers are awaited"
+            raise AssertionError(f"{selector} does not say '{text}': {state}") from error
+
+    def settle(self) -> None:
+        """Wait until the page has had all answers that it asked the server for, half a second long."""
+        self.wait_for(lambda: self._awaited == 0, times=5)
 
     def close(self) -> None:
         """Close the page."""

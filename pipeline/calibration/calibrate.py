@@ -77,8 +77,8 @@ class OrientationPatterns:
 class GreedyComparison:
     """How well a greedy search, which changes one noise parameter at a time, fits beside the calibration's own search.
 
-    Costs are squared Mahalanobis distances of the measured summary statistics from those of newly simulated maps; lower is
-    better.
+    Costs are squared Mahalanobis distances of the measured summary statistics (of size and pattern of the noise) from those of
+    newly simulated maps; lower is better.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class CalibrationResult:
     systematic : (h, w) mean of the measured maps, m; NaN outside stable ground.
     parameters : Names and bounds of the fitted parameters.
     found : Estimate, intervals and goodness of fit.
-    statistics : (m,) names of the summary statistics that were compared.
+    statistics : (m,) names of the summary statistics of the noise that were compared, such as "size.nmad".
     observed : (m,) summary statistics of the measurement (natural logarithms of lengths in m).
     patterns : Similarity of the maps of orientation errors; None for a laser scanner or a model without such errors.
     baseline : Comparison with a search that changes one parameter at a time; None if it was not asked for.

@@ -50,7 +50,7 @@ def greedy_search(
 
     Parameters
     ----------
-    simulate : Function that simulates epochs and returns the logarithms of their summary statistics.
+    simulate : Function that simulates epochs and returns the logarithms of summary statistics of their noise.
     parameters : Names and bounds of the k noise parameters.
     start : (k,) parameter values. The search begins at a multiple of them that gives four times the measured noise.
     std : Index of the standard deviation among the summary statistics.
@@ -59,7 +59,7 @@ def greedy_search(
 
     Returns
     -------
-    The parameters at which no further step brings the standard deviations nearer, or they agree to 2 %.
+    The parameters at which the standard deviations agree to 2 %, or no further step brings them nearer.
     """
 
     def error(values: FloatArray, test: int) -> float:

@@ -79,7 +79,7 @@ class Simulations:
     Attributes
     ----------
     x : (n, k) natural logarithms of the noise parameters.
-    s : (n, m) summary statistics (logarithms of lengths in m).
+    s : (n, m) summary statistics of size and spatial pattern of the noise (logarithms of lengths in m).
     """
 
     x: FloatArray
@@ -101,8 +101,9 @@ class Simulations:
 class ResponseSurface:
     """Response surface: predicts the summary statistics of simulated difference maps from noise parameters.
 
-    The mean of the statistics is a quadratic polynomial of z = (x - centre) / scale, where x are the natural logarithms of the
-    parameters. The cost of parameters is the squared Mahalanobis distance of the measured statistics from that mean.
+    The statistics describe size and spatial pattern of the noise. Their mean is a quadratic polynomial of z = (x - centre) /
+    scale, where x are the natural logarithms of the parameters. The cost of parameters is the squared Mahalanobis distance of
+    the measured statistics from that mean.
 
     Attributes
     ----------
@@ -120,10 +121,11 @@ class ResponseSurface:
 
     @classmethod
     def fit(cls, sample: Simulations) -> ResponseSurface:
-        """Fit the mean of the summary statistics, as a quadratic function of the logarithmic noise parameters, by least squares.
+        """Fit a response surface, which predicts the summary statistics of simulated maps from noise parameters.
 
-        The covariance (m, m) of the statistics is that of their residuals from the fit, with off-diagonal elements reduced
-        (shrinkage).
+        The mean of the statistics is a quadratic function of the logarithmic parameters, fitted by least squares. Their
+        covariance (m, m) is that of the residuals, with off-diagonal elements reduced (shrinkage), as few simulations
+        determine them poorly.
 
         Parameters
         ----------
@@ -165,12 +167,15 @@ class ResponseSurface:
     def jacobian(self, x: FloatArray) -> FloatArray:
         """Return the derivatives of the whitened misfit of the summary statistics by the logarithmic noise parameters.
 
-        x: (k,) natural logarithms of the parameters at which to differentiate. Returns (m, k): statistics by parameters.
+        The search for the parameters of least misfit uses them. x: (k,) natural logarithms of the parameters at which to
+        differentiate. Returns (m, k): statistics by parameters.
         """
         return -self.whitening @ (_gradient((x - self.centre) / self.scale) @ self.coefficients).T / self.scale
 
     def minimum(self, observed: FloatArray, start: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-        """Find the noise parameters of least cost, that is the squared whitened misfit of the summary statistics, within bounds.
+        """Find the noise parameters within bounds whose predicted summary statistics are nearest to the measured ones.
+
+        They have the least cost: the sum of squares of the whitened misfit.
 
         Parameters
         ----------
@@ -274,7 +279,7 @@ class NoiseSearch:
         Parameters
         ----------
         observed : (m,) statistics of the measurement.
-        simulations : Number of simulations in the last round.
+        simulations : Number of simulations in the last round, near the minimum, which gives the intervals.
         confidence : Confidence level of the intervals, 0 to 1.
         """
         found = self._run_once(observed, simulations, confidence, _DENSITIES[0])
@@ -368,7 +373,7 @@ class NoiseSearch:
             self.progress.advance((number + 1) / len(points))
         if len(found) < len(points) / 2:
             raise InputError(
-                f"{len(points) - len(found)} of {len(points)} simulations failed",
+                f"{len(points) - len(found)} of {len(points)} simulated measurements failed, more than half",
                 where="calibration",
                 remedy="run scarpsim simulate with the same config to see the error, and correct the config",
             )
@@ -409,7 +414,7 @@ class NoiseSearch:
 def cost_of_new_simulations(
     search: NoiseSearch, surface: ResponseSurface, observed: FloatArray, x: FloatArray, sets: int = 4
 ) -> float:
-    """Compute the cost of noise parameters from new simulations, to compare searches without relying on either's approximation.
+    """Compute the cost of noise parameters from new simulations, to compare the results of two searches; lower is better.
 
     The cost is the squared Mahalanobis distance of the measured summary statistics from the mean statistics of the
     simulations, divided by 1 + 1 / sets for the scatter of that mean.

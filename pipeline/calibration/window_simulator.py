@@ -74,7 +74,7 @@ class WindowSimulator:
 
     Attributes
     ----------
-    observations : Number of observations simulated so far.
+    observations : Number of observations (measurements of the wall) simulated so far.
     cells : Indices of the traced cells, counted row by row over the sensor's whole view.
     caster : The wall, for ray casting.
     noiseless_model : The sensor model with its effects but without noise.
@@ -145,7 +145,7 @@ class WindowSimulator:
         return self.windows.cut(values)
 
     def heights(self, model: Model, random: KeyedRandom) -> FloatArray:
-        """Simulate one observation and return the heights of its surface in the windows given at construction.
+        """Simulate one noisy measurement of the wall, and return its surface in k windows, square parts of the wall.
 
         Parameters
         ----------
@@ -154,7 +154,7 @@ class WindowSimulator:
 
         Returns
         -------
-        (k, n, n) heights in k windows of n x n pixels, wall frame, m; NaN without data.
+        (k, n, n) heights (z) in windows of n x n pixels, wall frame, m; NaN without data.
         """
         return self._raster(self._surface(self._registered(model, random)))
 

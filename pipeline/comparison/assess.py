@@ -141,7 +141,7 @@ class DetectionClass:
 class DetectionSummary:
     """Which of the fallen blocks a sensor detected, and its false alarms.
 
-    A block is in view if the sensor saw at least half of its place on the wall before it fell.
+    A block is in view if the sensor, before the block fell, saw at least half of the wall that its fall changed.
 
     Attributes
     ----------

@@ -131,7 +131,7 @@ class BlockMeanTest:
         Parameters
         ----------
         footprint : (n, m) mask of the block's pixels, true inside.
-        window : Rows and columns of the whole map that the mask covers, n and m of them.
+        window : The n rows and m columns of the whole map that the mask covers.
         """
         level = self.level[window][footprint].astype(np.float64)
         share = variance_of_mean(self.model, footprint, self.gsd_m) / self.model.sill_m2 if self.model.sill_m2 > 0 else 0.0
@@ -146,7 +146,7 @@ class BlockMeanTest:
         ----------
         change : (h, w) difference map, m; NaN without data.
         footprint : (n, m) mask of the block's pixels, true inside.
-        window : Rows and columns of the map that the mask covers, n and m of them.
+        window : The n rows and m columns of the map that the mask covers.
 
         Returns
         -------

@@ -152,7 +152,7 @@ def _whole(name: Given, overrides: Overrides, seed: int | None) -> list[SensorSe
     if path.is_dir():
         path = path / RUN_FILE
         if not path.exists():
-            raise InputError(f"the folder contains no {RUN_FILE}", where=name, remedy="name a run's folder or a config file")
+            raise InputError("the folder contains no run.json", where=name, remedy="name a run's folder or a config file")
         read_run(path, "name a config file")
     elif not path.is_file() and not is_path(name):
         path = _bundled(name)

@@ -237,7 +237,7 @@ def _model(request: Request) -> tuple[TlsModel, tuple[str, ...]]:
             )
         return model, (f"as in {request.model}",)
     if request.scanner is None:
-        raise InputError("the scanner is unknown", where="--scanner", remedy=_NAME_SCANNER)
+        raise InputError("the scanner, and so its noise, is unknown", where="--scanner", remedy=_NAME_SCANNER)
     preset = read_preset(request.scanner)
     return preset.model(), (f"preset {preset.name}: values of its data sheet, defaults where it states none",)
 

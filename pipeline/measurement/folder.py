@@ -149,7 +149,7 @@ def _check_readable(folder: Path, out: Path) -> None:
     except InputError as error:
         where = error.where.replace(str(folder), str(out))
         raise InputError(
-            f"the measurement cannot be used: {error.what}",
+            f"scarpsim gap cannot use the measurement: {error.what}",
             where=where,
             allowed=error.allowed,
             remedy=error.remedy or "correct the file that is named",

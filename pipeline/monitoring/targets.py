@@ -53,7 +53,7 @@ def read_targets(path: Path) -> Targets:
     table = csv.DictReader(io.StringIO(read_text(path)))
     if not set(_COLUMNS) <= set(table.fieldnames or ()):
         raise InputError(
-            f"has the columns {', '.join(table.fieldnames or ()) or 'none'}",
+            f"lacks a column; it has {', '.join(table.fieldnames or ()) or 'none'}",
             where=str(path),
             allowed=", ".join(_COLUMNS),
             remedy="name all of these columns in the first line, separated by commas",

@@ -88,7 +88,7 @@ def read_measured(folder: Path, config: DifferenceConfig, icp: IcpConfig | None,
         raise InputError(
             "the folder contains no measured epochs",
             where=str(folder),
-            remedy=f"name a folder with {FILE} or with difference maps (*.tif)",
+            remedy="name a folder with measurement.yaml or with difference maps (*.tif)",
         )
     maps, grids = zip(*map(read_geotiff, files), strict=True)
     for file, grid in zip(files, grids, strict=True):

@@ -33,7 +33,8 @@ class TailFigures:
 
     Attributes
     ----------
-    quantile_025_m, quantile_250_m, quantile_750_m, quantile_975_m : float Quantiles at 2.5, 25, 75 and 97.5 %, m.
+    quantile_025_m, quantile_250_m, quantile_750_m, quantile_975_m : float
+        Quantiles at 2.5, 25, 75 and 97.5 %, m.
     skewness, excess_kurtosis : float
         Both are 0 for a normal distribution.
     beyond_3_nmad : float
@@ -80,7 +81,8 @@ class Normality:
     Attributes
     ----------
     statistic : float or None
-        K2 of skewness and kurtosis, chi-squared with 2 degrees of freedom under normality; None if there are too few values.
+        Test statistic K2, which combines skewness and kurtosis; None if there are too few values. It follows a chi-squared
+        distribution with 2 degrees of freedom if the sample is normally distributed.
     p_value : float or None
         p-value of the test; None if there are too few values.
     sample : int

@@ -80,14 +80,15 @@ def variogram(
 
     Parameters
     ----------
-    values : (h, w) or (e, h, w) array One raster or e rasters, m; NaN without data.
+    values : (h, w) or (e, h, w) array
+        One raster or e rasters, m; NaN without data.
     gsd_m : float
         Side of a pixel, m.
     largest_lag_m : float, optional
         Largest distance of a pair, m; by default half of the raster's larger side. Bins of distance grow geometrically from
         one pixel.
     direction : str
-        "all", or only pairs along "x" (rows) or "y" (columns), within 22.5 degrees.
+        "all", or only pairs whose direction is within 22.5 degrees of "x" (along rows) or "y" (along columns).
 
     Raises
     ------
@@ -236,11 +237,12 @@ class VariogramModel:
 
 
 def fit_variogram(found: Variogram) -> VariogramModel:
-    """Fit a variogram model with a nugget and up to two correlated parts (structures) to an empirical variogram.
+    """Fit a variogram model to an empirical variogram, to describe how far the noise of a map is correlated.
 
-    The model has the smallest relative misfit over all bins of distance. Each further structure must reduce the squared misfit
-    by at least 20 %. All bins have equal weight except those with few pairs of pixels: the model is assumed accurate to 3 %,
-    and n pairs determine a semivariance to sqrt(2 / n).
+    The model has a nugget (uncorrelated noise) and up to two correlated parts (structures). It has the smallest relative
+    misfit over all bins of distance. Each further structure must reduce the squared misfit by at least 20 %. All bins have
+    equal weight except those with few pairs of pixels: the model is assumed accurate to 3 %, and n pairs determine a
+    semivariance to sqrt(2 / n).
     """
     if not found.semivariance_m2.max() > 0:
         return VariogramModel(0.0, ())

@@ -44,11 +44,6 @@ def drawn(page: WatchedPage, address: str) -> Any:
     return opened
 
 
-def says(opened: Any, selector: str, text: str) -> None:
-    """Wait until an element contains a text; the page's policy lets no string run as a script, so this is no script."""
-    opened.locator(selector, has_text=text).wait_for()
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_folder_in_the_viewer(kind: str, outputs: Path, page: WatchedPage) -> None:
     with served(*(outputs / name for name in KINDS[kind])) as address:
@@ -70,19 +65,23 @@ def test_the_controls_by_mouse(outputs: Path, page: WatchedPage) -> None:
         opened = drawn(page, address)
         assert "Share chart" not in opened.content()  # Plotly's own button would upload the chart
         opened.click("#next")
-        says(opened, "#facts h2", "block 1")
+        page.says("#facts h2", "block 1")
+        page.settle()
         opened.click("#previous")
-        says(opened, "#facts h2", "block 3")
+        page.says("#facts h2", "block 3")
+        page.settle()
         opened.click("#whole")
         opened.click("#shown label:has-text('points')")
-        says(opened, "#note", "points are shown")
+        page.says("#note", "points are shown")
+        page.settle()
         opened.click("#step")
         opened.click("[role=listbox] >> text=epoch 2")
-        says(opened, "#step-value", "epoch 2")
+        page.says("#step-value", "epoch 2")
+        page.settle()
         opened.click("#play")
-        says(opened, "#step-value", "epoch 1")
+        page.says("#step-value", "epoch 1")
         opened.click("#play")
-        says(opened, "#play", "play")
+        page.says("#play", "play")
         opened.close()
 
 
@@ -96,7 +95,8 @@ def test_the_controls_by_keyboard(outputs: Path, page: WatchedPage) -> None:
             opened.keyboard.press(key)
             page.wait_for(lambda value=chosen: opened.evaluate("document.activeElement.value") == value)
         opened.keyboard.press("Space")
-        says(opened, "#step-value", "epoch 2")
+        page.says("#step-value", "epoch 2")
+        page.settle()
         seen = []
         while "next" not in seen and len(seen) < 30:
             opened.keyboard.press("Tab")
@@ -106,8 +106,9 @@ def test_the_controls_by_keyboard(outputs: Path, page: WatchedPage) -> None:
                 opened.keyboard.press("Space")
             if name == "slider":
                 opened.keyboard.press("ArrowRight")
-        says(opened, "#note", "points are shown")
+        page.says("#note", "points are shown")
         assert opened.evaluate("document.querySelector('#border [role=slider]').ariaValueNow") == "51"
+        page.settle()
         opened.keyboard.press("Enter")
-        says(opened, "#facts h2", "block 1")
+        page.says("#facts h2", "block 1")
         opened.close()

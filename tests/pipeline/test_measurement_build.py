@@ -394,7 +394,7 @@ BAD: dict[str, tuple[Callable[[Case, Path], list[str]], str]] = {
     "no such scanner": (asked(scanner="riegl_vz400j"), "riegl_vz400i"),
     "millimetres": (move(lambda points: 1000 * points), "add --unit mm"),
     "few in millimetres": (move(lambda points: 1000 * points[::50]), "add --unit mm"),
-    "one point": (move(lambda points: points[:1]), "has 1 points"),
+    "one point": (move(lambda points: points[:1]), "has only 1 points"),
     "identical points": (move(lambda points: np.repeat(points[:1], 500, axis=0)), "at the same place"),
     "NaN": (move(lambda points: points * np.nan), "no point with finite values"),
     "no order": (move(lambda points: np.random.default_rng(1).permutation(points)), "give --position X,Y,Z"),

@@ -42,15 +42,19 @@ change as it moves.
 def fit_pose_robustly(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
     """Fit the pose of the sensor to the residuals by least squares, rejecting outliers in several rounds.
 
+    The surveyed pose is never exact, so it is corrected before errors of the sensor are searched for in the residuals.
+
     Parameters
     ----------
-    residuals : Residuals of n points with k set-ups; only usable points are fitted.
+    residuals : Residuals of n points with k set-ups (positions of the sensor); only points marked as usable are fitted.
 
     Returns
     -------
-    (n,) residuals minus the effect of the pose, in the unit of the observable; (6 k,) the pose, shift (m) and small rotation
-    (rad) of each set-up in the wall frame; and the NMAD of the standardised residuals, at least 1. It is above 1 if they are
-    overdispersed.
+    value : (n,) residuals minus the effect of the pose, m or px, as the residuals.
+    pose : (6 k,) shift (m) and small rotation (rad) of each set-up in the wall frame. For a cloud without cameras it has one
+        value for each column of its pose Jacobian (with a scale, up to seven).
+    noise_ratio : NMAD of the residuals divided by their predicted standard deviations, at least 1. It is above 1 if the
+        residuals scatter more than predicted.
     """
     kept, scale = residuals.usable.copy(), 1.0
     value, pose, design = residuals.value, np.zeros(residuals.pose_jacobian.shape[1]), _weighted_design(residuals)
@@ -68,16 +72,17 @@ def fit_pose_robustly(residuals: Residuals) -> tuple[FloatArray, FloatArray, flo
 
 
 def fit_pose(residuals: Residuals, rows: BoolArray | NDArray[np.int64]) -> FloatArray:
-    """Fit the pose of the sensor to the residuals of some points by weighted least squares.
+    """Fit the pose of the sensor to the residuals of some points by weighted least squares, without rejecting outliers.
 
     Parameters
     ----------
-    residuals : Residuals with their pose Jacobian.
-    rows : The points to use, as a mask or as row numbers.
+    residuals : Residuals of n points, with their predicted standard deviations and their derivatives by the pose.
+    rows : The points to use, as a mask (n,) or as row numbers.
 
     Returns
     -------
-    (6 k,) shift (m) and small rotation (rad) of each of k set-ups, wall frame.
+    (6 k,) shift (m) and small rotation (rad) of each of k set-ups (positions of the sensor), wall frame. For a cloud without
+    cameras: one value for each column of the pose Jacobian.
     """
     return _least_squares(_weighted_design(residuals, rows))
 
@@ -112,7 +117,19 @@ def _qr_factors(blocks: FloatArray) -> FloatArray:
 
 
 def compute_raw_residuals(measurement: Measurement) -> Residuals:
-    """Compute the residuals of a laser scan, a stereo pair or a surface without cameras, with the sensor at its surveyed pose."""
+    """Compute residuals (measured minus predicted observable) with the sensor at the pose that the measurement states.
+
+    All epochs share this pose.
+
+    Parameters
+    ----------
+    measurement : A laser scan or several, a stereo pair, or a point cloud from photographs without its cameras, with the
+        reference surface and the sensor model that predict it.
+
+    Returns
+    -------
+    Residuals of the class for this kind of measurement: ranges, disparities, or distances from the reference surface.
+    """
     if isinstance(measurement, SurfaceMeasurement):
         return surface_residuals(measurement)
     if isinstance(measurement, StereoMeasurement):
@@ -121,9 +138,16 @@ def compute_raw_residuals(measurement: Measurement) -> Residuals:
 
 
 def compute_residuals(measurement: Measurement) -> Residuals:
-    """Compute the residuals of a measurement with the sensor at its surveyed pose.
+    """Compute the residuals (measured minus predicted observable) of a measurement, with the sensor at its surveyed pose.
 
-    If it has several epochs, the differences between their poses are removed.
+    Parameters
+    ----------
+    measurement : A laser scan or several, a stereo pair or a cloud without cameras, with reference surface and sensor model. If
+        it has several epochs, a pose is fitted to each, and the effect of its difference from the mean pose is subtracted.
+
+    Returns
+    -------
+    Residuals of all points that can be compared with the reference.
     """
     found = compute_raw_residuals(measurement)
     epochs = measurement.epochs[found.index]
@@ -137,13 +161,14 @@ def compute_residuals(measurement: Measurement) -> Residuals:
 
 
 class AlignedMeasurement(NamedTuple):
-    """A measurement with the sensor at the pose that fits the reference best.
+    """A measurement whose sensor was moved to the pose that fits the reference surface best.
 
     Attributes
     ----------
-    measurement : The measurement with that pose.
-    residuals : Its residuals there.
-    pose : (6 k,) total shift (m) and small rotation (rad) of each of k set-ups from the surveyed pose, wall frame.
+    measurement : The measurement with the sensor at this pose.
+    residuals : Its residuals (measured minus predicted observable) at this pose.
+    pose : (6 k,) total shift (m) and small rotation (rad) of each of k set-ups (positions of the sensor) from the surveyed
+        pose, wall frame. For a cloud without cameras: one value for each column of its pose Jacobian (with a scale).
     """
 
     measurement: Measurement
@@ -156,18 +181,20 @@ def align(
 ) -> AlignedMeasurement:
     """Move the sensor to the pose that fits the residuals best, and compute the residuals there.
 
-    The pose is fitted to linearised residuals. If it moves the rays by more than 2 mm on the wall, the rays are traced again and
-    the fit is repeated, up to three times (twelve times for a surface without cameras).
+    The pose is fitted to linearised residuals. If it moves the rays by more than 2 mm on the wall, the rays are traced again
+    and the fit is repeated, up to three times. For a point cloud without cameras the limit is a tenth of the predicted standard
+    deviation, on average, and the fit is repeated up to twelve times.
 
     Parameters
     ----------
     measurement : The measurement with the sensor at its surveyed pose.
-    trusted : Rows of the measurement's points to fit; None for all.
-    found : Residuals at the surveyed pose; None: they are computed.
+    trusted : Row numbers of the measurement's points to which the pose is fitted, for example those on stable rock; None for
+        all.
+    found : Residuals at the surveyed pose, if they are known; None: they are computed.
 
     Returns
     -------
-    The measurement and its residuals at the fitted pose. The surveyed pose stays if the rays would miss the wall.
+    The measurement, its residuals at the fitted pose, and the pose. A move is undone if no ray would hit the wall after it.
     """
     found = compute_residuals(measurement) if found is None else found
     total = np.zeros(found.pose_jacobian.shape[1])
@@ -202,14 +229,18 @@ def _moves_rays_far(pose: FloatArray, residuals: Residuals) -> bool:
 
 
 def at_points_of(found: Residuals, part: Residuals) -> Residuals:
-    """Restrict residuals to the points of other residuals.
+    """Restrict residuals to the points of other residuals, to compare two sensor models on the same points.
 
-    Points that are no longer on smooth surface, or that became outliers, are left out.
+    Points that are unusable for fitting in `found` (for example at edges), or outliers there, are left out.
 
     Parameters
     ----------
-    found : residuals to restrict, for example with other effects in the model.
-    part : residuals of the points to keep.
+    found : Residuals to restrict, for example with one more effect in the sensor model.
+    part : Residuals of the points to keep, of the same measurement.
+
+    Returns
+    -------
+    The residuals `found` at the remaining points, in the order of `part`.
     """
     registered_residuals, _, noise_ratio = fit_pose_robustly(found)
     good = found.usable & (np.abs(registered_residuals) < thresholds().points.outlier_sigmas * noise_ratio * found.sigma)

@@ -27,11 +27,13 @@ _REACH = 2.5
 
 @dataclass(frozen=True, eq=False)
 class NodeField:
-    """Grid-correlated noise in matrix form: random values at q nodes, interpolated bilinearly to n points.
+    """Grid-correlated noise in matrix form: random values at q grid nodes, interpolated bilinearly to n points.
+
+    The noise of the points has the covariance weights · covariance · weightsᵀ.
 
     Attributes
     ----------
-    weights : (n, q) bilinear weights.
+    weights : (n, q) sparse matrix of bilinear weights.
     covariance : (q, q) covariance of the nodes' values, px².
     """
 
@@ -40,19 +42,22 @@ class NodeField:
 
     @property
     def variance(self) -> float:
-        """Mean variance of a point, px²."""
+        """Mean variance of the interpolated noise over a sample of the points, px²; 0 without nodes."""
         some = self.weights[:: max(self.weights.shape[0] // _SAMPLE, 1)]
         return float(np.mean((some @ self.covariance * some.toarray()).sum(axis=1))) if some.shape[1] else 0.0
 
 
 @dataclass(frozen=True)
 class GridCorrelatedNoise:
-    """The part of a stereo pair's predicted noise that neighbouring points share, because it is interpolated between grid nodes.
+    """The part of a stereo pair's predicted noise that neighbouring points share.
+
+    It is modelled by random values at the nodes of a grid in the image, interpolated bilinearly to the points, as a stereo
+    matcher with regularisation makes it. The fits need it because the points are not independent.
 
     Attributes
     ----------
-    effects : Effects of the sensor model that make such noise.
-    pixels : (n, 2) columns and rows of the points in the left image, px; None without such noise.
+    effects : The noise terms of the sensor model that are of this kind, each with its standard deviation and node spacing.
+    pixels : (n, 2) columns and rows of the points in the left image, px; None if there is no such noise.
     """
 
     effects: tuple[NodeNoise, ...] = ()
@@ -60,21 +65,34 @@ class GridCorrelatedNoise:
 
     @classmethod
     def of(cls, model: StereoModel, pixels: FloatArray) -> GridCorrelatedNoise:
-        """Collect the grid-correlated noise of a sensor model at pixels (n, 2), column and row, px."""
+        """Collect the noise terms of a sensor model that are correlated between the nodes of a grid.
+
+        Parameters
+        ----------
+        model : The sensor model of the stereo pair.
+        pixels : (n, 2) column and row of each point in the left image, px.
+        """
         return cls(_grid_correlated(model.matching_noise), pixels)
 
     def part(self, rows: Any) -> GridCorrelatedNoise:
-        """Return the noise at a subset of the n points, given as row numbers, a mask or a slice."""
+        """Return the grid-correlated noise at a subset of the n points, given as row numbers, a mask (n,) or a slice."""
         return self if self.pixels is None else replace(self, pixels=self.pixels[rows])
 
     def with_effects(self, effects: Sequence[MatchingNoise]) -> GridCorrelatedNoise:
-        """Return the noise with further effects added; those that are not grid-correlated are ignored."""
+        """Return this grid-correlated noise with further noise terms added.
+
+        effects: noise terms of a stereo matcher; those that are not grid-correlated (such as white noise) are ignored.
+        """
         return replace(self, effects=(*self.effects, *_grid_correlated(effects)))
 
     def node_field(self, count: int) -> NodeField:
-        """Return the noise in matrix form for `count` points.
+        """Return the grid-correlated noise of all points in matrix form, for the covariance in a least-squares fit.
 
-        Noise on a grid finer than the points' own spacing acts like white noise and is left out.
+        Noise on a grid finer than the mean spacing of the points acts like white noise and is left out.
+
+        Parameters
+        ----------
+        count : Number n of points, which is the number of rows of the weights even if there is no such noise.
         """
         if self.pixels is None or not count:
             return _empty_field(count)

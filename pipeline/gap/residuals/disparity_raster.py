@@ -37,14 +37,17 @@ _STEEP = 0.3
 
 @dataclass(frozen=True)
 class DisparityRaster:
-    """Disparities of the reference on the stereo matcher's pixel raster, for simulating effects of neighbouring pixels.
+    """Disparities of the reference surface on the stereo matcher's pixel raster.
+
+    It is used to predict errors in which a pixel is affected by its neighbours: edge fattening, smoothing and filled
+    occlusions.
 
     Attributes
     ----------
-    step : Spacing of the cells, px.
+    step : Spacing of the raster's cells, px of the left image.
     disparity : (rows, columns) disparity of the reference, px; NaN where nothing can be matched.
-    hidden : (rows, columns) true where the left camera sees the reference and the right one does not.
-    row, column : (n,) row and column of the cell of each measured point.
+    hidden : (rows, columns) true where the left camera sees the reference and the right one does not (an occlusion).
+    row, column : (n,) row and column of the cell in which each measured point lies.
     """
 
     step: float
@@ -55,12 +58,12 @@ class DisparityRaster:
 
     @classmethod
     def of(cls, measurement: StereoMeasurement, geometry: PixelGeometry) -> DisparityRaster | None:
-        """Compute the raster of a measurement.
+        """Compute the disparities of the reference surface on the pixel raster of a measured stereo pair.
 
         Parameters
         ----------
-        measurement : The pair with its reference and model.
-        geometry : The pixels of its points.
+        measurement : The stereo pair with its reference surface and sensor model.
+        geometry : The pixels of its n points.
 
         Returns
         -------
@@ -94,14 +97,17 @@ class DisparityRaster:
 
     @property
     def depth_step_px(self) -> float:
-        """Difference of neighbouring cells, px, above which they lie on both sides of a depth step."""
+        """Difference in disparity of neighbouring raster cells, px, above which a depth step of the rock lies between them."""
         return max(_STEEP * self.step, 1.0)
 
     def search_part(self) -> tuple[DisparityRaster, NDArray[np.int64]]:
-        """Return the part of the raster in which edge effects are searched, and the (k,) indices of its points.
+        """Return the part of the raster in which edge effects (such as edge fattening) are searched for, to save time.
 
-        This is the whole raster, or several bands of rows if it is large. Bands are separated by empty rows so that they do not
-        affect each other; `hidden` is only valid in rows with points.
+        Returns
+        -------
+        raster : The whole raster, or four bands of rows if it has more than a million cells. The bands are separated by empty
+            rows so that they do not affect each other; `hidden` is only valid in rows with points.
+        points : (k,) row numbers, among the n measured points, of those that lie in it.
         """
         from scipy.ndimage import maximum_filter1d
 
@@ -124,7 +130,10 @@ class DisparityRaster:
         return np.asarray(raster[self.row, self.column])
 
     def near_border(self, sigma_px: float) -> BoolArray:
-        """Tell for which points more than 1 % of a low-pass filter's weight lies outside of the area that both cameras see.
+        """Tell which points are so near the border of the common field of view that smoothing cannot be predicted there.
+
+        These are the points for which more than 1 % of the weight of a Gaussian low-pass filter lies outside that field of view
+        (occlusions count as inside).
 
         Parameters
         ----------
@@ -140,11 +149,13 @@ class DisparityRaster:
         return self.at_points(gaussian_filter(inside, sigma_px / self.step, mode="constant") < 1 - _BEYOND)
 
     def in_filled_occlusions(self, effects: Iterable[Effect]) -> BoolArray:
-        """Tell which points lie where only the left camera sees the reference, and no effect of the model gives a disparity.
+        """Tell which measured points lie in occlusions, where a matcher can only have filled in a disparity.
+
+        Only the left camera sees the reference there, and the given effects predict no disparity.
 
         Parameters
         ----------
-        effects : Effects of the model.
+        effects : Effects of the sensor model, such as edge fattening, which may predict a disparity beside an edge.
 
         Returns
         -------
@@ -153,7 +164,9 @@ class DisparityRaster:
         return np.asarray(np.isnan(self.at_points(self.apply(effects))) & self.at_points(self.hidden))
 
     def copied_from_neighbour(self, found: FloatArray, tolerance: float) -> BoolArray:
-        """Tell which measured disparities equal the disparity of a neighbouring cell in the row, as filled occlusions do.
+        """Tell which measured disparities equal that of a neighbouring cell in the same row.
+
+        A stereo matcher that fills occlusions copies disparities from a neighbouring pixel, so equal values reveal it.
 
         Parameters
         ----------
@@ -170,15 +183,18 @@ class DisparityRaster:
         return self.at_points(np.pad(same, ((0, 0), (1, 0))) | np.pad(same, ((0, 0), (0, 1))))
 
     def apply(self, effects: Iterable[Effect]) -> FloatArray:
-        """Apply effects of neighbouring pixels (edge fattening, smoothing, filled occlusions) to the reference's disparities.
+        """Predict the disparities that a matcher with effects of neighbouring pixels measures on the reference surface.
+
+        Such effects are edge fattening, smoothing and filled occlusions. They are applied to the raster of the reference's
+        disparities.
 
         Parameters
         ----------
-        effects : Effects of the model; others are ignored.
+        effects : Effects of the sensor model; those that do not involve neighbouring pixels are ignored.
 
         Returns
         -------
-        (rows, columns) disparities, px, NaN without a match.
+        (rows, columns) disparities, px; NaN without a match.
         """
         found = self.disparity
         filters = (effect for effect in effects if isinstance(effect, RasterEffect))
@@ -187,36 +203,36 @@ class DisparityRaster:
         return found
 
     def added_by(self, effects: Iterable[Effect], disparity: FloatArray) -> FloatArray:
-        """Return what effects of neighbouring pixels add to the disparities at the points.
+        """Return what effects of neighbouring pixels (such as edge fattening and smoothing) add to the points' disparities.
 
         Parameters
         ----------
-        effects : Effects of the model; others are ignored.
+        effects : Effects of the sensor model; those of other kinds are ignored.
         disparity : (n,) disparity of the reference at the points, px, used where the raster has none.
 
         Returns
         -------
-        (n,) added disparity, px; 0 where the effects give none.
+        (n,) added disparity, px; 0 where the effects predict no disparity.
         """
         plain = self.at_points(self.disparity)
         return np.nan_to_num(self.at_points(self.apply(effects)) - np.where(np.isnan(plain), disparity, plain))
 
 
 def apply_smoothing(effects: Iterable[Effect], geometry: PixelGeometry, columns: FloatArray) -> FloatArray:
-    """Apply the smoothing of a stereo matcher to small changes of the disparities, such as columns of a Jacobian.
+    """Apply the smoothing of a stereo matcher to small changes of the disparities, such as the columns of a pose Jacobian.
 
-    A move of the cameras changes disparities in proportion to the rock's relief, which smoothing reduces. If the points are a
-    subsample, only their own cells are averaged.
+    A move of the cameras changes the disparities in a pattern that follows the rock's relief; the matcher smooths this pattern
+    too. If the points are a subsample, only the pixels that are present are averaged.
 
     Parameters
     ----------
-    effects : Effects of the model; only smoothing is used.
+    effects : Effects of the sensor model; only smoothing is used.
     geometry : The pixels of n points.
-    columns : (n, k) changes of the disparity at the points, px per unit.
+    columns : (n, k) changes of the disparity at the points by k parameters, px per unit of the parameter.
 
     Returns
     -------
-    (n, k) smoothed changes; unchanged without smoothing or without a raster.
+    (n, k) smoothed changes; unchanged without smoothing or if the pixels lie on no raster.
     """
     filters, step = [effect for effect in effects if isinstance(effect, Smoothing)], raster_cell_px(geometry.u, geometry.v)
     if not filters or step is None or raster_cell_count(geometry.u, geometry.v, step) > MOST_CELLS:
@@ -237,7 +253,7 @@ def apply_smoothing(effects: Iterable[Effect], geometry: PixelGeometry, columns:
 
 
 def raster_cell_count(u: FloatArray, v: FloatArray, step: float) -> int:
-    """Return the number of cells of a raster that covers all given pixels.
+    """Return the number of cells of a raster that covers all given pixels, to tell whether it would be too large.
 
     Parameters
     ----------
@@ -271,15 +287,15 @@ def _cell(x: FloatArray, step: float) -> NDArray[np.int64]:
 
 
 def raster_cell_px(u: FloatArray, v: FloatArray) -> float | None:
-    """Return the spacing of the raster on which pixels lie, px: the smaller one of its columns' and its rows' spacings.
+    """Return the spacing of the pixel raster on which a stereo matcher measured, such as every second or fourth pixel.
 
     Parameters
     ----------
-    u, v : (n,) columns and rows of the pixels, px.
+    u, v : (n,) columns and rows of the measured pixels, px.
 
     Returns
     -------
-    The spacing; None if the pixels lie on no raster.
+    The smaller one of the spacings of columns and of rows, px; None if the pixels lie on no raster.
     """
     steps = [step for step in (raster_spacing_px(u), raster_spacing_px(v)) if step is not None]
     return min(steps, default=None)

@@ -27,18 +27,18 @@ _SAME_STEP = 0.5
 def simulate_disparities(
     measurement: StereoMeasurement, model: StereoModel, residuals: StereoResiduals, randoms: Sequence[KeyedRandom]
 ) -> FloatArray:
-    """Simulate the disparity of each measured pixel by tracing the cell of a depth map in which the pixel lies.
+    """Simulate the disparity that a sensor model gives at each measured pixel of a stereo pair.
 
-    Of the qualities high, medium and low, the depth map is used whose cell centres are nearest to the pixels on average. Its
-    cells are at least two pixels wide, so the pixel is not at the cell's centre. The disparity is therefore corrected by the
-    nominal disparity of the reference surface at the pixel minus that at the centre. Effects of the matcher on neighbouring
-    pixels are applied on the measurement's own raster if its spacing differs from that of the depth map.
+    The full simulation produces depth maps of three qualities, with cells of 2, 4 or 8 px. The one is used whose cell centres
+    are nearest to the pixels on average, and only the cells in which measured pixels lie are traced. As a pixel is not at the
+    centre of its cell, the difference of the reference's nominal disparity between pixel and centre is added. Edge fattening
+    and smoothing are applied on the measurement's own raster if its spacing differs from that of the depth map.
 
     Parameters
     ----------
     measurement : The pair, with the cameras at their aligned pose.
     model : The sensor model to simulate.
-    residuals : Residuals with n pixels; they may belong to another pose of the cameras.
+    residuals : Residuals with the n pixels; they may have been computed at another pose of the cameras.
     randoms : d sources of random numbers, one for each simulation.
 
     Returns

@@ -29,7 +29,9 @@ _HIDDEN_SHARE = 2e-4
 
 @dataclass(frozen=True)
 class PixelGeometry:
-    """Geometry of n pixels that a stereo pair matched, as the equations of the stereo effects use it.
+    """Geometry of n pixels that a stereo pair matched: the quantities on which errors of disparities depend.
+
+    The reference is the surface with which the measurement is compared.
 
     Attributes
     ----------
@@ -37,13 +39,13 @@ class PixelGeometry:
     v_right : (n,) row in the right image, px.
     disparity : (n,) disparity of the reference, px.
     found : (n,) measured disparity, px.
-    point, normal : (n, 3) point and unit normal of the reference, wall frame, m.
+    point, normal : (n, 3) point of the reference that the pixel sees, m, and its unit normal, wall frame.
     radius, radius_right : (n,) distance from the centre of the left and of the right image, px.
-    tangent : (n,) tangent of the angle between the rectified row and the rectified axis.
+    tangent : (n,) vertical slope of the line of sight in the rectified left image: (row - principal row) / focal length in px.
     infinity : (n,) disparity of a point at infinity, px.
     shaped : (n,) what effects of neighbouring pixels (edge fattening, smoothing) add to the reference's disparity, px.
-    along_row, along_column : (n,) change of the reference's disparity per px along the row and along the column of the left
-        image; None if not computed.
+    along_row, along_column : (n,) change of the reference's disparity from one pixel to the next along the row and along the
+        column of the left image, px per px; None if not computed.
     """
 
     u: FloatArray
@@ -65,7 +67,7 @@ class PixelGeometry:
         return len(self.u)
 
     def part(self, rows: Rows) -> PixelGeometry:
-        """Return the geometry of a subset of the n points, given as row numbers, a mask or a slice."""
+        """Return the geometry of a subset of the n matched pixels, given as row numbers, a mask (n,) or a slice."""
         return select_rows(self, rows)
 
     @property
@@ -75,18 +77,21 @@ class PixelGeometry:
 
     @property
     def departure(self) -> FloatArray:
-        """(n,) measured disparity minus that of the reference, px."""
+        """(n,) measured minus reference disparity, px, without subtracting any effect of the sensor model."""
         return np.asarray(self.found - self.disparity)
 
 
 @dataclass(frozen=True)
 class NominalPair:
-    """A stereo pair with its nominal calibration and pose, in the wall frame, in whose rectification disparities are given.
+    """A stereo pair with the calibration and pose that the measurement states, in the wall frame.
+
+    Disparities are differences of columns in the images that this pair rectifies. The real cameras may differ from it by errors
+    of calibration and pose.
 
     Attributes
     ----------
     pair : The two cameras.
-    geometry : Their rectification.
+    geometry : Rectification of their images to common rows.
     """
 
     pair: CameraPair
@@ -94,16 +99,16 @@ class NominalPair:
 
     @classmethod
     def of(cls, measurement: StereoMeasurement) -> NominalPair:
-        """Return the nominal pair of a measurement, transformed to the wall frame."""
+        """Return the stereo pair of a measurement with its stated calibration and pose, transformed to the wall frame."""
         pair = measurement.cameras.in_wall_frame(measurement.frame)
         return cls(pair, rectify(pair))
 
     def disparity(self, left: tuple[FloatArray, FloatArray], right: tuple[FloatArray, FloatArray]) -> FloatArray:
-        """Return the disparities of matched pixels.
+        """Return the disparities of matched pixels: the rectified column in the left image minus that in the right image.
 
         Parameters
         ----------
-        left, right : (n,) column and (n,) row in the left and in the right image, px.
+        left, right : (n,) column and (n,) row of the pixels in the left and in the right original image, px.
 
         Returns
         -------
@@ -113,12 +118,12 @@ class NominalPair:
         return _on_host(self.left_column(*first) - self.right_column(*second))[0]
 
     def surface_disparity(self, scene: RayCaster, u: FloatArray, v: FloatArray) -> FloatArray:
-        """Return the disparity of the surface that pixels of the left image see.
+        """Return the disparity of the surface point that each pixel of the left image sees.
 
         Parameters
         ----------
-        scene : The surface.
-        u, v : (n,) columns and rows, px.
+        scene : The surface, for casting rays on it, wall frame.
+        u, v : (n,) columns and rows of the pixels in the left image, px.
 
         Returns
         -------
@@ -130,12 +135,17 @@ class NominalPair:
         return self.disparity((u, v), project(self.pair.right, point))
 
     def left_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
-        """Return the (n,) rectified columns of pixels (u, v) of the left image, px."""
+        """Rectify pixels of the left image and return their columns, px. Arrays (n,) lie on the ray-tracing device.
+
+        u, v: columns and rows in the original image, px.
+        """
         rect = self.geometry
         return rectified_pixel(self.pair.left, rect.left, u, v, rect.f, rect.u_left, rect.v)[0]
 
     def tangent(self, u: FloatArray, v: FloatArray) -> FloatArray:
-        """Return (row - principal row) / f of each pixel in the rectified left image: the vertical slope of its line of sight.
+        """Return the vertical slope of each pixel's line of sight in the rectified left image.
+
+        It is (row - principal row) / focal length.
 
         Parameters
         ----------
@@ -143,7 +153,7 @@ class NominalPair:
 
         Returns
         -------
-        (n,) tangents.
+        (n,) slopes, without unit.
         """
         rect = self.geometry
         pixel = on_device(mi.Float64, u), on_device(mi.Float64, v)
@@ -151,21 +161,27 @@ class NominalPair:
         return _on_host(row_tangent(rect, row))[0]
 
     def right_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
-        """Return the (n,) rectified columns of pixels (u, v) of the right image, px."""
+        """Rectify pixels of the right image and return their columns, px. Arrays (n,) lie on the ray-tracing device.
+
+        u, v: columns and rows in the original image, px.
+        """
         rect = self.geometry
         return rectified_pixel(self.pair.right, rect.right, u, v, rect.f, rect.u_right, rect.v)[0]
 
     def right_column_of(self, real: Camera, point: mi.Array3f64) -> mi.Float64:
-        """Return the rectified columns of points that a real right camera sees, if its pixels are rectified as nominal ones.
+        """Predict in which rectified column points appear if the real right camera differs from the nominal one.
+
+        The real camera takes the image; the image is then rectified with the nominal calibration, because the difference is
+        unknown to the user. Arrays lie on the ray-tracing device.
 
         Parameters
         ----------
-        real : The real right camera.
+        real : The right camera as it really is.
         point : n points, wall frame, m.
 
         Returns
         -------
-        (n,) columns, px.
+        (n,) columns in the rectified right image, px.
         """
         x, y = _seen_tangents(real, point)
         if _interior(real) != _interior(self.pair.right):  # else both cameras have the same tangents
@@ -175,22 +191,33 @@ class NominalPair:
 
 
 def project(camera: Camera, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Project points (n, 3), m, in the frame of the camera's pose, into a camera; return columns and rows (n,), px."""
+    """Project points into the image of a camera, with its lens distortion.
+
+    Parameters
+    ----------
+    camera : The camera with its pose.
+    points : (n, 3) points in the frame in which the pose is given, m.
+
+    Returns
+    -------
+    (n,) columns and (n,) rows, px.
+    """
     u, v = _on_host(*_pixel(camera, vectors_on_device(points)))
     return u, v
 
 
 def pixel_rays(camera: Camera, u: FloatArray, v: FloatArray) -> FloatArray:
-    """Return the directions of the rays of pixels.
+    """Return the directions in which pixels of a camera look, corrected for lens distortion.
 
     Parameters
     ----------
-    camera : The camera.
+    camera : The camera with its pose.
     u, v : (n,) columns and rows, px.
 
     Returns
     -------
-    (n, 3) directions in the frame of the camera's pose, with a component of 1 along its axis.
+    (n, 3) directions in the frame in which the camera's pose is given. They are not of unit length: the component along the
+    camera's axis is 1.
     """
     return np.stack(_on_host(*_ray(camera, on_device(mi.Float64, u), on_device(mi.Float64, v))), axis=1)
 
@@ -242,17 +269,20 @@ def is_hidden(scene: RayCaster, position: FloatArray, points: FloatArray) -> Boo
 
 
 def predict_disparities(nominal: NominalPair, real: Iterable[CameraPair], geometry: PixelGeometry) -> list[FloatArray]:
-    """Predict the disparities that real pairs of cameras measure, with the surface replaced by its tangent planes.
+    """Predict the disparities of given pixels for several positions or calibrations of the real cameras.
+
+    Differences of the results give, for example, derivatives by the pose. To be fast, the surface is replaced by its tangent
+    planes, so that no ray is traced again.
 
     Parameters
     ----------
-    nominal : The nominal pair, in whose rectification disparities are given.
-    real : The real pairs.
-    geometry : n pixels with their points on the reference and its normals.
+    nominal : The pair with its stated calibration, with which the images are rectified.
+    real : The pairs as they might really be.
+    geometry : n pixels of the left image, with the points of the reference surface that they see and its normals.
 
     Returns
     -------
-    For each pair the (n,) disparities, px.
+    For each real pair the (n,) disparities, px.
     """
     u, v = on_device(mi.Float64, geometry.u), on_device(mi.Float64, geometry.v)
     point, normal = vectors_on_device(geometry.point), vectors_on_device(geometry.normal)
@@ -279,13 +309,13 @@ def predict_disparities(nominal: NominalPair, real: Iterable[CameraPair], geomet
 
 
 def moved_pair(pair: CameraPair, centre: FloatArray, vector: FloatArray, *, turned: bool) -> CameraPair:
-    """Shift or rotate both cameras of a pair as one rigid body.
+    """Shift or rotate both cameras of a stereo pair together, as one rigid body.
 
     Parameters
     ----------
     pair : The cameras.
-    centre : (3,) fixed point of a rotation, m.
-    vector : (3,) shift, m, or small rotation vector, rad.
+    centre : (3,) point about which they are rotated, m.
+    vector : (3,) shift, m, or small rotation vector, rad, in the frame of the pair.
     turned : Whether `vector` is a rotation.
 
     Returns
@@ -304,13 +334,13 @@ def moved_pair(pair: CameraPair, centre: FloatArray, vector: FloatArray, *, turn
 
 
 def real_pair(nominal: NominalPair, effects: tuple[Effect, ...], measurement: StereoMeasurement) -> CameraPair:
-    """Return the pair as it really is if the camera effects of a model are true, in the wall frame.
+    """Return the cameras of a stereo pair with the errors of calibration and pose of a sensor model, in the wall frame.
 
     Parameters
     ----------
-    nominal : The nominal pair.
-    effects : Effects of the model; those that do not change cameras are ignored.
-    measurement : The measurement with its cameras and frame.
+    nominal : The pair as calibrated. It is not used: `measurement` has the same cameras.
+    effects : Effects of the sensor model; those that do not change the cameras are ignored.
+    measurement : The measurement with its stated cameras, and the wall frame.
     """
     pair = measurement.cameras
     for effect in effects:

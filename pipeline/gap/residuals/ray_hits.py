@@ -20,19 +20,22 @@ _LEAST_COSINE = 0.05
 
 @dataclass(frozen=True)
 class RayGeometry(PulseGeometry):
-    """Geometry of n laser rays, as the equations of the laser effects use it, with the measured ranges.
+    """Geometry of n laser rays with the measured ranges: the quantities on which errors of ranges depend.
 
-    The fields of `PulseGeometry` describe the average direction of the beam under the current model.
+    It has all fields of `PulseGeometry`: recorded directions, range to the reference surface, cosine of the incidence angle,
+    received power, scan line and time. Range and incidence angle are those of the direction in which the beam left under the
+    current sensor model. The last four fields below describe a reference whose points have errors.
 
     Attributes
     ----------
     measured_m : (n,) measured ranges, m.
-    bulge_m : (n,) how much nearer the curved surface lies than the triangle between its points, m; included in `range_m`. None if
-        the reference is used as it is.
-    corner : (n, 3) vertices of the triangle that was hit; None if the vertices have no errors of their own.
-    weight : (n, 3) barycentric weights of these vertices at the hit.
-    plane_normal : (n, 3) normals, scanner frame, of the planes along which a deflected ray is followed; None: along the
-        triangles.
+    bulge_m : (n,) how much nearer a curved surface through the reference's points lies than the triangle between them, m; it is
+        already subtracted from the field `range_m`. None if the triangles are used as they are.
+    corner : (n, 3) row numbers of the reference's vertices at the corners of the triangle that was hit; None if the vertices
+        have no errors of their own.
+    weight : (n, 3) barycentric weights of these vertices at the hit; None with `corner`.
+    plane_normal : (n, 3) normals, scanner frame, of planes on which a ray of slightly other direction is assumed to hit; None:
+        it hits the triangles.
     """
 
     measured_m: FloatArray = field(default_factory=lambda: np.zeros(0))
@@ -52,28 +55,29 @@ class RayGeometry(PulseGeometry):
 
     @property
     def departure(self) -> FloatArray:
-        """(n,) measured range minus the range to the reference, m."""
+        """(n,) measured range minus that to the reference surface, m, without subtracting any effect of the sensor model."""
         return np.asarray(self.measured_m - self.range_m)
 
 
 @dataclass(frozen=True)
 class RayHits:
-    """Where n rays hit the reference surface.
+    """Where n rays of a laser scanner hit the reference surface, and how the surface lies there.
 
-    If the reference is made of points, incidence angles refer to planes through 24 points. Its triangles lean with the noise of
-    their corners, which is also in the range, so it would imitate every effect that depends on the incidence angle. Where noise
-    dominates the scatter of the points, the normals are those of the planes too.
+    If the reference was itself measured as points, incidence angles refer to planes fitted to 24 neighbouring points. Its
+    triangles are tilted by the noise of their corners. The same noise is in the range, so it would imitate errors that depend
+    on the incidence angle. If noise rather than relief dominates the scatter of the points, the normals are those of the planes
+    too.
 
     Attributes
     ----------
     distance : (n,) range to the surface, m; infinite or NaN without a hit.
-    normal : (n, 3) unit normals, wall frame, of the triangle or of the plane through the points.
+    normal : (n, 3) unit normals, wall frame, of the triangle or of the plane.
     cos_incidence : (n,) cosine of the incidence angle.
-    curvature : (n,) largest deviation of the surface from the triangle's plane within a beam's width, m.
-    bulge : (n,) how much nearer the curved surface lies than the triangle, m; included in `distance`. None if the reference is
-        used as it is.
-    scatter : (n,) scatter of the reference's points about the planes, relative to its median; None without planes.
-    corner : (n, 3) vertices of the triangle that was hit; None if the vertices have no errors of their own.
+    curvature : (n,) largest deviation of the surface from the triangle's plane within a beam's width, m, along the ray.
+    bulge : (n,) how much nearer a curved surface through the points lies than the triangle, m; already subtracted from
+        `distance`. None if the triangles are used as they are.
+    scatter : (n,) scatter of the reference's points about the planes, divided by its median; None without planes.
+    corner : (n, 3) row numbers of the vertices of the triangle that was hit; None if the vertices have no errors of their own.
     weight : (n, 3) barycentric weights of these vertices at the hit; None with `corner`.
     """
 
@@ -88,13 +92,13 @@ class RayHits:
 
 
 def cast_rays(measurement: TlsMeasurement, axes: list[FloatArray]) -> RayHits:
-    """Trace rays from the scanner to the reference surface.
+    """Trace rays from a laser scanner to the reference surface.
 
     Parameters
     ----------
-    measurement : The scan, with its station and reference.
-    axes : Three (n, 3) arrays in the wall frame: unit directions of the rays, and their derivatives by azimuth and by zenith
-        angle.
+    measurement : The scan, with the scanner's pose and the reference surface.
+    axes : Three arrays (n, 3), wall frame: unit directions of the rays, and unit vectors in which they move with growing
+        azimuth and with growing zenith angle. Rays beside each ray along these vectors show how much the surface bends.
 
     Returns
     -------
@@ -122,20 +126,20 @@ def cast_rays(measurement: TlsMeasurement, axes: list[FloatArray]) -> RayHits:
 
 
 def redirect_hits(found: RayHits, nominal: FloatArray, real: FloatArray) -> RayHits:
-    """Compute the hits of deflected rays from those of the nominal rays, along the planes that the nominal rays hit.
+    """Compute where rays hit if they are deflected a little, by extending the plane that each nominal ray hits.
 
-    This is used for a reference whose scatter is mostly noise: traced again, a deflected ray would follow the noise of a
-    triangle.
+    A ray is deflected if the model contains errors of the scanner's axes. This is used instead of tracing if the reference's
+    points are noisy: a ray traced anew would follow the tilt of a single triangle, which is noise.
 
     Parameters
     ----------
-    found : Hits of the nominal rays.
-    nominal : (n, 3) unit directions of the nominal rays.
-    real : (n, 3) unit directions of the deflected rays.
+    found : Hits of the nominal rays (in the recorded directions).
+    nominal : (n, 3) unit directions of the nominal rays, wall frame.
+    real : (n, 3) unit directions of the deflected rays, wall frame.
 
     Returns
     -------
-    The hits with the new distances and incidence angles.
+    The hits with the new distances and incidence angles; NaN distances for rays that graze the plane.
     """
     before, after = (np.einsum("ni,ni->n", found.normal, each) for each in (nominal, real))
     distance = found.distance * before / np.where(np.abs(after) > _LEAST_COSINE, after, np.nan)

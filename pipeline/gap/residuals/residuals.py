@@ -26,20 +26,31 @@ _Columns = TypeVar("_Columns", bound="DataclassInstance")
 
 
 class Geometry(Protocol):
-    """Geometry of n measured points, as the equations of the effects use it. Each kind of sensor has a class of its own."""
+    """Interface of the geometry of n measured points: the quantities on which errors of the sensor depend.
+
+    Examples are the range, the incidence angle or the image position. Laser rays, matched pixels and points of a cloud without
+    cameras have a class each.
+    """
 
     def __len__(self) -> int: ...
 
     def part(self, rows: Rows) -> Self:
-        """Return the geometry of a subset of the n points, given as row numbers, a mask or a slice."""
+        """Return the geometry of a subset of the n points, given as row numbers, a mask (n,) or a slice."""
 
     @property
     def sensor_coordinates(self) -> FloatArray:
-        """(n, 2) direction of each point in sensor coordinates: azimuth and zenith, rad, or image column and row, px."""
+        """(n, 2) position of each point in the sensor's field of view.
+
+        For a scanner these are azimuth and zenith angle, rad; for a stereo pair column and row of the left image, px; for a
+        cloud without cameras positions along and up the wall, m.
+        """
 
     @property
     def departure(self) -> FloatArray:
-        """(n,) measured minus geometric observable, m or px, without any effect of the model."""
+        """(n,) measured observable minus that of the reference surface, before any effect of the sensor model is subtracted.
+
+        It is a range or a distance in m, or a disparity in px.
+        """
 
 
 def _order(values: FloatArray) -> NDArray[np.int32]:
@@ -48,12 +59,12 @@ def _order(values: FloatArray) -> NDArray[np.int32]:
 
 
 def select_rows(columns: _Columns, rows: Rows) -> _Columns:
-    """Return the same dataclass with only some rows of its (n, ...) arrays; fields that are None stay None.
+    """Return a copy of a dataclass of arrays that has only some of their rows, as for a subset of the points.
 
     Parameters
     ----------
-    columns : A dataclass whose fields are arrays with n rows, or None.
-    rows : Row numbers, a mask or a slice.
+    columns : A dataclass whose fields are arrays (n, ...), one row for each of n points, or None (which stays None).
+    rows : Row numbers, a mask (n,) or a slice.
     """
     values: dict[str, Any] = {column.name: getattr(columns, column.name) for column in fields(columns)}
     return replace(columns, **{name: value[rows] for name, value in values.items() if value is not None})
@@ -61,36 +72,37 @@ def select_rows(columns: _Columns, rows: Rows) -> _Columns:
 
 @dataclass(frozen=True)
 class Residuals(ABC):
-    """Residuals of n points, measured minus predicted observable, with all that is needed to explain them.
+    """Residuals of n points (measured minus predicted observable) with all that is needed to explain them by sensor errors.
 
     The observable is a range (m) for a laser scan, a disparity (px) for a stereo pair, or a distance along the normal (m) for a
-    surface without cameras.
+    point cloud without cameras. It is predicted from the reference surface and the sensor model.
 
     Attributes
     ----------
     value : (n,) residuals, in the unit of the observable.
-    sigma : (n,) standard deviation that the model predicts, same unit.
+    sigma : (n,) standard deviation that the sensor model predicts, same unit.
     unit_m : (n,) metres of range or depth per unit of the observable, always positive (`depth_m` has the sign).
     usable : (n,) whether a point is used for fitting: the surface around it is smooth, and it lies on stable ground.
     on_smooth_surface : (n,) whether the surface around a point is smooth, on stable ground or not.
-    pose_jacobian : (n, 6 k) derivatives of the observable by the poses of k set-ups: shift (m) and small rotation (rad) of each
-        in the wall frame. A surface without cameras has up to seven columns (with a scale).
-    wall_xy : (n, 2) x and y of the reference's point in the wall frame, m. It does not move with the noise of the measured point.
-    covariates : (n,) arrays by name, on which an error may depend.
-    index : (n,) rows of the points in the measurement.
-    geometry : The rays or pixels behind the points.
+    pose_jacobian : (n, 6 k) derivatives of the observable by the poses of k set-ups (positions of the sensor): shift (m) and
+        small rotation (rad) of each in the wall frame. A cloud without cameras has up to seven columns (with a scale).
+    wall_xy : (n, 2) x (along the wall) and y (up) of the place on the reference, wall frame, m. It does not move with the noise
+        of the measured point.
+    covariates : (n,) arrays by name, such as "range" or "incidence", on which an error may depend.
+    index : (n,) row number of each point in the measurement.
+    geometry : Geometry of the rays, pixels or points.
     epoch_offset : (n,) what was subtracted from `value` because each epoch had its own pose; None for a single epoch.
     notes : Remarks for the user.
-    expected_pulses : Pulses that should have hit the wall; None if the scan pattern is not known.
+    expected_pulses : Laser pulses that should have hit the wall, returned or not; None if the scan pattern is not known.
     correlated_noise : The part of the predicted noise that neighbouring points share.
 
     Class attributes
     ----------------
-    sensor : Sensor whose catalogue of effects applies.
-    position_covariates : Names of the two covariates of the point's position in the sensor's field of view, along which an error
-        may vary jointly.
-    empirical_term, white_noise : The effect class of an empirical term and of white noise for this observable, each with the name
-        of the field that holds its values.
+    sensor : Kind of sensor, "tls" or "stereo", which decides the effects that may explain the residuals.
+    position_covariates : Names of the two covariates of the point's position in the sensor's field of view. An error may depend
+        on both jointly.
+    empirical_term, white_noise : For this observable the effect class of a fitted curve or surface without physical cause, and
+        that of white noise, each with the name of the field that holds its values.
     label : What the points are, in words for the report.
     """
 
@@ -120,62 +132,70 @@ class Residuals(ABC):
     @property
     @abstractmethod
     def depth_m(self) -> FloatArray:
-        """(n,) signed change of depth per unit of the observable, m: positive if a larger value means missing rock."""
+        """(n,) signed change of depth per unit of the observable, m: positive if a larger value means that rock is missing."""
 
     @property
     def with_sigma_of_means(self) -> Self:
-        """Return the residuals with the sigma that counts for means over many neighbours: sqrt(n) times the sigma of a mean of n.
+        """Return the residuals with a standard deviation `sigma` for statistics of means over many neighbouring points.
 
-        It is larger than the sigma of single points if neighbours share noise.
+        Divided by sqrt(k), this `sigma` is the standard deviation of a mean of k neighbours. It is larger than that of single
+        points if neighbours share noise. Here they do not, so the residuals are returned unchanged; subclasses may differ.
         """
         return self
 
     def reference_covariance_with(self, other: NDArray[np.int64]) -> FloatArray:
-        """Return the covariance of each point's error with that of another point, as far as errors of the reference cause it.
+        """Return the covariance of each point's residual with that of another point due to errors of the reference surface.
+
+        It is needed for the variance of differences of neighbouring residuals. Here it is zero; subclasses may differ.
 
         Parameters
         ----------
-        other : (n,) row of the other point.
+        other : (n,) for each point the row number of the other point.
 
         Returns
         -------
-        (n,) covariances, squared unit of the observable.
+        (n,) covariances, squared unit of the observable (m² or px²).
         """
         return np.zeros(len(other))
 
     @property
     def candidates(self) -> Effects:
-        """Classes of the effects that may be named for this kind of measurement."""
+        """Classes of the effects (error terms of a sensor model) that may explain residuals of this kind of measurement."""
         return catalogue(self.sensor)
 
     @property
     def total_departure(self) -> FloatArray:
-        """(n,) measured minus geometric observable without any effect of the model, with each epoch's own pose removed."""
+        """(n,) measured observable minus that of the reference surface, m or px, before any effect of the model is subtracted.
+
+        If there are several epochs, the effect of each one's own pose has been removed.
+        """
         return self.geometry.departure if self.epoch_offset is None else self.geometry.departure - self.epoch_offset
 
     @cached_property
     def sort_orders(self) -> dict[str, NDArray[np.int32]]:
-        """For each covariate, the (n,) row numbers that sort it in ascending order; equal values keep their order."""
+        """For each covariate by name, the (n,) row numbers that sort it in ascending order, for binning along it."""
         return dict(zip(self.covariates, map_in_threads(_order, self.covariates.values()), strict=True))
 
     def values_at(self, values: FloatArray, index: NDArray[np.int64]) -> FloatArray:
-        """Look values up by the row numbers of points in the measurement.
+        """Look up values of these residuals' points for points that are given by their row numbers in the measurement.
+
+        It serves to compare two residuals that do not have the same points.
 
         Parameters
         ----------
-        values : (n,) one value for each residual.
-        index : (m,) rows of points in the measurement.
+        values : (n,) one value for each point of these residuals.
+        index : (m,) row numbers of points in the measurement.
 
         Returns
         -------
-        (m,) values; NaN for points without a residual.
+        (m,) values; NaN for points that have no residual here.
         """
         found = np.full(int(max(self.index.max(initial=-1), index.max(initial=-1))) + 1, np.nan)
         found[self.index] = values
         return np.asarray(found[index])
 
     def part(self, rows: Rows) -> Self:
-        """Return the residuals of a subset of the n points, given as row numbers, a mask or a slice."""
+        """Return the residuals of a subset of the n points, given as row numbers, a mask (n,) or a slice."""
         return replace(
             self,
             value=self.value[rows],
@@ -193,12 +213,15 @@ class Residuals(ABC):
         )
 
     def with_rows_from(self, known: BoolArray, other: Self) -> Self:
-        """Replace some rows by those of other residuals, except `usable` and `on_smooth_surface`, which stay.
+        """Replace the residuals of some points, for example by those computed again with further effects in the sensor model.
+
+        Values, predicted standard deviations, Jacobian, covariates and geometry are replaced; `usable` and `on_smooth_surface`
+        stay.
 
         Parameters
         ----------
-        known : (n,) true for rows to replace.
-        other : Residuals of just those points, in the same order.
+        known : (n,) true for the points to replace.
+        other : New residuals of just these points, in the same order.
         """
         names = ("value", "sigma", "unit_m", "pose_jacobian", "wall_xy")
         columns: dict[str, Any] = {name: _merged(getattr(self, name), getattr(other, name), known) for name in names}
@@ -218,13 +241,13 @@ def _merged(mine: NDArray[Any], theirs: NDArray[Any], known: BoolArray) -> NDArr
 
 @dataclass(frozen=True)
 class ExpectedPulses:
-    """The m pulses of a scan pattern that should have hit the wall, and whether each returned.
+    """The m pulses of a scan pattern that should have hit the wall, and whether each returned; used to explain lost returns.
 
     Attributes
     ----------
     lost : (m,) true for a pulse in whose direction no point was recorded.
-    covariates : (m,) arrays by name, on which a loss may depend.
-    wall_xy : (m, 2) x and y of the place on the wall that the pulse should have hit, wall frame, m.
+    covariates : (m,) arrays by name, such as "range" or "incidence", on which the probability of a loss may depend.
+    wall_xy : (m, 2) x (along the wall) and y (up) of the place that the pulse should have hit, wall frame, m.
     """
 
     lost: BoolArray
@@ -233,19 +256,19 @@ class ExpectedPulses:
 
 
 def range_derivative(normal: FloatArray, direction: FloatArray, moved: FloatArray, distance: FloatArray) -> FloatArray:
-    """Return how the distance to a plane along a ray changes as the ray turns.
+    """Return how the range along a ray to a plane changes as the ray turns, for first-order effects of angle errors.
 
     With t = (p - o)·n / (u·n), for a plane through p and a ray from o, the derivative is dt = -t (du·n) / (u·n).
 
     Parameters
     ----------
-    normal : (n, 3) normals n of the planes.
-    direction : (n, 3) unit directions u of the rays.
-    moved : (n, 3) derivative du of the direction, per unit of the turning angle.
-    distance : (n,) distances t, m.
+    normal : (n, 3) unit normals n of the planes.
+    direction : (n, 3) unit directions u of the rays, same frame.
+    moved : (n, 3) derivative du of the direction by the turning angle, per rad.
+    distance : (n,) ranges t, m.
 
     Returns
     -------
-    (n,) derivative of the distance, m per unit of the turning angle.
+    (n,) derivative of the range, m/rad.
     """
     return -distance * np.einsum("ni,ni->n", moved, normal) / np.einsum("ni,ni->n", direction, normal)

@@ -29,10 +29,11 @@ class DirectedScanner(LaserScanner):
 
     Attributes
     ----------
-    geometry : Directions of the pulses. Recorded powers, if there are any, replace those that the reference's albedo would give.
-    inclined : Whether the geometry's incidence angles replace those to the reference's triangles.
-    between : Correction of the ranges for a reference made of points, with the planes along which deflected pulses are followed;
-        None without correction.
+    geometry : Directions of the n pulses. If it contains received powers or scan lines and times, these are used in the
+        simulation.
+    inclined : Whether the incidence angles of `geometry` are used instead of those to the triangles of the reference surface.
+    between : Geometry of the same rays for a reference surface that is made of noisy points. It corrects the simulated ranges
+        for the curvature between these points, and has the planes on which deflected pulses hit. None without correction.
     """
 
     geometry: PulseGeometry = field(kw_only=True)
@@ -40,7 +41,7 @@ class DirectedScanner(LaserScanner):
     between: RayGeometry | None = None
 
     def emit(self) -> Pulses:
-        """Return one pulse for each direction."""
+        """Return one undisturbed pulse for each given direction, as the input of the scanner simulation."""
         angles, count = self.geometry, len(self.geometry.azimuth)
         index = dr.arange(mi.UInt32, count)
         zero = np.zeros(count)
@@ -60,11 +61,11 @@ class DirectedScanner(LaserScanner):
         )
 
     def ranges(self, scene: RayCaster, random: KeyedRandom) -> FloatArray:
-        """Simulate the recorded ranges of all pulses.
+        """Simulate the ranges that the scanner records for all its n pulses.
 
         Parameters
         ----------
-        scene : The surface.
+        scene : The surface, for casting rays on it, wall frame.
         random : Source of the random numbers.
 
         Returns
@@ -75,13 +76,13 @@ class DirectedScanner(LaserScanner):
         return self._recorded_ranges(pulses, self.echo(scene, self._traced_pulses(pulses), beam, beam.combine_echoes), random)
 
     def ranges_by_mode(self, scene: RayCaster, random: KeyedRandom, modes: Sequence[Mode]) -> dict[Mode, FloatArray]:
-        """Simulate the recorded ranges for several ways in which a scanner combines the echoes of a beam.
+        """Simulate the ranges that the scanner records, for several ways to form a range from the echoes within one beam.
 
-        The sub-rays of the beam are traced only once.
+        A beam is simulated by several sub-rays over its footprint, which are traced only once for all ways.
 
         Parameters
         ----------
-        scene : The surface.
+        scene : The surface, for casting rays on it, wall frame.
         random : Source of the random numbers.
         modes : Ways to combine the echoes of a footprint: strongest, mean or first.
 
@@ -112,15 +113,15 @@ class DirectedScanner(LaserScanner):
         return np.array(dr.select(pulses.returned, pulses.range_m, np.nan))
 
     def measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
-        """Apply the effects that act on recorded values, such as intensity and range noise.
+        """Apply the errors that arise when an echo is recorded, such as range noise or a bias that depends on the intensity.
 
-        The measurement supplies what the effects depend on: its recorded intensity as the echo's power, its angle of incidence,
-        and the range to the surface after a correction of the reference's shape between its vertices.
+        Where known, the recorded intensities replace the simulated power of the echoes, and incidence angles come from the
+        measurement. Ranges are corrected for the curvature of the surface between the reference's vertices.
 
         Parameters
         ----------
-        pulses : Pulses as emitted.
-        echo : What returned from the surface.
+        pulses : The pulses as emitted.
+        echo : What returned from the surface for each pulse.
         random : Source of the random numbers.
 
         Returns
@@ -161,13 +162,13 @@ def _scanner(
 
 
 def simulate_ranges(measurement: TlsMeasurement, model: TlsModel, geometry: RayGeometry, random: KeyedRandom) -> FloatArray:
-    """Simulate the ranges that a sensor model gives along the measured rays.
+    """Simulate the ranges that a scanner with a given sensor model would record along measured rays.
 
     Parameters
     ----------
-    measurement : The scan, with its station and reference.
-    model : The sensor model.
-    geometry : n rays.
+    measurement : The scan, with the scanner's pose and the reference surface.
+    model : The sensor model to simulate, instead of that of the measurement.
+    geometry : The n measured rays.
     random : Source of the random numbers.
 
     Returns
@@ -180,14 +181,14 @@ def simulate_ranges(measurement: TlsMeasurement, model: TlsModel, geometry: RayG
 def simulate_ranges_by_mode(
     measurement: TlsMeasurement, model: TlsModel, modes: Sequence[Mode], geometry: RayGeometry, random: KeyedRandom
 ) -> dict[Mode, FloatArray]:
-    """Simulate the ranges of a sensor model with a wide beam, for several ways in which a scanner combines its echoes.
+    """Simulate the ranges of a scanner with a wide beam, for several ways to form a range from the echoes within one beam.
 
     Parameters
     ----------
-    measurement : The scan, with its station and reference.
-    model : The sensor model.
+    measurement : The scan, with the scanner's pose and the reference surface.
+    model : The sensor model, which states the width of the beam.
     modes : Ways to combine the echoes of a footprint: strongest, mean or first.
-    geometry : n rays.
+    geometry : The n measured rays.
     random : Source of the random numbers.
 
     Returns
@@ -198,18 +199,23 @@ def simulate_ranges_by_mode(
 
 
 def systematic_part(model: TlsModel) -> TlsModel:
-    """Return a sensor model with its systematic and edge effects only: without noise and without lost returns."""
+    """Return a sensor model without its noise and lost returns, to predict mean ranges.
+
+    Systematic errors and errors at edges (such as those of a wide beam) are kept.
+    """
     kept = tuple(effect for effect in model.effects if effect.shows_in in (ShowsIn.MEAN, ShowsIn.EDGES))
     return model.model_copy(update={"noise": _NO_NOISE, "effects": kept})
 
 
 def mean_beam_directions(measurement: TlsMeasurement, geometry: PulseGeometry) -> tuple[FloatArray, FloatArray]:
-    """Predict the directions in which the pulses leave on average, under the measurement's model.
+    """Predict in which directions the beams really left, given the errors of axes and angles in the sensor model.
+
+    Noise is not included.
 
     Parameters
     ----------
-    measurement : The scan.
-    geometry : n recorded directions.
+    measurement : The scan with its sensor model.
+    geometry : The n recorded directions.
 
     Returns
     -------
@@ -221,15 +227,15 @@ def mean_beam_directions(measurement: TlsMeasurement, geometry: PulseGeometry) -
 
 
 def predict_ranges(measurement: TlsMeasurement, geometry: RayGeometry) -> FloatArray:
-    """Predict the ranges along measured rays under the measurement's model, by a simulation without noise.
+    """Predict the mean ranges along measured rays under the measurement's sensor model, by a simulation without noise.
 
     Parameters
     ----------
-    measurement : The scan, with its station, reference and model.
-    geometry : n rays.
+    measurement : The scan, with the scanner's pose, the reference surface and the sensor model.
+    geometry : The n measured rays.
 
     Returns
     -------
-    (n,) mean ranges, m.
+    (n,) ranges, m; NaN without a return.
     """
     return simulate_ranges(measurement, systematic_part(measurement.model), geometry, KeyedRandom(0, ("gap", "mean")))

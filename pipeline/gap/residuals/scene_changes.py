@@ -71,13 +71,13 @@ _SAMPLE, _ALMOST_ALL = 4000, 5.0
 
 @dataclass(frozen=True)
 class SceneChange:
-    """A region where the surface itself changed between the reference and the measurement.
+    """A region where the rock itself changed between the reference and the measurement, such as a rockfall.
 
     Attributes
     ----------
-    corners : (k, 3) corners of the prisms that the region's rays span between the surfaces before and after, wall frame, m.
-    volume_m3 : Volume of the rock that is missing or was added, m³.
-    volume_std_m3 : Its standard deviation, m³.
+    corners : (k, 3) points on the old and on the new surface that enclose the region, wall frame, m.
+    volume_m3 : Volume of the rock that is missing or was added, m³, always positive.
+    volume_std_m3 : Standard deviation of the volume, m³.
     offset_m : Median change of range, m, positive where rock is missing.
     """
 
@@ -88,20 +88,25 @@ class SceneChange:
 
     @property
     def bounds(self) -> FloatArray:
-        """(2, 3) lowest and highest coordinates of the region, wall frame, m."""
+        """(2, 3) lowest and highest coordinates of the changed region, wall frame, m."""
         return np.stack([self.corners.min(axis=0), self.corners.max(axis=0)])
 
     def to_dict(self, frame: WallFrame) -> dict[str, Any]:
-        """Return the entry of gap.json: the bounding box in the world frame, and the volume."""
+        """Return this changed region as an entry of the result file gap.json.
+
+        Keys: `bbox_m` (lowest x, y, z, then highest, in the world frame of the survey, m), `volume_m3`, `volume_std_m3`.
+
+        frame: the wall frame of the measurement, which converts to the world frame.
+        """
         world = frame.to_world(self.corners)
         return {"bbox_m": [*world.min(axis=0).tolist(), *world.max(axis=0).tolist()], "volume_m3": self.volume_m3,
                 "volume_std_m3": self.volume_std_m3}  # fmt: skip
 
 
 def find_scene_changes(residuals: Residuals, view: SensorView, eligible: BoolArray) -> tuple[list[SceneChange], BoolArray]:
-    """Find regions where the surface changed between the reference and the measurement.
+    """Find regions where the rock changed between reference and measurement, so that they are not taken for sensor errors.
 
-    The level of the surroundings and the scatter of the residuals are estimated again without the changes found, until no more
+    Residuals are compared with the local median and scatter. These are estimated again without the regions found, until no more
     are found.
 
     Parameters
@@ -112,7 +117,7 @@ def find_scene_changes(residuals: Residuals, view: SensorView, eligible: BoolArr
 
     Returns
     -------
-    The changes, largest first; and (n,) true for points that lie in or beside one.
+    The changed regions, largest volume first; and (n,) true for points in such a region or within three point spacings of one.
     """
     beside = np.zeros(len(residuals), dtype=bool)
     departure, error = np.zeros(len(residuals)), np.zeros((2, len(residuals)))
@@ -139,7 +144,10 @@ def find_scene_changes(residuals: Residuals, view: SensorView, eligible: BoolArr
 
 
 def drop_duplicates(changes: list[SceneChange]) -> list[SceneChange]:
-    """Drop changes that several scans show: those whose centre lies in the bounding box of a larger one."""
+    """Drop changed regions that were found in several scans of the same wall.
+
+    changes: regions, largest volume first. One is dropped if its centre lies in the bounding box of an earlier one.
+    """
     kept: list[SceneChange] = []
     for change in changes:
         middle = change.bounds.mean(axis=0)
@@ -149,19 +157,20 @@ def drop_duplicates(changes: list[SceneChange]) -> list[SceneChange]:
 
 
 def moved_share(residuals: Residuals, view: SensorView, eligible: BoolArray) -> float:
-    """Return the share of points that deviate from the reference together with their neighbours, anywhere and by any amount.
+    """Return the share of points that lie off the reference together with their neighbours, as where much of the rock moved.
 
-    The median of each point and its eight neighbours is tested. White noise moves it by 0.4 sigma only.
+    A point counts if the median residual of it and its eight neighbours exceeds three predicted standard deviations and 2 cm
+    (defaults). White noise moves such a median by only 0.4 standard deviations.
 
     Parameters
     ----------
     residuals : Residuals of n points after alignment.
     view : How the sensor saw the same points.
-    eligible : (n,) true for points that count.
+    eligible : (n,) true for points that are considered.
 
     Returns
     -------
-    The share, from 0 to 1.
+    The share of the eligible points, from 0 to 1.
     """
     known = np.flatnonzero(eligible & np.isfinite(residuals.value))
     if len(known) < NEIGHBOURS:

@@ -40,17 +40,19 @@ _FROM_AFAR, _STEEPEST = 1000.0, 0.2
 class SensorView:
     """How the sensor saw n points: their rays, their neighbours in its field of view, and how a residual moves a point.
 
+    It is used to find regions where the rock changed, and to measure their volumes.
+
     Attributes
     ----------
-    coordinates : (n, 2) direction of each point: azimuth and zenith, rad, or column and row, px. Each of several scans is
-        shifted by a constant, so that points of different scans are not neighbours.
-    epoch : (n,) number of the point's epoch.
+    coordinates : (n, 2) position in the field of view: azimuth and zenith, rad, or column and row, px, or along and up the
+        wall, m. Each of several scans is shifted by a constant, so that points of different scans are not neighbours.
+    epoch : (n,) number of the epoch (the repetition of the measurement) of each point.
     origin : (3,) origin of the rays, or (n, 3) for several scans, wall frame, m.
     ray : (n, 3) unit directions of the rays, wall frame.
-    reference_m : (n,) range to the reference along the rays, m.
-    disparity : (n,) disparity of the reference minus that at infinity, px; None if ranges were measured.
-    slant : (n,) change of range per metre of residual. Only for points whose cameras are unknown, where rays are assumed to come
-        from a distant place in front of the wall; else None.
+    reference_m : (n,) range to the reference surface along the rays, m.
+    disparity : (n,) disparity of the reference minus that of a point at infinity, px; None if ranges were measured.
+    slant : (n,) change of range per metre of residual, for a cloud without cameras, whose rays are assumed to come from a
+        distant place in front of the wall; None for other measurements.
     """
 
     coordinates: FloatArray
@@ -73,7 +75,7 @@ class SensorView:
         Raises
         ------
         TypeError
-            If both are of different sensors.
+            If the residuals are of another kind of sensor than the measurement.
         """
         origin, reference, disparity, slant = measurement.viewpoint, None, None, None
         match measurement, residuals:
@@ -96,7 +98,7 @@ class SensorView:
         return cls(plane, epoch, origin, towards / length[:, None], reference, disparity, slant)
 
     def part(self, rows: Rows) -> SensorView:
-        """Return the view of a subset of the n points, given as row numbers, a mask or a slice."""
+        """Return how the sensor saw a subset of the n points, given as row numbers, a mask (n,) or a slice."""
         return replace(
             self,
             coordinates=self.coordinates[rows],
@@ -109,12 +111,15 @@ class SensorView:
         )
 
     def range_at_residual(self, rows: NDArray[np.int64], residual: FloatArray) -> FloatArray:
-        """Return the range at which a point lies if it has a given residual; for disparities R d / (d + residual).
+        """Return the range of points that have given residuals, to locate a surface that differs from the reference.
+
+        A disparity residual r changes the range R of the reference to R d / (d + r), where d is the reference's disparity minus
+        that at infinity.
 
         Parameters
         ----------
-        rows : (m,) rows of the points.
-        residual : (m,) residuals, m of range or px of disparity.
+        rows : (m,) row numbers of the points.
+        residual : (m,) residuals (measured minus predicted): m of range or of distance, or px of disparity.
 
         Returns
         -------
@@ -127,16 +132,16 @@ class SensorView:
         return np.asarray(self.reference_m[rows] * self.disparity[rows] / (self.disparity[rows] + residual))
 
     def points_at(self, rows: NDArray[np.int64], range_m: FloatArray) -> FloatArray:
-        """Return the places on the rays of some points at given ranges.
+        """Return the positions at given ranges on the rays of some points.
 
         Parameters
         ----------
-        rows : (m,) rows of the points.
-        range_m : (m,) ranges, m.
+        rows : (m,) row numbers of the points.
+        range_m : (m,) ranges from the sensor, m.
 
         Returns
         -------
-        (m, 3) places, wall frame, m.
+        (m, 3) positions, wall frame, m.
         """
         origin = self.origin if self.origin.ndim == 1 else self.origin[rows]
         return np.asarray(origin + range_m[:, None] * self.ray[rows])
@@ -161,16 +166,19 @@ class SensorView:
         return [(rows, cKDTree(self.scaled_coordinates[rows])) for rows in groups]
 
     def neighbour_pairs(self, rows: NDArray[np.int64], count: int = NEIGHBOURS) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Pair points with their nearest neighbours in the same epoch, and with the point at the same place in the next epoch.
+        """Pair points with their neighbours in the sensor's field of view, to find connected groups of points.
+
+        Neighbours are the nearest points of the same epoch within three point spacings, and the point at the same place in the
+        next epoch.
 
         Parameters
         ----------
-        rows : Rows of the points.
-        count : Number of neighbours of each point.
+        rows : Row numbers of the points whose neighbours are wanted.
+        count : Number of neighbours of each point in its own epoch.
 
         Returns
         -------
-        (k,) and (k,) rows of the first and of the second point of each pair.
+        (k,) and (k,) row numbers of the first and of the second point of k pairs.
         """
         pairs = [np.empty((2, 0), dtype=np.int64)]
         wanted = np.zeros(len(self.coordinates), dtype=bool)
@@ -191,15 +199,15 @@ class SensorView:
         return first[first != second], second[first != second]
 
     def neighbour_median(self, z: FloatArray) -> FloatArray:
-        """Return, for each point, the median of values over the point and its ring of eight neighbours.
+        """Return, for each point, the median of values over it and its eight nearest neighbours in the sensor's field of view.
 
         Parameters
         ----------
-        z : (n,) values.
+        z : (n,) values of the points, such as standardised residuals.
 
         Returns
         -------
-        (n,) medians.
+        (n,) medians, in the unit of the values.
         """
         found = np.empty(len(z))
         for group, near in self._rings:
@@ -218,16 +226,16 @@ class SensorView:
         ]
 
     def near(self, rows: NDArray[np.int64], spacings: float) -> NDArray[np.bool_]:
-        """Tell which points lie within some point spacings of any of the points `rows`, in any epoch.
+        """Tell which points lie near given ones in the sensor's field of view, whatever their epochs.
 
         Parameters
         ----------
-        rows : Rows of the points.
-        spacings : Distance in the field of view, in point spacings.
+        rows : Row numbers of the given points.
+        spacings : Largest distance in the field of view, in spacings of neighbouring points.
 
         Returns
         -------
-        (n,) true for points within the distance.
+        (n,) true for points within the distance of any of the given ones.
         """
         distance = cKDTree(self.scaled_coordinates[rows]).query(
             self.scaled_coordinates, distance_upper_bound=spacings, workers=-1
@@ -235,14 +243,15 @@ class SensorView:
         return np.asarray(np.isfinite(distance))
 
     def solid_angles(self, rows: NDArray[np.int64]) -> FloatArray:
-        """Compute the solid angle that some points represent: a third of the Delaunay triangles of which each is a corner.
+        """Compute the solid angle that each of some points represents, to turn changes of range into volumes.
 
-        The points of one epoch thus share the area between them, including that of lost returns. Triangles across larger gaps
-        count at most four times the median area.
+        It is a third of the area of the Delaunay triangles, in the sensor's field of view, of which the point is a corner. The
+        points of one epoch thus share the area between them, including that of lost returns. A triangle across a gap counts at
+        most four times the median area.
 
         Parameters
         ----------
-        rows : (m,) rows of the points.
+        rows : (m,) row numbers of the points.
 
         Returns
         -------

@@ -17,9 +17,10 @@ from sensors.models.sensor_model import TlsModel
 
 
 def residuals_of_scans(measurement: TlsMeasurement) -> TlsResiduals:
-    """Compute the range residuals of all scans of a measurement, in the order of its points.
+    """Compute the range residuals of a measurement that consists of several laser scans, in the order of its points.
 
-    The pose Jacobian is (n, 6 k), with six columns for each of k set-ups.
+    All scans share the sensor model. The pose Jacobian is (n, 6 k), with six columns (shift in m, rotation in rad) for each of
+    k set-ups (positions of the scanner).
     """
     count = 1 + max((scan.set_up for scan in measurement.scans), default=0)
     parts = []
@@ -50,13 +51,13 @@ def _concatenated(parts: Sequence[TlsResiduals]) -> TlsResiduals:
 def simulate_range_errors(
     measurement: TlsMeasurement, model: TlsModel, residuals: TlsResiduals, random: KeyedRandom
 ) -> FloatArray:
-    """Simulate the range errors that a sensor model gives at measured points: simulated minus geometric range.
+    """Simulate the range errors (simulated minus geometric range) that a sensor model gives at measured points.
 
     Parameters
     ----------
-    measurement : One scan or several.
-    model : The sensor model.
-    residuals : Residuals with the n rays to simulate.
+    measurement : One laser scan or several, with the reference surface.
+    model : The sensor model to simulate.
+    residuals : Residuals of the n points whose rays are simulated.
     random : Source of the random numbers.
 
     Returns

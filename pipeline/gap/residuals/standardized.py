@@ -31,19 +31,20 @@ _ENOUGH = 5_000
 def standardize(residuals: Residuals, view_xy: FloatArray, unchanged: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
     """Subtract the local median from residuals and divide by their local scatter, so that a change of the rock stands out.
 
-    The scatter is the predicted sigma times the largest NMAD of the standardised residuals among points with a similar value of
-    one covariate, but at least the predicted sigma. Noise that the model lacks, and misdirected rays on steep surfaces, therefore
-    raise it only where they occur.
+    The scatter is at least the predicted standard deviation. It is larger where points with a similar value of one covariate,
+    such as the incidence angle, scatter more than predicted. Noise that the model lacks thus raises it only where that noise
+    occurs.
 
     Parameters
     ----------
     residuals : Residuals of n points.
-    view_xy : (n, 2) positions in the sensor's field of view, equally scaled on both axes.
-    unchanged : (n,) true for points without changes, from which median and scatter are estimated.
+    view_xy : (n, 2) positions in the sensor's field of view, in units that are equal along both axes.
+    unchanged : (n,) true for points where the rock did not change, from which median and scatter are estimated.
 
     Returns
     -------
-    (n,) residuals minus the local median in the unit of the observable, and the same divided by the scatter.
+    departure : (n,) residuals minus the local median, in the unit of the observable (m or px).
+    z : (n,) `departure` divided by the scatter.
     """
     departure = residuals.value - _local_median(view_xy, residuals.value, unchanged)
     z = departure / residuals.sigma
@@ -51,17 +52,20 @@ def standardize(residuals: Residuals, view_xy: FloatArray, unchanged: NDArray[np
 
 
 def nmad_along_covariates(residuals: Residuals, z: FloatArray, unchanged: NDArray[np.bool_]) -> FloatArray:
-    """Return how much the residuals scatter around each point, as the largest NMAD along any covariate.
+    """Estimate how much larger the residuals' scatter is than predicted, at each point.
+
+    The points are sorted into bins of each covariate, such as range or incidence angle, and the NMAD of each bin is computed.
 
     Parameters
     ----------
-    residuals : Residuals with their covariates.
-    z : (n,) standardised residuals.
-    unchanged : (n,) true for points without changes, from which the NMADs are computed.
+    residuals : Residuals of n points with their covariates.
+    z : (n,) residuals divided by their predicted standard deviations.
+    unchanged : (n,) true for points where the rock did not change, from which the NMADs are computed.
 
     Returns
     -------
-    (n,) for each point the largest of the NMADs of z in its bins of the covariates and over all points.
+    (n,) for each point the largest NMAD of z among its bins of all covariates and that over all points; about 1 if the
+    prediction is right.
     """
 
     def along(name: str) -> FloatArray:
@@ -90,12 +94,12 @@ def _local_median(view_xy: FloatArray, value: FloatArray, unchanged: NDArray[np.
 
 
 def group_medians(value: FloatArray, cell: NDArray[np.int64], count: int, fewest: int) -> FloatArray:
-    """Return the median of each group of values.
+    """Return the median of each group of values, such as of the points in each cell of a raster.
 
     Parameters
     ----------
     value : (n,) values.
-    cell : (n,) number of each value's group.
+    cell : (n,) number of the group to which each value belongs, from 0 to count - 1.
     count : Number of groups.
     fewest : Groups with fewer values get NaN.
 

@@ -56,11 +56,14 @@ _ON_RAY = 0.1
 
 @dataclass(frozen=True)
 class StereoResiduals(Residuals):
-    """Residuals of a stereo pair: measured minus predicted disparities, px. Further attributes are those of `Residuals`.
+    """Residuals of a stereo pair: measured minus predicted disparities, px.
+
+    It has all attributes of `Residuals`: values, predicted standard deviations, mask of usable points, pose Jacobian and
+    covariates.
 
     Attributes
     ----------
-    geometry : The pixels of the points.
+    geometry : The matched pixels of the points, with the places on the reference surface that they see.
     """
 
     sensor = "stereo"
@@ -72,21 +75,25 @@ class StereoResiduals(Residuals):
 
     @property
     def depth_m(self) -> FloatArray:
-        """(n,) depth per disparity, m/px, negative: a disparity f B / Z falls with the depth."""
+        """(n,) change of depth Z per px of disparity, m/px: negative.
+
+        The disparity f B / Z (f: focal length in px, B: base) falls with depth.
+        """
         return -self.unit_m
 
 
 def move_onto_rays(left: Camera, points: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
     """Undo the registration of a stereo reconstruction: move its points rigidly so that they project into their matched pixels.
 
-    A reconstruction lies on the rays of its pixels until it is registered. The motion is found by Gauss-Newton with some thousand
-    points; the points stay if that brings them no nearer.
+    A reconstruction lies on the rays of its pixels until it is registered to other data. Measured disparities can only be
+    computed from points on these rays. The motion is found by Gauss-Newton from some thousand points. It is applied only if it
+    reduces the reprojection error to less than a tenth.
 
     Parameters
     ----------
     left : The left camera.
-    points : (n, 3) reconstructed points, m.
-    u, v : (n,) columns and rows at which they were matched, px.
+    points : (n, 3) reconstructed points, in the frame of the camera's pose, m.
+    u, v : (n,) columns and rows at which they were matched in the left image, px.
 
     Returns
     -------
@@ -115,9 +122,10 @@ def _reprojection_error(left: Camera, points: FloatArray, u: FloatArray, v: Floa
 
 
 def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
-    """Compute the disparity residuals of a pair, with predicted sigma, covariates and pose Jacobian.
+    """Compute the residuals of a stereo pair: measured disparities minus those of the reference surface and the sensor model.
 
-    Points whose pixel does not see the reference are left out.
+    They come with predicted standard deviations, covariates and pose Jacobian. Points whose pixel does not see the reference
+    are left out.
     """
     nominal, model = NominalPair.of(measurement), measurement.model
     u, v, points = _pixels(nominal, measurement)
@@ -149,15 +157,19 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
 
 
 def with_surroundings(measurement: StereoMeasurement, found: StereoResiduals) -> StereoMeasurement:
-    """Return the measurement with the surroundings of each pixel's place stored, so that they need not be searched again.
+    """Store in a measurement how the rock looks around each pixel's place, so that it need not be traced again.
 
-    Stored are smoothness, depth steps and visibility from the right camera. They stay valid for small moves of the cameras. After
-    a large move the visibility is wrong at a few points beside edges.
+    Stored are depth steps, smoothness and visibility from the right camera. They stay valid for small moves of the cameras.
+    After a large move the visibility is wrong at a few points beside edges.
 
     Parameters
     ----------
-    measurement : The pair.
-    found : Its residuals, which contain the surroundings.
+    measurement : The stereo pair.
+    found : Its residuals, from which these properties are taken.
+
+    Returns
+    -------
+    The measurement with the stored properties.
     """
     edge = found.covariates["edge_step"]
     about = Surroundings(found.geometry.point, edge, ~found.on_smooth_surface & (edge < _EDGE_PX))

@@ -16,9 +16,10 @@ from scene.common.keyed_random import KeyedRandom
 
 
 def subsample_measurement(measurement: Measurement, random: KeyedRandom) -> tuple[Measurement, NDArray[np.int64]]:
-    """Draw at most about `points.most` points of a laser scan or a surface; keep all points of a stereo pair.
+    """Draw a random subsample of a laser scan or of a cloud without cameras that is too large for the memory.
 
-    Call it after `with_scan_order`, because scan lines and times cannot be recovered from a subsample.
+    About two million points are kept (the threshold `points.most`). A stereo pair keeps all its points. Call `with_scan_order`
+    first: scan lines and times cannot be recovered from a subsample.
 
     Parameters
     ----------
@@ -27,7 +28,8 @@ def subsample_measurement(measurement: Measurement, random: KeyedRandom) -> tupl
 
     Returns
     -------
-    The subsampled measurement, with a note if points were left out, and the (m,) rows of its points in the full one.
+    The subsampled measurement, with a note for the user if points were left out, and the (m,) row numbers of its points in the
+    full one.
     """
     count, most = len(measurement.cloud.points), thresholds().points.most
     if isinstance(measurement, StereoMeasurement) or count <= most:

@@ -42,15 +42,17 @@ _DIRECTIONS = np.linspace(0, np.pi / 2, 8, endpoint=False)
 
 @dataclass(frozen=True)
 class SurfaceNoise:
-    """Noise of a point cloud's distances to a reference surface, as estimated from the cloud.
+    """Noise of a photogrammetric cloud's distances to a reference surface, as estimated from the cloud itself.
+
+    Part of it is shared by neighbouring points: random values at the nodes of a grid, interpolated bilinearly to the points.
 
     Attributes
     ----------
     sigma_m : Standard deviation of each point's own (white) noise, m.
-    node_sigma_m : Standard deviation at the nodes of grid-correlated noise, m; 0 without such noise.
-    step_m : Spacing of these nodes, m.
-    spacing_m : Typical distance between neighbouring points, m.
-    correlated_share : Share of the variance that is grid-correlated, 0 to 1.
+    node_sigma_m : Standard deviation of the values at the grid's nodes, m; 0 without such noise.
+    step_m : Spacing of the nodes, m.
+    spacing_m : Typical distance between neighbouring points of the cloud, m.
+    correlated_share : Share of the variance that neighbouring points share, 0 to 1.
     """
 
     sigma_m: float
@@ -61,7 +63,7 @@ class SurfaceNoise:
 
     @property
     def model(self) -> StereoModel:
-        """Return a sensor model with this noise and no effects."""
+        """Return a sensor model that has this noise of the points, in m, and no systematic effects."""
         return StereoModel(
             noise=StereoNoise(
                 parallax_sigma_px=0.0,
@@ -74,7 +76,7 @@ class SurfaceNoise:
 
     @property
     def summary(self) -> str:
-        """One line for the terminal with the size and the correlation of the noise."""
+        """One line for the terminal that states the white noise, the correlated noise and the spacing of the points, mm."""
         how = "estimated from the semivariogram of the cloud's distances to the reference"
         own = f"{how}: {1e3 * self.sigma_m:.3g} mm of white noise"
         if not self.node_sigma_m:
@@ -86,14 +88,18 @@ class SurfaceNoise:
 
 
 def estimate_surface_noise(measurement: SurfaceMeasurement, where: str) -> SurfaceNoise:
-    """Estimate the noise of a cloud's points, after aligning the cloud with the reference.
+    """Estimate the noise of a cloud's points from the semivariogram of its distances to the reference, after aligning it.
 
-    The noise that the measurement's model states is ignored.
+    The noise that the measurement's sensor model states is ignored.
 
     Parameters
     ----------
-    measurement : The cloud with its reference.
-    where : Name of the input, for the error message.
+    measurement : The cloud (without cameras) with its reference surface.
+    where : Name of the input file or folder, for the error message.
+
+    Returns
+    -------
+    White and grid-correlated noise.
 
     Raises
     ------

@@ -51,7 +51,9 @@ _ROUNDING = 1e-6
 
 @dataclass(frozen=True)
 class SurfaceGeometry(SurfacePlaces):
-    """For each of n points of a cloud, the place on the reference below it, and the distance between the two.
+    """Geometry of n points of a cloud without cameras: the place on the reference surface below each, and the distance to it.
+
+    The place has the fields of `SurfacePlaces`: point, normal, roughness, convexity and distance to the nearest edge.
 
     Attributes
     ----------
@@ -62,7 +64,10 @@ class SurfaceGeometry(SurfacePlaces):
 
     @property
     def sensor_coordinates(self) -> FloatArray:
-        """(n, 2) positions along the wall and up the wall, m."""
+        """(n, 2) positions along the wall and up the wall, m.
+
+        They stand for the position in the field of view, because the cameras are unknown.
+        """
         return np.asarray(self.point[:, :2])
 
     def part(self, rows: Rows) -> SurfaceGeometry:
@@ -72,16 +77,17 @@ class SurfaceGeometry(SurfacePlaces):
 
 @dataclass(frozen=True)
 class SurfaceResiduals(Residuals):
-    """Residuals of a cloud without cameras: distances from the reference along its normal, m, positive out of the rock.
+    """Residuals of a photogrammetric cloud without cameras: distances from the reference along its normal, m.
 
-    The pose Jacobian is evaluated at the places on the reference, because the noise of the points would bias the scale. Further
-    attributes are those of `Residuals`.
+    They are positive out of the rock. The class has all attributes of `Residuals`; those that differ are described here.
 
     Attributes
     ----------
     geometry : For each point the place on the reference below it.
-    pose_jacobian : (n, k) derivatives by those k combinations of shift, rotation and scale that the reference can determine.
-    datum : (7, k) these combinations in terms of shift (m), rotation (rad) and scale.
+    pose_jacobian : (n, k) derivatives of the distances by the cloud's datum: those k combinations of shift, rotation and scale
+        that the relief of the reference can determine. It is evaluated at the places on the reference, because the noise of the
+        points would bias the scale.
+    datum : (7, k) these combinations, in terms of shift (m), rotation (rad) and scale.
     """
 
     sensor = "stereo"
@@ -94,19 +100,23 @@ class SurfaceResiduals(Residuals):
 
     @property
     def depth_m(self) -> FloatArray:
-        """(n,) -1: a point above the surface lies less deep."""
+        """(n,) change of depth per metre of distance from the reference: -1, as points further out are less deep."""
         return -self.unit_m
 
     @property
     def candidates(self) -> Effects:
-        """Classes of the effects that may be named: only noise in metres, because all others need cameras."""
+        """The effects (error terms) by which the residuals of a cloud without cameras may be explained, as classes.
+
+        Only noise of the points in metres: all other effects need the cameras.
+        """
         return (PointNoise,)
 
 
 def surface_residuals(measurement: SurfaceMeasurement) -> SurfaceResiduals:
-    """Compute the distances of a cloud from the reference, with predicted sigma, covariates and pose Jacobian.
+    """Compute the residuals of a cloud without cameras: the distances of its points from the reference along its normals.
 
-    Points that do not project onto the reference nearby are left out.
+    They come with predicted standard deviations, covariates and the derivatives by the cloud's datum. Points from which a line
+    along the normal does not hit the reference nearby are left out.
     """
     points, model = measurement.cloud.points, measurement.model
     spacing = point_spacing_m(points)
@@ -146,7 +156,10 @@ def _varying_covariates(geometry: SurfaceGeometry, hit: BoolArray, measurement: 
 
 
 def point_spacing_m(points: FloatArray) -> float:
-    """Return the median distance from a point to its nearest neighbour, m. `points` are (n, 3), m."""
+    """Return the median distance from a point of a cloud to its nearest neighbour, m, from a sample of about 2000 points.
+
+    points: (n, 3), m. With fewer than two points the result is 0.
+    """
     from scipy.spatial import cKDTree
 
     if len(points) < 2:
@@ -221,37 +234,41 @@ def _correlated_noise(model: StereoModel, at: FloatArray, spacing: float) -> Gri
 
 
 def simulate_distances(model: StereoModel, residuals: SurfaceResiduals, random: KeyedRandom) -> FloatArray:
-    """Simulate the distances from the reference that a sensor model gives at the points of a cloud.
+    """Simulate the distances from the reference surface that the points of a cloud have under a sensor model.
 
     Parameters
     ----------
-    model : The sensor model.
-    residuals : Residuals of n points with their places on the reference.
+    model : The sensor model to simulate.
+    residuals : Residuals of n points, with the place on the reference below each.
     random : Source of the random numbers.
 
     Returns
     -------
-    (n,) distances along the normal, m.
+    (n,) distances along the normal, m, positive out of the rock.
     """
     start = RecordedPoints(residuals.geometry, np.zeros(len(residuals)))
     return apply_stage(model.of_points(), Stage.POINT, start, random).above
 
 
 def predicted_sigma(model: StereoModel, residuals: SurfaceResiduals) -> FloatArray:
-    """Return the (n,) standard deviation that a sensor model predicts for the distances of the residuals' points, m."""
+    """Return the (n,) standard deviations of a cloud's distances from the reference that a sensor model predicts, m.
+
+    model: the sensor model. residuals: residuals of the n points, with the place on the reference below each.
+    """
     return np.sqrt(sum((effect.variance(residuals.geometry) for effect in model.of_points()), np.zeros(len(residuals))))
 
 
 def datum_covariance(residuals: SurfaceResiduals, value: FloatArray, rows: BoolArray) -> FloatArray:
     """Estimate the covariance of a cloud's datum (shift, rotation and scale) by a jackknife over wall blocks.
 
-    Blocks are left out as a whole because errors are correlated within them. Without block b the datum changes by -(A - A_b)⁻¹
-    r_b, with A and r the matrix and the right side of the normal equations.
+    A wall block is one of about thirty squares of the wall. Blocks are left out as a whole because errors are correlated within
+    them. Without block b the datum changes by -(A - A_b)⁻¹ r_b, where A is the matrix of the normal equations, and A_b and r_b
+    are the contributions of block b to their matrix and right side.
 
     Parameters
     ----------
-    residuals : Residuals of the cloud.
-    value : (n,) residuals after the alignment, m.
+    residuals : Residuals of the n points of the cloud.
+    value : (n,) distances from the reference after the alignment, m.
     rows : (n,) true for points by which the cloud was aligned.
 
     Returns

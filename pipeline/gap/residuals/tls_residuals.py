@@ -34,13 +34,18 @@ _LEAST_POWER = 1e-9
 
 @dataclass(frozen=True)
 class TlsResiduals(Residuals):
-    """Residuals of a laser scan: measured minus predicted ranges, m. Further attributes are those of `Residuals`.
+    """Residuals of a laser scan: measured minus predicted ranges, m.
+
+    It has all attributes of `Residuals`: values, predicted standard deviations, mask of usable points, pose Jacobian and
+    covariates.
 
     Attributes
     ----------
     geometry : The rays of the points.
-    reference_error_m : Standard deviation of each vertex of the reference along the rays, m.
+    reference_error_m : Standard deviation of the error of each vertex of the reference surface along the rays, m; 0: no such
+        error.
     error_is_relief : Whether that error is mostly relief between the reference's points, which is independent from ray to ray.
+        Otherwise rays that hit neighbouring triangles share the errors of common vertices.
     """
 
     sensor = "tls"
@@ -54,7 +59,7 @@ class TlsResiduals(Residuals):
 
     @property
     def reference_variance(self) -> FloatArray:
-        """(n,) variance of the ranges, m², that independent errors of the reference's vertices cause."""
+        """(n,) part of the ranges' variance due to errors of the reference surface's vertices, m²; 0 without such errors."""
         return _reference_variance(self.reference_error_m, self.geometry)
 
     @property
@@ -74,15 +79,17 @@ class TlsResiduals(Residuals):
         return replace(self, sigma=np.sqrt(variance))
 
     def reference_covariance_with(self, other: NDArray[np.int64]) -> FloatArray:
-        """Return the covariance of two rays that share vertices of the reference.
+        """Return the covariance of each ray's residual with that of another ray that hits a triangle with common vertices.
+
+        Only errors of the reference's vertices are considered.
 
         Parameters
         ----------
-        other : (n,) row of the other ray.
+        other : (n,) for each ray the row number of the other ray.
 
         Returns
         -------
-        (n,) covariances, m².
+        (n,) covariances, m²; 0 without common vertices.
         """
         corner, weight = self.geometry.corner, self.geometry.weight
         if not self.reference_error_m or corner is None or weight is None:
@@ -91,7 +98,10 @@ class TlsResiduals(Residuals):
         return np.asarray(self.reference_error_m**2 * np.einsum("nab,na,nb->n", same, weight, weight[other]))
 
     def draw_reference_error(self, random: KeyedRandom) -> FloatArray:
-        """Draw random errors of the reference's vertices; return the (n,) range errors that they cause, m."""
+        """Simulate errors of the reference surface's vertices, to include them in simulated errors of the ranges.
+
+        random: source of the random numbers. Returns the (n,) range errors of the rays that they cause, m.
+        """
         corner, weight = self.geometry.corner, self.geometry.weight
         if not self.reference_error_m or corner is None or weight is None:
             return np.zeros(len(self))
@@ -102,14 +112,15 @@ class TlsResiduals(Residuals):
 
     @property
     def depth_m(self) -> FloatArray:
-        """(n,) 1: a range grows with the depth."""
+        """(n,) change of depth per metre of range: 1, because a longer range means that rock is missing."""
         return self.unit_m
 
 
 def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
-    """Compute the range residuals of a scan, with predicted sigma, covariates and pose Jacobian.
+    """Compute the residuals of one laser scan: measured ranges minus those to the reference surface under the sensor model.
 
-    Points whose ray misses the reference are left out.
+    They come with predicted standard deviations, covariates and pose Jacobian. Points whose ray misses the reference are left
+    out.
     """
     (position, rotation), model = measurement.station, measurement.model
     azimuth, zenith, measured = recorded_polar(measurement)
@@ -175,7 +186,11 @@ def _reference_variance(error_m: float, geometry: RayGeometry) -> FloatArray:
 
 
 def with_scan_order(measurement: TlsMeasurement) -> TlsMeasurement:
-    """Return the scan with the scan line and the time of each point determined, so that a subsample keeps them."""
+    """Return a laser scan with the scan line and the time of each point determined and stored.
+
+    Call it before the scan is subsampled: a subsample has gaps from which they could not be recovered. Times are shares of the
+    scan's duration, from 0 to 1.
+    """
     if measurement.scans:
         found = [(rows, with_scan_order(one).order or (None, None)) for _, rows, one in measurement.each_scan() if len(rows)]
         line, share = (_assembled([(rows, order[which]) for rows, order in found], len(measurement.scan_of)) for which in (0, 1))
@@ -194,17 +209,23 @@ def _assembled(parts: list[tuple[NDArray[np.int64], FloatArray | None]], count: 
 
 
 def log_over_median(power: FloatArray) -> FloatArray:
-    """Return (n,) the logarithm of received powers (n,) relative to their median."""
+    """Return the logarithm of received powers relative to their median, as a covariate for errors that depend on the intensity.
+
+    power: (n,) received powers, in any unit. Returns (n,) natural logarithms.
+    """
     positive = np.maximum(power, 1e-12)
     return np.asarray(np.log(positive / np.median(positive)), dtype=np.float64)
 
 
 def recorded_polar(measurement: TlsMeasurement) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the recorded directions and ranges of a scan's n points.
+    """Return the directions and ranges that the scanner recorded for the n points of a scan.
+
+    Angles follow the face in which the instrument measured: in face 2 the zenith angle is 2 π minus that of face 1, and the
+    azimuth is larger by π.
 
     Returns
     -------
-    (n,) azimuth without jumps and (n,) zenith angle, rad, as the face of the instrument counts them, and (n,) range, m.
+    (n,) azimuth without jumps by 2 π, (n,) zenith angle, both in rad in the scanner frame, and (n,) range, m.
     """
     position, rotation = measurement.station
     local = np.einsum("ji,nj->ni", rotation, measurement.cloud.points - position)
@@ -288,16 +309,16 @@ def _notes(measurement: TlsMeasurement) -> tuple[str, ...]:
 
 
 def find_expected_pulses(measurement: TlsMeasurement, residuals: TlsResiduals) -> ExpectedPulses | None:
-    """List every pulse of the scan pattern that should hit the wall, and whether it returned; epoch after epoch.
+    """List every pulse of the scan pattern that should hit the wall, and whether it returned, to explain lost returns.
 
     Parameters
     ----------
-    measurement : The scan, with its pattern.
+    measurement : The scan, with its pattern of nominal directions.
     residuals : Residuals of all its points.
 
     Returns
     -------
-    The pulses; None if the pattern is not known.
+    The pulses, epoch after epoch; None if the pattern is not known.
     """
     pattern = measurement.pattern
     if pattern is None:
@@ -325,21 +346,21 @@ def find_expected_pulses(measurement: TlsMeasurement, residuals: TlsResiduals) -
 
 
 def pulse_count(pattern: ScanPattern) -> int:
-    """Return the number of pulses of a scan pattern."""
+    """Return the number of pulses of a scan pattern, a raster of azimuths and zenith angles: lines times pulses in a line."""
     return int(np.prod([len(sweep) for sweep in _sweeps(pattern)]))
 
 
 def pulse_number(pattern: ScanPattern, azimuth: FloatArray, zenith: FloatArray) -> NDArray[np.int64]:
-    """Find the pulse of a scan pattern whose direction is nearest to a recorded one.
+    """Find the pulse of a scan pattern whose nominal direction is nearest to each recorded direction.
 
     Parameters
     ----------
-    pattern : The scan pattern.
-    azimuth, zenith : (n,) recorded directions, rad.
+    pattern : The scan pattern, a raster of azimuths (one scan line each) and zenith angles.
+    azimuth, zenith : (n,) recorded directions, rad, scanner frame.
 
     Returns
     -------
-    (n,) numbers of the pulses, counted line after line.
+    (n,) numbers of the pulses, counted from 0 line after line.
     """
     sweeps = _sweeps(pattern)
     turn = 2 * np.pi * np.round((azimuth.mean() - sweeps[0].mean()) / (2 * np.pi))

@@ -23,13 +23,13 @@ BLOCK_CELLS = 3
 
 @dataclass(frozen=True)
 class WallCells:
-    """Square cells into which the wall is divided, with the points in each.
+    """Square cells into which the wall is divided, for means of residuals over neighbouring points.
 
     Attributes
     ----------
     side_m : Side of a cell, m.
-    cell : (n,) number of each point's cell; -1 in a cell with fewer than three points.
-    centre : (m, 2) mean position of each cell's points, wall frame, m.
+    cell : (n,) number of the cell in which each point lies; -1 for cells with fewer than three points, which are not used.
+    centre : (m, 2) mean position of the points in each of the m used cells, x along the wall and y up, wall frame, m.
     """
 
     side_m: float
@@ -38,7 +38,10 @@ class WallCells:
 
     @classmethod
     def over(cls, at: FloatArray) -> WallCells:
-        """Divide the extent of points (n, 2), wall frame, m, into at most about 800 cells."""
+        """Divide the wall into at most about 800 square cells of equal size that cover the given points.
+
+        at: (n, 2) positions of the points, x along the wall and y up, wall frame, m.
+        """
         side = float(np.sqrt(np.prod(np.ptp(at, axis=0)) / _MOST_CELLS)) or 1.0
         column, row = (np.floor((at[:, axis] - at[:, axis].min()) / side).astype(np.int64) for axis in (0, 1))
         _, number, counts = np.unique(column + 100_000 * row, return_inverse=True, return_counts=True)
@@ -55,34 +58,34 @@ class WallCells:
 
 
 def wall_block_numbers(at: FloatArray, side_m: float) -> NDArray[np.int64]:
-    """Return the number of the wall block that holds each point.
+    """Return the number of the wall block in which each point lies, for spatial cross-validation.
 
-    A wall block is a square of BLOCK_CELLS by BLOCK_CELLS cells, within which residuals may be correlated.
+    A wall block is a square of 3 by 3 cells of the wall. Residuals may be correlated within it, so it is used as a whole.
 
     Parameters
     ----------
-    at : (n, 2) points, wall frame, m.
-    side_m : Side of a cell, m.
+    at : (n, 2) positions of the points, x along the wall and y up, wall frame, m.
+    side_m : Side of a cell, m: a third of the side of a block.
 
     Returns
     -------
-    (n,) numbers.
+    (n,) numbers; they are not consecutive.
     """
     column, row = (np.floor((at[:, axis] - at[:, axis].min()) / (BLOCK_CELLS * side_m)).astype(np.int64) for axis in (0, 1))
     return column + 100_000 * row
 
 
 def wall_blocks_by_points(at: FloatArray, points: float) -> NDArray[np.int64]:
-    """Divide the wall into square wall blocks of about the same number of points.
+    """Divide the wall into square blocks of equal size, chosen so that a block has a given number of points on average.
 
     Parameters
     ----------
-    at : (n, 2) points, wall frame, m.
+    at : (n, 2) positions of the points, x along the wall and y up, wall frame, m.
     points : Mean number of points in a block.
 
     Returns
     -------
-    (n,) number of each point's block, counted from 0.
+    (n,) number of the block in which each point lies, counted from 0.
     """
     side = float(np.sqrt(np.prod(np.ptp(at, axis=0)) / max(len(at) / points, 1.0))) or 1.0
     column, row = (np.floor((at[:, axis] - at[:, axis].min()) / side).astype(np.int64) for axis in (0, 1))
@@ -90,12 +93,14 @@ def wall_blocks_by_points(at: FloatArray, points: float) -> NDArray[np.int64]:
 
 
 def in_validation_blocks(at: FloatArray, side_m: float) -> NDArray[np.bool_]:
-    """Tell which points are kept for validation: those in every fifth wall block, in a knight's-move pattern. No fit uses them.
+    """Tell which points are kept for validation and must not be used in any fit: those in every fifth wall block.
+
+    A wall block is a square of 3 by 3 cells. The blocks are spread evenly (each a knight's move from the next).
 
     Parameters
     ----------
-    at : (n, 2) points, wall frame, m.
-    side_m : Side of a cell, m.
+    at : (n, 2) positions of the points, x along the wall and y up, wall frame, m.
+    side_m : Side of a cell, m: a third of the side of a block.
 
     Returns
     -------
