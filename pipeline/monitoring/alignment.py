@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.change.areas import Area, in_areas
-from pipeline.monitoring.gridding import HeightRaster
+from pipeline.monitoring.gridding import SAMPLE, HeightRaster
 from pipeline.monitoring.unchanged import unchanged_pixels
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import IcpConfig, register_to
@@ -33,8 +33,8 @@ from scene.geometry.mesh import FloatArray
 
 SAME = RigidTransform(np.eye(3), np.zeros(3))
 """No motion."""
-_MOST_REFERENCE, _MOST_MOVING = 400_000, 200_000
-"""Points that ICP works with."""
+_MOST_REFERENCE = 400_000
+"""Points of the reference that ICP works with."""
 _TUKEY = 4.685
 """Tuning constant of Tukey's biweight, in standard deviations: 95 % efficient for normal errors (Huber 1981)."""
 _ROUNDS, _SETTLED_M = 30, 1e-6
@@ -199,7 +199,7 @@ def coarse(surface: ReferenceSurface, points: FloatArray, gsd_m: float, seed: in
         If the points do not overlap the reference.
     """
     config = IcpConfig(outlier_distance_threshold=max(0.1, 3 * gsd_m))
-    moving = points[:: max(len(points) // _MOST_MOVING, 1)]
+    moving = points[:: max(len(points) // SAMPLE, 1)]
     return register_to(surface, moving, config, KeyedRandom(seed)).transform
 
 

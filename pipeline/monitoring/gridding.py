@@ -28,6 +28,8 @@ _PRIOR_POINTS = 4.0
 """Weight of the raster's median variance in that of a pixel, in points: few points tell little of their own scatter."""
 _CHUNK = 4_000_000
 """Points of which sums are taken at a time."""
+SAMPLE = 200_000
+"""Points of an epoch that ICP works with."""
 _BAND = 64
 """Rows to which planes are fitted at a time, so that the sums stay in the processor's cache."""
 
@@ -77,7 +79,7 @@ class WallPoints:
     Attributes
     ----------
     sample : (n, 3) array
-        A subset of the points, spread over all of the epoch, m.
+        A subset of the points for ICP, spread over all of the epoch, m.
     chunks : callable
         Function that yields all points in chunks (k, 3), m, each time it is called.
     """

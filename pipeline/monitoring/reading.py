@@ -17,7 +17,7 @@ from pipeline.formats.points.points import SUFFIXES
 from pipeline.formats.records.result_records import RUN_FILE, read_run
 from pipeline.measurement.reference import DEMS, is_cloud, reference_from_dem
 from pipeline.measurement.scans import read_scans
-from pipeline.monitoring.gridding import WallPoints
+from pipeline.monitoring.gridding import SAMPLE, WallPoints
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.times import EpochTime, check_order, time_of
 from scene.common.errors import InputError
@@ -164,7 +164,8 @@ class EpochData:
             triangles, also on those that are steep in the wall frame.
         """
         if self.mesh is None:
-            return WallPoints(frame.to_wall(self.points), lambda: map(frame.to_wall, self.chunks()))
+            sample = self.points[:: max(len(self.points) // SAMPLE, 1)]
+            return WallPoints(frame.to_wall(sample), lambda: map(frame.to_wall, self.chunks()))
         if several:
             return WallPoints.of(frame.to_wall(_spread_over(self.mesh, gsd_m / 2)))
         from pipeline.change.difference import surface_raster
