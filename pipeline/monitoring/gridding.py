@@ -28,8 +28,8 @@ _PRIOR_POINTS = 4.0
 """Weight of the raster's median variance in that of a pixel, in points: few points tell little of their own scatter."""
 _CHUNK = 4_000_000
 """Points of which sums are taken at a time."""
-SAMPLE = 200_000
-"""Points of an epoch that ICP works with."""
+SAMPLE = 50_000
+"""Points of an epoch that ICP works with: it only brings the epoch near, and is followed by a fit of the rasters."""
 _BAND = 64
 """Rows to which planes are fitted at a time, so that the sums stay in the processor's cache."""
 

@@ -87,12 +87,20 @@ def _changed(means: dict[int, NDArray[np.float32]], unchanged: NDArray[np.bool_]
         if not begun.any():
             continue
         reached = (sign * means[3] > _GROWS * scatter[3]) | begun
-        changed |= ndimage.binary_propagation(begun, mask=reached)
+        changed |= _connected_with(begun, reached)
     return changed
 
 
+def _connected_with(begun: NDArray[np.bool_], reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(h, w) connected parts of `reached` that contain a pixel of `begun`, all of which are in `reached`."""
+    labels, count = ndimage.label(reached)
+    wanted = np.zeros(count + 1, dtype=bool)
+    wanted[labels[begun]] = True
+    return np.asarray(wanted[labels])
+
+
 def _dilated(changed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(h, w) changed places with a margin of `_MARGIN_PX`; faster than a binary dilation, as rows and columns are done in turn."""
+    """(h, w) changed places with a margin of `_MARGIN_PX`, as a binary dilation gives them more slowly."""
     side = 2 * _MARGIN_PX + 1
     return ndimage.maximum_filter(changed.view(np.uint8), side, mode="constant").view(bool)
 
