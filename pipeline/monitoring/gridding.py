@@ -149,8 +149,10 @@ def _add_moments(sums: FloatArray, points: FloatArray, grid: Grid) -> None:
     first = int(pixel.min())
     pixel -= first
     u, v = column - whole_column - 0.5, 0.5 - (row - whole_row)
-    for place, value in enumerate((None, u, v, z, u * u, u * v, v * v, u * z, v * z, z * z)):
-        found = np.bincount(pixel, value)
+    product = whole_row  # its memory is used again
+    for place, factors in enumerate(((), (u,), (v,), (z,), (u, u), (u, v), (v, v), (u, z), (v, z), (z, z))):
+        weights = np.multiply(*factors, out=product) if len(factors) == 2 else factors[0] if factors else None
+        found = np.bincount(pixel, weights)
         sums[place, first : first + len(found)] += found
 
 
