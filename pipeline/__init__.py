@@ -50,6 +50,9 @@ if TYPE_CHECKING:
     from pipeline.api.runs import Run as Run
     from pipeline.api.runs import open_run as open_run
     from pipeline.api.runs import simulate as simulate
+    from pipeline.api.series_plans import SeriesForecast as SeriesForecast
+    from pipeline.api.series_plans import SeriesPlans as SeriesPlans
+    from pipeline.api.series_plans import plan_series as plan_series
     from pipeline.config.simulation import SimulationConfig as SimulationConfig
     from pipeline.dataset.loaders import Sample as Sample
     from pipeline.dataset.loaders import Tiles as Tiles
@@ -71,6 +74,7 @@ _MODULES = {
     "pipeline.api.planning": ("Plans", "SensorPlan", "plan"),
     "pipeline.api.points": ("Points",),
     "pipeline.api.runs": ("Epoch", "Run", "open_run", "simulate"),
+    "pipeline.api.series_plans": ("SeriesForecast", "SeriesPlans", "plan_series"),
     "pipeline.config.simulation": ("SimulationConfig",),
     "pipeline.dataset.loaders": ("Sample", "Tiles"),
 }  # fmt: skip

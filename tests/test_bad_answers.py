@@ -113,7 +113,7 @@ def test_pixels_of_another_picture_are_named() -> None:
 
 def test_an_octree_finer_than_the_points_is_refused() -> None:
     points = np.random.default_rng(1).uniform([0, 0, 0], [10, 10, 0.1], (500, 3))
-    with pytest.raises(InputError, match="of the points' spacing"):
+    with pytest.raises(InputError, match="smaller than the points' spacing"):
         mesh_cloud(points, np.zeros(500, np.int32), np.array([5, 5, 20.0]), SurfaceConfig(method="poisson", poisson_depth=16))
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
 
-from pipeline.change.annotate import BLOCK_CATEGORY
+from pipeline.change.annotate import BLOCK_CATEGORY, KIND_CATEGORIES
 from pipeline.dataset.card import README, write_card
 from pipeline.dataset.folder import CHECKSUMS, Damage, file_damage, tile_files
 from pipeline.dataset.plan import SPLITS, Split
@@ -57,7 +57,8 @@ def assemble(folder: Path, *, complete: bool) -> AssembledSet:
         path = folder / split / ANNOTATIONS
         before = (writer.image, writer.annotation)
         with writing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
-            _write_coco(file, _info(dataset, split, complete), _chained(first, records), writer, statistics, digests)
+            found = _chained(first, records)
+            _write_coco(file, _info(dataset, split, complete), _categories(dataset), found, writer, statistics, digests)
         result.images[split], result.annotations[split] = writer.image - before[0], writer.annotation - before[1]
         digests[f"{split}/{ANNOTATIONS}"] = sha256(path)
     for name in write_card(folder, dataset, statistics, digests, complete=complete):
@@ -154,9 +155,16 @@ def _info(dataset: Record, split: Split, complete: bool) -> dict[str, Any]:
     }
 
 
+def _categories(dataset: Record) -> list[dict[str, Any]]:
+    """Return COCO's categories: of missing, moved and deposited rock if a time series distinguishes them, else the only one."""
+    walls = (wall for source in dataset["sources"].values() for wall in source["config"]["walls"].values())
+    return KIND_CATEGORIES if any((wall.get("series") or {}).get("kinds") for wall in walls) else [BLOCK_CATEGORY]
+
+
 def _write_coco(
     file: TextIO,
     info: dict[str, Any],
+    categories: list[dict[str, Any]],
     records: Iterator[Record],
     ids: _LastIds,
     statistics: SetStatistics,
@@ -172,6 +180,8 @@ def _write_coco(
         Where to write.
     info : dict
         Entry `info` of the file.
+    categories : list of dict
+        Categories of the annotations.
     records : iterator of Record
         Records of the tiles.
     ids : _LastIds
@@ -181,7 +191,7 @@ def _write_coco(
     digests : dict
         Checksum of each file by name; added to.
     """
-    head = {"info": info, "licenses": [], "categories": [BLOCK_CATEGORY]}
+    head = {"info": info, "licenses": [], "categories": categories}
     file.write(_compact(head)[:-1] + ',"annotations":[')
     images = []
     separator = "\n"

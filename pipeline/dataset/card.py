@@ -101,6 +101,7 @@ def _readme(
     yield "with their known shape separates from the noise, which is about what any detector could find."
     yield "Niche / box: the share of its bounding box that a niche fills, on average.\n"
     yield from _surfaces(dataset, statistics)
+    yield from _series(dataset)
     yield from (f"![{_in_words(name)}]({name})\n" for name in pictures)
     yield "In the samples, red is missing rock, blue a surface that stands further out; the colours end at six times the noise."
     yield "Black outlines are the annotated masks, grey is no data.\n"
@@ -128,6 +129,19 @@ def _surfaces(dataset: dict[str, Any], statistics: SetStatistics) -> Iterator[st
         "Surfaces: " + "; ".join(f"{words}, of {', '.join(whose)}" for words, whose in _reconstructions(dataset).items()) + ".\n"
     )
     yield from (f"**{warning}**\n" for warning in statistics.warnings())
+
+
+def _series(dataset: dict[str, Any]) -> Iterator[str]:
+    """Say which walls have time series, and what is annotated in them."""
+    walls = {name: wall for source in dataset["sources"].values() for name, wall in source["config"]["walls"].items()}
+    series = {name: wall["series"] for name, wall in walls.items() if wall.get("series")}
+    if not series:
+        return
+    other = "moved blocks and fallen fragments"
+    kinds = any(each["kinds"] for each in series.values())
+    rule = f"{other} have categories of their own" if kinds else f"{other} are changes without an annotation"
+    yield f"The epochs of {', '.join(series)} are those of time series. Rock that has fallen since the reference is annotated;"
+    yield f"{rule}.\n"
 
 
 def _reconstructions(dataset: dict[str, Any]) -> dict[str, list[str]]:

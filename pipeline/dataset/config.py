@@ -97,6 +97,10 @@ class Part(Config):
     test: int = Field(0, ge=0, le=9999, description="test epochs of each combination")
 
 
+MOST_EPOCHS = 100_000
+"""Largest number of epochs in a data set; it keeps a damaged file from causing minutes of work."""
+
+
 class DatasetConfig(Config):
     """Config of a data set of annotated difference map tiles, on which detectors of rockfall are trained and tested."""
 
@@ -149,6 +153,33 @@ class DatasetConfig(Config):
             cells |= found
             self._models_are_there(number, part)
         return self
+
+    @model_validator(mode="after")
+    def _series_fit(self) -> Self:
+        series = {name: wall.series for name, wall in self.walls.items() if wall.series is not None}
+        for name, each in series.items():
+            if each.surfaces:
+                raise ValueError(f"walls.{name}.series.surfaces have no blocks to annotate; use rockfall or events instead")
+        different = [name for name, each in series.items() if each.kinds != next(iter(series.values())).kinds]
+        if different:
+            first = next(iter(series))
+            raise ValueError(f"walls.{first} and walls.{different[0]} differ in series.kinds; set it alike on all walls")
+        epochs = sum(
+            (part.train + part.val + part.test) * len(self.sensors) * len(part.noise) * len(part.sizes) * len(self.steps(wall))
+            for part in self.parts
+            for wall in part.walls
+        )
+        if epochs > MOST_EPOCHS:
+            raise ValueError(f"these are {epochs:,} epochs; allowed: up to {MOST_EPOCHS:,}")
+        return self
+
+    def steps(self, wall: str) -> Sequence[int]:
+        """Return the numbers of the epochs after the reference in the time series of a wall; only 0 on a wall without one.
+
+        wall: name of the wall.
+        """
+        series = self.walls[wall].series
+        return (0,) if series is None else range(1, series.count)
 
     def _models_are_there(self, number: int, part: Part) -> None:
         for sensor in self.sensors:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,12 +24,13 @@ from pipeline.dataset.plan import (
     simulation_of,
     tile_region,
 )
+from pipeline.dataset.series import SeriesWalk, annotated, observe_step, reference_site
 from pipeline.report.progress import Progress
 from pipeline.run.epoch import LaterEpoch, ReferenceEpoch, observe_epoch, observe_reference
 from pipeline.run.site import SensorSite, prepare_site
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
-from scene.geometry.mesh import WALL
+from scene.geometry.mesh import WALL, IntArray
 
 _DRAWS = 5
 """Number of times that an epoch's blocks are drawn if they find no room."""
@@ -45,12 +46,14 @@ class EpochStage:
     reference : The reference epoch, with which the others are compared.
     spacing_m : Spacing of ray-traced samples on the wall, m; None if the surface consists of the wall's own vertices.
     true : Raster of the untouched wall; None unless the config asks for true differences.
+    walk : Follows the wall through the time series of its config; unused without one.
     """
 
     site: SensorSite
     reference: ReferenceEpoch
     spacing_m: float | None
     true: SurfaceRaster | None
+    walk: SeriesWalk
 
 
 @dataclass(frozen=True)
@@ -108,12 +111,13 @@ def _set_up(config: DatasetConfig, epoch: PlannedEpoch, progress: Progress) -> E
     simulation = simulation_of(config, epoch)
     with progress.stage("wall"):
         site = prepare_site(simulation, epoch.sensor, random_of_wall(config, epoch.wall))
-    reference = observe_reference(simulation, site, random_of_reference(config, epoch), progress)
+    before = reference_site(config, epoch, site)
+    reference = observe_reference(simulation, before, random_of_reference(config, epoch), progress)
     true = cast_raster(reference.caster, reference.raster.grid) if config.truth else None
     grid, samples = reference.raster.grid, len(reference.surface.vertices)
     by_vertices = reference.seen is not None and reference.seen.vertices is not None
     spacing = None if by_vertices else float(np.sqrt(grid.width * grid.height / samples) * grid.gsd)
-    return EpochStage(site, replace(reference, seen=None), spacing, true)
+    return EpochStage(site, replace(reference, seen=None), spacing, true, SeriesWalk(config, site))
 
 
 def make_epoch(config: DatasetConfig, epoch: PlannedEpoch, stages: StageCache, progress: Progress) -> MadeEpoch:
@@ -136,16 +140,15 @@ def make_epoch(config: DatasetConfig, epoch: PlannedEpoch, stages: StageCache, p
         grid = stage.reference.raster.grid
         where = tile_region(epoch.split, config.validation_region, grid, config.tiles)
         check_tiles_filled(epoch.split, where, grid, config.tiles)
-        simulation = with_count(simulation_of(config, epoch), block_count(config, epoch.size, grid))
-        found, draw = _observed(config, simulation, epoch, stage, progress)
+        found, shown, draw = _observed(config, epoch, stage, progress)
     except InputError as error:
         raise InputError(f"this epoch of the data set could not be simulated: {error}", where=epoch.name) from None
     with progress.stage("tiles"):
         truth = None if stage.true is None else true_difference(stage.true, found)
-        cut = [tile for tile in _cut(config, found, grid, truth) if where.holds(tile.tile.column, config.tiles.size_px)]
+        cut = [tile for tile in _cut(config, found, shown, truth) if where.holds(tile.tile.column, config.tiles.size_px)]
     if not cut:
         raise no_tile_error(config, epoch, found.difference, grid)
-    return MadeEpoch({**_record(config, epoch, found, simulation), "draw": draw, "spacing_m": stage.spacing_m}, cut)
+    return MadeEpoch({**_record(config, epoch, found), "draw": draw, "spacing_m": stage.spacing_m}, cut)
 
 
 def no_tile_error(config: DatasetConfig, epoch: PlannedEpoch, values: NDArray[np.float32], grid: Grid) -> InputError:
@@ -172,14 +175,31 @@ def no_tile_error(config: DatasetConfig, epoch: PlannedEpoch, values: NDArray[np
     )
 
 
+@dataclass(frozen=True)
+class _Annotated:
+    """What is annotated in an epoch: the label of each pixel, (h, w), 0 for none, and the record of each label's block."""
+
+    labels: IntArray
+    blocks: Mapping[int, dict[str, Any]]
+
+
 def _observed(
-    config: DatasetConfig, simulation: SimulationConfig, epoch: PlannedEpoch, stage: EpochStage, progress: Progress
-) -> tuple[LaterEpoch, int]:
-    """Simulate the epoch, drawing its blocks again if they find no room; return it with the number of the draw."""
+    config: DatasetConfig, epoch: PlannedEpoch, stage: EpochStage, progress: Progress
+) -> tuple[LaterEpoch, _Annotated, int]:
+    """Simulate the epoch; return it with what is annotated in it, and the number of the draw.
+
+    Without a time series, blocks that find no room are drawn again.
+    """
+    simulation = simulation_of(config, epoch)
+    if simulation.series is not None:
+        found, scene = observe_step(stage.walk, stage.reference, epoch, progress)
+        return found, _Annotated(*annotated(found, scene, simulation.series.kinds)), 1
+    simulation = with_count(simulation, block_count(config, epoch.size, stage.reference.raster.grid))
     for draw in range(1, _DRAWS + 1):
         try:
             random = random_of_epoch(config, epoch, draw)
-            return observe_epoch(simulation, stage.site, stage.reference, epoch.number, random, progress), draw
+            found = observe_epoch(simulation, stage.site, stage.reference, epoch.number, random, progress)
+            return found, _Annotated(found.raster.block, dict(enumerate(found.blocks, start=1))), draw
         except InputError:
             if draw == _DRAWS:
                 raise
@@ -200,13 +220,13 @@ def true_difference(wall: SurfaceRaster, epoch: LaterEpoch) -> NDArray[np.float3
     return difference(wall, surface_raster(epoch.carved.mesh, wall.grid))
 
 
-def _cut(config: DatasetConfig, epoch: LaterEpoch, grid: Grid, truth: NDArray[np.float32] | None) -> Iterator[EpochTile]:
+def _cut(config: DatasetConfig, epoch: LaterEpoch, shown: _Annotated, truth: NDArray[np.float32] | None) -> Iterator[EpochTile]:
     """Cut the difference map into tiles with annotations."""
-    labels = np.where(np.isnan(epoch.difference), np.int32(WALL), epoch.raster.block)
-    whole = np.bincount(labels.ravel(), minlength=len(epoch.blocks) + 1)
+    labels = np.where(np.isnan(epoch.difference), np.int32(WALL), shown.labels)
+    whole = np.bincount(labels.ravel())
     size = config.tiles.size_px
-    for tile in tiles(epoch.difference, labels, grid, config.tiles):
-        annotations = [_described(each, epoch.blocks, whole, config) for each in block_annotations(tile.block, config.annotation)]
+    for tile in tiles(epoch.difference, labels, epoch.raster.grid, config.tiles):
+        annotations = [_described(each, shown.blocks, whole, config) for each in block_annotations(tile.block, config.annotation)]
         yield EpochTile(tile, annotations, None if truth is None else _window(truth, tile.row, tile.column, size))
 
 
@@ -217,11 +237,12 @@ def _window(raster: NDArray[np.float32], row: int, column: int, size: int) -> ND
 
 
 def _described(
-    annotation: dict[str, Any], blocks: list[dict[str, Any]], whole: NDArray[np.intp], config: DatasetConfig
+    annotation: dict[str, Any], blocks: Mapping[int, dict[str, Any]], whole: NDArray[np.intp], config: DatasetConfig
 ) -> dict[str, Any]:
     """Add what is known of its block to a COCO annotation; lengths in m, volumes in m^3."""
-    block = blocks[annotation["block"] - 1]
+    block = blocks[annotation["block"]]
     ratio = block["signal_to_noise"]
+    named: dict[str, Any] = {key: block[key] for key in ("category_id", "block") if key in block}
     return annotation | {
         "shape": block["shape"],
         "size_m": [round(value, 5) for value in block["size_m"]],
@@ -231,15 +252,16 @@ def _described(
         "signal_to_noise": ratio,
         "ignore": int(ratio is not None and ratio < config.annotation.ignore_below),
         "share_in_tile": round(annotation["area"] / int(whole[annotation["block"]]), 4),
+        **named,
     }
 
 
-def _record(config: DatasetConfig, epoch: PlannedEpoch, found: LaterEpoch, simulation: SimulationConfig) -> dict[str, Any]:
+def _record(config: DatasetConfig, epoch: PlannedEpoch, found: LaterEpoch) -> dict[str, Any]:
     """Return the epoch's description for its shard."""
     return {
         "epoch": epoch.to_dict(),
         "seed": config.seed,
-        "blocks": simulation.rockfall.count,
+        "blocks": len(found.blocks),
         "registration": None if found.registration is None else found.registration.to_dict(),
         "outside_blocks": found.statistics.outside.to_dict(),
         "inside_blocks": found.statistics.inside.to_dict(),

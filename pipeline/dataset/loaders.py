@@ -75,6 +75,7 @@ class Tiles(Sequence[Sample]):
                     remedy=nearest(key, FILTERS) or "choose one of these filters",
                 )
         content = read_coco(self.folder / "annotations.json")
+        self.categories = content.categories
         self.records = [image for image in content.images if all(image.get(key) == value for key, value in filters.items())]
         if not self.records:
             present = {key: sorted({str(image[key]) for image in content.images if key in image}) for key in filters}

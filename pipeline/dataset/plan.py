@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from pipeline.change.tiles import TileConfig, tile_starts
@@ -28,6 +28,7 @@ class PlannedEpoch:
     sensor, wall, noise, size : The combination of sensor, wall, noise level and size class that it belongs to, by their names.
     number : Number among the epochs of its combination and split, from 1.
     reference : Number of the reference epoch that it is compared with, from 1.
+    step : On a wall with a time series, the number of the epoch in it, from 1; `number` then counts the series. Otherwise 0.
     """
 
     index: int
@@ -38,11 +39,13 @@ class PlannedEpoch:
     size: str
     number: int
     reference: int
+    step: int = 0
 
     @property
     def name(self) -> str:
         """A word that names the epoch in file names, unique in the data set."""
-        return f"{self.wall}_{self.sensor}_{self.noise}_{self.size}_{self.split}{self.number:04d}"
+        step = f"e{self.step:04d}" if self.step else ""
+        return f"{self.wall}_{self.sensor}_{self.noise}_{self.size}_{self.split}{self.number:04d}{step}"
 
     @property
     def stage(self) -> tuple[SensorName, str, str, int]:
@@ -50,14 +53,17 @@ class PlannedEpoch:
         return self.sensor, self.wall, self.noise, self.reference
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields of the planned epoch as a dictionary, for its record."""
-        return asdict(self)
+        """Return the fields of the planned epoch as a dictionary, for its record; `step` only if it is one of a series."""
+        return {key: value for key, value in asdict(self).items() if key != "step" or value}
 
 
 def planned_epochs(config: DatasetConfig) -> list[PlannedEpoch]:
-    """List all epochs that a data set's config asks for, those that share a reference epoch next to each other."""
+    """List all epochs that a data set's config asks for, those that share a reference epoch next to each other.
+
+    On a wall with a time series, each epoch of its config is a whole series, of which all epochs after the reference are listed.
+    """
     found = [
-        PlannedEpoch(0, split, sensor, wall, noise, size, number, (number - 1) % config.references + 1)
+        PlannedEpoch(0, split, sensor, wall, noise, size, number, (number - 1) % config.references + 1, step)
         for part in config.parts
         for sensor in config.sensors
         for wall in part.walls
@@ -65,10 +71,11 @@ def planned_epochs(config: DatasetConfig) -> list[PlannedEpoch]:
         for size in part.sizes
         for split in SPLITS
         for number in range(1, getattr(part, split) + 1)
+        for step in config.steps(wall)
     ]
     order = {stage: rank for rank, stage in enumerate(dict.fromkeys(epoch.stage[:3] for epoch in found))}
     found.sort(key=lambda epoch: (order[epoch.stage[:3]], epoch.reference))
-    return [PlannedEpoch(**{**epoch.to_dict(), "index": index}) for index, epoch in enumerate(found)]
+    return [replace(epoch, index=index) for index, epoch in enumerate(found)]
 
 
 def simulation_of(config: DatasetConfig, epoch: PlannedEpoch) -> SimulationConfig:
@@ -136,6 +143,15 @@ def random_of_epoch(config: DatasetConfig, epoch: PlannedEpoch, draw: int) -> Ke
     """
     path = epoch.wall, epoch.sensor, epoch.noise, epoch.size, epoch.split
     return KeyedRandom(config.seed).child("dataset", "epoch", *path, "draw", draw)
+
+
+def random_of_series(config: DatasetConfig, epoch: PlannedEpoch) -> KeyedRandom:
+    """Return the random source for the rockfalls, the conditions and the measurements of a data set's time series.
+
+    epoch: an epoch of the series; the source is the same for all of them.
+    """
+    path = epoch.wall, epoch.sensor, epoch.noise, epoch.size, epoch.split
+    return KeyedRandom(config.seed).child("dataset", "series", *path, epoch.number)
 
 
 @dataclass(frozen=True)

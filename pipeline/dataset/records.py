@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, StringConstraints, ValidationError, model_validator
 
-from pipeline.dataset.config import DATASET_FILE
+from pipeline.dataset.config import DATASET_FILE, MOST_EPOCHS
 from pipeline.dataset.plan import Split
 from pipeline.formats.files.atomic import write_json, write_text
 from scene.common.config import parse
@@ -19,8 +19,6 @@ from scene.common.regular_file import read_json, read_text
 SCHEMA = 1
 SHARDS = "shards"
 Record = dict[str, Any]
-_MOST_EPOCHS = 100_000
-"""Largest number of epochs in a set; the limit keeps a damaged file from causing minutes of work."""
 _REMEDY = "restore it from a copy, or make the set again in another folder; tiles and annotations.json are still usable"
 _Fingerprint = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{12}$")]
 _Word = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
@@ -52,7 +50,7 @@ class _DatasetFile(BaseModel):
     fingerprint: str
     complete: bool
     sources: dict[_Fingerprint, _Source] = Field(min_length=1)
-    epochs: dict[_Fingerprint, Annotated[list[NonNegativeInt], Field(max_length=_MOST_EPOCHS)]]
+    epochs: dict[_Fingerprint, Annotated[list[NonNegativeInt], Field(max_length=MOST_EPOCHS)]]
     sha256: str = ""
 
     @model_validator(mode="after")

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.change.annotate import BLOCK_CATEGORY
 from pipeline.dataset.loaders import Sample, Tiles
 from pipeline.export.exported_set import splits_of
 from pipeline.formats.files.atomic import filling, write_text
@@ -111,7 +110,7 @@ def _without_bars(library: Any) -> Iterator[None]:
 
 def _write(library: Any, stem: Path, tiles: Tiles) -> int:
     """Write a split's files; return the number of blocks in them."""
-    features, files, blocks = _features(library), -(-len(tiles) // _TILES_A_FILE), 0
+    features, files, blocks = _features(library, tiles), -(-len(tiles) // _TILES_A_FILE), 0
     for number in range(files):
         some = range(number * _TILES_A_FILE, min((number + 1) * _TILES_A_FILE, len(tiles)))
         rows = [_row(tiles, tiles[index]) for index in some]
@@ -121,13 +120,13 @@ def _write(library: Any, stem: Path, tiles: Tiles) -> int:
     return blocks
 
 
-def _features(library: Any) -> Any:
+def _features(library: Any, tiles: Tiles) -> Any:
     """Return the types of the columns."""
     whole, number, text = (library.Value(kind) for kind in ("int64", "float64", "string"))
     objects = {
         "id": whole,
         "bbox": library.Sequence(number, length=4),
-        "category": library.ClassLabel(names=[BLOCK_CATEGORY["name"]]),
+        "category": library.ClassLabel(names=[str(each.get("name", each["id"])) for each in tiles.categories]),
         "segmentation": text,
         "ignore": whole,
         **dict.fromkeys(_OF_A_BLOCK, number),
@@ -139,11 +138,11 @@ def _features(library: Any) -> Any:
 def _row(tiles: Tiles, sample: Sample) -> dict[str, Any]:
     """Return the row of one tile."""
     record, blocks = sample.record, sample.annotations
-    name = record["file_name"]
+    name, categories = record["file_name"], [each["id"] for each in tiles.categories]
     objects: dict[str, list[Any]] = {
         "id": [each["id"] for each in blocks],
         "bbox": [each["bbox"] for each in blocks],
-        "category": [0] * len(blocks),
+        "category": [categories.index(each["category_id"]) for each in blocks],
         "segmentation": [each["segmentation"]["counts"] for each in blocks],
         "ignore": [each.get("ignore", 0) for each in blocks],
     }

@@ -27,7 +27,7 @@ _LARGEST_INCIDENCE_RAD = np.radians(85)
 
 @dataclass(frozen=True)
 class Curve:
-    """Detection probability of a fallen block as a function of one quantity, such as the range.
+    """Store the detection probability of a fallen block as a function of one quantity, such as the range, to be drawn as a curve.
 
     It is the median over places in the middle of the wall. All other quantities have their values at these places.
 
@@ -36,11 +36,11 @@ class Curve:
     label : str
         The quantity, with its unit.
     x : (k,) array
-        Values of the quantity.
+        Values of the quantity, in this unit.
     at : float
         Value of the quantity in the planned set-up, one of x.
-    probability : dict of (k,) arrays
-        Detection probability at each value, by the side of the block, m.
+    probability : dict of float to (k,) array
+        Key: side of a cubic block, m. Value: the probability, 0 to 1, that its fall is detected, at each x.
     """
 
     label: str
@@ -50,19 +50,21 @@ class Curve:
 
 
 def middle_places(raster: WallRaster, seen: BoolArray) -> BoolArray:
-    """Select places that represent the middle of the wall: at most some hundred that the sensor sees there, evenly spread.
+    """Select places that represent the middle of the wall: at most 201 that the sensor sees there, evenly spread.
+
+    The statements of a plan about a typical place of the wall are medians over these places.
 
     Parameters
     ----------
     raster : WallRaster
-        The wall with its n places.
+        The wall, sampled at n places.
     seen : (n,) bool array
-        Places that the sensor sees.
+        True for places that the sensor sees.
 
     Returns
     -------
     (n,) bool array
-        The selected places.
+        True for the selected places.
     """
     points = raster.places.points[:, :2]
     low, high = points.min(axis=0), points.max(axis=0)
@@ -75,18 +77,18 @@ def middle_places(raster: WallRaster, seen: BoolArray) -> BoolArray:
 
 @dataclass(frozen=True)
 class Views:
-    """The places in the middle of the wall as the sensor sees them, which can be moved to other ranges and angles.
+    """Describe how the sensor sees k places in the middle of the wall, to predict what it would see at other ranges and angles.
 
     Attributes
     ----------
     viewpoint : (3,) array
-        Position of the sensor, wall frame, m.
+        Position of the sensor (of a stereo pair: middle of its base), wall frame, m.
     places : Places
-        The k places.
+        Positions, normals and albedo of the k places.
     aside : (k, 3) array
-        Unit vectors perpendicular to the lines of sight, towards which the normals lean.
+        Unit vectors perpendicular to the lines of sight, in the direction in which the normals deviate from them.
     range_m, incidence_rad : (k,) arrays
-        Range, m, and angle of incidence, rad.
+        Distance from the viewpoint, m, and angle between normal and line of sight, rad.
     """
 
     viewpoint: FloatArray
@@ -97,7 +99,7 @@ class Views:
 
     @classmethod
     def of(cls, places: Places, viewpoint: FloatArray, upright: FloatArray) -> Views:
-        """Describe places as seen from a viewpoint.
+        """Compute range and angle of incidence of places seen from a viewpoint.
 
         Parameters
         ----------
@@ -106,7 +108,7 @@ class Views:
         viewpoint : (3,) array
             Position of the sensor, wall frame, m.
         upright : (3,) array
-            Axis about which a surface is rotated that is seen at normal incidence.
+            Vertical axis of the sensor, wall frame. `seen_at` rotates a place about it that is seen exactly at normal incidence.
         """
         sight = places.points - viewpoint
         distance = np.linalg.norm(sight, axis=1)
@@ -120,14 +122,14 @@ class Views:
         return cls(viewpoint, places, aside, distance, np.arccos(cosine))
 
     def seen_at(self, ratio: float = 1.0, turn_rad: float = 0.0) -> Places:
-        """Return the places moved along their lines of sight and rotated.
+        """Return the places at another range and angle of incidence: moved along their lines of sight and rotated.
 
         Parameters
         ----------
         ratio : float
-            New range over the present one.
+            New range divided by the present range.
         turn_rad : float
-            Increase of the angles of incidence, rad.
+            Amount, rad, that is added to every angle of incidence; the sum is limited to 0 to 85 degrees.
         """
         sight = self.places.points - self.viewpoint
         if turn_rad == 0:
@@ -140,23 +142,24 @@ class Views:
 def probability_curves(
     sampling_of: Callable[[Places], tuple[Sampling, BoolArray]], views: Views, config: PlanningConfig, step: tuple[str, float]
 ) -> list[Curve]:
-    """Compute the detection probability of fallen blocks against range, sampling step and angle of incidence.
+    """Compute how the detection probability of fallen blocks depends on range, sampling step and angle of incidence.
 
     Parameters
     ----------
     sampling_of : callable
-        Function from places to their sampling and a mask of those that the sensor reaches.
+        Function from places to their `Sampling` (density and precision of the points there) and a bool array, True for places
+        within the sensor's reach.
     views : Views
-        The places in the middle of the wall.
+        The places in the middle of the wall, as the sensor sees them.
     config : PlanningConfig
-        Sizes of the blocks and the level of detection.
+        Sizes of the blocks, and settings of the test for a change.
     step : (str, float)
-        Label of the sampling step with its unit, and its value in the planned set-up.
+        Name and unit of the sampling step for the axis of the curve, and its value in the planned set-up.
 
     Returns
     -------
     list of Curve
-        Three curves; none if nothing is seen in the middle of the wall.
+        Three curves, one for each quantity; an empty list if nothing is seen in the middle of the wall.
     """
     if not len(views.range_m):
         return []

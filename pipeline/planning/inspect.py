@@ -25,21 +25,23 @@ _WALL_S, _MAPS_S = 2.0, 4.0
 
 
 def inspect(config: SimulationConfig, sensors: Sequence[SensorName], progress: Progress | None = None) -> list[Plan]:
-    """Predict what each sensor of a config achieves on its wall, with equations instead of a simulation.
+    """Predict how well each sensor of a config would measure its wall, with equations instead of a simulation.
+
+    It is what `scarpsim inspect` computes, to choose a set-up before anything is simulated or measured.
 
     Parameters
     ----------
     config : SimulationConfig
-        The wall, the sensors' places and the settings of the plan.
+        The wall, the sensors and their positions, and the settings of the prediction (section `planning`).
     sensors : sequence of str
         Any of "stereo" and "tls".
     progress : Progress, optional
-        Receives the progress.
+        Object that is told which stage is running, to show it to the user.
 
     Returns
     -------
     list of Plan
-        One plan for each sensor; a scanner with several stations has one for all together and one for each.
+        One plan for each sensor. A scanner with several stations has one plan for all together and one for each.
     """
     progress = progress or Progress()
     progress.plan(
@@ -55,31 +57,31 @@ def inspect(config: SimulationConfig, sensors: Sequence[SensorName], progress: P
 
 
 def write_plans(out: Path, config: SimulationConfig, found: Sequence[Plan], series: Sequence[SeriesPlan] = ()) -> Path:
-    """Write the maps, plan.json and report.html of plans into a folder, which appears when everything has been written.
+    """Write what `inspect` predicts into a folder: a GeoTIFF of each map, plan.json and report.html.
 
-    Maps are named <sensor>_<map>.tif, or <sensor>_station_<n>_<map>.tif for one of several stations; values are SI, in the wall
-    frame.
+    The folder appears only when everything has been written. Maps are named <sensor>_<map>.tif, or
+    <sensor>_station_<n>_<map>.tif for one of several stations. Their values are in SI units, on pixels of the wall frame.
 
     Parameters
     ----------
     out : Path
         Folder to write.
     config : SimulationConfig
-        The config of the plans.
+        The config for which the plans were computed.
     found : sequence of Plan
-        The plans.
+        The plans that `inspect` returned.
     series : sequence of SeriesPlan
-        Predictions for series of epochs, for plan.json and the report.
+        Predictions for series of epochs, which are added to plan.json and the report.
 
     Returns
     -------
     Path
-        Path of the report.
+        Path of report.html.
 
     Raises
     ------
     InputError
-        If the folder is in use.
+        If the folder exists and is not empty, or cannot be written.
     """
     with filling(out) as folder:
         _write(folder, config, found, series)

@@ -34,18 +34,20 @@ _FACES = {1: "", 2: "mean of two faces"}
 
 @dataclass(frozen=True)
 class PlanMap:
-    """A map of one predicted quantity over the wall.
+    """Store a map of one quantity over the wall that is predicted for a sensor, such as the smallest detectable block.
 
     Attributes
     ----------
     name : str
-        Name of its file without ending; it ends with the SI unit.
+        Name of its file without ending. A name that ends with _m or _rad tells the unit of the values.
     title : str
         The quantity, in words.
     values : (n,) array
-        Values at the raster's n places, SI; NaN where there is none.
-    unit, factor : str, float
-        Unit in which reports show it, and the factor from SI to that unit.
+        Values at the n places of the plan's raster, in SI units; NaN where there is no value.
+    unit : str
+        Unit in which reports show the quantity; "" for a ratio.
+    factor : float
+        Factor by which `values` are multiplied to get that unit.
     """
 
     name: str
@@ -56,23 +58,23 @@ class PlanMap:
 
     @property
     def si_unit(self) -> str:
-        """SI unit of the values, taken from the end of the name."""
+        """Unit of the map's values, taken from the end of its name: "m" or "rad", and "1" for numbers without a unit."""
         return next((unit for unit in ("m", "rad") if self.name.endswith(f"_{unit}")), "1")
 
     def summary(self, middle: BoolArray) -> dict[str, float | None]:
-        """Summarise the map by its median in the middle of the wall, and its median and 5 and 95 % quantiles over all of it, SI.
+        """Summarise the map by its median in the middle of the wall, and its median and 5 and 95 % quantiles over the whole wall.
 
-        A place without a value counts as infinite in the middle of the wall, because no block is large enough there.
+        In the middle, a place without a value counts as infinite: in a map of the smallest block, no block is large enough there.
 
         Parameters
         ----------
         middle : (n,) bool array
-            The places in the middle of the wall.
+            True for the places in the middle of the wall.
 
         Returns
         -------
         dict
-            The figures by name; None where there is no value.
+            "middle", "median", "quantile_5" and "quantile_95", in the SI unit of the map; None where there is no value.
         """
         values, centre = self.values[np.isfinite(self.values)], np.nan_to_num(self.values[middle], nan=np.inf)
         there = float(np.median(centre)) if centre.size else np.nan
@@ -87,30 +89,30 @@ class PlanMap:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a sensor is predicted to achieve on a wall.
+    """Store what a sensor is predicted to achieve on a wall: maps, single figures and curves.
 
     Attributes
     ----------
     sensor, instrument : str
         "stereo" or "tls", and a description of the instrument.
     station : int or None
-        Number of the station if a scanner has several; None for the only one and for all together.
+        Number of the scanner's position if there are several; None if there is one, and for the plan of all together.
     wall : str
         Name of the wall.
     raster : WallRaster
-        The n places on the wall.
+        The n places on the wall for which values are predicted.
     maps : list of PlanMap
         Maps of the predicted quantities.
     figures : dict of float
-        Single numbers by name, SI.
+        Single numbers by name, in SI units, such as the share of the wall that is seen.
     curves : list of Curve
-        Detection probability against range, step and incidence.
+        Detection probability of a fallen block against range, sampling step and angle of incidence.
     ignored : list of str
-        Effects of the sensor model that a plan does not take into account.
+        Names of the error sources of the sensor that the prediction does not take into account.
     config : PlanningConfig
-        Settings of the plan.
+        Settings of the prediction.
     in_middle : (n,) bool array
-        The places to which statements about the middle of the wall refer.
+        True for places in the middle of the wall, over which the main statements are medians.
     """
 
     sensor: str
@@ -127,11 +129,11 @@ class Plan:
 
     @property
     def prefix(self) -> str:
-        """Beginning of the names of the plan's files."""
+        """Beginning of the names of this plan's files, such as "tls", or "tls_station_2" for one of several stations."""
         return self.sensor if self.station is None else f"{self.sensor}_station_{self.station}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return everything except the maps' pixels, as plan.json holds it."""
+        """Return the plan as plan.json holds it: figures, curves, settings, and a summary of each map instead of pixels."""
         middle = self.in_middle
         return {
             "sensor": self.sensor,
@@ -155,14 +157,19 @@ class Plan:
 
 
 def plans(config: SimulationConfig, site: SensorSite) -> list[Plan]:
-    """Compute the plan of a sensor; for a scanner with several stations, the plan of all together and then of each.
+    """Predict what one sensor achieves on a wall, as maps, figures and curves.
 
     Parameters
     ----------
     config : SimulationConfig
-        Settings of the plan, and how wet the rock is.
+        Its section `planning` has the settings of the prediction, its section `wetness` says where the rock is wet.
     site : SensorSite
-        The sensor in front of the wall.
+        The wall with the sensor, or the scanner's several stations, in front of it.
+
+    Returns
+    -------
+    list of Plan
+        One plan; for a scanner with several stations, the plan of all together and then one for each.
 
     Raises
     ------
@@ -191,7 +198,12 @@ def _stereo_plan(wall: str, pair: StereoPair, caster: RayCaster, raster: WallRas
     left = found.in_left & visible_from(caster, places, nominal.left.position)
     right = found.in_right & visible_from(caster, places, nominal.right.position)
     both = left & right
-    _require_seen(both, "no part of the wall is seen by both cameras", "cameras")
+    _require_seen(
+        both,
+        "no part of the wall is seen by both cameras",
+        "cameras",
+        "correct position_m and rotation of both cameras so that they look at the front of the wall",
+    )
     middle = middle_places(raster, both)
     sigma = np.sqrt(np.einsum("nii->ni", found.covariance))
     orientation = np.sqrt(np.einsum("nii->ni", found.orientation_covariance))
@@ -242,7 +254,10 @@ def _tls_plan(
     in_sight = visible_from(caster, places, scanner.position)
     seen = in_sight & found.reached
     _require_seen(
-        seen, "no part of the wall is seen by the scanner", "station" if station is None else f"station, number {station}"
+        seen,
+        "no part of the wall is seen by the scanner",
+        "station" if station is None else f"station, number {station}",
+        "correct the scanner's position, rotation, window and range limits so that it sees the front of the wall",
     )
     middle = middle_places(raster, seen)
     sigma = np.sqrt(np.einsum("nii->ni", found.covariance))
@@ -318,14 +333,10 @@ def _ignored(names: Any) -> list[str]:
     return sorted(set(names))
 
 
-def _require_seen(seen: BoolArray, problem: str, where: str) -> None:
-    """Raise InputError if nothing is seen."""
+def _require_seen(seen: BoolArray, problem: str, where: str, remedy: str) -> None:
+    """Raise InputError, with the given texts, if no place is seen."""
     if not seen.any():
-        raise InputError(
-            problem,
-            where=where,
-            remedy="correct position_m and rotation of both cameras so that they look at the front of the wall",
-        )
+        raise InputError(problem, where=where, remedy=remedy)
 
 
 def _map(name: str, title: str, values: FloatArray, seen: BoolArray, unit: str = "", factor: float = 1.0) -> PlanMap:

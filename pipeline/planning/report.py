@@ -13,7 +13,8 @@ import yaml
 from pipeline.formats.files.atomic import write_text
 from pipeline.planning.maps import Plan, PlanMap
 from pipeline.precision.detectability import CLEAR_SNR
-from pipeline.report.figures import CurvePanel, curves_figure, map_figure
+from pipeline.report.curve_figures import CurvePanel, curves_figure
+from pipeline.report.figures import map_figure
 from pipeline.report.page import percent, template
 
 _NOTHING = "\N{EN DASH}"
@@ -67,7 +68,10 @@ class _Part:
 
 
 def summary(plan: Plan) -> str:
-    """Describe a plan as lines of text for the terminal: its single figures and the summaries of its maps."""
+    """Describe a plan (what a sensor is predicted to achieve on a wall) as lines of text for the terminal.
+
+    They are the main result, the single figures, and a table of the maps with medians and 5 and 95 % quantiles.
+    """
     lines = [f"{plan.instrument}, wall {plan.wall}", f"  {answer(plan)}"]
     lines += [f"  {title:<52}{value:>12}" for title, value in _figures(plan)]
     lines.append(f"  {'map':<52}{'middle':>12}{'median':>10}{'5 %':>10}{'95 %':>10}")
@@ -76,7 +80,7 @@ def summary(plan: Plan) -> str:
 
 
 def answer(plan: Plan) -> str:
-    """State the main result of a plan in words: the smallest block that the sensor detects in the middle of the wall."""
+    """State the main result of a plan in words: the smallest block whose fall the sensor detects in the middle of the wall."""
     share = percent(plan.config.probability, 0)
     middle, least = (_in_the_middle(plan, name) for name in ("smallest_block_m", "smallest_findable_m"))
     name = plan.instrument
@@ -97,18 +101,20 @@ def _in_the_middle(plan: Plan, name: str) -> float | None:
 
 
 def write_plan_report(path: Path, plans: Sequence[Plan], config: Mapping[str, Any], series: Sequence[Any] = ()) -> None:
-    """Write report.html of some plans, completely or not at all. Equal arguments give equal bytes.
+    """Write report.html, the page that shows plans: what sensors are predicted to achieve on a wall.
+
+    The file is written completely or not at all. Equal arguments give equal bytes.
 
     Parameters
     ----------
     path : Path
         File to write.
     plans : sequence of Plan
-        The plans.
+        The plans, one or more of the same wall.
     config : mapping
-        The resolved config, which the page lists.
+        The config with all its values, which the page lists.
     series : sequence of SeriesPart
-        What the page shows of predictions for series of epochs.
+        Prepared sections of the page on what series of epochs will show (from `series_parts`).
     """
     page = template("planning/report.html.jinja").render(
         title=f"{plans[0].wall.replace('_', ' ').capitalize()}: a plan",
@@ -151,7 +157,15 @@ def _values(found: PlanMap, figures: Mapping[str, float | None]) -> list[str]:
 
 
 def map_picture(plan: Plan, found: PlanMap) -> bytes:
-    """Draw a map (`found`) of a plan as PNG, in the unit in which reports show it."""
+    """Draw one map of a plan as PNG, with a colour bar in the unit that the map gives for reports.
+
+    Parameters
+    ----------
+    plan : Plan
+        The plan, whose raster says where on the wall the values lie.
+    found : PlanMap
+        The map to draw, one of the plan's.
+    """
     return map_figure(plan.raster.image(found.values * found.factor), plan.raster.grid, found.unit or "ratio", found.title)
 
 

@@ -67,21 +67,21 @@ _CURVE_POINTS = 60
 
 @dataclass(frozen=True)
 class DetectionLaw:
-    """Probability that `monitor` lists a change, by the volume of the rock; from a logistic regression on simulated trial blocks.
+    """Give the probability that `monitor` lists a change of volume V, by a logistic regression on simulated trial blocks.
 
-    The model is logit P = coefficients . (1, ln V, ln u), with the volume V and, for a block that moved, its displacement u. The
-    model of missing rock has no term in u.
+    logit P = coefficients . (1, ln V, ln u), where u is the displacement of a block that has moved. For rock that has fallen
+    the term in u is absent.
 
     Attributes
     ----------
     coefficients : (2,) or (3,) array
         Coefficients of the best fit, for V in m3 and u in m.
     resampled : (b, 2) or (b, 3) array
-        Coefficients fitted to b bootstrap samples of the trial blocks.
+        Coefficients fitted to b bootstrap samples of the trial blocks, for confidence intervals.
     blocks : int
-        Number of trial blocks of which the sensor sees at least half.
+        Number of trial blocks that were used: those of which the sensor sees at least half.
     seen_share : float
-        Their share of all trial blocks.
+        `blocks` divided by the number of all trial blocks.
     """
 
     coefficients: FloatArray
@@ -90,24 +90,44 @@ class DetectionLaw:
     seen_share: float
 
     def probability(self, volume_m3: FloatArray, moved_m: FloatArray | float = 1.0) -> FloatArray:
-        """Return the probability that `monitor` lists a change, (k,), for k volumes of rock.
+        """Return the probability that changes are listed.
 
-        volume_m3: (k,) volumes. moved_m: displacements of blocks that moved, (k,) or one for all; ignored for missing rock.
+        Parameters
+        ----------
+        volume_m3 : (k,) array
+            Volumes of the blocks, m3.
+        moved_m : (k,) array or float
+            How far each block has moved, m; ignored by a law for rock that has fallen.
+
+        Returns
+        -------
+        (k,) array
+            Probabilities, 0 to 1.
         """
         return _logistic(_design(np.asarray(volume_m3), np.asarray(moved_m), len(self.coefficients)) @ self.coefficients)
 
     def volume_m3(self, probability: float = PROBABILITY) -> tuple[float, float, float]:
-        """Return the volume of missing rock, m3, from which on `monitor` lists it with the given probability.
+        """Return the volume of fallen rock, m3, that is listed with a given probability, by default 0.95.
 
-        Returns the volume and the ends of its 95 % interval.
+        The three numbers are the volume and the lower and upper end of its 95 % confidence interval.
         """
         logit = np.log(probability / (1 - probability))
         return _with_interval(self, lambda fit: np.exp((logit - fit[..., 0]) / fit[..., 1]))
 
     def displacement_m(self, volume_m3: float, probability: float = PROBABILITY) -> tuple[float, float, float]:
-        """Return the displacement, m, from which on `monitor` lists a moved block of the given volume with the given probability.
+        """Return how far a block must have moved, m, to be listed with a given probability.
 
-        Returns the displacement and the ends of its 95 % interval.
+        Parameters
+        ----------
+        volume_m3 : float
+            Volume of the block, m3.
+        probability : float
+            Probability of being listed, between 0 and 1.
+
+        Returns
+        -------
+        (float, float, float)
+            The displacement, and the lower and upper end of its 95 % confidence interval.
         """
         logit = np.log(probability / (1 - probability))
         return _with_interval(self, lambda fit: np.exp((logit - fit[..., 0] - fit[..., 1] * np.log(volume_m3)) / fit[..., 2]))
@@ -115,16 +135,18 @@ class DetectionLaw:
 
 @dataclass(frozen=True)
 class EpochPromise:
-    """What `monitor` is predicted to find in an epoch that consists of one or more scans, whose points are joined.
+    """State which changes an epoch is predicted to show if it consists of a given number of scans, whose points are joined.
 
     Attributes
     ----------
     scans : int
-        Number of scans in the epoch; more scans average out noise.
+        Number of scans in the epoch.
     level_m : float
-        Median level of detection of the epoch, m.
-    missing, moved : DetectionLaw
-        Probabilities of detection of missing rock and of blocks that moved.
+        Median level of detection of the epoch's map of changes, m.
+    missing : DetectionLaw
+        Probability that fallen rock is listed, by its volume.
+    moved : DetectionLaw
+        Probability that a block that has moved is listed, by its volume and displacement.
     """
 
     scans: int
@@ -135,22 +157,22 @@ class EpochPromise:
 
 @dataclass(frozen=True)
 class SeriesPlan:
-    """What `monitor` is predicted to find in a planned time series of epochs: rockfalls and, before them, moving blocks.
+    """Store which rockfalls a series of epochs is predicted to show, and how early it shows a moving block.
 
     Attributes
     ----------
     sensor : str
         "stereo" or "tls".
     gsd_m : float
-        Side of a pixel of the maps, m.
+        Side of a pixel of the maps of changes, m.
     every_h : float or None
-        Interval between the epochs in the config, h; None: they are not at equal intervals.
+        Interval between the epochs of the config's series, h; None if it is not regular.
     promises : tuple of EpochPromise
-        What an epoch shows, for each number of scans that it may consist of.
+        What an epoch shows, for each number of scans of which it may consist.
     volumes_m3 : tuple of float
-        Volumes, m3, of moving blocks for which lead times (from notice to fall) are predicted.
+        Volumes, m3, of the moving blocks for which warning times are predicted.
     motion : Motion
-        How such blocks move before they fall.
+        How these blocks move out of the wall before they fall.
     """
 
     sensor: SensorName
@@ -162,15 +184,15 @@ class SeriesPlan:
 
     @property
     def schedules_h(self) -> list[float]:
-        """Intervals between epochs for which lead times (from notice of a moving block to its fall) are predicted, h."""
+        """Intervals between epochs, h, for which warning times are predicted: an hour, a day, a week and the config's own."""
         own = () if self.every_h is None else (self.every_h,)
         return sorted({*SCHEDULES_H, *own})
 
     def lead_h(self, volume_m3: float, every_h: float, promise: EpochPromise) -> tuple[float, float]:
-        """Predict how long before its fall a moving block is noticed, h, as a cautious and a median value.
+        """Return how long before its fall, h, a moving block is noticed: a cautious value and a median value.
 
-        The cautious value is reached in 95 % of cases even if the last epoch was a whole interval ago when the motion became
-        large enough. Both are 0 if the motion is not noticed before the fall.
+        The cautious value is reached in 95 % of cases, even if a whole interval between epochs passes after the block has moved
+        far enough. Both are 0 if the motion is not noticed before the fall.
 
         Parameters
         ----------
@@ -179,14 +201,14 @@ class SeriesPlan:
         every_h : float
             Interval between epochs, h.
         promise : EpochPromise
-            From which displacement on an epoch shows the motion.
+            What an epoch shows, by which the displacement is known from which the motion is noticed.
         """
         late = self.motion.time_left(promise.moved.displacement_m(volume_m3)[0]) - every_h
         usual = self.motion.time_left(promise.moved.displacement_m(volume_m3, 0.5)[0]) - every_h / 2
         return max(late, 0.0), max(usual, late, 0.0)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the prediction for the series as plan.json stores it."""
+        """Return what the series is predicted to show as a dictionary for JSON, as plan.json stores it."""
         return {
             "sensor": self.sensor,
             "gsd_m": self.gsd_m,
@@ -227,21 +249,18 @@ class SeriesPlan:
 
 
 def plan_series(config: SimulationConfig, sensor: SensorName, progress: Progress | None = None) -> SeriesPlan:
-    """Predict which rockfalls and moving blocks `monitor` will find in a planned time series, from simulated trial epochs.
+    """Predict which rockfalls and moving blocks the series of a config will show with a sensor.
+
+    It simulates trial epochs with blocks that have fallen or moved, and compares them with a reference as `monitor` does.
 
     Parameters
     ----------
     config : SimulationConfig
-        Wall, sensor, and a section `series` with rockfalls (not with `surfaces`, the user's own meshes).
+        A config with a section `series` that simulates rockfalls, so without its key `surfaces` (given surfaces of epochs).
     sensor : str
         "stereo" or "tls".
     progress : Progress, optional
-        Receives the progress.
-
-    Returns
-    -------
-    SeriesPlan
-        The prediction.
+        Object that is told which stage is running, to show it to the user.
 
     Raises
     ------
@@ -314,10 +333,10 @@ class _Sample:
         size = 3 if self._moved else 2
         if len(used) < _FEWEST:
             raise InputError(
-                f"the sensor sees enough of only {len(used)} of {len(rows)} blocks that were placed on the wall as a trial",
+                f"of {len(rows)} simulated blocks on the wall, the sensor sees at least half of only {len(used)}",
                 where="inspect --series",
                 allowed=f"{_FEWEST} blocks or more",
-                remedy="move or turn the sensor so that it sees more of the wall; the map of scarpsim inspect shows what it sees",
+                remedy="move or turn the sensor so that it sees more of the wall; a map of `scarpsim inspect` shows what it sees",
             )
         design, listed = _design(used[:, 0], used[:, 1], size), used[:, 3]
         best = _fit(design, listed)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.planning.series import PROBABILITY, EpochPromise, SeriesPlan
-from pipeline.report.figures import CurvePanel, curves_figure
+from pipeline.report.curve_figures import CurvePanel, curves_figure
 from pipeline.report.page import litres, millimetres
 
 _SENSORS = {"tls": "Laser scanner", "stereo": "Stereo pair"}
@@ -17,18 +17,18 @@ _CURVE_POINTS = 80
 
 @dataclass(frozen=True)
 class SeriesPart:
-    """The section of the planning report about one planned time series of epochs.
+    """Hold what report.html of `scarpsim inspect` shows about one series of epochs.
 
     Attributes
     ----------
     title : str
-        Heading.
+        Heading of the section.
     sentences : list of str
-        Main statements.
+        The main statements, such as the smallest rockfall that is listed.
     curves : bytes
-        PNG picture of the probability of detection, by the volume that falls and by the displacement of a moving block.
-    heads, rows : lists
-        Header and rows of a table of moving blocks: from which displacement each shows, and how long before its fall.
+        Picture of the detection probabilities, PNG.
+    heads, rows : list of str, list of lists of str
+        Header and rows of a table: how early moving blocks are noticed, by number of scans, volume and interval.
     """
 
     title: str
@@ -39,7 +39,7 @@ class SeriesPart:
 
 
 def series_summary(plan: SeriesPlan) -> str:
-    """Describe what a planned time series is predicted to show as lines of text for the terminal."""
+    """Describe which rockfalls a series of epochs is predicted to show, and how early, as lines of text for the terminal."""
     part = series_part(plan)
     widths = [max(len(row[place]) for row in [part.heads, *part.rows]) for place in range(len(part.heads))]
     table = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in [part.heads, *part.rows]]
@@ -47,7 +47,7 @@ def series_summary(plan: SeriesPlan) -> str:
 
 
 def series_part(plan: SeriesPlan) -> SeriesPart:
-    """Make the section of the planning report about one planned time series."""
+    """Prepare the section of report.html that shows what one series of epochs is predicted to detect."""
     return SeriesPart(
         title=f"{_SENSORS[plan.sensor]}, series, maps of {plan.gsd_m * 1e3:g} mm a pixel",
         sentences=_sentences(plan),
@@ -115,5 +115,5 @@ def _hours(hours: float) -> str:
 
 
 def series_parts(plans: Sequence[SeriesPlan]) -> list[SeriesPart]:
-    """Make the sections of the planning report about several planned time series, one each."""
+    """Prepare the sections of report.html for several predicted series of epochs, one for each sensor."""
     return [series_part(plan) for plan in plans]

@@ -30,24 +30,24 @@ _ON_SURFACE_M = 1e-4
 
 @dataclass(frozen=True)
 class Trials:
-    """Results for k simulated blocks: the predicted detection probability, and whether each was detected.
+    """Hold the outcome of k simulated rockfalls, to check predicted detection probabilities.
 
     Attributes
     ----------
     predicted : (k,) array
-        Detection probability by the equations of `detectability`.
+        Detection probability of each block by the equations of `detection_probability`.
     detected : (k,) bool array
-        Whether the simulated change exceeded its level of detection.
+        Whether the simulated change of each block exceeded its level of detection.
     """
 
     predicted: FloatArray
     detected: BoolArray
 
     def score(self) -> float:
-        """Return observed minus expected number of detections, over its standard deviation.
+        """Return the z-score of the number of detections: observed minus predicted number, over its standard deviation.
 
-        Values beyond about 3 in magnitude mean that the prediction is wrong. The standard deviation is that of a sum of
-        independent draws with different probabilities (Poisson binomial).
+        Values beyond about 3 in magnitude mean that the predicted probabilities are wrong. The standard deviation is that of a
+        sum of independent draws with different probabilities (Poisson binomial).
         """
         variance = (self.predicted * (1 - self.predicted)).sum()
         return float((self.detected.sum() - self.predicted.sum()) / np.sqrt(max(variance, 1e-12)))
@@ -64,15 +64,16 @@ def detection_trials(
 ) -> Trials:
     """Check predicted detection probabilities by simulation: carve cubes out of a flat wall and test for a change at each.
 
-    Half of each cube is in the rock. The wall is observed before and after, and the floor of each niche is tested as in
-    `detectability`. A noiseless copy of the sensor tells which cells see the part of the floor that every viewpoint sees.
+    Half of each cube is in the rock, so that its fall leaves a niche (a hole) of half its side in depth. The sensor observes the
+    wall before and after. At the floor of each niche, the change is tested against the level of detection of M3C2. Only points
+    count whose noiseless counterpart lies on the part of the floor that is visible from the scanner or from both cameras.
 
     Parameters
     ----------
     sensor : LaserScanner or StereoPair
-        The sensor.
+        The sensor, with its noise.
     wall : TriangleMesh
-        The flat wall z = 0, wall frame.
+        The flat wall z = 0, wall frame, m.
     side_m : float
         Side of the cubes, m.
     config : PlanningConfig
@@ -82,7 +83,7 @@ def detection_trials(
     count : int
         Number of cubes.
     apart_m : float
-        Distance between cubes, m.
+        Least distance between cubes, m.
     """
     blocks = place_blocks(_cubes(side_m, count, apart_m), wall, random.child("blocks"))
     centres = blocks.position_m * [1.0, 1.0, 0.0]

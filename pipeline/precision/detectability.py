@@ -56,7 +56,10 @@ _SMALLEST_M, _LARGEST_M, _HALVINGS = 1e-3, 30.0, 13
 
 
 class PlanningConfig(Config):
-    """Settings of `scarpsim inspect`: which maps it makes, and when a fallen block counts as detected."""
+    """Settings of `scarpsim inspect`: which maps it makes, and when a fallen block counts as detected.
+
+    A block is a cube. Its fall leaves a niche (a hole) in the wall, whose floor is compared between the two epochs.
+    """
 
     gsd_m: float | None = Field(None, gt=0, description="side of a map's pixel; none: about 100,000 pixels for the wall [m]")
     image_sigma_px: float = Field(
@@ -78,27 +81,28 @@ class PlanningConfig(Config):
 
 @dataclass(frozen=True)
 class Sampling:
-    """How densely and how precisely a sensor samples a surface at n places; all attributes are (n,) arrays or numbers.
+    """Describe how densely and precisely a sensor samples a surface at n places, to predict which fallen blocks it detects.
 
     The sensor's rays meet the surface in a lattice of points. Directions a and b are two perpendicular ones on the surface. A
-    niche is the hole that a fallen block leaves.
+    niche is the hole that a fallen block leaves. All attributes are (n,) arrays or numbers.
 
     Attributes
     ----------
     step_a, step_b
-        Steps of the lattice along a and b, m.
+        Distance between neighbouring points along a and b, m.
     shadow_a, shadow_b
         Width of the niche's floor that its rim hides along a and b, divided by the niche's depth.
     white
-        Standard deviation of a point's independent error along the normal, m.
+        Standard deviation along the normal of the part of a point's error that is independent from point to point, m.
     slope_a, slope_b
         Tangents along a and b of the angle between the rays and the normal.
     blur_a, blur_b
-        Standard deviation of a point's true position along a and b, m.
+        Standard deviation along a and b of where a ray truly hits the surface, about where it is recorded, m.
     smooth
-        Standard deviation of the grid-correlated error along the normal, averaged over positions, m.
+        Standard deviation along the normal of the grid-correlated part of the error, averaged over positions, m. This part is
+        interpolated between random values at the nodes of a grid.
     grain_a, grain_b
-        Distance between the nodes of the grid-correlated error along a and b, m.
+        Distance between these nodes along a and b, m.
     """
 
     step_a: FloatArray
@@ -116,19 +120,25 @@ class Sampling:
 
 
 def lattice(step_a: FloatArray, step_b: FloatArray, normals: FloatArray, sights: Sequence[FloatArray]) -> dict[str, FloatArray]:
-    """Compute the steps, shadows and slopes of a `Sampling`, by name.
+    """Describe the lattice in which a sensor's rays meet a surface at n places, for a `Sampling`.
 
     An oblique lattice is replaced by the rectangular one of equal area along step_b, the direction of the scan lines or of the
-    image's columns. On a steep wall these run upright, as the sides of the block do.
+    image's columns. On a steep wall these run upright, as the sides of a block do.
 
     Parameters
     ----------
     step_a, step_b : (n, 3) arrays
-        Steps of the lattice on the surface, m.
+        Vectors from a point to the next one on the surface: from line to line (or column to column), and along it, m.
     normals : (n, 3) array
         Unit normals of the surface.
     sights : sequence of (n, 3) arrays
         Vectors from each viewpoint to the places, of any length. The rays of the first viewpoint make the lattice.
+
+    Returns
+    -------
+    dict of (n,) arrays
+        step_a, step_b, m; shadow_a, shadow_b: width of the part of a hole's floor that some viewpoint does not see, divided by
+        the hole's depth; slope_a, slope_b: tangents of the angle between ray and normal.
     """
     length = np.linalg.norm(step_b, axis=1)
     width = np.linalg.norm(np.cross(step_a, step_b), axis=1) / length
@@ -146,24 +156,24 @@ def lattice(step_a: FloatArray, step_b: FloatArray, normals: FloatArray, sights:
 
 
 def detection_probability(sampling: Sampling, side_m: FloatArray | float, config: PlanningConfig) -> FloatArray:
-    """Return the probability that the fall of a cube is detected: the change of the niche's floor exceeds the level of detection.
+    """Predict the probability that a sensor detects the fall of a cube at n places of a wall.
 
-    Change and level of detection are those of M3C2. The probability is the mean over the places of the sampling lattice relative
-    to the niche.
+    The fall counts as detected if the mean change on the floor of the hole that it leaves exceeds the level of detection, as in
+    M3C2 (Lague et al. 2013). The probability is the mean over all positions of the lattice of points relative to the hole.
 
     Parameters
     ----------
     sampling : Sampling
-        How the sensor samples the surface at n places.
+        How densely and precisely the sensor samples the surface at the places.
     side_m : (n,) array or float
         Side of the cube that fell, m.
     config : PlanningConfig
-        Critical value, least number of points and registration error of the test; ratio of the niche's depth to the side.
+        Critical value, least number of points and registration error of the test; ratio of the hole's depth to the side.
 
     Returns
     -------
     (n,) array
-        Probabilities.
+        Probabilities, 0 to 1.
     """
     depth = config.depth_ratio * np.asarray(side_m)
     width_a, width_b = (np.maximum(side_m - depth * shadow, 0.0) for shadow in (sampling.shadow_a, sampling.shadow_b))
@@ -181,63 +191,64 @@ def detection_probability(sampling: Sampling, side_m: FloatArray | float, config
 
 
 def smallest_block(sampling: Sampling, config: PlanningConfig) -> FloatArray:
-    """Return the side of the smallest block that is detected with the probability `config.probability`.
+    """Find the side of the smallest cube whose fall a sensor detects with the probability `config.probability` at n places.
 
     Parameters
     ----------
     sampling : Sampling
-        How the sensor samples the surface at n places.
+        How densely and precisely the sensor samples the surface at the places.
     config : PlanningConfig
-        Critical value, least number of points and registration error of the test; ratio of the niche's depth to the side.
+        Probability, critical value, least number of points and registration error of the test; ratio of the depth of the hole
+        that the cube leaves to its side.
 
     Returns
     -------
     (n,) array
-        Sides, m; NaN if not even a block of 30 m is detected or no floor of its niche is visible.
+        Sides, m; NaN if not even a block of 30 m is detected, or if no part of the hole's floor is visible.
     """
     return _smallest(sampling, lambda side: detection_probability(sampling, side, config) >= config.probability)
 
 
 def smallest_clear_block(sampling: Sampling, config: PlanningConfig) -> FloatArray:
-    """Return the side of the smallest block that stands out from the noise of the whole wall.
+    """Find the side of the smallest cube whose fall stands out from the noise of the whole wall, at n places.
 
-    Its change has a signal-to-noise ratio of CLEAR_SNR. A detector that does not know place and shape of the block needs at least
-    this ratio. Below it, noise somewhere else on the wall looks as much like a block.
+    It is the cube from which on the signal-to-noise ratio of the change is 4 (CLEAR_SNR). A detector that does not know place and
+    shape of the block needs at least this ratio. Below it, noise somewhere else on the wall looks as much like a block.
 
     Parameters
     ----------
     sampling : Sampling
-        How the sensor samples the surface at n places.
+        How densely and precisely the sensor samples the surface at the places.
     config : PlanningConfig
-        Critical value, least number of points and registration error of the test; ratio of the niche's depth to the side.
+        Registration error between the epochs; ratio of the depth of the hole that the cube leaves to its side.
 
     Returns
     -------
     (n,) array
-        Sides, m; NaN as in `smallest_block`.
+        Sides, m; NaN if not even a block of 30 m stands out, or if no part of the hole's floor is visible.
     """
     return _smallest(sampling, lambda side: signal_to_noise(sampling, side, config) >= CLEAR_SNR)
 
 
 def signal_to_noise(sampling: Sampling, side_m: FloatArray | float, config: PlanningConfig) -> FloatArray:
-    """Return the signal-to-noise ratio of a fallen cube: the mean change on the niche's floor over its standard deviation.
+    """Return the signal-to-noise ratio of the fall of a cube: mean change on the floor of its hole over its standard deviation.
 
-    The mean change is the niche's depth times the share of the beams that hit its floor. The standard deviation is that of the
+    The mean change is the hole's depth times the share of the beams that hit its floor. The standard deviation is that of the
     difference of two epochs' means over the floor, including the error of their registration.
 
     Parameters
     ----------
     sampling : Sampling
-        How the sensor samples the surface at n places.
+        How densely and precisely the sensor samples the surface at n places.
     side_m : (n,) array or float
         Side of the cube that fell, m.
     config : PlanningConfig
-        Ratio of the niche's depth to the cube's side, and standard deviation of the registration.
+        Ratio of the hole's depth to the cube's side, and standard deviation of the registration.
 
     Returns
     -------
     (n,) array
-        Ratios, at the mean number of points on the niche's floor; 0 if that number is less than one.
+        Ratios, for the mean number of points on the hole's floor; 0 if that number is less than one.
     """
     depth = config.depth_ratio * np.asarray(side_m)
     width_a, width_b = (np.maximum(side_m - depth * shadow, 0.0) for shadow in (sampling.shadow_a, sampling.shadow_b))

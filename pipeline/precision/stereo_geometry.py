@@ -23,7 +23,7 @@ from sensors.stereo.stereo_pair import REDUCTION, StereoPair
 
 @dataclass(frozen=True)
 class StereoGeometry:
-    """Resolution and precision of a stereo pair at n places, as if nothing obstructed the view.
+    """Store resolution and precision of a stereo pair at n places of a wall, as if nothing obstructed the view.
 
     All attributes are (n,) arrays unless noted.
 
@@ -34,11 +34,11 @@ class StereoGeometry:
     gsd_m
         Ground sampling distance: side of the square that has the area of a pixel of the left image on the surface, m.
     cell_m
-        The same for a cell of the depth map, m.
+        The same for a pixel of the depth map, which may be coarser than the image's, m.
     base_to_distance
-        Base over distance.
+        Distance between the cameras divided by `distance_m`.
     convergence_rad
-        Angle between the two rays, rad.
+        Angle between the rays from both cameras, rad.
     incidence_rad
         Angle of incidence of the more oblique ray, rad.
     covariance : (n, 3, 3)
@@ -47,11 +47,11 @@ class StereoGeometry:
         Covariance of a point from the noise of the cameras' orientation, wall frame, m2. It is common to the whole observation
         and largely removed by the registration.
     normal_sigma_m
-        Standard deviation along the surface's normal from matching and image noise, m.
+        Standard deviation of a point along the surface's normal from matching and image noise, m.
     in_left, in_right
         Whether the place is within the frame of the left and of the right image.
     sampling : Sampling
-        Input of the detection probability.
+        How densely and precisely the pair samples the surface: what `detection_probability` of a fallen block needs.
     """
 
     distance_m: FloatArray
@@ -70,16 +70,18 @@ class StereoGeometry:
 
 @dataclass(frozen=True)
 class DisparityNoise:
-    """Noise of the disparities of a stereo pair, as standard deviations.
+    """Summarise the noise of the disparities of a stereo pair, to predict the precision of its points.
+
+    Grid-correlated noise is interpolated between random values at the nodes of a grid in the image.
 
     Attributes
     ----------
     white : float
-        Noise that is independent from pixel to pixel, px.
+        Standard deviation of the noise that is independent from pixel to pixel, px.
     smooth : float
-        Grid-correlated noise, averaged over positions, px.
+        Standard deviation of the grid-correlated noise, averaged over positions, px.
     step : float
-        Distance between the nodes of the grid-correlated noise, px.
+        Distance between the nodes of the grid-correlated noise, px; infinite if there is none.
     """
 
     white: float
@@ -88,7 +90,10 @@ class DisparityNoise:
 
     @classmethod
     def of(cls, model: StereoModel) -> DisparityNoise:
-        """Combine all noise of a sensor model in quadrature; of several grids, the coarsest step is used."""
+        """Summarise the matching noise of a stereo sensor model, by adding the variances of independent and of correlated noise.
+
+        If several noise terms have grids of nodes, the largest distance between nodes is used.
+        """
         noise = [effect for effect in model.matching_noise if not effect.is_null]
         white, smooth = (sum(each.total_variance for each in noise if each.shared == shared) for shared in (False, True))
         step = max((each.step_px for each in noise if isinstance(each, NodeNoise)), default=np.inf)
@@ -96,16 +101,16 @@ class DisparityNoise:
 
 
 def stereo_geometry(pair: StereoPair, places: Places, image_sigma_px: float = 0.0) -> StereoGeometry:
-    """Compute resolution and precision of a stereo pair at some places of a wall.
+    """Compute resolution and precision of a stereo pair at n places of a wall, by error propagation instead of simulation.
 
     Parameters
     ----------
     pair : StereoPair
-        The pair with its sensor model.
+        The cameras in front of the wall, with their sensor model.
     places : Places
-        n places, wall frame.
+        Positions and normals of the places, wall frame.
     image_sigma_px : float
-        Noise of each coordinate of measured image points, in addition to the sensor model's matching noise, px.
+        Standard deviation of each coordinate of measured image points, in addition to the sensor model's matching noise, px.
     """
     nominal = pair.cameras.in_wall_frame(pair.frame)
     noise = DisparityNoise.of(pair.model)
@@ -187,15 +192,15 @@ def _intersection(nominal: CameraPair, points: FloatArray) -> _Derivatives:
 
 
 def orientation_covariance(pair: StereoPair, points: FloatArray) -> FloatArray:
-    """Compute the covariance of points from the noise of both cameras' orientation, to first order.
+    """Compute the covariance of points of a stereo pair that results from the noise of both cameras' orientation, to first order.
 
-    Each orientation parameter is changed by its standard deviation alone, in each camera or in both alike. The real cameras see
-    the point with the change, the nominal ones intersect its rays without it.
+    Each orientation parameter in turn is changed by its standard deviation, in one camera, or in both if its error is common to
+    them. The point is projected with the change and intersected without it; the shift is one term of the covariance.
 
     Parameters
     ----------
     pair : StereoPair
-        The pair with its sensor model.
+        The cameras in front of the wall, with their sensor model.
     points : (n, 3) array
         Points, wall frame, m.
 

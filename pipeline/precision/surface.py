@@ -25,16 +25,16 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Places:
-    """n places on a surface, wall frame.
+    """Hold n places on a wall, for which the precision of a sensor is predicted. Coordinates are in the wall frame.
 
     Attributes
     ----------
     points : (n, 3) array
         Positions, m.
     normals : (n, 3) array
-        Outward unit normals.
+        Outward unit normals of the surface.
     albedo : (n,) array
-        Albedo.
+        Share of light that the rock reflects, 0 to 1.
     """
 
     points: FloatArray
@@ -42,20 +42,20 @@ class Places:
     albedo: FloatArray
 
     def at(self, chosen: BoolArray) -> Places:
-        """Return the places that a mask (n,) selects."""
+        """Return the places on the wall that a bool mask (n,) selects."""
         return Places(self.points[chosen], self.normals[chosen], self.albedo[chosen])
 
 
 @dataclass(frozen=True)
 class WallRaster:
-    """A wall sampled on a grid, as seen along -z of the wall frame.
+    """Hold a wall sampled at the pixels of a grid, looking along -z of the wall frame, for maps of predicted quantities.
 
     Attributes
     ----------
     grid : Grid
-        The pixels.
+        Size and position of the pixels.
     found : (height, width) bool array
-        True where there is a surface.
+        True where the line of sight meets the surface.
     places : Places
         The n places on the surface at those pixels, row by row.
     """
@@ -65,19 +65,19 @@ class WallRaster:
     places: Places
 
     def image(self, values: NDArray[np.generic]) -> FloatArray:
-        """Arrange n values of the places as an image (height, width), with NaN where there is no surface."""
+        """Arrange n values, one for each pixel with a surface, as an image (height, width) of the wall with NaN elsewhere."""
         result = np.full(self.grid.shape, np.nan)
         result[self.found] = values
         return result
 
 
 def wall_raster(caster: RayCaster, gsd_m: float | None = None) -> WallRaster:
-    """Sample a wall at the pixels of a grid, looking along -z of the wall frame.
+    """Sample a wall at the pixels of a grid, looking along -z of the wall frame, for maps of predicted quantities.
 
     Parameters
     ----------
     caster : RayCaster
-        The wall, wall frame.
+        Casts rays on the wall's mesh, wall frame.
     gsd_m : float, optional
         Side of a pixel, m; by default chosen for about 100,000 pixels.
 
@@ -114,16 +114,16 @@ def wall_raster(caster: RayCaster, gsd_m: float | None = None) -> WallRaster:
 
 
 def visible_from(caster: RayCaster, places: Places, viewpoint: FloatArray) -> BoolArray:
-    """Return whether each place faces a viewpoint with nothing in between.
+    """Test whether each place on a wall faces a viewpoint with no rock in between.
 
     Parameters
     ----------
     caster : RayCaster
-        The surface, for tests of visibility.
+        Casts rays on the wall's mesh, wall frame.
     places : Places
-        n places on it.
+        The n places, with positions and normals.
     viewpoint : (3,) array
-        The viewpoint, wall frame, m.
+        Position of the camera or scanner, wall frame, m.
 
     Returns
     -------
@@ -143,18 +143,19 @@ def rotate_vectors(matrix: FloatArray, vectors: FloatArray) -> FloatArray:
 
 
 def surface_shift(ray: FloatArray, turn: FloatArray, normals: FloatArray) -> FloatArray:
-    """Return how far the point where a ray hits a plane moves when the direction of the ray changes a little.
+    """Compute how far the point where a ray hits a plane moves when the ray's direction changes a little, for error propagation.
 
-    With the ray c + t r and the plane's normal n: dp = t (dr - r (n . dr) / (n . r)).
+    A point of the ray is c + t r, with origin c, direction r and length t. dr is the change of r, and n the plane's normal. The
+    point moves by dp = t (dr - r (n . dr) / (n . r)).
 
     Parameters
     ----------
     ray : (n, 3) array
-        t r, from the origin c of the ray to the plane, m.
+        t r: vectors from the origin of each ray to its plane, m.
     turn : (n, 3) array
-        t dr, the change of the direction times t, m.
+        t dr: changes of the direction times t, m.
     normals : (n, 3) array
-        Unit normals n of the planes.
+        Unit normals of the planes.
 
     Returns
     -------

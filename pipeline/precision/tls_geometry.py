@@ -22,7 +22,9 @@ _OFTEN = 0.5
 
 @dataclass(frozen=True)
 class TlsGeometry:
-    """Resolution and precision of a scanner station at n places, as if nothing obstructed the view. All are (n,) unless noted.
+    """Store resolution and precision of a laser scanner at n places of a wall, as if nothing obstructed the view.
+
+    All attributes are (n,) arrays unless noted.
 
     Attributes
     ----------
@@ -31,8 +33,8 @@ class TlsGeometry:
     spacing_line_m, spacing_pulse_m
         Point spacing on the surface, from scan line to scan line (azimuth) and from pulse to pulse (zenith), m.
     footprint_m, footprint_long_m
-        Diameter of the beam across its direction, and longest extent of its footprint on the surface, m; 0 if no divergence is
-        given.
+        Diameter of the beam across its direction, and longest extent of its footprint on the surface, m; 0 if the scanner's
+        model gives no divergence.
     range_sigma_m, azimuth_sigma_m, zenith_sigma_m
         Standard deviations of a point along the beam, and across it towards azimuth and zenith, m.
     covariance : (n, 3, 3)
@@ -42,9 +44,9 @@ class TlsGeometry:
     power
         Received power, relative to that of albedo 1 at 100 m and normal incidence.
     reached
-        Whether the place is within the scan window, the range limits and the detection limit.
+        Whether the place is within the scan window and the range limits, and its echo is strong enough to be recorded.
     sampling : Sampling
-        How densely and precisely the station samples the surface: what `detection_probability` of a fallen block needs.
+        How densely and precisely the scanner samples the surface: what `detection_probability` of a fallen block needs.
     """
 
     range_m: FloatArray
@@ -64,20 +66,20 @@ class TlsGeometry:
 
 
 def tls_geometry(scanner: LaserScanner, places: Places) -> TlsGeometry:
-    """Compute resolution and precision of a laser scanner at some places of a wall.
+    """Compute resolution and precision of a laser scanner at n places of a wall, by error propagation instead of simulation.
 
-    With u the beam's direction, e_az and e_ze the unit vectors towards increasing azimuth and zenith, and independent noise
-    of range R and angles, the covariance is s_R^2 u u' + (R sin z s_az)^2 e_az e_az' + (R s_ze)^2 e_ze e_ze'. On a plane, a
-    beam that leaves in another direction than recorded causes the same error along the normal as a point moved across the
-    beam. If two faces are averaged, the mean has half of these variances; each of its beams misses a niche's floor as often
-    as a single one.
+    u is the beam's direction, R the range, z the zenith angle. e_az and e_ze are the unit vectors towards increasing azimuth and
+    zenith. s_R, s_az and s_ze are the standard deviations of range and angles, which are independent. The covariance of a point
+    is then s_R^2 u u' + (R sin z s_az)^2 e_az e_az' + (R s_ze)^2 e_ze e_ze'. On a plane, a beam that leaves in another direction
+    than recorded causes the same error along the normal as a point moved across the beam. If two faces are averaged, the mean
+    has half of these variances.
 
     Parameters
     ----------
     scanner : LaserScanner
-        The scanner with its sensor model.
+        The scanner in front of the wall, with its sensor model.
     places : Places
-        n places, wall frame.
+        Positions, normals and albedo of the places, wall frame.
     """
     effects = scanner.model.chain()
     local = rotate_vectors(scanner.rotation.T, places.points - scanner.position)

@@ -34,18 +34,20 @@ Map = Callable[[Callable[[FloatArray], FloatArray], Iterable[FloatArray]], Itera
 
 @dataclass(frozen=True)
 class ReferenceSurface:
-    """Points of a reference surface with a search tree, to which other points are registered.
+    """Hold the points of a reference surface with a search tree, to which other points are registered by ICP.
+
+    ICP is the iterative closest point algorithm.
 
     Attributes
     ----------
     origin : (3,) array
-        Origin of the local coordinates, m.
+        Centroid of the reference, m, which is subtracted from coordinates to keep them small.
     points : (m, 3) array
-        Points relative to `origin`, m.
+        Reference points relative to `origin`, m.
     normals : (m, 3) array, optional
-        Unit normals; None if they are not known.
+        Unit normals of the points; None if they are not known.
     tree : scipy.spatial.cKDTree
-        Search tree of the points.
+        Search tree of `points`.
     """
 
     origin: FloatArray
@@ -55,14 +57,14 @@ class ReferenceSurface:
 
     @classmethod
     def build(cls, points: FloatArray, normals: FloatArray | None = None) -> ReferenceSurface:
-        """Index the points of a reference once, for any number of registrations to it.
+        """Make the search tree of a reference once, for any number of registrations to it.
 
         Parameters
         ----------
         points : (m, 3) array
-            Points, m.
+            Reference points, m.
         normals : (m, 3) array, optional
-            Normals of any length and sign; only point_to_plane needs them.
+            Their normals, of any length and sign; needed only if ICP minimises point-to-plane distances.
 
         Raises
         ------
@@ -82,10 +84,10 @@ class ReferenceSurface:
     def moments(
         self, blocks: list[FloatArray], pose: RigidTransform, gate: float, normals: FloatArray | None, map_blocks: Map
     ) -> FloatArray:
-        """Pair points with their nearest reference points and sum the products u u^T over the pairs, for normal equations of ICP.
+        """Pair points with their nearest reference points, and sum up what the normal equations of one ICP iteration need.
 
-        Pairs farther apart than `gate` are left out. u is the column vector of one pair of a point p and a reference point q,
-        with g the pose's translation:
+        The sum runs over pairs of a moved point p and a reference point q, at most `gate` apart. It is that of u u^T, where the
+        column vector u of a pair is, with the translation g of the pose,
         with normals n:  ((p - g) x n, n, n . (p - q), 1), so that the result is (8, 8);
         without:         (p - g, q - p, 1), so that it is (7, 7).
         The last element of the result is the number of pairs.
@@ -93,15 +95,15 @@ class ReferenceSurface:
         Parameters
         ----------
         blocks : list of (k, 3) arrays
-            The moving points, m, in blocks that are processed separately.
+            The moving points, m, divided into parts that are processed separately.
         pose : RigidTransform
-            Moves them to coordinates relative to `origin`.
+            Moves these points to the reference's coordinates relative to `origin`.
         gate : float
             Largest distance of a pair, m.
         normals : (m, 3) array, optional
-            The reference's normals, for point_to_plane.
+            The reference's normals, for point-to-plane distances; None for point-to-point distances.
         map_blocks : Map
-            Function that applies another one to all blocks, possibly in threads.
+            Function like the built-in `map`, which may use threads.
         """
 
         def block_moments(block: FloatArray) -> FloatArray:
@@ -132,14 +134,18 @@ def _plane_columns(arm: FloatArray, offset: FloatArray, normal: FloatArray) -> F
 
 
 def blocks_of(points: FloatArray) -> list[FloatArray]:
-    """Divide points (n, 3) into blocks of a fixed size, which are processed separately; the last block is shorter."""
+    """Divide points (n, 3) into consecutive parts of 16,384 points (the last may be shorter), to process them in threads.
+
+    The size is fixed, so that sums do not depend on the number of threads.
+    """
     return [points[start : start + _BLOCK] for start in range(0, len(points), _BLOCK)]
 
 
 def scan_order(points: FloatArray) -> NDArray[np.intp] | slice:
-    """Return an index that sorts points (n, 3) so that neighbours in space are neighbours in memory.
+    """Return an index that sorts points (n, 3) so that neighbours in space are neighbours in memory, for a faster search.
 
-    If the points already are in the order of a sensor's rows, that order is kept; else it is Morton's space-filling curve.
+    Points that are already in such an order, as from a scanner's lines, keep it. Others are sorted along Morton's space-filling
+    curve.
     """
     stride = max(len(points) // _BLOCK, 1)
     steps = np.abs(points[1::stride] - points[:-1:stride]).max(axis=1)
@@ -159,7 +165,7 @@ def _spread_bits(number: NDArray[np.uint32]) -> NDArray[np.uint32]:
 
 
 def checked_cloud(points: FloatArray, name: str) -> FloatArray:
-    """Return points (n, 3) unchanged after checking that they can determine a pose.
+    """Check that points can determine a pose in a registration, and return them as float64.
 
     Parameters
     ----------
@@ -171,7 +177,7 @@ def checked_cloud(points: FloatArray, name: str) -> FloatArray:
     Raises
     ------
     InputError
-        If there are fewer than six points, values that are not finite, or points on one line.
+        If the shape is wrong, or if there are fewer than six points, values that are not finite, or points on one line.
     """
     points = np.ascontiguousarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -181,7 +187,11 @@ def checked_cloud(points: FloatArray, name: str) -> FloatArray:
     finite = np.isfinite(points)
     if not finite.all():
         bad = int((~finite.all(axis=1)).sum())
-        raise InputError(f"{bad:,} of {len(points):,} points are not finite", where=name, remedy="remove them before registering")
+        raise InputError(
+            f"{bad:,} of {len(points):,} points have coordinates that are NaN or infinite",
+            where=name,
+            remedy="remove them before registering",
+        )
     if _on_a_line(points[:: max(len(points) // _BLOCK, 1)]) and _on_a_line(
         points
     ):  # the sample alone may be one column of a grid
@@ -210,6 +220,8 @@ def _unit(normals: FloatArray, count: int) -> FloatArray:
     good = np.isfinite(length) & (length > 0)
     if not good.all():
         raise InputError(
-            f"{int((~good).sum()):,} of {count:,} are zero or not finite", where="reference normals", remedy="remove these points"
+            f"{int((~good).sum()):,} of {count:,} normals are zero, NaN or infinite",
+            where="reference normals",
+            remedy="remove these points and their normals",
         )
     return normals / length[:, None]

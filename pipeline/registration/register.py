@@ -49,7 +49,7 @@ estimated. A wall whose normals vary by less than 1 mrad is a plane.
 
 
 class IcpConfig(Config):
-    """Settings of the iterative closest point algorithm (ICP): eight parameters (thesis, 3.6) and the error to minimise.
+    """Settings of the iterative closest point algorithm (ICP), which moves one point cloud onto another.
 
     `threshold` and `delta_threshold` both end the search, whichever is met first. `threshold` applies to the error of the fit.
     Near the minimum this changes with the square of the motion, so it tells when further iterations no longer pay.
@@ -92,10 +92,10 @@ class IcpConfig(Config):
     subsample_ratio: float = Field(0.9, ge=0, lt=1, description="share of the moving points that subsampling leaves out")
 
     def outlier_threshold_m(self, iteration: int) -> float:
-        """Return the outlier threshold of an iteration, m: T 2^max(k - i, 0).
+        """Return the distance, m, beyond which ICP ignores pairs of points in an iteration: T 2^max(k - i, 0).
 
-        T is `outlier_distance_threshold`, k is `outlier_threshold_decay_iteration`, and i is the number of the iteration, from 1.
-        Without outlier removal the threshold is infinite.
+        T is `outlier_distance_threshold`, k is `outlier_threshold_decay_iteration`, and i is `iteration`, counted from 1. Without
+        outlier removal the distance is infinite.
         """
         if not self.remove_outlier:
             return float("inf")
@@ -104,7 +104,7 @@ class IcpConfig(Config):
 
 @dataclass(frozen=True)
 class IcpIteration:
-    """One iteration of ICP: the pairs of closest points that it found, and the step that it took.
+    """Record one iteration of ICP (iterative closest point): the pairs of points that it found, and the step that it took.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class IcpIteration:
         RMS of the inliers' residuals after the step, with the pairs found before it, m (point_to_plane: to first order in the
         rotation).
     error_m : float
-        The same with every outlier counted at the outlier threshold, m.
+        The same RMS over all points in use, with each outlier's residual set to the outlier threshold, m.
     residual_change_m : float
         RMS over the inliers of the change of their residuals in the step, m.
     step_m : float
@@ -135,19 +135,19 @@ class IcpIteration:
     undetermined: int
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as a dictionary for JSON; an infinite outlier threshold becomes null."""
+        """Return the record of an ICP iteration as a dictionary for JSON; an infinite outlier threshold becomes null."""
         values = dataclasses.asdict(self)
         return values | {"outlier_threshold_m": _finite(self.outlier_threshold_m)}
 
 
 @dataclass(frozen=True)
 class Registration:
-    """Result of a registration: the transform x_reference = R x_moving + t, and how it was found.
+    """Store the result of a registration by ICP: the transform x_reference = R x_moving + t, and how it was found.
 
     Attributes
     ----------
     transform : RigidTransform
-        Transform from moving to reference coordinates.
+        Rotation R and translation t from moving to reference coordinates.
     converged, reason : bool, str
         Whether a convergence threshold was met, and why the search stopped, in words.
     history : tuple of IcpIteration
@@ -161,48 +161,48 @@ class Registration:
 
     @property
     def rotation(self) -> FloatArray:
-        """(3, 3) rotation matrix R from moving to reference coordinates."""
+        """Rotation matrix R (3, 3) of the registration, from moving to reference coordinates."""
         return self.transform.rotation
 
     @property
     def translation(self) -> FloatArray:
-        """(3,) translation t, m."""
+        """Translation t (3,) of the registration in x_reference = R x_moving + t, m."""
         return self.transform.translation
 
     @property
     def iterations(self) -> int:
-        """Number of iterations."""
+        """Number of iterations of the registration."""
         return len(self.history)
 
     @property
     def rms_m(self) -> float:
-        """RMS of the inliers' residuals in the last iteration, m."""
+        """RMS of the inliers' residuals in the last iteration of the registration, m."""
         return self.history[-1].rms_m
 
     @property
     def points(self) -> int:
-        """Number of points in use in the last iteration."""
+        """Number of moving points in use in the last iteration of the registration."""
         return self.history[-1].points
 
     @property
     def inliers(self) -> int:
-        """Number of points within the outlier threshold in the last iteration."""
+        """Number of moving points within the outlier threshold in the last iteration of the registration."""
         return self.history[-1].inliers
 
     @property
     def undetermined(self) -> int:
-        """How many of the six components of the motion the surface does not determine.
+        """How many of the six components of the registration's motion the surface does not determine.
 
-        It is 0 for a rough wall, and 3 for a plane with point_to_plane.
+        It is 0 for a rough wall, and 3 for a plane if point-to-plane distances are minimised.
         """
         return self.history[-1].undetermined
 
     def apply(self, points: FloatArray) -> FloatArray:
-        """Transform moving points (..., 3) to reference coordinates, m."""
+        """Transform points (..., 3) of the moving cloud to reference coordinates by the registration, m."""
         return self.transform.apply(points)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the transform, the outcome and all iterations for JSON."""
+        """Return the registration's transform, its outcome and all iterations as a dictionary for JSON."""
         names = ("rms_m", "iterations", "points", "inliers", "undetermined", "converged", "reason")
         return (
             self.transform.to_dict()
@@ -211,7 +211,7 @@ class Registration:
         )
 
     def summary(self) -> str:
-        """Describe the result on one line for the terminal: residuals, inliers and iterations."""
+        """Describe the registration on one line for the terminal: residuals, inliers and iterations."""
         end = "converged" if self.converged else "not converged"
         return (
             f"{end} after {self.iterations} iterations ({self.reason}), RMS {self.rms_m * 1e3:.2f} mm, "
@@ -221,14 +221,14 @@ class Registration:
 
 @dataclass(frozen=True)
 class FitQuality:
-    """How well points fit a reference surface without being moved.
+    """Store how well points fit a reference surface without being moved.
 
     Attributes
     ----------
     points, inliers : int
-        Number of points, and of those within the outlier threshold.
+        Number of points, and of those closer to the reference than the outlier threshold.
     rms_m : float
-        RMS of the inliers' residuals, m; NaN if there are none.
+        RMS of the inliers' distances from the reference, m; NaN if there are none.
     """
 
     points: int
@@ -252,11 +252,11 @@ def register(
     moving, reference : (n, 3) and (m, 3) arrays
         Points in the same frame, roughly aligned, m, without NaN.
     reference_normals : (m, 3) array or None
-        Normals of any length and sign; may be None for point_to_point.
+        Normals of the reference points, of any length and sign; may be None if `config.method` is point_to_point.
     config : IcpConfig
         Settings of the algorithm.
     random : KeyedRandom
-        Source of the random subsample.
+        Source of random numbers for the subsamples of the moving points.
     threads : int, optional
         Number of threads, by default one per core. It does not affect the result.
 
@@ -272,14 +272,22 @@ def register(
 def register_to(
     surface: ReferenceSurface, moving: FloatArray, config: IcpConfig, random: KeyedRandom, *, threads: int | None = None
 ) -> Registration:
-    """Register a cloud to a reference that is already indexed, which saves time for many registrations to one reference.
+    """Find the rigid transform that brings a cloud to a reference whose search tree exists already, by ICP.
+
+    It saves time over `register` when many clouds are registered to one reference, and raises the same errors.
 
     Parameters
     ----------
     surface : ReferenceSurface
-        The reference.
-    moving, config, random, threads
-        As in `register`, which also lists the errors.
+        The reference points with their search tree, and with normals if `config.method` is point_to_plane.
+    moving : (n, 3) array
+        Points in the frame of the reference, roughly aligned, m, without NaN.
+    config : IcpConfig
+        Settings of the algorithm.
+    random : KeyedRandom
+        Source of random numbers for the subsamples of the moving points.
+    threads : int, optional
+        Number of threads, by default one per core. It does not affect the result.
     """
     normals = _normals(surface, config)
     moving = checked_cloud(moving, "moving points")
@@ -295,13 +303,14 @@ def measure_fit(surface: ReferenceSurface, points: FloatArray, config: IcpConfig
     Parameters
     ----------
     surface : ReferenceSurface
-        The reference.
+        The reference points with their search tree.
     points : (n, 3) array
         Points in the frame of the reference, m.
     config : IcpConfig
-        Its `method` defines the residuals, its final outlier threshold the inliers.
+        Its `method` says whether distances are from points or tangent planes. Points farther than its final outlier threshold
+        are not inliers.
     threads : int, optional
-        Number of threads; it does not affect the result.
+        Number of threads, by default one per core. It does not affect the result.
     """
     normals = _normals(surface, config)
     local = checked_cloud(points, "points") - surface.origin
@@ -320,25 +329,16 @@ def _normals(surface: ReferenceSurface, config: IcpConfig) -> FloatArray | None:
         return None
     if surface.normals is None:
         raise InputError(
-            "point_to_plane needs the reference's normals", where="icp.method", remedy="give them, or set it to point_to_point"
+            "point_to_plane needs the reference's normals", where="icp.method", remedy="give normals, or set point_to_point"
         )
     return surface.normals
 
 
 @dataclass(frozen=True)
 class _Step:
-    """One step of the search.
+    """One step of the search: rotation (3, 3) about the centroid and shift (3,), m; mean square of the residuals after it, m2.
 
-    Attributes
-    ----------
-    rotation, shift : (3, 3) and (3,) arrays
-        Rotation about the centroid, and shift, m.
-    mean_squares : float
-        Mean square of the residuals after the step, m2.
-    residual_change_m : float
-        RMS of the change of the residuals, m.
-    undetermined : int
-        Number of motions that were not estimated.
+    residual_change_m: RMS of the change of the residuals, m; undetermined: number of motions that were not estimated.
     """
 
     rotation: FloatArray
@@ -469,7 +469,7 @@ def _point_step(moments: FloatArray) -> _Step:
     u, singular, vt = np.linalg.svd(spread + cross)
     if not singular[1] > ON_A_LINE * singular[0]:
         raise InputError(
-            "all points within this distance lie on one line", where="icp.outlier_distance_threshold", remedy="use a larger one"
+            "all points this near the reference lie on one line", where="icp.outlier_distance_threshold", remedy="raise it"
         )
     rotation = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
     turn = rotation - np.eye(3)

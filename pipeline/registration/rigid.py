@@ -15,12 +15,12 @@ _AT_ONCE = 1 << 14
 
 @dataclass(frozen=True)
 class RigidTransform:
-    """Rigid transform x' = R x + t of points.
+    """Store a rigid transform x' = R x + t of points.
 
     Attributes
     ----------
     rotation : (3, 3) array
-        Proper rotation matrix R.
+        Rotation matrix R with determinant +1.
     translation : (3,) array
         Translation t, m.
     """
@@ -30,27 +30,27 @@ class RigidTransform:
 
     @classmethod
     def identity(cls) -> RigidTransform:
-        """Return the transform that moves nothing."""
+        """Return the rigid transform that moves nothing."""
         return cls(np.eye(3), np.zeros(3))
 
     @classmethod
     def about(cls, centre: FloatArray, rotation_vector: FloatArray, translation: FloatArray) -> RigidTransform:
-        """Return the transform that rotates about a centre and then shifts: x' = exp(w) (x - centre) + centre + t.
+        """Make the rigid transform that rotates about a centre and then shifts: x' = R (x - centre) + centre + t.
 
         Parameters
         ----------
         centre : (3,) array
             Centre of the rotation, m.
         rotation_vector : (3,) array
-            w: axis times angle, rad; the rotation is counter-clockwise seen against the axis (right-handed).
+            Axis times angle of the rotation R, rad; counter-clockwise if the axis points to the viewer (right-handed).
         translation : (3,) array
-            t, m.
+            Shift t, m.
         """
         rotation = rotation_matrix(rotation_vector)
         return cls(rotation, centre + translation - rotation @ centre)
 
     def apply(self, points: FloatArray) -> FloatArray:
-        """Transform points (..., 3), m; NaN stays NaN."""
+        """Apply the rigid transform to points (..., 3), m; NaN stays NaN."""
         every = points.reshape(-1, 3)
         moved = np.empty(every.shape)
         for start in range(0, len(every), _AT_ONCE):
@@ -60,23 +60,23 @@ class RigidTransform:
         return moved.reshape(points.shape)
 
     def after(self, first: RigidTransform) -> RigidTransform:
-        """Return the transform that applies `first` and then this one."""
+        """Compose two rigid transforms: return the one that applies `first` and then this one."""
         return RigidTransform(self.rotation @ first.rotation, self.rotation @ first.translation + self.translation)
 
     def inverse(self) -> RigidTransform:
-        """Return the inverse transform."""
+        """Return the inverse of the rigid transform."""
         return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
 
     @property
     def rotation_vector(self) -> FloatArray:
-        """(3,) rotation axis times angle, rad, for a rotation by less than pi."""
+        """Axis times angle (3,) of the rotation, rad, for an angle below pi."""
         sine = np.array([self.rotation[i, j] - self.rotation[j, i] for i, j in ((2, 1), (0, 2), (1, 0))]) / 2
         norm = float(np.linalg.norm(sine))
         angle = float(np.arctan2(norm, (np.trace(self.rotation) - 1) / 2))
         return sine * (angle / norm) if norm > 0 else sine
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as a dictionary for JSON: rotation, translation_m and, for readers, rotation_vector_rad."""
+        """Return the rigid transform for JSON: rotation, translation_m and rotation_vector_rad (axis times angle)."""
         return {
             "rotation": self.rotation.tolist(),
             "translation_m": self.translation.tolist(),

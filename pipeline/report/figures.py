@@ -1,4 +1,4 @@
-"""Draw the pictures of reports: hillshades, difference maps, histograms, convergence of the registration; each as PNG bytes.
+"""Draw the maps of reports: hillshades, maps of changes and of other quantities; each as PNG bytes.
 
 Equal arguments give equal bytes. Colours can be distinguished by colour-blind readers (Okabe and Ito's, RdBu for differences).
 """
@@ -6,10 +6,9 @@ Equal arguments give equal bytes. Colours can be distinguished by colour-blind r
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from textwrap import fill
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -25,8 +24,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from pipeline.change.difference import DifferenceStatistics, statistics
-from pipeline.report.plain_text import plain_text, powers_of_ten
+from pipeline.report.plain_text import plain_text
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import WALL, IntArray
 
@@ -49,13 +47,13 @@ _LOW_IN, _BENEATH_IN = 3.6, 0.65
 _FAR_M, _ROUND_M = 1e4, 1e3
 """Coordinates beyond the first value, such as those of a national grid, are given relative to a multiple of the second."""
 _LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _TOP_IN = 0.7, 1.25, 0.6, 0.4
-_OUTSIDE, _INSIDE = "#0072B2", "#D55E00"
+PICTURE_WIDTH_IN = _LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN
+"""Width of a picture that fills the page."""
 FAMILY = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 """Okabe and Ito's colours for families of curves."""
 NO_DATA, _NO_DATA_HILLSHADE = "#b5b5b5", "#c9dced"
 _LIGHT = np.array([-0.5, 0.5, np.sqrt(0.5)])
 """Direction towards the light: from the upper left, 45 degrees above the wall's plane."""
-_BINS = 120
 COLOURS = colormaps["RdBu_r"].resampled(49)
 """Steps of a quarter of a sigma, which the eye cannot distinguish and which make a smaller file."""
 _GREYS = colormaps["gray"].resampled(64)
@@ -76,41 +74,18 @@ _CROWDED = 0.15
 """A map whose median lies within this share of its range from the lower end gets a logarithmic scale."""
 
 
-class Iteration(Protocol):
-    """One iteration of ICP as `convergence_figure` draws it: any object with these attributes."""
-
-    @property
-    def rms_m(self) -> float:
-        """RMS of the inliers' residuals, m."""
-        ...
-
-    @property
-    def inliers(self) -> int:
-        """Number of points within the outlier threshold."""
-        ...
-
-    @property
-    def points(self) -> int:
-        """Number of points."""
-        ...
-
-
-@dataclass(frozen=True)
-class CurvePanel:
-    """One panel of `curves_figure`: curves of shares, 0 to 1, against one quantity (logarithmic: its axis is).
-
-    label, x, at: the quantity with its unit, its values (k,), and its value in the present set-up. curves: shares (k,) by name.
-    """
-
-    label: str
-    x: NDArray[np.floating]
-    at: float
-    curves: Mapping[str, NDArray[np.floating]]
-    logarithmic: bool = False
-
-
 def hillshade_figure(heights: NDArray[np.floating], grid: Grid, title: str = "") -> bytes:
-    """Draw a raster of heights (h, w), m, NaN without data, lit from the upper left."""
+    """Draw the relief of a raster of heights as grey shading, lit from the upper left, and return it as PNG.
+
+    Parameters
+    ----------
+    heights : (h, w) array
+        Heights, m; NaN without data.
+    grid : Grid
+        Size and position of the raster's pixels, wall frame.
+    title : str
+        Title of the picture.
+    """
     heights, pixel = mean_pooled(heights, pooling(grid)), grid.gsd * pooling(grid)
     down, right = np.gradient(heights, pixel) if min(heights.shape) > 1 else (0 * heights, 0 * heights)
     shade = (-_LIGHT[0] * right + _LIGHT[1] * down + _LIGHT[2]) / np.sqrt(
@@ -124,18 +99,20 @@ def hillshade_figure(heights: NDArray[np.floating], grid: Grid, title: str = "")
 
 
 def difference_figure(difference: NDArray[np.floating], grid: Grid, block: IntArray, sigma_m: float, title: str = "") -> bytes:
-    """Draw a difference map on a scale of +-6 sigma, with outlines and numbers of the blocks.
+    """Draw a map of the changes between a reference and an epoch, with outlines and numbers of the blocks that fell, as PNG.
+
+    The colours reach from -6 to +6 times `sigma_m`.
 
     Parameters
     ----------
     difference : (h, w) array
-        Difference, m; NaN without data.
+        Reference minus epoch, m, so that missing rock is positive; NaN without data.
     grid : Grid
-        Its pixels.
+        Size and position of the pixels, wall frame.
     block : (h, w) array
-        Block labels. With more than 200 blocks the numbers are omitted.
+        Number of the block at each pixel; 0 for the wall. With more than 200 blocks the numbers are omitted.
     sigma_m : float
-        Noise of the map, m.
+        Standard deviation of the map's noise, m, greater than 0.
     title : str
         Title of the picture.
     """
@@ -160,7 +137,19 @@ def difference_figure(difference: NDArray[np.floating], grid: Grid, block: IntAr
 
 
 def block_boxes(block: IntArray) -> dict[int, tuple[int, int, int, int]]:
-    """Return left, right, bottom, top of each label's pixels in (h, w), px from the top-left corner; ends are exclusive."""
+    """Find the bounding box of each block's pixels, to place labels and enlarged pictures.
+
+    Parameters
+    ----------
+    block : (h, w) array
+        Number of the block at each pixel; 0 for the wall, which gets no box.
+
+    Returns
+    -------
+    dict
+        Number of the block, and left, right, bottom, top in px from the top-left corner of the raster (right and bottom
+        exclusive).
+    """
     rows, columns = np.nonzero(block != WALL)
     if not len(rows):
         return {}
@@ -178,25 +167,32 @@ def block_boxes(block: IntArray) -> dict[int, tuple[int, int, int, int]]:
 def blocks_figure(
     difference: NDArray[np.floating], grid: Grid, block: IntArray, sigma_m: float, captions: Mapping[int, str]
 ) -> bytes | None:
-    """Draw each block of a difference map enlarged, in a window twice as large as the block; None if there are no blocks.
+    """Draw each block of a map of changes enlarged, in a window twice as large as the block, as PNG.
 
     Parameters
     ----------
-    difference, block : (h, w) arrays
-        Difference, m, and block labels.
+    difference : (h, w) array
+        Reference minus epoch, m; NaN without data.
     grid : Grid
-        Their pixels.
+        Size and position of the pixels.
+    block : (h, w) array
+        Number of the block at each pixel; 0 for the wall.
     sigma_m : float
-        Noise of the map, m, for the colour scale.
+        Standard deviation of the map's noise, m. The colours reach from -6 to +6 times this.
     captions : mapping of int to str
-        Captions by label, in the order in which blocks are shown, at most 24.
+        Captions by number of the block, in the order in which blocks are shown. At most 24 are.
+
+    Returns
+    -------
+    bytes or None
+        The picture; None if none of the blocks is on the map.
     """
     places = block_boxes(block)
     shown = [label for label in captions if label in places][:_MOST_ZOOMED]
     if not shown:
         return None
     rows = -(-len(shown) // _ZOOMS_A_ROW)
-    figure = Figure(figsize=(_LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN, 0.3 + 2.1 * rows), dpi=DPI, layout="constrained")
+    figure = Figure(figsize=(PICTURE_WIDTH_IN, 0.3 + 2.1 * rows), dpi=DPI, layout="constrained")
     limit = SCALE_SIGMAS * sigma_m * 1e3
     for axes, label in zip(figure.subplots(rows, _ZOOMS_A_ROW, squeeze=False).flat, shown, strict=False):
         left, right, bottom, top = places[label]
@@ -218,10 +214,21 @@ def blocks_figure(
 
 
 def map_figure(values: NDArray[np.floating], grid: Grid, label: str, title: str = "") -> bytes:
-    """Draw any quantity over the wall (h, w), in the unit of `label`, NaN without data; colours span its 1 to 99 % quantiles.
+    """Draw a map of any quantity over the wall, such as the point spacing, as PNG.
 
-    The scale is logarithmic if the map would otherwise have nearly one colour. Whole numbers, such as counts, get a colour
-    each. A quantity that is the same everywhere is stated in words instead of a colour bar.
+    Colours span its 1 to 99 % quantiles, on a logarithmic scale if most of the map would otherwise have nearly one colour. Whole
+    numbers, such as counts, get a colour each. A quantity that is the same everywhere is written as text instead.
+
+    Parameters
+    ----------
+    values : (h, w) array
+        Values of the quantity; NaN without data.
+    grid : Grid
+        Size and position of the pixels, wall frame.
+    label : str
+        Unit of the values, as text of the colour bar.
+    title : str
+        Title of the picture.
     """
     known = values[np.isfinite(values)]
     counts = bool(known.size) and np.array_equal(known, np.round(known))
@@ -270,7 +277,7 @@ def _scale(known: NDArray[np.floating]) -> Normalize:
 
 
 def plain_numbers(axis: Axis) -> None:
-    """Label a logarithmic axis at 1, 2, 5, 10, ... with ordinary numbers; over many decades only at 1, 10, ..."""
+    """Label a logarithmic axis with ordinary numbers at 1, 2, 5, 10, 20, ...; from a span of 250 on, only at powers of ten."""
 
     def number(value: float, _: Any) -> str:
         low, high = axis.get_view_interval()
@@ -280,98 +287,6 @@ def plain_numbers(axis: Axis) -> None:
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter(FuncFormatter(number))
     axis.set_minor_formatter(NullFormatter())
-
-
-def curves_figure(panels: Sequence[CurvePanel], y_label: str, title: str = "") -> bytes:
-    """Draw families of curves side by side, in per cent; a dashed line marks the present set-up."""
-    figure = Figure(figsize=(_LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN, 4.0), dpi=DPI, layout="constrained")
-    figure.suptitle(title, fontsize=11)
-    row = np.atleast_1d(figure.subplots(1, len(panels), sharey=True))
-    for axes, panel in zip(row, panels, strict=True):
-        for colour, (name, values) in zip(FAMILY * len(panel.curves), panel.curves.items(), strict=False):
-            axes.plot(panel.x, 100 * np.asarray(values), color=colour, linewidth=1.5, label=name)
-        axes.axvline(panel.at, color="0.3", linewidth=0.8, linestyle="--", label="this set-up")
-        if panel.logarithmic:
-            axes.set_xscale("log")
-            plain_numbers(axes.xaxis)
-        axes.set_ylim(-2, 102)
-        label_axes(axes, panel.label, y_label)
-        axes.label_outer()
-        axes.grid(color="0.9", linewidth=0.6)
-    figure.legend(*row[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=9, frameon=False)
-    return png_bytes(figure)
-
-
-def histogram_figure(outside: NDArray[np.floating], inside: NDArray[np.floating], title: str = "") -> bytes:
-    """Draw histograms of differences, m, outside and inside blocks: linear near the noise, logarithmic over all."""
-    groups = [("outside the blocks", outside, _OUTSIDE), ("inside the blocks", inside, _INSIDE)]
-    samples = [(name, values[~np.isnan(values)] * 1e3, colour) for name, values, colour in groups]
-    figure = Figure(figsize=(_LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN, 4.6), dpi=DPI, layout="constrained")
-    figure.suptitle(title, fontsize=11)
-    noise, whole = figure.subplots(1, 2)
-    _histogram(noise, samples, _noise_range(samples[0][1]))
-    noise.set_title("The noise: linear scale", fontsize=10)
-    _histogram(whole, samples, _whole_range(samples))
-    whole.set_title("Everything: logarithmic scale", fontsize=10)
-    whole.set_yscale("symlog", linthresh=1)
-    powers_of_ten(whole.yaxis)
-    whole.set_ylim(bottom=0)
-    handles = [Patch(color=colour, label=f"{name}\n{_in_words(statistics(values))}") for name, values, colour in samples]
-    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
-    return png_bytes(figure)
-
-
-def convergence_figure(history: Sequence[Iteration], title: str = "") -> bytes:
-    """Draw the RMS of the inliers' residuals and the share of inliers over the iterations of the registration."""
-    iteration = np.arange(1, len(history) + 1)
-    figure = Figure(figsize=(_LEFT_IN + _MAP_WIDTH_IN + _RIGHT_IN, 3.4), dpi=DPI, layout="constrained")
-    figure.suptitle(title, fontsize=11)
-    panels = [
-        ("RMS of the inliers, mm", [step.rms_m * 1e3 for step in history], _OUTSIDE),
-        ("inliers, % of the points", [100 * step.inliers / max(step.points, 1) for step in history], _INSIDE),
-    ]
-    for axes, (label, values, colour) in zip(figure.subplots(1, 2), panels, strict=True):
-        axes.plot(iteration, values, color=colour, marker="o", markersize=3.5, linewidth=1.2)
-        axes.xaxis.get_major_locator().set_params(integer=True)
-        label_axes(axes, "iteration", label)
-        axes.grid(color="0.9", linewidth=0.6)
-    return png_bytes(figure)
-
-
-def _histogram(axes: Axes, samples: Sequence[tuple[str, NDArray[np.floating], str]], limits: tuple[float, float]) -> None:
-    edges = np.linspace(*limits, _BINS + 1)
-    for _, values, colour in samples:
-        counts, _ = np.histogram(values, edges)
-        axes.stairs(counts, edges, fill=True, color=colour, alpha=0.35)
-        axes.stairs(counts, edges, color=colour, linewidth=1.2)
-    axes.axvline(0, color="0.3", linewidth=0.8)
-    axes.set_xlim(limits)
-    label_axes(axes, DIFFERENCE_LABEL, f"pixels per {edges[1] - edges[0]:.3g} mm")
-
-
-def _noise_range(values: NDArray[np.floating]) -> tuple[float, float]:
-    """Return the median plus and minus SCALE_SIGMAS times the NMAD, mm."""
-    found = statistics(values)
-    centre, half = (found.median, SCALE_SIGMAS * found.nmad) if found.count else (0.0, 0.0)
-    return centre - (half or 1.0), centre + (half or 1.0)
-
-
-def _whole_range(samples: Sequence[tuple[str, NDArray[np.floating], str]]) -> tuple[float, float]:
-    values = [values for _, values, _ in samples if len(values)]
-    low = min((float(part.min()) for part in values), default=-1.0)
-    high = max((float(part.max()) for part in values), default=1.0)
-    margin = 0.02 * (high - low) or 1.0
-    return low - margin, high + margin
-
-
-def _in_words(found: DifferenceStatistics) -> str:
-    """Describe the statistics of values in mm."""
-    if not found.count:
-        return "no data"
-    return (
-        f"median {_signed(found.median, 1)}, StD {found.standard_deviation:.1f}, "
-        f"RMSE {found.rmse:.1f}, NMAD {found.nmad:.1f} mm\n{found.count:,} pixels"
-    )
 
 
 def _map_figure(grid: Grid, title: str, *, bar: bool = True, size: float = 1.0) -> tuple[Figure, Axes]:
@@ -393,7 +308,17 @@ def _map_figure(grid: Grid, title: str, *, bar: bool = True, size: float = 1.0) 
 
 
 def label_map_axes(axes: Axes, left: float, bottom: float) -> None:
-    """Label the axes of a map over a wall; coordinates far from zero, m, are relative to round numbers."""
+    """Label the axes of a map over a wall with x and y in metres.
+
+    Coordinates of 10 km and more, such as those of a national grid, are shortened: the label names a round number to add.
+
+    Parameters
+    ----------
+    axes : Axes
+        Matplotlib's axes that show the map.
+    left, bottom : float
+        Smallest x and y of the map, wall frame, m.
+    """
     offsets = [_shortened(axis, low) for axis, low in ((axes.xaxis, left), (axes.yaxis, bottom))]
     far = f" (from x {offsets[0]:,.0f}, y {offsets[1]:,.0f})" if any(offsets) else ""
     label_axes(axes, f"x along the wall, m{far}", "y up the wall, m")
@@ -409,14 +334,25 @@ def _shortened(axis: Axis, low: float) -> float:
 
 
 def colour_bar_position(height_in: float) -> tuple[dict[str, Any], float]:
-    """Return Matplotlib's arguments that place a map's colour bar, and the height that it takes below the map, inches."""
+    """Choose where a map's colour bar goes: to the right of a high map, below a low one, whose side has no room for the label.
+
+    Parameters
+    ----------
+    height_in : float
+        Height of the map, inches.
+
+    Returns
+    -------
+    (dict, float)
+        Arguments for Matplotlib's `colorbar`, and the height that the bar takes below the map, inches; 0 at the right.
+    """
     if height_in < _LOW_IN:
         return {"location": "bottom", "shrink": 0.6, "aspect": 45}, _BENEATH_IN
     return {"location": "right", "shrink": 0.8}, 0.0
 
 
 def label_axes(axes: Axes, x_label: str, y_label: str) -> None:
-    """Label the axes of a picture in the font size that all pictures of the reports share."""
+    """Label the x and y axes of a picture, in the font size that all pictures of the reports share."""
     axes.set_xlabel(x_label, fontsize=9)
     axes.set_ylabel(y_label, fontsize=9)
     axes.tick_params(labelsize=8)
@@ -443,11 +379,11 @@ def _sigma_bar(figure: Figure, axes: Axes, image: AxesImage, sigma_mm: float) ->
     digits = max(0, int(np.ceil(-np.log10(np.diff(ticks).min()) + 0.39)))  # + 0.39, because 2.5 needs one more digit
     sigma = "\N{GREEK SMALL LETTER SIGMA}"
     label = f"{DIFFERENCE_LABEL}; to 6 {sigma}, {sigma} = {sigma_mm:.3g} mm"
-    _colour_bar(figure, axes, image, label, "both").set_ticks(ticks, labels=[_signed(tick, digits) for tick in ticks])
+    _colour_bar(figure, axes, image, label, "both").set_ticks(ticks, labels=[signed(tick, digits) for tick in ticks])
 
 
-def _signed(value: float, digits: int) -> str:
-    """Format a number with its sign, with a true minus, and no sign for zero."""
+def signed(value: float, digits: int) -> str:
+    """Format a number with `digits` decimals and its sign, with a typographic minus sign; a rounded zero has no sign."""
     return f"{value:+.{digits}f}".replace("-", "\N{MINUS SIGN}") if round(value, digits) else f"{0:.{digits}f}"
 
 
@@ -460,12 +396,23 @@ def _no_data_legend(axes: Axes, values: NDArray[np.floating], colour: str, outli
 
 
 def pooling(grid: Grid) -> int:
-    """Return how many pixels of the raster, along a row or column, are averaged to one of the picture."""
+    """Return by which factor a raster is reduced for a picture of at most 2000 pixels a side.
+
+    Blocks of this many by this many pixels are then averaged to one pixel of the picture. 1 means no reduction.
+    """
     return max(1, int(np.ceil(max(grid.width, grid.height) / _WIDEST_PX)))
 
 
 def raster_extent(grid: Grid, shape: tuple[int, ...]) -> tuple[float, float, float, float]:
-    """Return left, right, bottom, top of a pooled raster, wall frame, m."""
+    """Return left, right, bottom, top of a raster that was reduced for a picture, wall frame, m (Matplotlib's `extent`).
+
+    Parameters
+    ----------
+    grid : Grid
+        Size and position of the original pixels.
+    shape : (int, int)
+        Height and width of the reduced raster (see `pooling`), px.
+    """
     pixel = grid.gsd * pooling(grid)
     return grid.x_min, grid.x_min + shape[1] * pixel, grid.y_max - shape[0] * pixel, grid.y_max
 
@@ -478,7 +425,20 @@ def _cells(raster: NDArray[Any], factor: int) -> NDArray[Any]:
 
 
 def mean_pooled(raster: NDArray[np.floating], factor: int) -> NDArray[np.float32]:
-    """Return the mean of each cell of `factor` x `factor` pixels, ignoring NaN."""
+    """Reduce a raster by averaging blocks of `factor` x `factor` pixels, so that it fits a picture.
+
+    Parameters
+    ----------
+    raster : (h, w) array
+        The raster; NaN is ignored in the averages.
+    factor : int
+        Side of the blocks, px. Incomplete blocks at the right and lower edge are left out.
+
+    Returns
+    -------
+    (h // factor, w // factor) array
+        The averages; NaN where a block has no data.
+    """
     if factor == 1:
         return raster.astype(np.float32)
     cells = _cells(raster, factor)
@@ -493,7 +453,7 @@ def _max_pooled(mask: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
 
 
 def png_bytes(figure: Figure) -> bytes:
-    """Return the figure as a PNG file without date or version, so that equal figures give equal bytes."""
+    """Convert a Matplotlib figure to a PNG file without date or version, so that equal figures give equal bytes."""
     buffer = io.BytesIO()
     with plain_text(figure):
         FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None}, pil_kwargs={"compress_level": _COMPRESSION})

@@ -18,23 +18,35 @@ _STEPS = 12
 
 
 def difference_style(raster: Path, limit_m: float) -> None:
-    """Write the style of a difference map: red where rock is missing, colours to +-`limit_m`, legend in mm."""
+    """Write a QGIS style file (.qml) beside a map of changes, so that QGIS opens it in the colours of the reports.
+
+    Red is where rock is missing. The legend is in mm.
+
+    Parameters
+    ----------
+    raster : Path
+        File of the map, whose values are reference minus epoch, m.
+    limit_m : float
+        The colours reach from -limit_m to +limit_m, m.
+    """
     _write(raster, COLOURS, -limit_m, limit_m, lambda value: f"{1e3 * value:+.3g} mm")
 
 
 def quantity_style(raster: Path, values: NDArray[np.floating], unit: str, factor: float = 1.0) -> None:
-    """Write the style of any other map, over the 1 to 99 % quantiles of its values.
+    """Write a QGIS style file (.qml) beside a map of any quantity, so that QGIS opens it in the colours of the reports.
+
+    The colours span the 1 to 99 % quantiles of the values.
 
     Parameters
     ----------
     raster : Path
         File of the map.
     values : array
-        Its values.
+        Values in the file, of any shape; NaN without data.
     unit : str
-        Unit of the legend.
+        Unit that the legend shows.
     factor : float
-        Conversion from the values to `unit`.
+        Factor by which `values` are multiplied for the legend, to get `unit`.
     """
     known = values[np.isfinite(values)]
     low, high = np.quantile(known, [0.01, 0.99]).tolist() if known.size else (0.0, 1.0)

@@ -13,7 +13,10 @@ _BAR = '<progress value="{share:.3f}" max="1" style="width: 20em"></progress> {p
 
 
 class NotebookProgress(Progress):
-    """Shows progress in a notebook as an HTML bar, which is redrawn when a stage begins or advances, and vanishes at the end."""
+    """Show how much of a long computation is done as an HTML bar in a Jupyter notebook.
+
+    The bar is redrawn when a stage begins or advances, and vanishes at the end.
+    """
 
     def __init__(self, display: Any) -> None:
         """Make a bar. display: IPython's function, or one with the same arguments."""
@@ -28,19 +31,25 @@ class NotebookProgress(Progress):
         self._show("")
 
     def plan(self, weights: Mapping[str, float]) -> None:
-        """Set the stages and their weights, and draw the bar."""
+        """Announce the stages of the computation, and draw the bar in the notebook.
+
+        Parameters
+        ----------
+        weights : mapping of str to float
+            Name of each stage, and the seconds that it is expected to take.
+        """
         super().plan(weights)
         self._draw()
 
     @contextmanager
     def stage(self, name: str) -> Iterator[Self]:
-        """Run one stage, with its name beside the bar."""
+        """Mark what is done inside the `with` block as a stage of the computation, and show its name beside the bar."""
         with super().stage(name):
             self._draw()
             yield self
 
     def advance(self, fraction: float) -> None:
-        """Report which fraction of the stage is done, and draw the bar."""
+        """Report which fraction of the current stage is done, 0 to 1, and redraw the bar in the notebook."""
         super().advance(fraction)
         self._draw()
 
@@ -54,9 +63,18 @@ class NotebookProgress(Progress):
 
 
 def python_progress(show: bool | str = "auto") -> Progress:
-    """Return the progress for a call from Python.
+    """Choose how a function that is called from Python shows its progress.
 
-    show: True, False, or "auto": a bar in a notebook and on a terminal, nothing elsewhere.
+    Parameters
+    ----------
+    show : bool or "auto"
+        True: a bar in a notebook or on a terminal, lines of text elsewhere. "auto": the same bars, but nothing elsewhere.
+        False: nothing.
+
+    Returns
+    -------
+    Progress
+        Object that the function tells its stages; to be used in a `with` statement.
     """
     if show is False:
         return Progress()
@@ -68,7 +86,7 @@ def python_progress(show: bool | str = "auto") -> Progress:
 
 
 def in_notebook() -> bool:
-    """Return whether the code runs in a notebook's kernel."""
+    """Return whether the code runs in a Jupyter notebook, where progress is shown as HTML."""
     ipython = sys.modules.get("IPython")
     shell = ipython.get_ipython() if ipython is not None else None
     return shell is not None and hasattr(shell, "kernel")

@@ -17,7 +17,13 @@ _LEAST_P = 0.001
 
 @cache
 def template(name: str) -> jinja2.Template:
-    """Return a template by its path in `pipeline`, with the filters that reports share. It includes style.css."""
+    """Load a Jinja2 template of an HTML report, with the filters that format numbers and embed pictures in all reports.
+
+    Parameters
+    ----------
+    name : str
+        Path of the template, relative to the folder `pipeline` or `pipeline/report`.
+    """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader([_HERE, _HERE.parent]),
         autoescape=True,
@@ -36,19 +42,32 @@ def template(name: str) -> jinja2.Template:
 
 
 def p_value_in_words(p: float | None) -> str:
-    """Format a p-value to the precision that is meaningful: with many pixels, tests give powers of ten that are not."""
+    """Format a p-value for a report: two digits, or "< 0.001"; a dash for None.
+
+    Smaller values are not distinguished, because with many pixels their powers of ten mean nothing.
+    """
     if p is None:
         return _NOTHING
     return f"{p:.2g}" if p >= _LEAST_P else f"< {_LEAST_P:g}"
 
 
 def millimetres(metres: float | None, digits: int = 1) -> str:
-    """Format metres as millimetres; a dash if there is no value."""
+    """Format a length in metres as text in millimetres, with `digits` decimals; a dash for None or NaN."""
     return _NOTHING if metres is None or math.isnan(metres) else f"{with_minus_sign(metres * 1e3, digits)} mm"
 
 
 def percent(ratio: float | None, digits: int = 1, *, signed: bool = False) -> str:
-    """Format a share as per cent; a dash if there is no value."""
+    """Format a ratio for a report as text in per cent; a dash for None or NaN.
+
+    Parameters
+    ----------
+    ratio : float or None
+        The ratio; 1 is 100 %.
+    digits : int
+        Number of decimals.
+    signed : bool
+        Whether a number that is not negative gets a plus sign.
+    """
     if ratio is None or math.isnan(ratio):
         return _NOTHING
     plus = "+" if signed and ratio >= 0 else ""
@@ -56,12 +75,12 @@ def percent(ratio: float | None, digits: int = 1, *, signed: bool = False) -> st
 
 
 def with_minus_sign(value: float, digits: int) -> str:
-    """Format a number with a true minus sign, and none for zero."""
+    """Format a number with `digits` decimals for a report, with a typographic minus sign. A rounded zero has no sign."""
     return f"{value:.{digits}f}".replace("-", "\N{MINUS SIGN}" if round(value, digits) else "")
 
 
 def picture_source(png: bytes) -> str:
-    """Return a PNG as the `src` of an embedded picture."""
+    """Encode a PNG as a data URL for the attribute `src` of an <img> element, so that a report is one file."""
     return f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
 
 
@@ -71,7 +90,7 @@ def _numbers(values: Sequence[float], digits: int = 2, factor: float = 1.0) -> s
 
 
 def litres(cubic_metres: float | None) -> str:
-    """Format cubic metres as litres with three significant digits, which suits a pebble as well as a house."""
+    """Format a volume in cubic metres as a number in litres with three significant digits, without unit; a dash for None."""
     if cubic_metres is None:
         return _NOTHING
     value = 1e3 * cubic_metres

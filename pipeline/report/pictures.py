@@ -10,7 +10,7 @@ from pipeline.report.plain_text import plain_text
 
 
 def png(figure: Figure, dpi: int = 110) -> bytes:
-    """Return the figure as PNG; equal figures give equal bytes."""
+    """Convert a Matplotlib figure to PNG with `dpi` dots per inch. Equal figures give equal bytes."""
     buffer = io.BytesIO()
     with plain_text(figure):
         figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})

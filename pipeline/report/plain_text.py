@@ -17,9 +17,10 @@ _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 @contextmanager
 def plain_text(figure: Figure) -> Iterator[None]:
-    """Draw a figure inside the `with` block without Matplotlib's mathematics. A logarithmic axis needs plain labels.
+    """Show all text of a figure literally while it is drawn inside the `with` block: a $ in a name does not begin a formula.
 
-    Control characters, surrogates and characters that the font lacks become boxes.
+    Characters that cannot be printed or that the font lacks become boxes. Matplotlib writes the labels of a logarithmic axis as
+    formulas, so such an axis needs `powers_of_ten`.
     """
     with rc_context({"text.parse_math": False}), warnings.catch_warnings():  # for tick labels, which are made while drawing
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
@@ -30,12 +31,12 @@ def plain_text(figure: Figure) -> Iterator[None]:
 
 
 def powers_of_ten(axis: Axis) -> None:
-    """Label the ticks of a logarithmic (or symlog) axis 10⁻² ... 10³, and other values as numbers."""
+    """Label the ticks of a logarithmic (or symlog) axis as 10⁻² ... 10³ in plain text, and values between powers as numbers."""
     axis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value)))
     axis.set_minor_formatter(NullFormatter())
 
 
 def power_of_ten(value: float) -> str:
-    """Format a power of ten in Unicode; other values as numbers."""
+    """Format a power of ten in plain text, such as 10⁻²; other values as ordinary numbers."""
     mantissa, exponent = f"{value:.6e}".split("e")
     return f"10{str(int(exponent)).translate(_SUPERSCRIPTS)}" if float(mantissa) == 1 else f"{value:g}"

@@ -24,14 +24,16 @@ _OVERDUE = 2.0
 
 
 class Progress:
-    """Tracks stages without showing them. Use it as a context manager around the stages.
+    """Measure how much of a long computation is done, and how long each of its stages takes, without showing it.
+
+    Subclasses show it. Use it in a `with` statement around the stages; `clock` returns the time in seconds.
 
     Attributes
     ----------
     timings : dict
-        Wall time of each stage, s, summed if it occurs several times.
+        Wall time of each stage, s; the sum if a stage occurs several times.
     current : str
-        The present stage.
+        Name of the stage that is running; "" between stages.
     """
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
@@ -51,11 +53,16 @@ class Progress:
         """Stop showing."""
 
     def plan(self, weights: Mapping[str, float]) -> None:
-        """Announce stages and the seconds that each is expected to take; once one is done, only their ratios matter.
+        """Announce stages that will follow, so that the share done and the remaining time can be estimated.
 
-        Stages that were announced before and are not done remain planned. A plan made on the way divides the remaining share,
-        so that the share done never decreases. A stage that is not in the plan is timed like the others but adds nothing to
-        the share done.
+        Stages that were announced earlier and are not done remain planned. Stages announced after some are done divide the
+        remaining share of the work, so that the share done never decreases. A stage that was not announced is timed, but adds
+        nothing to the share done.
+
+        Parameters
+        ----------
+        weights : mapping of str to float
+            Name of each stage, and the seconds that it is expected to take. Once a stage is done, only their ratios matter.
         """
         self._share_before, self._weight_before = self.share, self._weight_before + self._done()
         left = {name: weight for name, weight in self._weights.items() if name not in self._finished}
@@ -63,7 +70,7 @@ class Progress:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[Self]:
-        """Mark what is done inside the `with` block as the stage `name`. Stages do not nest."""
+        """Mark what is done inside the `with` block as the stage `name` of the computation, and time it. Stages do not nest."""
         self.current, self._stage_began, self._fraction = name, self._clock(), 0.0
         try:
             yield self
@@ -73,31 +80,34 @@ class Progress:
             self.current = ""
 
     def advance(self, fraction: float) -> None:
-        """Report how much of the current stage is done, 0 to 1."""
+        """Report which fraction of the current stage is done, 0 to 1, for the estimate of the remaining time."""
         self._fraction = min(max(fraction, self._fraction), 1.0)
 
     @property
     def elapsed_s(self) -> float:
-        """Wall time since the start, s."""
+        """Wall time since the computation started, s."""
         return self._clock() - self._began
 
     @property
     def share(self) -> float:
-        """Share of all the work that is done, 0 to 1; it never decreases."""
+        """Estimated share of the whole computation that is done, 0 to 1; it never decreases."""
         part = self._done() / (sum(self._weights.values()) or 1.0)
         self._most = max(self._most, self._share_before + (1 - self._share_before) * part)
         return self._most
 
     @property
     def left_s(self) -> float:
-        """Expected remaining wall time at the pace so far, s."""
+        """Expected remaining wall time of the computation, s, if it goes on at its pace so far."""
         done = self._done()
         so_far = self._weight_before + done
         return (sum(self._weights.values()) - done) * (self.elapsed_s / so_far if so_far > 0 else 1.0)
 
     @property
     def time(self) -> str:
-        """The remaining time in words; the elapsed time without a plan, or if the present stage is much slower than expected."""
+        """The remaining time in words, such as "about 40 s left".
+
+        It is the elapsed time instead if no stages were announced, or if the current stage takes much longer than expected.
+        """
         overdue = bool(self._finished) and self._guess() > _OVERDUE
         if self._weights and not overdue:
             return f"about {duration(self.left_s)} left"
@@ -132,7 +142,15 @@ class Progress:
 
 
 class LineProgress(Progress):
-    """Prints progress as plain lines, at most one every few seconds, for log files and pipes."""
+    """Print how much of a long computation is done as lines of text, one every few seconds, for log files and pipes.
+
+    Parameters
+    ----------
+    stream : TextIO
+        Where to print.
+    quiet_s, interval_s : float
+        Time before the first line, and between lines, s.
+    """
 
     def __init__(self, stream: TextIO, quiet_s: float = _QUIET_S, interval_s: float = _INTERVAL_S) -> None:
         super().__init__()
@@ -158,9 +176,19 @@ class LineProgress(Progress):
 
 
 def shown_progress(*, quiet: bool = False, stream: TextIO | None = None) -> Progress:
-    """Return the progress for a command: a bar on a terminal, plain lines elsewhere, nothing if `quiet`.
+    """Choose how a command shows its progress: as a bar on a terminal, as lines of text elsewhere.
 
-    It goes to stderr if that is open.
+    Parameters
+    ----------
+    quiet : bool
+        Whether to show nothing.
+    stream : TextIO, optional
+        Where to print; by default stderr. Nothing is shown if stderr is closed.
+
+    Returns
+    -------
+    Progress
+        Object that the command tells its stages; to be used in a `with` statement.
     """
     stream = stream or sys.stderr
     if quiet or stream is None:
@@ -173,7 +201,7 @@ def shown_progress(*, quiet: bool = False, stream: TextIO | None = None) -> Prog
 
 
 def duration(seconds: float) -> str:
-    """Format a duration: 40 s, 3 min 20 s, 2 h 5 min."""
+    """Format a time in seconds as text: 40 s, 3 min 20 s, 2 h 5 min."""
     total = round(seconds)
     hours, minutes = total // 3600, total % 3600 // 60
     if hours:

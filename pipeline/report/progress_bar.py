@@ -13,7 +13,10 @@ from pipeline.report.progress import Progress
 
 
 class BarProgress(Progress):
-    """Shows progress on a terminal as a bar that is redrawn several times a second and vanishes at the end."""
+    """Show how much of a long computation is done as a bar on a terminal.
+
+    The bar is redrawn several times a second, and vanishes at the end. `stream` is the terminal.
+    """
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__()

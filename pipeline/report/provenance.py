@@ -24,9 +24,9 @@ PACKAGES = (
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python, of this package and of those it computes with.
+    """Return the versions of Python, scarpsim and the packages that it computes with, by name, to record how a result was made.
 
-    Packages that are not installed are left out.
+    The key `platform` describes the operating system. Packages that are not installed are left out.
     """
     found = {"python": platform.python_version(), "platform": platform.platform()}
     for package in PACKAGES:

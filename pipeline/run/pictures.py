@@ -6,13 +6,12 @@ from pathlib import Path
 
 from pipeline.change.m3c2 import M3c2Map
 from pipeline.formats.files.atomic import write_bytes
+from pipeline.report.curve_figures import convergence_figure, histogram_figure
 from pipeline.report.figures import (
     SCALE_SIGMAS,
     blocks_figure,
-    convergence_figure,
     difference_figure,
     hillshade_figure,
-    histogram_figure,
 )
 from pipeline.report.map_styles import difference_style, quantity_style
 from pipeline.report.page import litres

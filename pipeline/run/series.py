@@ -98,6 +98,8 @@ class Series:
         The run's source of random numbers.
     conditions : SeriesConditions
         Pose and effects of the sensor, snow and vegetation at each epoch.
+    plants : KeyedRandom, optional
+        Source of the places where plants grow, to have them alike in several series; None: `random` decides.
     """
 
     config: SimulationConfig
@@ -105,6 +107,7 @@ class Series:
     site: SensorSite
     random: KeyedRandom
     conditions: SeriesConditions
+    plants: KeyedRandom | None = None
 
     @classmethod
     def of(cls, config: SimulationConfig, series: SeriesConfig, site: SensorSite, random: KeyedRandom) -> Series:
@@ -164,7 +167,8 @@ class Series:
 
         mesh: the bare wall, wall frame. number: of the epoch; 0 is the reference.
         """
-        return self.conditions.covers[number].on(mesh, self.up, self.random.child("series", "cover"))
+        random = self.random if self.plants is None else self.plants
+        return self.conditions.covers[number].on(mesh, self.up, random.child("series", "cover"))
 
     def rules(self) -> Rules:
         """Draw all rockfalls of the time series, and collect what else is the same at all its epochs.

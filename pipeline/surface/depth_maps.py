@@ -25,31 +25,37 @@ _LEAST_SAMPLES = 6
 
 @dataclass(frozen=True)
 class DepthMap:
-    """A depth map.
+    """Hold a depth map of a stereo pair, and the camera in which it is seen.
 
     Attributes
     ----------
     camera : Camera
-        Camera of the map's own pixels, wall frame.
+        Camera whose image has the depth map's pixels, wall frame.
     depth : (h, w) array
-        Depth along the camera's axis, m; NaN without data.
+        Depth of each pixel's surface point along the camera's axis, m; NaN without data.
     """
 
     camera: Camera
     depth: FloatArray
 
     def points(self) -> FloatArray:
-        """Return the surface points (h, w, 3), wall frame, m."""
+        """Compute the surface point of each pixel of the depth map, (h, w, 3), wall frame, m; NaN without data."""
         x, y = self.camera.tangents(*_centres(self.camera))
         local = np.stack([x, y, np.ones_like(x)], axis=-1) * self.depth[..., None]
         return local @ self.camera.rotation.T + self.camera.position
 
 
 def pinhole(source: DepthMap, depth_step_m: float) -> DepthMap:
-    """Resample the map without lens distortion, with the same f and principal point, bilinearly in inverse depth.
+    """Resample a depth map to a camera without lens distortion, with the same focal length and principal point.
 
-    Where the four samples around a pixel differ by more than `depth_step_m`, the nearest one is used. Where one of them has no
-    data, neither has the result.
+    Inverse depth is interpolated bilinearly. A pixel has no data if one of the four samples around it has none.
+
+    Parameters
+    ----------
+    source : DepthMap
+        The depth map, whose camera may have lens distortion.
+    depth_step_m : float
+        Where the four samples around a pixel differ by more than this, m, the nearest one is used instead of a mean.
     """
     plain = replace(source.camera, b1=0.0, b2=0.0, k1=0.0, k2=0.0, k3=0.0, k4=0.0, p1=0.0, p2=0.0)
     u, v = source.camera.pixel(*plain.tangents(*_centres(plain)))
@@ -62,10 +68,19 @@ def pinhole(source: DepthMap, depth_step_m: float) -> DepthMap:
 
 
 def normals(source: DepthMap, radius: int) -> NDArray[np.float64]:
-    """Compute unit normals (h, w, 3) in the camera's frame, towards the camera, from a map of a pinhole camera.
+    """Compute the surface normals of a depth map, by fitting a plane in a window around each pixel.
 
-    A plane is fitted by least squares in a window of 2 radius + 1 pixels. The result is NaN where there is no depth, or fewer
-    than six samples in the window.
+    Parameters
+    ----------
+    source : DepthMap
+        Depth map of a camera without lens distortion (see `pinhole`).
+    radius : int
+        The windows have 2 radius + 1 pixels a side.
+
+    Returns
+    -------
+    (h, w, 3) array
+        Unit normals towards the camera, in its frame; NaN where there is no depth, or fewer than six samples in the window.
     """
     valid = np.isfinite(source.depth)
     inverse = np.where(valid, 1.0 / np.where(valid, source.depth, 1.0), 0.0)

@@ -27,7 +27,7 @@ _STEEP = 0.99
 
 
 class CloudConfig(Config):
-    """How an unorganised point cloud is converted to a surface."""
+    """How a triangle mesh is made from a point cloud whose points are in no order."""
 
     method: Literal["triangulation", "poisson"] = Field(
         "triangulation",
@@ -44,23 +44,28 @@ class CloudConfig(Config):
 
 @dataclass(frozen=True)
 class CloudSurface:
-    """A surface made from a point cloud: mesh, in the cloud's frame, m, and notes on the points for the user."""
+    """Hold the triangle mesh made from a point cloud, in the cloud's frame, m, and remarks on the cloud to show to the user.
+
+    A remark says, for example, that coordinates are coarsely rounded.
+    """
 
     mesh: TriangleMesh
     notes: tuple[str, ...]
 
 
 def surface_of_cloud(cloud: PointCloud, viewpoint: FloatArray, config: CloudConfig, where: str) -> CloudSurface:
-    """Make the surface through unorganised points, in their own frame. Its faces point to the viewpoint.
+    """Make a triangle mesh from a point cloud whose points are in no order, in the cloud's own frame.
+
+    The triangles face the sensor. Large coordinates lose no precision, because whole metres are subtracted and added again.
 
     Parameters
     ----------
     cloud : PointCloud
-        The points, m. Large coordinates lose no precision, because whole metres are subtracted and added again.
+        The points, m.
     viewpoint : (3,) array
         Position of the sensor, in the cloud's frame, m.
     config : CloudConfig
-        The method and its settings.
+        The method (triangulation or Poisson reconstruction) and its settings.
     where : str
         Name of the cloud in error messages.
 
@@ -77,9 +82,9 @@ def surface_of_cloud(cloud: PointCloud, viewpoint: FloatArray, config: CloudConf
     extent = float(np.ptp(points, axis=0).max())
     if away > _FARTHEST * max(extent, 1.0):
         raise InputError(
-            f"the place lies {away:,.0f} m from the points, which extend over {extent:,.0f} m",
+            f"the sensor's place lies {away:,.0f} m from the points, which extend over only {extent:,.0f} m",
             where="--seen-from",
-            remedy="give the place in the coordinate system of the points",
+            remedy="give the sensor's x, y, z in the coordinate system of the points",
         )
     rounded = rounded_axes(points)
     notes = check_steps(rounded, median_spacing(points - origin), where, "the points' spacing is") if rounded else ()

@@ -38,7 +38,7 @@ _VOTES = 4096
 
 
 class SurfaceConfig(Config):
-    """How points are converted to a surface."""
+    """How the points that a sensor measures are converted to a triangle mesh."""
 
     method: Literal["grid", "poisson"] = Field("grid", description="grid triangulation, or Open3D's Poisson reconstruction")
     depth_step_m: float = Field(0.3, ge=0, description="edges with a smaller range difference are never cut [m]")
@@ -59,10 +59,23 @@ class SurfaceConfig(Config):
 
 
 def mesh_observation(observation: Observation, config: SurfaceConfig) -> TriangleMesh:
-    """Make the surface through an observation's points, wall frame, counter-clockwise as seen from its viewpoint.
+    """Make a triangle mesh from the points that a sensor observed, wall frame, m.
 
-    Vertices are the samples that belong to a triangle, in the sensor's order, each with its block in `vertex_block`. Raises
-    InputError if there is no triangle.
+    Triangles are counter-clockwise as seen from the sensor. With the method grid, neighbouring samples are joined, and vertices
+    are the samples that belong to a triangle, in the sensor's order. Each vertex has the number of its fallen block in
+    `vertex_block`, 0 for the wall.
+
+    Parameters
+    ----------
+    observation : Observation
+        The sensor's samples and its viewpoint, wall frame.
+    config : SurfaceConfig
+        The method (grid or Poisson reconstruction) and its settings.
+
+    Raises
+    ------
+    InputError
+        If no triangle results.
     """
     points, block = observation.points, observation.block
     if config.method == "poisson":
@@ -83,37 +96,44 @@ def mesh_observation(observation: Observation, config: SurfaceConfig) -> Triangl
 
 
 def mesh_cloud(points: FloatArray, block: IntArray, viewpoint: FloatArray, config: SurfaceConfig) -> TriangleMesh:
-    """Make a surface from an unorganised cloud by screened Poisson reconstruction (Kazhdan and Hoppe 2013, by Open3D).
+    """Make a triangle mesh from a point cloud whose points are in no order, by screened Poisson reconstruction.
 
-    Poisson reconstruction closes the surface where there are no points; vertices farther from every point than
-    `poisson_trim_spacings` median spacings are removed. It runs in one thread, because Open3D's result is not reproducible
-    with more.
+    The method is that of Kazhdan and Hoppe (2013), as in Open3D. It closes the surface also where there are no points, so
+    vertices farther from every point than `config.poisson_trim_spacings` times the median point spacing are removed. It runs in
+    one thread, because Open3D's result is not reproducible with more.
 
     Parameters
     ----------
     points : (n, 3) array
         The cloud, wall frame, m.
     block : (n,) array
-        Block labels. A vertex takes that of the nearest point.
+        Number of the fallen block to which each point belongs; 0 for the wall. A vertex takes that of the nearest point.
     viewpoint : (3,) array
-        Position to which normals and winding point, m.
+        Position of the sensor, wall frame, m, towards which triangles and normals face.
     config : SurfaceConfig
         Settings of the reconstruction.
+
+    Raises
+    ------
+    InputError
+        If there are too few points, or most coincide, or the octree depth is too large for them, or Open3D is missing.
     """
     if len(points) <= _NORMAL_NEIGHBOURS:
         raise InputError(
             f"{len(points)} points are too few",
             where="Poisson surface",
-            allowed="more than 16",
-            remedy="give more points, or use the method that joins neighbours",
+            allowed=f"more than {_NORMAL_NEIGHBOURS}",
+            remedy="give more points, or choose the method grid (for a point cloud: triangulation) instead of poisson",
         )
     usual = octree_depth(points)
     depth = config.poisson_depth or usual
     if depth > usual + _FINER:
         raise InputError(
-            f"got {depth}: cells of 1/{2 ** (depth - usual)} of the points' spacing", where="the octree's depth",
-            allowed=f"up to {usual + _FINER} for these points", remedy="leave it out for cells as large as their spacing",
-        )  # fmt: skip
+            f"a depth of {depth} makes the octree's cells {2 ** (depth - usual)} times smaller than the points' spacing",
+            where="poisson_depth",
+            allowed=f"up to {usual + _FINER} for these points",
+            remedy="leave poisson_depth out, which makes cells as large as the spacing",
+        )
     vertices, faces = _poisson(points, viewpoint, depth)
     return labelled_surface(vertices, faces, points, (points, block), config)
 
@@ -121,17 +141,20 @@ def mesh_cloud(points: FloatArray, block: IntArray, viewpoint: FloatArray, confi
 def labelled_surface(
     vertices: FloatArray, faces: IntArray, points: FloatArray, labels: tuple[FloatArray, IntArray], config: SurfaceConfig
 ) -> TriangleMesh:
-    """Trim a reconstructed surface to the neighbourhood of its points, and label its vertices.
+    """Remove the parts of a reconstructed surface that are far from its points, and label its vertices by fallen blocks.
+
+    Poisson reconstruction closes the surface also where there are no points.
 
     Parameters
     ----------
-    vertices, faces : (n, 3) arrays
-        The surface.
+    vertices, faces : (n, 3) and (m, 3) arrays
+        The reconstructed triangle mesh: coordinates, m, and vertex numbers of the triangles.
     points : (k, 3) array
-        The points from which it was made. Vertices farther from all of them than `poisson_trim_spacings` median spacings are
-        removed.
+        The points from which it was made, m. Vertices farther from all of them than `config.poisson_trim_spacings` times their
+        median spacing are removed.
     labels : (points, blocks)
-        Points (n, 3) and their block labels (n,). A vertex takes that of the nearest point.
+        Labelled points (l, 3), m, and the number (l,) of the fallen block at each, 0 for the wall. A vertex takes that of the
+        nearest point.
     config : SurfaceConfig
         Settings of the reconstruction.
 
@@ -156,16 +179,29 @@ def labelled_surface(
 
 
 def octree_depth(points: FloatArray) -> int:
-    """Return the octree depth whose cells are as large as the median spacing of points (n, 3).
+    """Choose the octree depth of a Poisson reconstruction, such that its cells are about as large as the point spacing.
 
-    Raises InputError if they coincide.
+    The depth is at least 4 and limited above, which keeps memory bounded.
+
+    Parameters
+    ----------
+    points : (n, 3) array
+        The points, m.
+
+    Raises
+    ------
+    InputError
+        If most points coincide.
     """
     longest = float(np.ptp(points, axis=0).max())
     return int(np.clip(np.ceil(np.log2(longest / median_spacing(points))), 4, _POISSON_DEPTH_LIMIT))
 
 
 def median_spacing(points: FloatArray) -> float:
-    """Return the median distance of points (n, 3) to their nearest neighbour, m. Raises InputError if most coincide."""
+    """Return the median distance of points (n, 3) of a cloud to their nearest neighbour, m.
+
+    Raises InputError if most points coincide with another one.
+    """
     from scipy.spatial import cKDTree
 
     spacing = float(np.median(cKDTree(points).query(points, k=2, workers=-1)[0][:, 1]))

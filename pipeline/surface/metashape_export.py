@@ -55,9 +55,17 @@ print("Loaded: %s. Next: Workflow > Build Model, source data: Depth maps." % ", 
 
 
 def write_metashape_export(folder: Path, left: DepthMap, right: DepthMap) -> None:
-    """Write cameras.xml, depth/, images/ and load_depth_maps.py into `folder`, all in the wall frame, m.
+    """Write the depth maps of a stereo pair for Agisoft Metashape, which can build a mesh from them.
 
-    The images are shaded depth, because there is no photograph when the matching is simulated.
+    The folder then has the cameras (cameras.xml), depth maps (depth/), images (images/), and a script that loads them in
+    Metashape (load_depth_maps.py). Images are shaded depth, because there is no photograph when the matching is simulated.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder to write to.
+    left, right : DepthMap
+        Depth maps of both cameras, wall frame, m.
     """
     maps = dict(zip(SIDES, (left, right), strict=True))
     write_metashape(folder / "cameras.xml", {side: source.camera for side, source in maps.items()})

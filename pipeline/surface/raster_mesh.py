@@ -10,19 +10,20 @@ from scene.geometry.mesh import TriangleMesh
 
 
 def mesh_of_raster(heights: NDArray[np.floating], grid: Grid) -> TriangleMesh:
-    """Put a vertex at the centre of each pixel that has a height, and two triangles between four such pixels.
+    """Make a triangle mesh from a raster of heights: a vertex at each pixel's centre, two triangles between four pixels.
 
     Parameters
     ----------
     heights : (h, w) array
-        In the unit of the grid; NaN where there is no data.
+        Heights, in the unit of the grid's coordinates; NaN where there is no data, which leaves a hole.
     grid : Grid
-        Where the pixels lie.
+        Size and position of the pixels.
 
     Returns
     -------
     TriangleMesh
-        Counter-clockwise seen from larger heights; without triangles where no four neighbouring pixels have heights.
+        Its triangles are counter-clockwise seen from above (from larger heights). It has none if no four neighbouring pixels
+        have heights.
     """
     known = np.isfinite(heights)
     x, y = np.meshgrid(

@@ -36,7 +36,10 @@ _LANDMARKS = 200
 
 
 class FusionConfig(Config):
-    """COLMAP's stereo fusion and Poisson reconstruction (`colmap stereo_fusion`, `colmap poisson_mesher`)."""
+    """Settings of COLMAP's stereo fusion, which joins depth maps to a point cloud, and of its Poisson reconstruction.
+
+    The commands of COLMAP are `colmap stereo_fusion` and `colmap poisson_mesher`.
+    """
 
     minimum_pixels: int = Field(2, ge=1, description="depth pixels that a fused point needs (COLMAP: 5; two images give two)")
     maximum_reprojection_px: float = Field(
@@ -57,23 +60,24 @@ class FusionConfig(Config):
 def write_workspace(
     folder: Path, left: DepthMap, right: DepthMap, landmarks: FloatArray, surface: SurfaceConfig, radius: int
 ) -> None:
-    """Write the depth maps as a COLMAP workspace that its `stereo_fusion` reads, in the wall frame.
+    """Write the depth maps of a stereo pair as a COLMAP workspace, from which `colmap stereo_fusion` makes a point cloud.
 
-    The folder then contains images/, sparse/ and stereo/. COLMAP's fusion puts the centre of the top-left pixel at (0, 0)
-    (colmap/mvs/fusion.cc), unlike its camera models; the principal points are written accordingly.
+    The folder then contains images/, sparse/ and stereo/, in the wall frame. Lens distortion is removed from the maps. COLMAP's
+    fusion puts the centre of the top-left pixel at (0, 0) (colmap/mvs/fusion.cc), unlike its camera models; the principal points
+    are written accordingly.
 
     Parameters
     ----------
     folder : Path
-        Where to write.
+        Folder to write to.
     left, right : DepthMap
-        The depth maps.
+        Depth maps of both cameras.
     landmarks : (n, 3) array
-        Points of the sparse model, wall frame, m.
+        Points on the surface for COLMAP's sparse model, wall frame, m.
     surface : SurfaceConfig
-        Gives the depth step at which maps are not interpolated.
+        Its `depth_step_m` says at which steps in depth the maps are not interpolated.
     radius : int
-        Radius of the window in which normals are fitted, px.
+        The surface normals are fitted in windows of 2 radius + 1 pixels a side.
     """
     cameras = {}
     for name, source in zip(NAMES, (left, right), strict=True):
@@ -91,25 +95,26 @@ def write_workspace(
 def colmap_surface(
     left: DepthMap, right: DepthMap, points: FloatArray, block: IntArray, surface: SurfaceConfig, fusion: FusionConfig
 ) -> TriangleMesh:
-    """Make the surface that COLMAP reconstructs from two depth maps, wall frame.
+    """Make the triangle mesh that COLMAP reconstructs from the depth maps of a stereo pair, wall frame, m.
 
     It runs in one thread, so that equal maps give equal bytes.
 
     Parameters
     ----------
     left, right : DepthMap
-        The depth maps.
+        Depth maps of both cameras.
     points, block : (n, 3) and (n,) arrays
-        The observation from which labels are taken, m.
+        Observed points, wall frame, m, and the number of the fallen block at each, 0 for the wall. A vertex of the mesh takes the
+        number of the nearest point.
     surface : SurfaceConfig
-        Settings of the Poisson reconstruction.
+        Its settings of the Poisson reconstruction (octree depth, trimming).
     fusion : FusionConfig
-        Settings of the fusion.
+        Settings of COLMAP's fusion of the depth maps.
 
     Raises
     ------
     InputError
-        If pycolmap is missing or nothing is fused.
+        If pycolmap is missing, or if fusion leaves fewer than 100 points.
     """
     pycolmap = _pycolmap()
     with tempfile.TemporaryDirectory(prefix="scarpsim_colmap_") as name:

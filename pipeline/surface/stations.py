@@ -35,7 +35,7 @@ _FACES = 1 << 20
 
 
 class StationsConfig(Config):
-    """How several stations of a laser scanner are joined into one surface."""
+    """How a wall that a laser scanner measured from several positions (stations) becomes one surface."""
 
     icp: IcpConfig | None = Field(
         IcpConfig(), description="registration of the further stations to the first; none: surveyed poses are used unchanged"
@@ -44,16 +44,16 @@ class StationsConfig(Config):
 
 @dataclass(frozen=True)
 class JoinedStations:
-    """All stations in the frame of the first one's surveyed pose.
+    """Store what a laser scanner measured from several positions (stations), joined in the wall frame of the first one's pose.
 
     Attributes
     ----------
     observations : tuple of Observation
-        One per station, with points moved by its registration.
+        One per station, with points moved by its registration to the first.
     surface : TriangleMesh
-        The merged surface.
+        The triangle mesh of all stations together, m.
     registrations : tuple of Registration
-        Registrations of the second and further stations to the first; empty without registration.
+        Registrations of the second and further stations to the first; empty if surveyed poses are used unchanged.
     """
 
     observations: tuple[Observation, ...]
@@ -69,22 +69,22 @@ def join_stations(
     raster: DifferenceConfig,
     random: KeyedRandom,
 ) -> JoinedStations:
-    """Register the observations of several stations to the first and merge their surfaces.
+    """Register what a scanner observed from several positions (stations) to the first one, and merge it to one surface.
 
     Parameters
     ----------
     scanners : sequence of LaserScanner
-        The stations.
+        The scanner at each station.
     observations : sequence of Observation
-        What they observed, in the same order.
+        What was observed from each station, in the same order, wall frame.
     config : StationsConfig
-        Settings of the registration.
+        Settings of the registration, or that there is none.
     surface : SurfaceConfig
-        How points are converted to surfaces.
+        How each station's points are converted to a triangle mesh.
     raster : DifferenceConfig
-        Gives the resolution at which surfaces are merged.
+        Gives the pixel size at which the best station is chosen for each place.
     random : KeyedRandom
-        Source of the registration's subsamples.
+        Source of random numbers for the subsamples of the registration.
     """
     meshes = [mesh_observation(observation, surface) for observation in observations]
     registrations = () if config.icp is None else tuple(_register_to_first(meshes, config.icp, random))
@@ -104,10 +104,19 @@ def _register_to_first(meshes: Sequence[TriangleMesh], config: IcpConfig, random
 
 
 def merge_stations(scanners: Sequence[LaserScanner], meshes: Sequence[TriangleMesh], config: DifferenceConfig) -> TriangleMesh:
-    """Merge the stations' meshes (wall frame): keep each triangle that covers a pixel for which its station is the best.
+    """Merge the meshes of a wall from several scanner positions (stations), taking each place from the most precise station.
 
-    Where two stations meet, their triangles overlap by less than one of them. Every pixel centre has a surface if any station
-    has one there.
+    The most precise one has the smallest expected variance of the mean of its points per area. Where two stations meet, their
+    triangles overlap by less than one triangle. Every pixel centre has a surface if any station has one there.
+
+    Parameters
+    ----------
+    scanners : sequence of LaserScanner
+        The scanner at each station, whose model gives the precision.
+    meshes : sequence of TriangleMesh
+        The mesh of each station, wall frame, m.
+    config : DifferenceConfig
+        Gives the pixel size at which the best station is chosen.
     """
     bounds = np.stack([np.min([mesh.bounds[0] for mesh in meshes], axis=0), np.max([mesh.bounds[1] for mesh in meshes], axis=0)])
     grid = raster_grid(bounds, config)

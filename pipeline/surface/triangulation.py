@@ -36,12 +36,12 @@ _BETWEEN, _OF_SEVEN = np.sqrt(1 / 2), np.sqrt(1 / 7)
 
 @dataclass(frozen=True)
 class SeenSurface:
-    """A surface as seen from one place.
+    """Store a triangle mesh made from a point cloud as seen from one place.
 
     Attributes
     ----------
     mesh : TriangleMesh
-        In the points' frame, counter-clockwise as seen from the viewpoint.
+        In the cloud's frame, m; triangles are counter-clockwise as seen from the viewpoint.
     spacing_m : float
         Median length of its edges, m.
     roughness_m : float
@@ -57,25 +57,27 @@ class SeenSurface:
 
     @property
     def error_m(self) -> float:
-        """Estimated standard deviation of the vertices along the rays, m.
+        """Estimated standard deviation of the mesh's vertices along the lines of sight, m.
 
-        Averaged vertices share points, so for them it is that of independent vertices that would make the surface equally
-        noisy between them.
+        If vertices are means of neighbouring points, their errors are correlated. The value is then that of independent vertices
+        that would give equal noise of the surface between vertices.
         """
         return float(np.nan_to_num((_OF_SEVEN / _BETWEEN if self.smoothed else 1.0) * self.roughness_m))
 
 
 def triangulate_seen_points(points: FloatArray, viewpoint: FloatArray, rotation: FloatArray, where: str) -> SeenSurface:
-    """Make the surface through points as seen from one place.
+    """Make a triangle mesh from a point cloud as seen from one place, by Delaunay triangulation of the directions.
+
+    Edges across steps in depth and across holes are cut.
 
     Parameters
     ----------
     points : (n, 3) array
         The cloud, m.
     viewpoint : (3,) array
-        Position of the sensor, in the points' frame, m.
+        Position of the sensor, in the cloud's frame, m.
     rotation : (3, 3) array
-        Scanner to the points' frame.
+        Rotation from the scanner's frame to the cloud's frame; directions are angles about the scanner's z axis.
     where : str
         Name of the cloud in error messages.
 
@@ -101,7 +103,9 @@ def triangulate_seen_points(points: FloatArray, viewpoint: FloatArray, rotation:
         ) from None
     faces = faces[_uncut(local, distance, plane, faces)]
     if not len(faces):
-        raise InputError("no triangle is left between the points", where=where, remedy="give a denser cloud, or a mesh")
+        raise InputError(
+            "no triangle is left between the points", where=where, remedy="give a denser cloud, or a triangle mesh instead"
+        )
     faces = _towards(faces, local)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     spacing = float(np.median(np.linalg.norm(local[edges[:, 0]] - local[edges[:, 1]], axis=1)))

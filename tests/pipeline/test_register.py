@@ -318,10 +318,10 @@ def test_errors_name_what_is_wrong(reference: ReferenceSurface) -> None:
         (points[:5], points, normals, {}, "moving points: 5 points are too few"),
         (points, points[:5], normals[:5], {}, "reference points: 5 points"),
         (points[:, :2], points, normals, {}, r"expected shape \(n, 3\)"),
-        (holes, points, normals, {}, "moving points: 1 of 240 points are not finite; remove"),
+        (holes, points, normals, {}, "moving points: 1 of 240 points have coordinates that are NaN or infinite; remove"),
         (line, points, normals, {}, "moving points: the points lie on one line"),
         (points, points, normals[:-1], {}, r"reference normals: expected shape \(240, 3\)"),
-        (points, points, normals * 0, {}, "reference normals: 240 of 240 are zero"),
+        (points, points, normals * 0, {}, "reference normals: 240 of 240 normals are zero"),
         (points, points, None, {}, "icp.method: point_to_plane needs"),
         (
             points,

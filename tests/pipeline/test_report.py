@@ -17,13 +17,12 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from pipeline.report.curve_figures import convergence_figure, histogram_figure
 from pipeline.report.figures import (
     block_boxes,
     blocks_figure,
-    convergence_figure,
     difference_figure,
     hillshade_figure,
-    histogram_figure,
     plain_numbers,
 )
 from pipeline.report.page import litres, template

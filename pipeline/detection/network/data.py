@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pycocotools import mask as coco_mask
 
+from pipeline.change.annotate import KIND_CATEGORIES
 from pipeline.detection.network.config import DetectorConfig, TrainingConfig
 from pipeline.detection.network.normalisation import normalised
 from pipeline.formats.files.inside import inside
 from pipeline.formats.rasters.geotiff import read_tiff
-from pipeline.formats.records.coco import read_coco
+from pipeline.formats.records.coco import Coco, Entry, read_coco
 from scene.common.errors import InputError
 
 Batch = dict[str, NDArray[Any]]
@@ -61,7 +62,7 @@ class CocoFolder:
         content = read_coco(folder / "annotations.json", masks=masks)
         self.folder = folder
         self.images = sorted(content.images, key=lambda image: image["id"])
-        self.annotations = content.annotations
+        self.annotations = _of_missing_rock(content)
         self._of: dict[int, list[dict[str, Any]]] = {image["id"]: [] for image in self.images}
         for annotation in self.annotations:
             self._of[annotation["image_id"]].append(annotation)
@@ -109,6 +110,15 @@ class CocoFolder:
                 remedy="use the image that was annotated",
             )
         return difference
+
+
+def _of_missing_rock(content: Coco) -> list[Entry]:
+    """Return the annotations of missing rock: all, unless the categories tell missing rock from other changes of a series."""
+    missing, *others = ((each["id"], each["name"]) for each in KIND_CATEGORIES)
+    known = {(each["id"], each.get("name")) for each in content.categories}
+    if missing not in known or known.isdisjoint(others):
+        return content.annotations
+    return [each for each in content.annotations if each["category_id"] == missing[0]]
 
 
 def batches(
