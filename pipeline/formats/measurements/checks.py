@@ -109,7 +109,7 @@ def finite(cloud: PointCloud, where: str) -> PointCloud:
     points = cloud.points
     box = bounding_box(points) if len(points) else np.full((2, 3), np.nan)
     all_finite = bool(np.isfinite(box).all())
-    keep: NDArray[np.bool_] = np.ones(len(points), dtype=bool) if all_finite else np.isfinite(points).all(axis=1)
+    keep: NDArray[np.bool_] = np.ones(len(points), dtype=bool) if all_finite else np.asarray(np.isfinite(points).all(axis=1))
     for channel in channels:
         if channel is not None:
             keep = keep & np.isfinite(channel)
