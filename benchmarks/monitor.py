@@ -239,7 +239,8 @@ class BothWays:
         change = compare_epoch(site.reference, points[1], (), options.seed)
         surface = SurfaceRaster(grid, raster.height, np.zeros(grid.shape, dtype=np.int32))
         config = M3c2Config(core_step_px=1, cylinder_radius_m=3 * grid.gsd, normal_radius_m=6 * grid.gsd, direction="wall")
-        other = m3c2(points[0].sample, change.transform.apply(points[1].sample), surface, surface.block, config)
+        clouds = [np.concatenate(list(each.chunks())) for each in points]
+        other = m3c2(clouds[0], change.transform.apply(clouds[1]), surface, surface.block, config)
         return cls(change, other)
 
     def areas(self, name: str) -> str:

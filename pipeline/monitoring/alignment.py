@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.change.areas import Area, in_areas
-from pipeline.monitoring.gridding import HeightRaster
+from pipeline.monitoring.gridding import SAMPLE, HeightRaster
 from pipeline.monitoring.unchanged import unchanged_pixels
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import IcpConfig, register_to
@@ -33,8 +33,8 @@ from scene.geometry.mesh import FloatArray
 
 SAME = RigidTransform(np.eye(3), np.zeros(3))
 """No motion."""
-_MOST_REFERENCE, _MOST_MOVING = 400_000, 200_000
-"""Points that ICP works with."""
+_MOST_REFERENCE = 400_000
+"""Points of the reference that ICP works with."""
 _TUKEY = 4.685
 """Tuning constant of Tukey's biweight, in standard deviations: 95 % efficient for normal errors (Huber 1981)."""
 _ROUNDS, _SETTLED_M = 30, 1e-6
@@ -55,8 +55,12 @@ _FEW_STABLE = 0.25
 """Share of the compared pixels below which the user is told that little of the wall is stable."""
 _FARTHEST_NOISE = 3.0
 """Times the limit of the robust fit (14 standard deviations) beyond which a difference in the user's stable areas is no noise."""
+_BAND = 16
+"""Rows of a raster that are worked on at a time, so that they stay in the processor's cache."""
 _REFITS = 3
-"""Fits on the pixels that did not change, each after a new search for them."""
+"""Most fits on the pixels that did not change, each after a new search for them."""
+_SAME_FIT = 0.02
+"""Expected standard deviations of a difference by which another fit moves no height once the search has converged."""
 _UNDETERMINED = 1e-7
 """Motions whose effect on the heights, relative to the largest, is smaller than this are left as they are."""
 
@@ -140,8 +144,13 @@ class Alignment:
         pair: heights of the reference and of the epoch in one view of the wall. Pixels without data are NaN.
         """
         design = pair.design(self.centre)
-        variance = (design * np.tensordot(self.covariance.astype(np.float32), design, 1)).sum(axis=0)
-        return np.sqrt(np.maximum(variance, 0.0)).astype(np.float32)
+        covariance = self.covariance.astype(np.float32)
+        sigma = np.empty(design.shape[1:], dtype=np.float32)
+        for start in range(0, len(sigma), _BAND):
+            part = design[:, start : start + _BAND]
+            variance = (part * np.tensordot(covariance, part, 1)).sum(axis=0)
+            sigma[start : start + _BAND] = np.sqrt(np.maximum(variance, 0.0))
+        return sigma
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fine registration of an epoch, with its standard deviations, by the names that monitor.json has for them."""
@@ -199,7 +208,7 @@ def coarse(surface: ReferenceSurface, points: FloatArray, gsd_m: float, seed: in
         If the points do not overlap the reference.
     """
     config = IcpConfig(outlier_distance_threshold=max(0.1, 3 * gsd_m))
-    moving = points[:: max(len(points) // _MOST_MOVING, 1)]
+    moving = points[:: max(len(points) // SAMPLE, 1)]
     return register_to(surface, moving, config, KeyedRandom(seed)).transform
 
 
@@ -233,11 +242,14 @@ def refine(pairs: Sequence[RasterPair], areas: Sequence[Area]) -> Alignment:
     fit = _robust_fit(columns, expected)
     stable = compared
     for _ in range(_REFITS):
+        before = fit.parameters
         stable = [_stable(*each, fit, bool(areas)) for each in zip(pairs, designs, compared, strict=True)]
         if sum(int(each.sum()) for each in stable) < _LEAST_PIXELS:
             stable = [_near(*each, fit) for each in zip(pairs, designs, compared, strict=True)]
         columns = _Columns.of(pairs, designs, stable)
         fit = _robust_fit(columns, expected)
+        if np.abs((fit.parameters - before) @ columns.design).max() < _SAME_FIT * expected:
+            break
     covariance, groups = _jackknife(columns, fit.robust)
     rest = columns.target - fit.parameters @ columns.design
     notes = _notes(sum(int(each.sum()) for each in stable) / count, groups, bool(areas))
@@ -306,11 +318,15 @@ def _places(grid: Grid) -> tuple[FloatArray, FloatArray]:
 
 def _design(raster: HeightRaster, centre: FloatArray) -> NDArray[np.float32]:
     """(6, h, w) change of height with shift and rotation about `centre`, frame of the grid; NaN without data."""
-    x, y = _places(raster.grid)
-    x, y, z = x - centre[0], y - centre[1], raster.height.astype(np.float64) - centre[2]
-    a, b = raster.slope_x.astype(np.float64), raster.slope_y.astype(np.float64)
-    found = np.stack([-a, -b, 0 * z + 1, y + b * z, -x - a * z, a * y - b * x], dtype=np.float32, casting="same_kind")
-    return np.asarray(found)
+    every_x, every_y = _places(raster.grid)
+    found = np.empty((6, *raster.grid.shape), dtype=np.float32)
+    for start in range(0, raster.grid.height, _BAND):
+        rows = slice(start, start + _BAND)
+        x, y, z = every_x[rows] - centre[0], every_y[rows] - centre[1], raster.height[rows].astype(np.float64) - centre[2]
+        a, b = raster.slope_x[rows].astype(np.float64), raster.slope_y[rows].astype(np.float64)
+        for derivative, values in zip(found, (-a, -b, 0 * z + 1, y + b * z, -x - a * z, a * y - b * x), strict=True):
+            derivative[rows] = values
+    return found
 
 
 def _weights_by_sigma(pair: RasterPair, where: NDArray[np.bool_]) -> FloatArray:

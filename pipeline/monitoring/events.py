@@ -166,14 +166,17 @@ def find_regions(change: Change) -> list[ChangedRegion]:
     change: the difference map with its levels of detection.
     """
     standard = change.difference / change.significance.one_sigma
+    begins = _begins(standard, change.significance)
     beyond = np.abs(change.difference) > _GROWS * change.significance.level
     regions: list[ChangedRegion] = []
-    for sign, kind in ((1.0, "missing"), (-1.0, "added")):
+    for sign, kind, begun in ((1.0, "missing", begins[0]), (-1.0, "added", begins[1])):
+        if not begun.any():
+            continue
         labels, count = ndimage.label(beyond & (sign * standard > 0))
-        begun = _begins(sign * standard, change.significance)
-        wanted = set(np.unique(labels[begun & (labels > 0)]).tolist())
-        for number, box in enumerate(ndimage.find_objects(labels, count), start=1):
-            if box is not None and number in wanted:
+        wanted = np.unique(labels[begun & (labels > 0)]).tolist()
+        boxes = ndimage.find_objects(labels, count) if wanted else []
+        for number in wanted:
+            if (box := boxes[number - 1]) is not None:
                 regions += _kept(labels[box] == number, box[0].start, box[1].start, kind, change)
     return sorted(regions, key=lambda region: -region.volume_m3)
 
@@ -206,14 +209,16 @@ def region_of_mask(mask: NDArray[np.bool_], row: int, column: int, score: float,
 
 
 def _begins(standard: NDArray[np.floating], significance: Significance) -> NDArray[np.bool_]:
-    """(h, w) where the mean over a square about the pixel is far beyond its error, with the sign that is looked for."""
+    """(2, h, w) where the mean over a square about the pixel is far beyond its error: above it, and below minus it."""
     known = np.isfinite(standard)
     filled = np.where(known, standard, 0.0)
-    found = np.zeros(standard.shape, dtype=bool)
+    found = np.zeros((2, *standard.shape), dtype=bool)
     for side in _SQUARES_PX:
         share = ndimage.uniform_filter(known.astype(np.float32), side)
         mean = ndimage.uniform_filter(filled.astype(np.float32), side) / np.maximum(share, 1e-6)
-        found |= (mean > _BEGINS * significance.sigma_of_mean(side**2)) & (share > 0.5)
+        least, filled_square = _BEGINS * significance.sigma_of_mean(side**2), share > 0.5
+        found[0] |= (mean > least) & filled_square
+        found[1] |= (mean < -least) & filled_square
     return found
 
 

@@ -10,6 +10,7 @@ from pipeline.measurement.station import find_station
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.reading import EpochData
 from scene.common.errors import InputError
+from scene.geometry.bounds import bounding_box
 from scene.geometry.frame import WallFrame
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray
@@ -100,7 +101,7 @@ def raster_of(points: FloatArray, gsd_m: float | None, count: int | None = None)
     InputError
         If the wall has fewer than ten pixels across, or the raster more than 60 million.
     """
-    bounds = np.array([points.min(axis=0), points.max(axis=0)])
+    bounds = bounding_box(points)
     gsd = gsd_m if gsd_m is not None else _usual_gsd(points, count or len(points))
     width, height = (bounds[1] - bounds[0])[:2]
     coarsest, finest = min(width, height) / 10, float(np.sqrt(width * height / _MOST_PIXELS))

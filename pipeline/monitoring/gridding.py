@@ -28,6 +28,8 @@ _PRIOR_POINTS = 4.0
 """Weight of the raster's median variance in that of a pixel, in points: few points tell little of their own scatter."""
 _CHUNK = 4_000_000
 """Points of which sums are taken at a time."""
+SAMPLE = 50_000
+"""Points of an epoch that ICP works with: it only brings the epoch near, and is followed by a fit of the rasters."""
 _BAND = 64
 """Rows to which planes are fitted at a time, so that the sums stay in the processor's cache."""
 
@@ -77,7 +79,7 @@ class WallPoints:
     Attributes
     ----------
     sample : (n, 3) array
-        A subset of the points, spread over all of the epoch, m.
+        A subset of the points for ICP, spread over all of the epoch, m.
     chunks : callable
         Function that yields all points in chunks (k, 3), m, each time it is called.
     """
@@ -147,8 +149,10 @@ def _add_moments(sums: FloatArray, points: FloatArray, grid: Grid) -> None:
     first = int(pixel.min())
     pixel -= first
     u, v = column - whole_column - 0.5, 0.5 - (row - whole_row)
-    for place, value in enumerate((None, u, v, z, u * u, u * v, v * v, u * z, v * z, z * z)):
-        found = np.bincount(pixel, value)
+    product = whole_row  # its memory is used again
+    for place, factors in enumerate(((), (u,), (v,), (z,), (u, u), (u, v), (v, v), (u, z), (v, z), (z, z))):
+        weights = np.multiply(*factors, out=product) if len(factors) == 2 else factors[0] if factors else None
+        found = np.bincount(pixel, weights)
         sums[place, first : first + len(found)] += found
 
 

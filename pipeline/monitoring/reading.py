@@ -17,11 +17,12 @@ from pipeline.formats.points.points import SUFFIXES
 from pipeline.formats.records.result_records import RUN_FILE, read_run
 from pipeline.measurement.reference import DEMS, is_cloud, reference_from_dem
 from pipeline.measurement.scans import read_scans
-from pipeline.monitoring.gridding import WallPoints
+from pipeline.monitoring.gridding import SAMPLE, WallPoints
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.times import EpochTime, check_order, time_of
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
+from scene.geometry.bounds import bounding_box
 from scene.geometry.frame import WallFrame
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray, TriangleMesh
@@ -144,7 +145,7 @@ class EpochData:
     @property
     def bounds(self) -> FloatArray:
         """Smallest and largest coordinates of all points, (2, 3), survey coordinates, m."""
-        return np.array([self.points.min(axis=0), self.points.max(axis=0)]) if self.large is None else self.large.bounds
+        return bounding_box(self.points) if self.large is None else self.large.bounds
 
     def chunks(self) -> Iterator[FloatArray]:
         """Yield all points of the epoch in chunks (n, 3), survey coordinates, m."""
@@ -164,7 +165,8 @@ class EpochData:
             triangles, also on those that are steep in the wall frame.
         """
         if self.mesh is None:
-            return WallPoints(frame.to_wall(self.points), lambda: map(frame.to_wall, self.chunks()))
+            sample = self.points[:: max(len(self.points) // SAMPLE, 1)]
+            return WallPoints(frame.to_wall(sample), lambda: map(frame.to_wall, self.chunks()))
         if several:
             return WallPoints.of(frame.to_wall(_spread_over(self.mesh, gsd_m / 2)))
         from pipeline.change.difference import surface_raster
@@ -259,7 +261,7 @@ def _sampled(files: tuple[Path, ...], unit: str | None) -> EpochData:
     """Read large files once, to get a sample of their points and their number, extent and coordinate system."""
     stated = sum(map(count_points, files))
     step, count = -(-stated // _SAMPLE), 0
-    sample, kept, lows, highs, first = [], [], [], [], None
+    sample, kept, boxes, first = [], [], [], None
     for chunk in itertools.chain.from_iterable(read_chunks(file, unit) for file in files):
         if not len(chunk):
             continue
@@ -267,8 +269,7 @@ def _sampled(files: tuple[Path, ...], unit: str | None) -> EpochData:
         sample.append(chunk[-count % step :: step].copy())
         if stated <= _KEPT_POINTS:
             kept.append(np.rint((chunk - first[0]) / _STEP_M).astype(np.int32))
-        lows.append(chunk.min(axis=0))
-        highs.append(chunk.max(axis=0))
+        boxes.append(bounding_box(chunk))
         count += len(chunk)
     if first is None:
         raise InputError(
@@ -276,7 +277,7 @@ def _sampled(files: tuple[Path, ...], unit: str | None) -> EpochData:
             where=str(files[0]),
             remedy="export it again, with its points, or clear these flags",
         )
-    bounds = np.array([np.min(lows, axis=0), np.max(highs, axis=0)])
+    bounds = bounding_box(np.concatenate(boxes))
     large = LargeFiles(files, unit, count, first, bounds, tuple(kept))
     note = f"its {count:,} points were read in chunks: memory depends on the maps alone"
     return EpochData(np.concatenate(sample), None, None, _crs_of(files[0]), (note,), large)
@@ -343,7 +344,8 @@ def _read_file(path: Path, options: MonitorOptions) -> EpochData:
     positions = [scan.position for scan in scans if scan.position is not None]
     notes = tuple(dict.fromkeys(note for scan in scans for note in scan.cloud.notes))
     position = np.mean(positions, axis=0) if positions else None
-    return EpochData(np.concatenate([scan.cloud.points for scan in scans]), None, position, _crs_of(path), notes)
+    points = scans[0].cloud.points if len(scans) == 1 else np.concatenate([scan.cloud.points for scan in scans])
+    return EpochData(points, None, position, _crs_of(path), notes)
 
 
 def _before(mesh: TriangleMesh) -> FloatArray:

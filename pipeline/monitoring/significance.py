@@ -104,8 +104,8 @@ def _sigma_with_tails(means: NDArray[np.float64]) -> float:
     """Largest of the standard deviations that quantiles tell, from the median on outwards: noise has long tails at edges."""
     apart = np.abs(means - np.median(means))
     known = [quantile for quantile in _QUANTILES if (1 - quantile) * len(apart) >= 1]
-    found = [float(np.quantile(apart, quantile)) / float(ndtri((1 + quantile) / 2)) for quantile in known]
-    return max(min(max(found), _LONGEST_TAIL * found[0]), 1e-3)
+    found = np.quantile(apart, known) / ndtri((1 + np.array(known)) / 2)
+    return float(max(min(found.max(), _LONGEST_TAIL * found[0]), 1e-3))
 
 
 def _factor(difference: NDArray[np.float32], predicted: NDArray[np.float32], stable: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -129,6 +129,7 @@ def _means_of_squares(values: NDArray[np.floating], side: int) -> NDArray[np.flo
     if not height or not width:
         return np.empty(0)
     cells = values[:height, :width].reshape(height // side, side, width // side, side)
-    filled = np.isfinite(cells).mean(axis=(1, 3))
-    total = np.nansum(cells, axis=(1, 3)) / np.maximum(np.isfinite(cells).sum(axis=(1, 3)), 1)
-    return np.asarray(total[filled >= _FILLED], dtype=np.float64)
+    known = np.isfinite(cells)
+    count = known.sum(axis=(1, 3))
+    total = np.where(known, cells, 0.0).sum(axis=(1, 3)) / np.maximum(count, 1)
+    return np.asarray(total[count >= _FILLED * side**2], dtype=np.float64)

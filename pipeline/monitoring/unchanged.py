@@ -24,8 +24,8 @@ _LONGEST_TAIL = 2.0
 _MARGIN_PX = 2
 _ROUNDS, _SETTLED = 6, 1e-4
 """Most rounds of the search, and share of the pixels below which a change ends it."""
-_SAMPLE = 400_000
-"""Pixels of which scatter is measured."""
+_SAMPLE = 100_000
+"""Pixels of which scatter is measured. The standard deviation of the 0.99 quantile of one sign is then about 1 %."""
 _FILLED = 0.5
 _FEWEST = 50
 """Pixels of one sign without which its scatter is not known."""
@@ -48,13 +48,13 @@ def unchanged_pixels(standard: NDArray[np.floating], candidates: NDArray[np.bool
     (h, w) bool
         The unchanged pixels.
     """
-    unchanged = candidates & np.isfinite(standard)
+    candidates = candidates & np.isfinite(standard)
+    unchanged = candidates
     means = {side: _mean_over_squares(standard, side) for side in _SQUARES_PX}
     for _ in range(_ROUNDS):
         before = unchanged
-        changed = _changed(means, unchanged)
-        unchanged = candidates & np.isfinite(standard) & ~ndimage.binary_dilation(changed, np.ones((3, 3)), _MARGIN_PX)
-        if unchanged.sum() < _FEWEST:
+        unchanged = candidates & ~_dilated(_changed(means, unchanged))
+        if np.count_nonzero(unchanged) < _FEWEST:
             return before
         if np.count_nonzero(before != unchanged) <= _SETTLED * before.size:
             break
@@ -84,9 +84,25 @@ def _changed(means: dict[int, NDArray[np.float32]], unchanged: NDArray[np.bool_]
         begun = np.zeros(unchanged.shape, dtype=bool)
         for side in _SQUARES_PX:
             begun |= sign * means[side] > _CHANGED * scatter[side]
+        if not begun.any():
+            continue
         reached = (sign * means[3] > _GROWS * scatter[3]) | begun
-        changed |= ndimage.binary_propagation(begun, mask=reached)
+        changed |= _connected_with(begun, reached)
     return changed
+
+
+def _connected_with(begun: NDArray[np.bool_], reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(h, w) connected parts of `reached` that contain a pixel of `begun`, all of which are in `reached`."""
+    labels, count = ndimage.label(reached)
+    wanted = np.zeros(count + 1, dtype=bool)
+    wanted[labels[begun]] = True
+    return np.asarray(wanted[labels])
+
+
+def _dilated(changed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(h, w) changed places with a margin of `_MARGIN_PX`, as a binary dilation gives them more slowly."""
+    side = 2 * _MARGIN_PX + 1
+    return ndimage.maximum_filter(changed.view(np.uint8), side, mode="constant").view(bool)
 
 
 def _scatter_on(mean: NDArray[np.float32], unchanged: NDArray[np.bool_]) -> float:

@@ -9,6 +9,9 @@ import numpy as np
 
 from scene.geometry.mesh import FloatArray
 
+_AT_ONCE = 1 << 14
+"""Points that are transformed at a time; their arrays then stay in the processor's cache."""
+
 
 @dataclass(frozen=True)
 class RigidTransform:
@@ -48,9 +51,13 @@ class RigidTransform:
 
     def apply(self, points: FloatArray) -> FloatArray:
         """Apply the rigid transform to points (..., 3), m; NaN stays NaN."""
-        x, y, z = points[..., 0], points[..., 1], points[..., 2]
-        rows = zip(self.rotation, self.translation, strict=True)
-        return np.stack([row[0] * x + row[1] * y + row[2] * z + shift for row, shift in rows], axis=-1)
+        every = points.reshape(-1, 3)
+        moved = np.empty(every.shape)
+        for start in range(0, len(every), _AT_ONCE):
+            x, y, z = every[start : start + _AT_ONCE].T
+            for axis, (row, shift) in enumerate(zip(self.rotation, self.translation, strict=True)):
+                moved[start : start + _AT_ONCE, axis] = row[0] * x + row[1] * y + row[2] * z + shift
+        return moved.reshape(points.shape)
 
     def after(self, first: RigidTransform) -> RigidTransform:
         """Compose two rigid transforms: return the one that applies `first` and then this one."""

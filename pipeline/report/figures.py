@@ -35,6 +35,8 @@ DIFFERENCE_LABEL = "reference minus epoch, mm; missing rock positive"
 _WIDEST_PX = 2000
 """Largest side of a picture, px; larger rasters are averaged."""
 DPI = 150
+_COMPRESSION = 3
+"""Level of PNG's compression: noisy maps take half of the time of level 6, and are not larger."""
 _MAP_WIDTH_IN, _MAP_HEIGHT_IN = 9.6, 9.0
 _PAIRED = 0.55
 """Relative size of a picture that stands beside another one. Its text is larger in proportion; its number of pixels is the
@@ -454,5 +456,5 @@ def png_bytes(figure: Figure) -> bytes:
     """Convert a Matplotlib figure to a PNG file without date or version, so that equal figures give equal bytes."""
     buffer = io.BytesIO()
     with plain_text(figure):
-        FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
+        FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None}, pil_kwargs={"compress_level": _COMPRESSION})
     return buffer.getvalue()

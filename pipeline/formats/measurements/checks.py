@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.formats.point_cloud import PointCloud
 from scene.common.errors import InputError
+from scene.geometry.bounds import bounding_box
 from scene.geometry.mesh import FloatArray
 from scene.ray_casting.raycast import RayCaster
 from sensors.cameras.camera import Camera, CameraPair
@@ -105,7 +106,10 @@ def finite(cloud: PointCloud, where: str) -> PointCloud:
     where: name of the file, for errors. Raises InputError if there are none, or all are at one place or on one line.
     """
     channels = [cloud.intensity, cloud.gps_time, *(cloud.extra.get(name) for name in ("pixel_x", "pixel_y"))]
-    keep: NDArray[np.bool_] = np.all(np.isfinite(cloud.points), axis=1)
+    points = cloud.points
+    box = bounding_box(points) if len(points) else np.full((2, 3), np.nan)
+    all_finite = bool(np.isfinite(box).all())
+    keep: NDArray[np.bool_] = np.ones(len(points), dtype=bool) if all_finite else np.asarray(np.isfinite(points).all(axis=1))
     for channel in channels:
         if channel is not None:
             keep = keep & np.isfinite(channel)
@@ -116,19 +120,23 @@ def finite(cloud: PointCloud, where: str) -> PointCloud:
             else "the cloud has no points"
         )
         raise InputError(problem, where=where, remedy="export the points again with all decimals of their coordinates")
-    if keep.sum() > 1 and np.ptp(cloud.points[keep], axis=0).max() < _ONE_PLACE_M:
+    if not keep.all():
+        cloud = cloud.part(keep)
+        box = bounding_box(cloud.points)
+    count = len(cloud.points)
+    if count > 1 and (box[1] - box[0]).max() < _ONE_PLACE_M:
         raise InputError(
-            f"all {keep.sum():,} points are at the same place",
+            f"all {count:,} points are at the same place",
             where=where,
             remedy="export the points again with all decimals of their coordinates",
         )
-    if keep.sum() >= _LINE_POINTS and _on_a_line(cloud.points[keep]):
+    if count >= _LINE_POINTS and _on_a_line(cloud.points):
         raise InputError(
-            f"all {keep.sum():,} points lie on one line",
+            f"all {count:,} points lie on one line",
             where=where,
             remedy="give a scan of a surface, whose points spread in two directions",
         )
-    return cloud if keep.all() else cloud.part(keep)
+    return cloud
 
 
 def _on_a_line(points: FloatArray) -> bool:

@@ -37,7 +37,7 @@ def without_fillers(cloud: PointCloud, where: str, *, grid: bool = False) -> Poi
         If all records are 0 0 0.
     """
     points = cloud.points
-    at_zero: NDArray[np.bool_] = np.asarray(~points.any(axis=1))
+    at_zero: NDArray[np.bool_] = np.logical_and.reduce([column == 0 for column in points.T])
     count = int(at_zero.sum())
     if count and count == len(points):
         raise InputError(

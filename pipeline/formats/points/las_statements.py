@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeline.formats.units import AxisUnits, metres_of_epsg_unit, not_understood, understood_crs, units_of_crs
 from scene.common.errors import InputError
+from scene.geometry.bounds import bounding_box
 from scene.geometry.mesh import FloatArray
 
 _OUTSIDE = 0.01
@@ -118,7 +119,7 @@ def check_box(header: laspy.LasHeader, points: FloatArray, where: str) -> tuple[
     low, high = np.array(header.mins), np.array(header.maxs)
     if not len(points) or not np.isfinite([low, high]).all() or (low > high).any() or not (low.any() or high.any()):
         return ()
-    found_low, found_high = points.min(axis=0), points.max(axis=0)
+    found_low, found_high = bounding_box(points)
     single = np.spacing(np.minimum(np.maximum(np.abs(low), np.abs(high)), 1e30).astype(np.float32)).astype(float)
     reach = np.maximum(np.maximum(_OUTSIDE, single), 2 * np.array(header.scales))
     said = f"a box from {_place(low)} to {_place(high)} in its header"

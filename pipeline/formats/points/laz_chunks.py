@@ -113,5 +113,5 @@ def _in_use(record: Any, factors: FloatArray, where: str) -> FloatArray:
     out = flagged(record)[0] | ((points[:, 0] == 0) & (points[:, 1] == 0) & (points[:, 2] == 0))
     points = (points[~out] if out.any() else points) * factors
     if len(points):
-        check_reach(np.array([points.min(axis=0), points.max(axis=0)]), where)
+        check_reach(points, where)
     return points

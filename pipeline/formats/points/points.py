@@ -17,6 +17,7 @@ from pipeline.formats.units import AxisUnits, agreed_units
 from scene.common.errors import InputError
 from scene.common.plug_ins import load_plug_ins
 from scene.common.regular_file import check_file
+from scene.geometry.bounds import bounding_box
 from scene.geometry.mesh import FloatArray
 
 PLUG_INS = "scarpsim.readers"
@@ -98,6 +99,8 @@ def read_placed_scans(
 
 def check_reach(points: FloatArray, where: str) -> None:
     """Raise InputError if coordinates (n, 3), m, are too large for a survey; NaN and infinity pass. where: name of the file."""
+    if len(points) and np.abs(bounding_box(points)).max() <= _LARGEST_M:
+        return
     known = np.where(np.isfinite(points), np.abs(points), 0.0)
     far = np.flatnonzero((known > _LARGEST_M).any(axis=1))
     if len(far):
