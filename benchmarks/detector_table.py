@@ -1,7 +1,7 @@
 """Measure F1 of a detector and of the threshold baseline, compared with the thesis: four walls, three noise levels, three sizes.
 
     scarpsim dataset configs/datasets/detector_test.yaml --out runs/detector_test       # continues an interrupted run
-    python benchmarks/detector_table.py --set runs/detector_test [--set another] [--model default] [--write]
+    python benchmarks/detector_table.py --set runs/detector_test [--set another] [--model default] [--mirrored] [--write]
 
 Each set, named by the placement of its blocks (`rockfall.placement`), gets tables of the stereo pair's and of the laser scanner's
 maps. Detections are kept in a folder beside the set's (--out) and reused. The confidence is 0.95, with an IoU of 0.25 (is the
@@ -70,10 +70,10 @@ class Tested:
     baseline: list[dict[str, Any]]
 
     @classmethod
-    def of(cls, folder: Path, model: str, out: Path) -> Tested:
-        """Read the set in `folder`; detections are kept in `out` and made only once."""
+    def of(cls, folder: Path, model: str, out: Path, *, mirrored: bool = False) -> Tested:
+        """Read the set in `folder`; detections are kept in `out` and made only once. mirrored: with mirrored views."""
         truth = json.loads((folder / "test" / "annotations.json").read_text(encoding="utf-8"))
-        network = detections(model, folder / "test", out, mirrored=model != BASELINE)
+        network = detections(model, folder / "test", out, mirrored=mirrored)
         return cls(placement_of(folder), truth, network, detections(BASELINE, folder / "test", out))
 
     def on(self, *sensors: str) -> Cells:
@@ -94,7 +94,7 @@ def placement_of(folder: Path) -> str:
 
 def detections(model: str, folder: Path, out: Path, *, mirrored: bool = False) -> list[dict[str, Any]]:
     """Return what a detector finds in a set's tests, made once. mirrored: with mirrored views."""
-    path = out / (BASELINE if model == BASELINE else "network") / "detections.json"
+    path = out / (BASELINE if model == BASELINE else "mirrored" if mirrored else "network") / "detections.json"
     if not path.exists():
         detect(model, [folder], path.parent, confidences=(LOWEST_SCORE,), pictures=False, mirrored=mirrored)
     return list(json.loads(path.read_text(encoding="utf-8"))["annotations"])
@@ -230,9 +230,13 @@ def main() -> None:
     parser.add_argument("--set", type=Path, required=True, action="append", dest="folders", help="what detector_test.yaml makes")
     parser.add_argument("--model", default="default", help="default, or a trained detector's folder")
     parser.add_argument("--out", default="found", help="name of the folder, beside each set's, for the detections")
+    parser.add_argument("--mirrored", action="store_true", help="also look at the mirror images of the maps")
     parser.add_argument("--write", action="store_true", help="put the tables into docs/validation")
     arguments = parser.parse_args()
-    tests = [Tested.of(each, arguments.model, each.with_name(f"{each.name}_{arguments.out}")) for each in arguments.folders]
+    tests = [
+        Tested.of(each, arguments.model, each.with_name(f"{each.name}_{arguments.out}"), mirrored=arguments.mirrored)
+        for each in arguments.folders
+    ]
     every = [tested.on(sensor) for tested in tests for sensor in SENSORS]
     parts = [line for cells in every for line in (f"## {cells.tested.placement}, {cells.sensors}", "", *tables(cells))]
     details, overview = (

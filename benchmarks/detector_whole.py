@@ -6,8 +6,8 @@ r"""Compare F1 on whole maps with that on tiles, to separate effects of tile edg
 
 The epochs are those of configs/datasets/detector_test.yaml, in tiles larger than a map. Compared are cells that both sets have:
 wall, noise and size of one sensor. A block that tiles cut counts once for each tile that shows part of it, a whole one once;
-`detect` covers whole maps with half-overlapping windows. The rest is as in detector_table.py. --write puts the table into
-docs/validation/detector.md.
+`detect` covers whole maps with windows that overlap by a quarter. The rest is as in detector_table.py. --write puts the table
+into docs/validation/detector.md.
 """
 
 from __future__ import annotations

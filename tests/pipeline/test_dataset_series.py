@@ -15,7 +15,7 @@ from pipeline.dataset.config import DatasetConfig
 from pipeline.dataset.epoch import StageCache, make_epoch
 from pipeline.dataset.loaders import Tiles
 from pipeline.dataset.plan import planned_epochs
-from pipeline.dataset.run import make_dataset, verify_dataset
+from pipeline.dataset.run import Workers, make_dataset, verify_dataset
 from pipeline.detection.network.data import CocoFolder
 from pipeline.report.progress import Progress
 from scene.common.errors import InputError
@@ -93,6 +93,14 @@ def test_an_epoch_is_the_same_without_those_before_it(made: Path) -> None:
     assert len(summary.made) == 1
     assert lost
     assert digests(made) == before
+
+
+def test_two_workers_make_the_same_bytes(made: Path, tmp_path: Path) -> None:
+    """The epochs of a series are divided between the workers, each of which follows the wall from its beginning."""
+    pytest.importorskip("distributed")
+    pytest.importorskip("cryptography")
+    make_dataset(config({"test": 1, "train": 1}), tmp_path / "set", Workers(2))
+    assert digests(tmp_path / "set") == digests(made)
 
 
 def test_going_back_in_a_series_gives_the_same_epoch() -> None:
