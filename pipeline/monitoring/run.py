@@ -29,6 +29,7 @@ from pipeline.monitoring.products import Followed, Result, write_results
 from pipeline.monitoring.reading import EpochData, EpochSource, find_epochs, read_epoch
 from pipeline.monitoring.records import EpochRecord, discard, kept
 from pipeline.monitoring.site import ReferenceSite, prepared
+from pipeline.monitoring.stable_areas import StableRock
 from pipeline.monitoring.targets import TargetFit, fit_targets, read_targets
 from pipeline.report.progress import Progress
 from scene.common.errors import InputError
@@ -238,7 +239,7 @@ def processed(
     points = data.wall_points(site.frame, site.grid.gsd, several=len(site.views) > 1)
     by_targets = _by_targets(options, site, source)
     start = None if by_targets is None else by_targets.transform
-    found = compare_epoch(site.reference, points, options.stable, options.seed, start)
+    found = compare_epoch(site.reference, points, StableRock(options.stable, site.frame), options.seed, start)
     if by_targets is not None:
         notes.append(f"{by_targets.count} targets brought it near the reference, with an RMS of {1e3 * by_targets.rms_m:.1f} mm")
     regions = found.regions if options.detector == NO_DETECTOR else []
