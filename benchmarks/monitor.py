@@ -236,7 +236,7 @@ class BothWays:
         site = prepared(reference, options)
         grid, raster = site.grid, site.views[0].raster
         points = [read_epoch(source, options).wall_points(site.frame, grid.gsd) for source in (reference, epoch)]
-        change = compare_epoch(site.reference, points[1], (), options.seed)
+        change = compare_epoch(site.reference, points[1], None, options.seed)
         surface = SurfaceRaster(grid, raster.height, np.zeros(grid.shape, dtype=np.int32))
         config = M3c2Config(core_step_px=1, cylinder_radius_m=3 * grid.gsd, normal_radius_m=6 * grid.gsd, direction="wall")
         clouds = [np.concatenate(list(each.chunks())) for each in points]

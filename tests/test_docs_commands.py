@@ -268,6 +268,7 @@ NAMED = (
     "scarpsim init --mesh wall.ply --cameras cameras.xml --out my_site.yaml",
     "scarpsim icp-study RUN|CONFIG [--sensor stereo|tls] [--epochs N] [--offset-m 0.03] --out DIR",
     "scarpsim inspect",
+    "scarpsim inspect --series",
     "scarpsim inspect my_site.yaml",
     "scarpsim dataset",
     "scarpsim surface",

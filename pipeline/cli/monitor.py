@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scanner", metavar="PRESET", help="also predict the level of detection of this scanner")
     parser.add_argument("--model", type=Path, metavar="FILE", help="sensor model (model.yaml) instead of --scanner")
     parser.add_argument("--photographs", action="store_true", help="the epochs are from photographs")
-    parser.add_argument("--stable", type=Path, metavar="FILE", help="stable rock: YAML list of boxes or polygons, wall frame, m")
+    parser.add_argument("--stable", type=Path, metavar="FILE", help="stable rock: YAML list of boxes or polygons, m")
     parser.add_argument(
         "--targets", type=Path, metavar="FILE", help="targets of each epoch: CSV with the columns epoch, target, x, y, z; m"
     )

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.change.areas import Area, in_areas
 from pipeline.monitoring.gridding import SAMPLE, HeightRaster
+from pipeline.monitoring.stable_areas import StableRock
 from pipeline.monitoring.unchanged import unchanged_pixels
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.register import IcpConfig, register_to
@@ -212,15 +212,15 @@ def coarse(surface: ReferenceSurface, points: FloatArray, gsd_m: float, seed: in
     return register_to(surface, moving, config, KeyedRandom(seed)).transform
 
 
-def refine(pairs: Sequence[RasterPair], areas: Sequence[Area]) -> Alignment:
+def refine(pairs: Sequence[RasterPair], areas: StableRock | None) -> Alignment:
     """Estimate the small shift and rotation of an epoch that remain after ICP, by a robust fit on rock that did not change.
 
     Parameters
     ----------
     pairs : sequence of RasterPair
         Heights of the reference and of the epoch, one pair for each view (separately mapped part) of the wall.
-    areas : sequence of Area
-        Areas of stable rock given by the user, wall frame, m; empty: unchanged pixels are found from the differences.
+    areas : StableRock or None
+        Areas of stable rock given by the user; None or no areas: unchanged pixels are found from the differences.
 
     Returns
     -------
@@ -268,12 +268,11 @@ def applied(alignment: Alignment, pair: RasterPair) -> NDArray[np.float32]:
     return np.asarray(pair.epoch.height + np.tensordot(parameters.astype(np.float32), pair.design(alignment.centre), 1))
 
 
-def _compared(pair: RasterPair, areas: Sequence[Area]) -> NDArray[np.bool_]:
+def _compared(pair: RasterPair, areas: StableRock | None) -> NDArray[np.bool_]:
     """(h, w) pixels with data in both epochs, in the user's stable areas where there are any."""
     found = np.isfinite(pair.difference)
     if areas:
-        places = pair.points(found)
-        found[found] = in_areas(areas, places[:, 0], places[:, 1])
+        found[found] = areas.contains(pair.points(found))
     return found
 
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.change.areas import Area
 from pipeline.monitoring.alignment import SAME, Alignment, RasterPair, applied, coarse, reference_surface, refine
 from pipeline.monitoring.events import Change, ChangedRegion, find_regions
 from pipeline.monitoring.gridding import HeightRaster, PointSums, WallPoints
 from pipeline.monitoring.significance import significance
+from pipeline.monitoring.stable_areas import StableRock
 from pipeline.monitoring.views import Partition
 from pipeline.registration.closest_points import ReferenceSurface
 from pipeline.registration.rigid import RigidTransform
@@ -97,7 +97,7 @@ class EpochChange:
 
 
 def compare_epoch(
-    reference: ReferenceHeights, points: WallPoints, stable: Sequence[Area], seed: int, start: RigidTransform | None = None
+    reference: ReferenceHeights, points: WallPoints, stable: StableRock | None, seed: int, start: RigidTransform | None = None
 ) -> EpochChange:
     """Register an epoch on the reference, and find where the wall changed between the two.
 
@@ -107,8 +107,8 @@ def compare_epoch(
         The reference epoch.
     points : WallPoints
         Points of the epoch, wall frame, m.
-    stable : sequence of Area
-        Areas of stable rock given by the user, wall frame, m; empty: unchanged rock is found from the differences.
+    stable : StableRock or None
+        Areas of stable rock given by the user; None or no areas: unchanged rock is found from the differences.
     seed : int
         Seed of the random subsets of points for ICP.
     start : RigidTransform, optional

@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from pipeline.change.areas import Area
+from pipeline.monitoring.stable_areas import StableArea
 from scene.common.config import load_yaml
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
@@ -32,8 +32,8 @@ class MonitorOptions:
         Number of views: parts of the wall that are mapped along directions of their own; None: as many as its shape needs.
     gsd_m : float or None
         Side of a pixel of the maps, m; None: derived from the density of the reference's points.
-    stable : tuple of Area
-        Areas of stable rock, wall frame, m; empty: `monitor` finds stable rock itself.
+    stable : tuple of StableArea
+        Areas of stable rock, on the map or in survey coordinates, m; empty: `monitor` finds stable rock itself.
     targets : Path or None
         CSV file of targets that were measured in each epoch, which replace ICP; None: there are none.
     unit : str or None
@@ -55,7 +55,7 @@ class MonitorOptions:
     direction: FloatArray | None = None
     views: int | None = None
     gsd_m: float | None = None
-    stable: tuple[Area, ...] = ()
+    stable: tuple[StableArea, ...] = ()
     targets: Path | None = None
     unit: str | None = None
     columns: tuple[str, ...] = ()
@@ -72,23 +72,24 @@ class MonitorOptions:
         return {name: str(value) if isinstance(value, Path) else value for name, value in plain.items()}
 
 
-def read_areas(path: Path) -> tuple[Area, ...]:
-    """Read stable areas from a YAML or JSON file: a list of boxes [x0, y0, x1, y1] or polygons [[x, y], ...], wall frame, m.
+def read_areas(path: Path) -> tuple[StableArea, ...]:
+    """Read stable areas, on which `monitor` registers epochs, from a YAML or JSON file with a list of boxes or polygons.
 
-    `monitor` registers epochs on the rock in these areas. The list may stand under the key `stable_areas`. Raises InputError for
-    anything else.
+    Boxes [x0, y0, x1, y1] and polygons [[x, y], ...] are in the wall frame, m. Boxes [x0, y0, z0, x1, y1, z1] and polygons
+    [[x, y, z], ...] are in survey coordinates, m, and can lie on any view (separately mapped part) of the wall. The list may
+    stand under the key `stable_areas`. Raises InputError for anything else.
     """
     values = load_yaml(path)
     areas = values.get("stable_areas") if isinstance(values, dict) else values
     try:
-        found = TypeAdapter(tuple[Area, ...]).validate_python(areas)
+        found = TypeAdapter(tuple[StableArea, ...]).validate_python(areas)
     except ValidationError as error:
         wrong = error.errors()[0]["msg"]
         raise InputError(
             f"is not a list of areas ({wrong})",
             where=str(path),
-            allowed="a list of boxes [x0, y0, x1, y1] or polygons [[x, y], ...]",
-            remedy="write the stable areas in this form, in metres in the wall frame",
+            allowed="boxes [x0, y0, x1, y1] or polygons [[x, y], ...] on the map, or the same with x, y, z in survey coordinates",
+            remedy="write the stable areas in this form, in metres",
         ) from None
     if not found:
         raise InputError("contains no area", where=str(path), remedy="add a box or polygon to the file, or leave --stable out")

@@ -100,17 +100,42 @@ def kept(folder: Path, number: int, inputs: Mapping[str, str], fingerprint: str)
     EpochRecord or None
         None if there is none, or if it was made from other files, options or another reference.
     """
+    found = stored(folder, number, fingerprint)
+    return found if found is not None and found.inputs == dict(inputs) else None
+
+
+def points_note(folder: Path, number: int) -> Path:
+    """Return the file with the checksum of all that the registered points of an epoch depend on, as they were last written.
+
+    folder: the folder of the results. number: number of the epoch.
+    """
+    return folder / KEPT / f"points_{number:03d}.txt"
+
+
+def discard(folder: Path, number: int) -> None:
+    """Remove the stored result of an epoch, if there is one, because it does not apply any more.
+
+    folder: the folder of the results. number: number of the epoch.
+    """
+    _file(folder, number).unlink(missing_ok=True)
+
+
+def stored(folder: Path, number: int, fingerprint: str) -> EpochRecord | None:
+    """Read the stored result of an epoch, whatever its files are now; None if there is none for this reference and options.
+
+    folder: the folder of the results. number: number of the epoch. fingerprint: checksum of the reference and the options.
+    """
     path = _file(folder, number)
     if not path.is_file():
         return None
     values = json.loads(path.read_text(encoding="utf-8"))
-    if values["fingerprint"] != fingerprint or values["inputs"] != dict(inputs):
+    if values["fingerprint"] != fingerprint:
         return None
     transform = RigidTransform(np.array(values["transform"]["rotation"]), np.array(values["transform"]["translation_m"]))
     predicted = values["predicted_level_m"]
     return EpochRecord(
         number=number,
-        inputs=inputs,
+        inputs=values["inputs"],
         points=values["points"],
         notes=tuple(values["notes"]),
         transform=transform,

@@ -12,6 +12,7 @@ from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.monitoring.magnitude import PowerLaw, fit_power_law
 from pipeline.monitoring.model import compared_in_words
 from pipeline.monitoring.products import Followed, Result, event_raster
+from pipeline.monitoring.records import KEPT, points_note
 from pipeline.monitoring.significance import NORMAL_95
 from pipeline.monitoring.site import WallView
 from pipeline.report.figures import blocks_figure, difference_figure, hillshade_figure, label_axes, png_bytes
@@ -41,7 +42,8 @@ def write_report(result: Result) -> None:
         if law is not None:
             pictures["magnitude_frequency.png"] = _law_figure(volumes, law)
     for name, png in pictures.items():
-        write_bytes(result.folder / name, png)
+        if not name.startswith(("map_", "events_")):  # those of epochs are written already
+            write_bytes(result.folder / name, png)
     rows = result.rows()
     text = template("monitoring/report.html.jinja").render(
         result=result,
@@ -104,7 +106,23 @@ def _about(epoch: Followed, result: Result) -> dict[str, Any]:
 
 
 def _pictures_of(epoch: Followed, view: WallView, result: Result) -> dict[str, bytes]:
-    """Map and gallery of an epoch in one view, and styles of its maps."""
+    """Map and gallery of an epoch in one view, which are drawn and written unless the folder has them from an earlier call."""
+    place = f"{epoch.number:03d}{view.suffix}"
+    note, points = result.folder / KEPT / f"pictures_{place}.txt", points_note(result.folder, epoch.number)
+    key = points.read_text(encoding="utf-8")
+    if note.is_file():
+        before, *names = note.read_text(encoding="utf-8").splitlines()
+        if before == key and all((result.folder / name).is_file() for name in names):
+            return {name: (result.folder / name).read_bytes() for name in names}
+    pictures = _drawn(epoch, view, result)
+    for name, png in pictures.items():
+        write_bytes(result.folder / name, png)
+    write_text(note, "\n".join([key, *pictures]))
+    return pictures
+
+
+def _drawn(epoch: Followed, view: WallView, result: Result) -> dict[str, bytes]:
+    """Draw map and gallery of an epoch in one view, and write styles of its maps."""
     grid, place = view.grid, f"{epoch.number:03d}{view.suffix}"
     difference, _ = read_geotiff(result.folder / f"difference_{place}.tif")
     level, _ = read_geotiff(result.folder / f"lod_{place}.tif")

@@ -24,10 +24,12 @@ from pipeline.monitoring.detector import regions_of_detector
 from pipeline.monitoring.events import Catalogue
 from pipeline.monitoring.model import predicted_level, scanner_model
 from pipeline.monitoring.options import NO_DETECTOR, MonitorOptions
-from pipeline.monitoring.products import Followed, Result, write_points, write_results
+from pipeline.monitoring.point_writing import PointsInOrder, write_points_once
+from pipeline.monitoring.products import Followed, Result, write_results
 from pipeline.monitoring.reading import EpochData, EpochSource, find_epochs, read_epoch
-from pipeline.monitoring.records import EpochRecord, kept
+from pipeline.monitoring.records import EpochRecord, discard, kept
 from pipeline.monitoring.site import ReferenceSite, prepared
+from pipeline.monitoring.stable_areas import StableRock
 from pipeline.monitoring.targets import TargetFit, fit_targets, read_targets
 from pipeline.report.progress import Progress
 from scene.common.errors import InputError
@@ -125,6 +127,8 @@ def monitor(
     progress.plan({f"epoch {number}": 1.0 for number, _ in further} | {"report": 0.3})
     records = {number: kept(out, number, source.checksums(), fingerprint) for number, source in further} if resume else {}
     left = [(number, source) for number, source in further if records.get(number) is None]
+    for number, _ in left:
+        discard(out, number)
     if workers > 1 and len(left) > 1:
         records |= _compared_in_processes(left, site, out, options, fingerprint, workers, progress)
     followed = []
@@ -135,7 +139,7 @@ def monitor(
             if record is None:
                 record, data = processed(number, source, site, out, options, fingerprint)
             epoch = Followed(source, record, catalogue.identified(record.regions))
-            write_points(epoch, data or read_epoch(source, options), site, out)
+            write_points_once(epoch, data, site, out, fingerprint, options)
             followed.append(epoch)
     with progress.stage("report"):
         result = Result(out, tuple(sources), site, tuple(followed), options)
@@ -179,7 +183,10 @@ def _compared_in_processes(
 def _in_worker(
     number: int, source: EpochSource, reference: EpochSource, out: Path, options: MonitorOptions, fingerprint: str
 ) -> EpochRecord:
-    return processed(number, source, _site_of_worker(reference, _Frozen(options)), out, options, fingerprint)[0]
+    points = _points_of_worker(reference, _Frozen(options), out, fingerprint)
+    record, data = processed(number, source, points.site, out, options, fingerprint)
+    points.add(source, record, data)
+    return record
 
 
 class _Frozen:
@@ -197,9 +204,9 @@ class _Frozen:
 
 
 @lru_cache(1)
-def _site_of_worker(reference: EpochSource, frozen: _Frozen) -> ReferenceSite:
-    """Return the reference site, prepared once in each process."""
-    return prepared(reference, frozen.options)
+def _points_of_worker(reference: EpochSource, frozen: _Frozen, out: Path, fingerprint: str) -> PointsInOrder:
+    """Return what writes the points of this process's epochs; the reference site is prepared once in each process."""
+    return PointsInOrder(prepared(reference, frozen.options), out, fingerprint, frozen.options)
 
 
 def processed(
@@ -232,7 +239,7 @@ def processed(
     points = data.wall_points(site.frame, site.grid.gsd, several=len(site.views) > 1)
     by_targets = _by_targets(options, site, source)
     start = None if by_targets is None else by_targets.transform
-    found = compare_epoch(site.reference, points, options.stable, options.seed, start)
+    found = compare_epoch(site.reference, points, StableRock(options.stable, site.frame), options.seed, start)
     if by_targets is not None:
         notes.append(f"{by_targets.count} targets brought it near the reference, with an RMS of {1e3 * by_targets.rms_m:.1f} mm")
     regions = found.regions if options.detector == NO_DETECTOR else []

@@ -426,7 +426,7 @@ class _Trials:
         """
         epoch = 1 + int(number * _GOLDEN % 1.0 * (self.series.series.count - 1))
         points = _scanned(self.series, mesh, epoch, scans, random.child("scan", scans))
-        found = compare_epoch(self.reference, WallPoints.of(points), (), self.series.config.seed)
+        found = compare_epoch(self.reference, WallPoints.of(points), None, self.series.config.seed)
         label = after.labels_down(self.grid, np.zeros((*self.grid.shape, 2), dtype=np.float32))
         listed = np.zeros(int(label.max(initial=0)) + _MOST_BLOCKS + 1, dtype=bool)
         for region in found.regions:

@@ -63,7 +63,7 @@ def test_the_registration_is_as_uncertain_as_it_says() -> None:
 
     errors = []
     for _ in range(10):
-        found = refine([RasterPair(gridded(wall(False), grid), gridded(wall(True), grid))], ())
+        found = refine([RasterPair(gridded(wall(False), grid), gridded(wall(True), grid))], None)
         shift = found.transform.apply(found.centre) - found.centre
         errors.append(np.concatenate([shift, found.transform.rotation_vector]) / np.sqrt(np.diag(found.covariance)))
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(1.0, abs=0.4)
@@ -78,5 +78,5 @@ def test_a_motion_beside_many_rockfalls_is_found() -> None:
     x, y = random.uniform([0, 0], [WIDTH_M, HEIGHT_M], (100_000, 2)).T
     fallen = 0.015 * ((x % 3.0 < 1.8) & (y % 3.0 < 1.8))
     before, after = (np.column_stack([x, y, depth(x, y) - z + 0.004 * random.normal(size=len(x))]) for z in (0.0, fallen))
-    found = refine([RasterPair(gridded(before, grid), gridded(motion.inverse().apply(after), grid))], ())
+    found = refine([RasterPair(gridded(before, grid), gridded(motion.inverse().apply(after), grid))], None)
     assert (found.transform.apply(found.centre) - found.centre)[2] == pytest.approx(0.006, abs=5e-4)

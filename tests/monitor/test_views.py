@@ -12,7 +12,7 @@ from monitor_cases import las, points
 from pipeline.api.monitoring import Monitoring
 from pipeline.formats.points.laz import read_laz
 from pipeline.formats.rasters.geotiff import read_geotiff
-from pipeline.monitoring.options import MonitorOptions
+from pipeline.monitoring.options import MonitorOptions, read_areas
 from pipeline.monitoring.products import Result
 from pipeline.monitoring.run import monitor_paths
 from pipeline.monitoring.views import divided
@@ -135,3 +135,17 @@ def test_the_number_of_views_can_be_given(tmp_path: Path) -> None:
     assert len(one.site.views) == 1
     with pytest.raises(InputError, match="--views"):
         monitor_paths(files, tmp_path / "none", MonitorOptions(position=STATION, views=7))
+
+
+def test_stable_areas_in_survey_coordinates_hold_for_every_view(tmp_path: Path) -> None:
+    """A box on one face and a polygon on the other, x, y and z: only pixels in them are stable, and both faces have some."""
+    files = [las(tmp_path / "2026-03-01.las", corner(1)), las(tmp_path / "2026-04-01.las", corner(2, fallen=True))]
+    low, high = np.array([1.0, -1.0, 0.5]), np.array([4.0, 1.0, 7.5])
+    face = np.array([[0.0, -1.0, 0.5], [0.0, -4.0, 0.5], [0.0, -4.0, 7.5], [0.0, -1.0, 7.5]])
+    areas = tmp_path / "stable.yaml"
+    areas.write_text(json.dumps({"stable_areas": [[*low, *high], face.tolist()]}), encoding="utf-8")
+    result = monitor_paths(files, tmp_path / "out", MonitorOptions(position=STATION, stable=read_areas(areas)))
+    (epoch,) = result.epochs
+    area = epoch.record.registration["stable_pixels"] * result.site.grid.gsd**2
+    assert area == pytest.approx(2 * 3.0 * 7.0, rel=0.05)
+    assert sorted(region.view for region in epoch.regions) == [1, 2]
