@@ -86,8 +86,8 @@ class ReferenceSurface:
     ) -> FloatArray:
         """Pair points with their nearest reference points, and sum up what the normal equations of one ICP iteration need.
 
-        The sum runs over pairs of a moved point p and a reference point q, at most `gate` apart. It is that of u u^T, where the
-        column vector u of a pair is, with the translation g of the pose,
+        The sum runs over pairs of a moved point p and a reference point q, at most `gate` apart, in the reference's coordinates.
+        It is that of u u^T, where the column vector u of a pair is, with the translation g of the pose and q's normal n,
         with normals n:  ((p - g) x n, n, n . (p - q), 1), so that the result is (8, 8);
         without:         (p - g, q - p, 1), so that it is (7, 7).
         The last element of the result is the number of pairs.
@@ -97,7 +97,7 @@ class ReferenceSurface:
         blocks : list of (k, 3) arrays
             The moving points, m, divided into parts that are processed separately.
         pose : RigidTransform
-            Moves these points to the reference's coordinates relative to `origin`.
+            Moves these points to the reference's coordinates, whose zero is the centroid of the reference.
         gate : float
             Largest distance of a pair, m.
         normals : (m, 3) array, optional

@@ -108,9 +108,10 @@ class ShapedSurface:
         return SurfacePlaces(point, normal, *values)
 
     def near(self, point: FloatArray) -> SurfacePlaces:
-        """Describe the surface around n places (n, 3), wall frame, m, by the properties of the nearest vertex.
+        """Describe the surface around n places (n, 3), wall frame, m, by normal, roughness, convexity and distance to the edge.
 
-        A NaN point keeps its NaN position.
+        These are the values of the mesh's vertex nearest to each place. A place with NaN coordinates keeps them, and the values
+        given for it mean nothing.
         """
         known = np.isfinite(point).all(axis=1, keepdims=True)
         vertices = self.nearest(np.where(known, point, 0.0))[1]

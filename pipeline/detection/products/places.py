@@ -22,9 +22,10 @@ are none.
 
 @dataclass(frozen=True)
 class EventPlaces:
-    """What places the events of a run in the world: its wall frame and the vertices of its reference surface.
+    """What converts an event's position on a difference map to world coordinates: a run's wall frame and its reference surface.
 
-    The vertices (n, 3), wall frame, m, are sorted by x; they are empty if the run wrote none.
+    The map gives x and y in the wall frame; the height comes from the vertices (n, 3) of the reference surface around them,
+    wall frame, m. They are sorted by x, so that those near an event are found by bisection, and empty if the run wrote none.
     """
 
     frame: WallFrame

@@ -147,9 +147,10 @@ class Candidate:
 
     @property
     def sine(self) -> Wave:
-        """The sine of a candidate that is a sinusoidal error: the quantity along which it runs, and its scale at each point.
+        """Return the sine of a candidate that is a sinusoidal error, such as a wobble along the azimuth.
 
-        Raises TypeError if the candidate is not sinusoidal.
+        It holds the quantity along which the sine runs, at each of n points, and by how much a sine of value 1 changes the
+        observable of each point. Raises TypeError if the candidate is not sinusoidal.
         """
         if self.wave is None:
             raise TypeError(f"candidate {self.name} is not a sine")

@@ -28,13 +28,13 @@ _LEAST_WHITE_SHARE = 0.02
 
 @dataclass(frozen=True)
 class ValidatedEffects:
-    """Named effects (sensor errors), sorted by whether they improve the predictions on parts of the wall that no fit used.
+    """Sensor errors that the fit found, sorted by whether they improve predictions on parts of the wall that no fit used.
 
     Attributes
     ----------
-    named : effects that do, with their log-likelihood ratio on these validation blocks.
-    failed : effects that do not.
-    weak : effects that do, beside the others, but by too little to be named.
+    named : effects that improve them, with the log-likelihood ratio on these validation blocks.
+    failed : effects that do not improve them.
+    weak : effects that improve them, but by less than an effect must to be reported by name.
     """
 
     named: list[NamedEffect]

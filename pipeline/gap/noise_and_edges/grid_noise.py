@@ -175,10 +175,11 @@ def separate_white_and_grid_noise(
 ) -> list[VarianceTerm]:
     """Decide whether noise that was taken for white is independent from point to point or correlated between grid nodes.
 
-    The semivariogram of the residuals decides. If it does not, both kinds are reported as indistinguishable. Grid nodes are the
-    widely spaced pixels between which a stereo matcher interpolates disparities and their noise. Grid-correlated noise also
-    replaces an empirical noise term (a variance fitted freely to a covariate such as the depth): so few nodes share one value
-    of the covariate that the noise seems to vary with it.
+    Grid nodes are the widely spaced pixels between which a stereo matcher interpolates disparities and their noise. The
+    semivariogram of the residuals decides; where it supports neither kind over the other, both are reported as
+    indistinguishable. A noise term may also be empirical, that is, a variance fitted freely to a covariate such as the depth.
+    Where the points with one value of the covariate belong to few grid nodes, grid-correlated noise looks as if it depended
+    on the covariate, and therefore replaces such a term.
 
     Parameters
     ----------

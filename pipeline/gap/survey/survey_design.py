@@ -163,12 +163,12 @@ class SurveyDesign:
         return np.array([left / max(whole, 1e-300) for left, whole in sizes])
 
     def cosines(self) -> FloatArray:
-        """Return the (m, m) absolute cosines between the signatures of the effects that a pose fit leaves.
+        """Return how similar the m effects look in the survey's observations: absolute cosines (m, m) between their signatures.
 
-        A signature is an effect's change of the observations. Near 1, the survey can hardly tell two effects apart.
-
-        A cosine is the largest canonical correlation of one effect's first variant with any variant of the other effect, such
-        as another camera. Of both orders of the two effects, the larger value counts.
+        A signature is an effect's change of the observations, less what a different pose of the sensor could explain. Near 1,
+        the survey can hardly tell two effects apart. Where an effect has several variants, such as one for each camera, the value
+        is the largest canonical correlation of the first variant of one effect with any variant of the other, whichever of the
+        two effects comes first.
         """
         bases = [[self._basis(span) for span in variants] for variants in self.spans]
         count = len(bases)
