@@ -121,7 +121,7 @@ ROWS = {
     "carve_large": Row(
         "the same out of 16 million triangles", "carve.py --large", {"GB": r"carve\s+[\d.]+\s+([\d.]+)"}, "at most 6 GB"
     ),
-    "difference": Row("difference map of 3500 x 1500 px", "difference.py", MEMORY, "at most 2 bare casts"),
+    "difference": Row("memory of a difference map of 3500 x 1500 px", "difference.py", MEMORY, "no aim"),
     "icp": Row("registration (ICP) of 1 million points", "icp.py", ICP, "at most half of Open3D's time"),
     "epoch_stereo": Row(
         "stereo epoch of Glendale with 1,500 blocks and all products",
