@@ -58,10 +58,11 @@ def monitor(
     progress : "auto" or bool
         Whether progress is shown; "auto": in notebooks and on terminals.
     **options
-        Fields of `MonitorOptions`: position (of the sensor) and direction (of change), survey coordinates, m; views (their
-        number) and gsd_m (side of a pixel, m) of the maps; stable (areas of stable rock, wall frame, m); targets (file of
-        measured targets, used instead of ICP); unit and columns of the files; scanner, model or photographs (what measured);
-        detector; seed. Default: found from the files.
+        Fields of `MonitorOptions`. Position (of the sensor) and direction (of change): survey coordinates, m. Views: number
+        of planes on which a wall that turns or overhangs is mapped, each with difference maps of its own. gsd_m: side of a
+        pixel, m. Stable: areas of stable rock, m. Targets: file of measured targets, used instead of ICP. Unit and columns
+        of the files. Scanner, model or photographs: what measured. Detector: name or file of a trained detector, whose
+        finds are then the events in place of significant regions. Seed of random numbers. Default: found from the files.
 
     Returns
     -------

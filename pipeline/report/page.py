@@ -80,7 +80,7 @@ def with_minus_sign(value: float, digits: int) -> str:
 
 
 def picture_source(png: bytes) -> str:
-    """Encode a PNG as a data URL for the attribute `src` of an <img> element, so that a report is one file."""
+    """Encode a PNG as a data URL for the attribute `src` of an HTML image, so that a report is one file."""
     return f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
 
 
