@@ -43,7 +43,10 @@ _SUFFIX = re.compile(r"^(?P<name>[^\s_]+)[\s_/]+(?P<unit>[^\s_]+)$")
 _NAME = re.compile(r"[^\s\[({]+(?:\s*[\[({][^\])}]*[\])}])?")
 """A name between white space, with its unit in brackets."""
 _PROJECT = "project the points to a coordinate system in metres, such as UTM, and export them again"
-_HOW = "name the columns x, y, z in the file, or with --columns where a command has it; delete a line of text that does not name columns"
+_HOW = (
+    "name the columns x, y, z in the file, or with --columns where a command has it; "
+    "delete a line of text that does not name columns"
+)
 
 
 @dataclass(frozen=True)
