@@ -15,7 +15,7 @@ the tests that take seconds each. `make validate` runs the tests below. Run it b
 What a long test covers as a whole also has short tests of its parts in `make test`. Each table has the files with long tests,
 how many they hold, and what a file tests. The sentence below a heading says which shorter tests cover the same.
 
-On two cores, with an empty kernel cache, the 4,658 tests of `make test` took 11.5 minutes of time and 19 of processor time.
+On two cores, with a filled kernel cache, the 4,711 tests of `make test` took 14 minutes, of which each worker takes two to collect them.
 
 The names of the long tests are in `tests/validation.toml`.
 """
