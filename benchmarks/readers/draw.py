@@ -170,8 +170,9 @@ def page() -> str:
     """Return the page, from files of grades: a list of {number, kind, where, grade, understood}."""
     lines = ["| round | kind | items | median grade | below 2 |", "|---|---|---|---|---|"]
     failed = ["| round | item | grade | what was unclear |", "|---|---|---|---|"]
-    for number, path in enumerate(sorted(FOLDER.glob("*.json")), start=1):
-        graded = json.loads(path.read_text(encoding="utf-8"))
+    rounds = {int(path.stem.rpartition("_")[2]): path for path in FOLDER.glob("round_*.json")}
+    for number in sorted(rounds):
+        graded = json.loads(rounds[number].read_text(encoding="utf-8"))
         for kind in COUNTS:
             grades = [each["grade"] for each in graded if each["kind"] == kind]
             if grades:

@@ -103,9 +103,12 @@ def surface_raster(mesh: TriangleMesh, grid: Grid) -> SurfaceRaster:
 
 
 def cast_raster(caster: RayCaster, grid: Grid) -> SurfaceRaster:
-    """Rasterise the heights and block labels of a mesh that is already prepared for ray casting, as `surface_raster` does.
+    """Rasterise a mesh that is already prepared for ray casting.
 
     caster: the mesh in the wall frame, m. grid: the pixels.
+
+    Returns a raster that has for each pixel the height z of the surface, m (NaN where there is none), and the label of the
+    fallen block whose niche is seen there (0 where there is none).
     """
     hits, point = caster.look_down(grid)
     block = hits.block

@@ -260,7 +260,9 @@ def _only_source(values: dict[str, Any], path: Path) -> dict[str, Any]:
         )
     if not configs or not isinstance(configs[0], dict):
         raise InputError(
-            "the file is damaged: it has no config", where=str(path), remedy="use the config that the set was made with"
+            "the record of the data set is damaged: it has no config",
+            where=str(path),
+            remedy="give the YAML file that the set was made with in its place",
         )
     return dict(configs[0])
 

@@ -48,7 +48,7 @@ class Sample:
 
 
 class Tiles(Sequence[Sample]):
-    """One split of a data set, read tile by tile.
+    """One split of a data set: a sequence of samples, each a tile of a difference map with its annotations, read on access.
 
         Tiles("sets/rockfall_9/train", sensor="stereo", noise="low")
 

@@ -48,10 +48,10 @@ class ShownTile:
 
     Attributes
     ----------
-    cell : Combination (wall, noise level, ...) that its epoch belongs to.
-    file : Path relative to the set's folder.
-    tile : Its entry in the record of the epoch.
-    noise_m : Noise of its epoch, m.
+    cell : Combination of wall, noise level and so on to which the epoch of the tile belongs.
+    file : Path of the tile's difference map, relative to the set's folder.
+    tile : What the epoch's record says of the tile, as in the JSON file.
+    noise_m : Noise of the epoch, m.
     """
 
     cell: Cell

@@ -160,8 +160,9 @@ def _for_file(scan: RawScan, station: Station) -> PointCloud:
 def _scans(request: Request) -> list[RawScan]:
     """Read all scans of the request, or one scan of each file."""
     found = []
-    if len(set(request.scans)) < len(request.scans):
-        raise InputError("a file is given twice", where="SCAN", remedy="give one file for each epoch")
+    twice = [path for number, path in enumerate(request.scans) if path in request.scans[:number]]
+    if twice:
+        raise InputError(f"a file is given twice: {twice[0]}", where="SCAN", remedy="give one file for each epoch")
     for path in request.scans:
         each = read_scans(path, request.unit, request.columns)
         if request.number is not None:

@@ -92,7 +92,8 @@ class WallFrame:
     def fit(cls, vertices: FloatArray, towards: FloatArray) -> WallFrame:
         """Fit the wall frame to a wall: its z axis is the normal of the vertices' mean plane (least squares, by SVD).
 
-        The origin lies in the mean plane at the smallest x and y of the vertices.
+        The z axis points towards the sensors, the y axis up the wall (on level ground, along the world's y). The origin lies
+        in the mean plane, where x and y of this frame are the smallest of all vertices.
 
         Parameters
         ----------

@@ -105,7 +105,7 @@ class ImportedWall(Config):
             remedy = (
                 f"set `unit` to {' or '.join(likely)} if that is the file's unit"
                 if likely
-                else "cut the mesh to the wall in a mesh editor, or export it with the unit in `unit`"
+                else "export the mesh in the unit that `unit` states, or, if it shows more than the wall, cut it in a mesh editor"
             )
             raise InputError(
                 f"the wall is {extent:.4g} m in size with `unit: {self.unit}`",

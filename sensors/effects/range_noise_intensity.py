@@ -39,7 +39,9 @@ class RangeNoiseIntensity(RangeSpread):
     )
 
     def sigma(self, at: PulseGeometry, m: Functions, p: Any) -> Any:
-        """Return the standard deviation of the range (n,), m, a power of the received power.
+        """Return the standard deviation of the range of each of n pulses, (n,), m.
+
+        It is proportional to a power of the received power.
 
         at: geometry of n pulses. m: elementary functions (sine, logarithm and so on) for its arrays, `HOST` for NumPy or
         `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.

@@ -230,8 +230,11 @@ class LaserScanner:
     def observe(self, scene: RayCaster, random: KeyedRandom) -> Observation:
         """Scan the scene once. Rows are scan lines (azimuth), columns the pulses of a line (zenith).
 
-        scene: the wall, wall frame. random: source of random numbers. Points are computed with the surveyed pose; pulses leave
-        from the real one: shifted, turned, and drawn with `pose_sigma`.
+        Pulses leave from the real pose of the scanner. It is the surveyed pose, displaced by `shift_m` and `turn` and then by a
+        random error with the standard deviations `pose_sigma`. Points are computed from angles and range with the surveyed pose,
+        so that they have its error.
+
+        scene: the wall, wall frame. random: source of random numbers.
         """
         moved = self.position if self.shift_m is None else self.position + self.shift_m
         rotated = self.rotation if self.turn is None else self.turn @ self.rotation

@@ -37,7 +37,8 @@ WHITE_LEVEL = 0.85
 class ExposureConfig(Config):
     """How light is converted to grey values.
 
-    It describes the image sensor of the simulated cameras, which take the photographs that are matched.
+    It describes the image sensor of the simulated cameras, which take the photographs that are matched. A
+    pixel of the frame is one of the full image sensor; a pixel of a simulated photograph may bin several of them.
     """
 
     samples_per_side: int = Field(2, ge=1, le=8, description="rays per pixel along a row or a column, averaged")

@@ -189,8 +189,8 @@ def check_place(out: Path) -> None:
 def filling(out: Path) -> Iterator[Path]:
     """Provide a temporary folder to write to, so that the output folder `out` is complete or absent.
 
-    Its content moves to `out` if the `with` block succeeds, and is removed if it fails. Raises InputError if `out` is in use,
-    and as `writing` does.
+    Its content moves to `out` if the `with` block succeeds, and is removed if it fails. Raises InputError if `out` exists and
+    is not empty or cannot be created, if the disk is full, or if a path cannot be written.
     """
     empty_folder(out)
     temporary = out / ".part" if out.exists() else out.absolute().with_name(f".{out.absolute().name}.part")
@@ -223,9 +223,10 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON in the order of the keys; NumPy values become numbers and lists, paths become strings.
+    """Write a value as a JSON file that is complete or absent. Keys stay in the order that they have in `value`.
 
-    Raises ValueError for NaN and infinity, which JSON does not have; use None for a missing value.
+    NumPy values become numbers and lists, paths become strings. Raises ValueError for NaN and infinity, which JSON does not
+    have; use None for a missing value.
     """
     write_text(path, json.dumps(value, indent=2, allow_nan=False, default=_plain) + "\n")
 

@@ -119,7 +119,7 @@ def finite(cloud: PointCloud, where: str) -> PointCloud:
             if len(keep)
             else "the cloud has no points"
         )
-        raise InputError(problem, where=where, remedy="export the points again with all decimals of their coordinates")
+        raise InputError(problem, where=where, remedy="export the points again, with numbers for all coordinates and channels")
     if not keep.all():
         cloud = cloud.part(keep)
         box = bounding_box(cloud.points)

@@ -139,10 +139,10 @@ def _place(values: FloatArray) -> str:
 
 
 def check_counts(header: laspy.LasHeader, path: Path) -> None:
-    """Check the number of points in a LAS or LAZ file's header.
+    """Check the number of points that the header of a LAS or LAZ file states.
 
-    path: the file. Raises InputError if the header states two numbers, or an uncompressed file does not have the size for its
-    points.
+    path: the file. Raises InputError if the fields of older and newer versions of LAS state different numbers, or if the size
+    of an uncompressed file is not that of so many points.
     """
     with path.open("rb") as file:
         (older,) = struct.unpack_from("<I", file.read(_OLDER_COUNT_AT + 4), _OLDER_COUNT_AT)

@@ -313,8 +313,8 @@ class MeanSearch:
     def fitted_std(self, item: FamilyScore) -> float:
         """Return how large a candidate error is: the standard deviation of its fitted values over the points.
 
-        The candidate is fitted alone with the sensor's pose. The result is in the unit of the observable (m, or px of
-        disparity).
+        The candidate and the sensor's pose are fitted together, without any other candidate. The result is in the unit of the
+        observable (m, or px of disparity).
 
         item: the candidate with its score.
         """

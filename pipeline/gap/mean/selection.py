@@ -219,6 +219,8 @@ class CandidateScorer(Protocol):
         ----------
         members : Other errors in the model, fitted jointly.
         form : The non-parametric term with its score; the answer is false for one that is no wave.
+
+        The wave is so small if its standard deviation is below a threshold's multiple of that of the reference's error.
         """
 
 

@@ -167,7 +167,8 @@ class Residuals(ABC):
     def total_departure(self) -> FloatArray:
         """(n,) measured observable minus that of the reference surface, m or px, before any effect of the model is subtracted.
 
-        If there are several epochs, the effect of each one's own pose has been removed.
+        With several epochs, the error of each epoch's own pose has been removed. With one epoch, the error of its pose is
+        still in it, and is fitted together with the effects.
         """
         return self.geometry.departure if self.epoch_offset is None else self.geometry.departure - self.epoch_offset
 
