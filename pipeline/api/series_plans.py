@@ -173,7 +173,10 @@ class SeriesPlans:
         return iter(self.plans)
 
     def summary(self) -> str:
-        """Return the main predictions for all sensors as lines of text."""
+        """Return what the series would show with each sensor, as lines of text.
+
+        They state from which volume on a rockfall is listed in 95 % of cases, and how long before its fall a moving block is.
+        """
         return "\n\n".join(each.summary() for each in self.plans)
 
     def plot(self, kind: str = "curves") -> Picture:

@@ -262,7 +262,7 @@ def _only_source(values: dict[str, Any], path: Path) -> dict[str, Any]:
         raise InputError(
             "the record of the data set is damaged: it has no config",
             where=str(path),
-            remedy="give the YAML file that the set was made with in its place",
+            remedy="give the YAML file that the set was made with instead of this record",
         )
     return dict(configs[0])
 

@@ -131,7 +131,9 @@ class VarianceThresholds(ThresholdGroup):
 class GridNoiseThresholds(ThresholdGroup):
     """Thresholds that separate white from grid-correlated noise of disparities, and noise from errors of the reference.
 
-    Grid-correlated noise is noise that a stereo matcher interpolates between widely spaced pixels (nodes of a grid).
+    Grid-correlated noise is noise that a stereo matcher interpolates between widely spaced pixels (nodes of a grid). The
+    semivariogram of the residuals decides which noise is named, or both. The last argument of each field states where the
+    value comes from: tuning on development cases, or judgement.
     """
 
     margin: PositiveFloat = threshold_field(

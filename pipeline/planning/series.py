@@ -333,7 +333,7 @@ class _Sample:
         size = 3 if self._moved else 2
         if len(used) < _FEWEST:
             raise InputError(
-                f"of only {len(used)} of {len(rows)} simulated blocks does the sensor see at least half of the volume that fell",
+                f"the sensor sees only {len(used)} of {len(rows)} simulated blocks (at least half of the volume of each)",
                 where="inspect --series",
                 allowed=f"{_FEWEST} blocks or more",
                 remedy="move or turn the sensor so that it sees more of the wall; a map of `scarpsim inspect` shows what it sees",

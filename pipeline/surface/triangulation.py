@@ -59,8 +59,8 @@ class SeenSurface:
     def error_m(self) -> float:
         """Estimated standard deviation of the mesh's vertices along the lines of sight, m.
 
-        If vertices are means of neighbouring points, their errors are correlated. The value is then that of independent vertices
-        that would give equal noise of the surface between vertices.
+        Vertices may be means of neighbouring points, whose errors are then correlated. For these the value is an equivalent one:
+        vertices with independent errors of this size would make the surface between them equally noisy.
         """
         return float(np.nan_to_num((_OF_SEVEN / _BETWEEN if self.smoothed else 1.0) * self.roughness_m))
 

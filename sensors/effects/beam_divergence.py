@@ -51,7 +51,9 @@ class BeamDivergence(Effect):
     )
 
     def evaluate(self, state: Beam, random: KeyedRandom) -> Beam:
-        """Replace the beam of no width by one of this divergence, with its sub-rays and its way of ranging.
+        """Replace the beam of no width by one of this divergence.
+
+        The new beam also says how many sub-rays stand for it, and how the ranges of their echoes become one.
 
         state: the beam before this effect. `random` is not used.
         """

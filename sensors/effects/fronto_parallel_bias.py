@@ -15,10 +15,10 @@ from sensors.signal_chain.matches import Matches
 class FrontoParallelBias(Effect):
     """A matcher with windows of one disparity is biased in proportion to the gradient of the disparity.
 
-    dd = min(max(a |grad d| + b d_u, -L), L), with the slope a, the displacement b, the limit L and the change d_u of the
-    disparity d per column. It lies between -L and L. A window on a slanted surface contains a range of disparities and takes
-    one of them (Bleyer et al. 2011, 1). An asymmetric window takes that of a place beside its centre, b px along the row
-    (Kanade & Okutomi 1994). Registration absorbs most of b, because it displaces the whole surface.
+    dd = min(max(a |grad d| + b d_u, -L), L): the bias dd never exceeds the limit L. The change of the disparity d per column
+    is d_u. The first term is for windows that find one disparity in the range that a slanted surface has within them (Bleyer
+    et al. 2011, 1). The second is for asymmetric windows, which find the disparity of a place b px along the row from their
+    centre (Kanade & Okutomi 1994). That displaces the whole surface along the row, so that registration removes most of it.
     """
 
     name: Literal["fronto_parallel_bias"] = "fronto_parallel_bias"

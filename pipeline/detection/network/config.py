@@ -148,7 +148,8 @@ class TrainingConfig(Config):
     weight_decay: float = Field(1e-4, ge=0, le=1000, description="decay of the weights towards zero")
     clip_norm: float = Field(5.0, gt=0, le=1e9, description="largest norm of the gradient")
     loss_weights: dict[Loss, Annotated[float, Field(gt=0, le=1e6)]] = Field(
-        {}, description="factors of the losses in their sum; 1 for those not listed, as in the thesis"
+        {},
+        description="factors of the losses (proposal_class, proposal_box, class, box, mask) in their sum; 1 for those not listed",
     )
     precision: Literal["float32", "bfloat16"] = Field(
         "float32",
@@ -177,7 +178,12 @@ class TrainingConfig(Config):
         ge=0,
         description="also keep the detector every so many epochs, in folders stage_0004, ... (0: only the best and the last)",
     )
-    seed: int = Field(1, ge=0, lt=2**63, description="seed of weights, order, flips and samples")
+    seed: int = Field(
+        1,
+        ge=0,
+        lt=2**63,
+        description="seed of the initial weights, of the order and mirroring of images, and of the random choice of proposals",
+    )
 
 
 class TrainConfig(Config):

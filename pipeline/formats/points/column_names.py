@@ -44,8 +44,7 @@ _NAME = re.compile(r"[^\s\[({]+(?:\s*[\[({][^\])}]*[\])}])?")
 """A name between white space, with its unit in brackets."""
 _PROJECT = "project the points to a coordinate system in metres, such as UTM, and export them again"
 _HOW = (
-    "name the columns x, y, z in the file, or with --columns where a command has it; "
-    "delete a line of text that does not name columns"
+    "name the columns x, y, z in this line, or with --columns where a command has it; if the line is a title or remark, delete it"
 )
 
 

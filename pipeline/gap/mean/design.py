@@ -197,9 +197,9 @@ class Design:
 
     @property
     def plain_columns(self) -> list[list[int]]:
-        """The numbers of the design columns of each candidate that has known columns, in the order of `families.plain`.
+        """The numbers of the design columns of each candidate whose columns are known before the fit: a list for each.
 
-        Sines of unknown period are not included.
+        Candidates come in the order of `families.plain`. Sines of unknown period are not among them.
         """
         return [self.column_numbers[candidate] for candidate in self.families.plain]
 

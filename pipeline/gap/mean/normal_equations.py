@@ -316,12 +316,12 @@ class NormalEquations:
         Parameters
         ----------
         base : Numbers of the b columns to fit.
-        right : (C, b, a) right-hand sides: inner products of these columns with `a` columns of residuals, or with other
-            columns.
+        right : (C, b, a) right-hand sides: inner products of these columns with the `a` vectors that are to be fitted, such as
+            residuals, under each covariance.
 
         Returns
         -------
-        (C, b, a) fitted coefficients.
+        (C, b, a) fitted coefficients, a column for each fitted vector.
         """
         matrix = self.fixed[:, base][:, :, base]
         scale = 1 / np.sqrt(np.maximum(np.einsum("ckk->ck", matrix), 1e-300))

@@ -136,15 +136,18 @@ class MeanSearch:
         return self._null.p_value(score)
 
     def goodness_of_fit_p_value(self, family_scores: Sequence[FamilyScore]) -> float | None:
-        """Test whether the selected errors leave anything to explain, by the p-value of the best score of a further candidate.
+        """Test whether the selected systematic errors leave anything to explain.
 
-        The simulations behind the p-value draw the reference surface's error from a Gaussian process. A real reference may
-        have larger single waves. How much larger is estimated along oblique directions on the wall, where no sensor has an
-        axis, and all sines are discounted by that factor. This is genomic control (Devlin & Roeder 1999).
+        The p-value is that of the best score that any further candidate reaches. It comes from simulations in which the error of
+        the reference surface is drawn from a Gaussian process. A real reference may have larger single waves, which would pass
+        for sinusoidal sensor errors. How much larger is estimated along oblique directions on the wall, where no sensor has an
+        axis, and the null distribution of all sinusoidal candidates is stretched by that factor: genomic control (Devlin & Roeder
+        1999).
 
         Parameters
         ----------
-        family_scores : Scores of all families of candidates beside the selected errors, as `select` returns them.
+        family_scores : Scores of all further candidates beside the selected errors, as `select` returns them. A family is a
+            candidate with its variants, such as a sine with all its periods.
 
         Returns
         -------
@@ -313,7 +316,7 @@ class MeanSearch:
     def fitted_std(self, item: FamilyScore) -> float:
         """Return how large a candidate error is: the standard deviation of its fitted values over the points.
 
-        The candidate and the sensor's pose are fitted together, without any other candidate. The result is in the unit of the
+        The fit has the candidate and the pose of the sensor, and no other candidate. The result is in the unit of the
         observable (m, or px of disparity).
 
         item: the candidate with its score.

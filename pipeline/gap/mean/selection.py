@@ -213,14 +213,14 @@ class CandidateScorer(Protocol):
         """
 
     def may_be_reference_error(self, members: EffectSet, form: FamilyScore) -> bool:
-        """Tell whether a wave in the residuals is so small that it may be part of the reference surface's error.
+        """Tell whether a wave in the residuals is so small that the reference surface's own error may cause it.
+
+        It is if the standard deviation of the fitted wave is below a threshold's multiple of that of the reference's error.
 
         Parameters
         ----------
-        members : Other errors in the model, fitted jointly.
-        form : The non-parametric term with its score; the answer is false for one that is no wave.
-
-        The wave is so small if its standard deviation is below a threshold's multiple of that of the reference's error.
+        members : The systematic errors already in the model, which are fitted together with the wave.
+        form : The wave: a non-parametric term with its score. For a term that is no wave the answer is false.
         """
 
 

@@ -299,11 +299,11 @@ class Estimate:
 
 
 def effect_from_estimate(found: Estimate, part: Residuals) -> NamedEffect:
-    """Convert a fitted systematic error to a named effect, as an entry of gap.json, with standard deviations.
+    """Describe a fitted systematic error as an entry of gap.json: name, parameters and their standard deviations.
 
     A non-parametric term is described by its values at evenly spaced places along its covariate.
 
-    found: the error as a regression term with fitted coefficients; part: residuals of the points that are its rows.
+    found: the error as a regression term with fitted coefficients. part: residuals of the points to which it was fitted.
     """
     if found.candidate.empirical:
         return _empirical_effect(found.candidate, found.values, found.chosen, part)

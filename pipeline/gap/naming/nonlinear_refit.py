@@ -192,11 +192,11 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
 
 
 def search_at_joint_fit(given: SearchInput) -> SearchOutcome | None:
-    """Search for systematic sensor errors (effects) with the model linearised at the joint fit of all effects of the catalogue.
+    """Search for systematic sensor errors (effects) after fitting all effects of the catalogue together.
 
-    It serves measurements with several large errors. With all effects in the model, rays meet the reference where the real rays
-    did, so the Jacobian is right even if an error is large. What the fitted effects explain is added back to the residuals
-    before the search.
+    It serves measurements with several large errors, for which the ordinary model, linearised without effects, is inexact. The
+    joint fit moves each ray to about where the real one was, so that the derivatives taken there are right. What the fitted
+    effects explain is then added back to the residuals, so that the search can select the effects anew.
 
     Parameters
     ----------

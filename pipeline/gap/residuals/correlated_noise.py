@@ -90,9 +90,7 @@ class GridCorrelatedNoise:
 
         Noise on a grid finer than the mean spacing of the points acts like white noise and is left out.
 
-        Parameters
-        ----------
-        count : Number n of points, which is the number of rows of the weights even if there is no such noise.
+        count: number n of points. The weights have a row for each, also if there is no such noise.
         """
         if self.pixels is None or not count:
             return _empty_field(count)

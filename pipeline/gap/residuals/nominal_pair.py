@@ -269,20 +269,21 @@ def is_hidden(scene: RayCaster, position: FloatArray, points: FloatArray) -> Boo
 
 
 def predict_disparities(nominal: NominalPair, real: Iterable[CameraPair], geometry: PixelGeometry) -> list[FloatArray]:
-    """Predict the disparities of given pixels for several positions or calibrations of the real cameras.
+    """Predict what disparities a pair would measure at given pixels if its cameras were not where the calibration says.
 
-    Differences of the results give, for example, derivatives by the pose. To be fast, the surface is replaced by its tangent
-    planes, so that no ray is traced again.
+    Images are rectified with the stated (nominal) calibration, so that an error of the real cameras shows in the disparities.
+    Differences of the results are the derivatives by pose or calibration that the diagnosis needs. To be fast, the surface is
+    replaced by its tangent planes, so that no ray is traced again.
 
     Parameters
     ----------
-    nominal : The pair with its stated calibration, with which the images are rectified.
-    real : The pairs as they might really be.
+    nominal : The pair with its stated calibration.
+    real : Pairs as they might really be, such as the nominal one with one camera rotated a little.
     geometry : n pixels of the left image, with the points of the reference surface that they see and its normals.
 
     Returns
     -------
-    For each real pair the (n,) disparities, px.
+    A list with the (n,) disparities, px, for each of the real pairs.
     """
     u, v = on_device(mi.Float64, geometry.u), on_device(mi.Float64, geometry.v)
     point, normal = vectors_on_device(geometry.point), vectors_on_device(geometry.normal)

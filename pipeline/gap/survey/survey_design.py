@@ -166,9 +166,9 @@ class SurveyDesign:
         """Return how similar the m effects look in the survey's observations: absolute cosines (m, m) between their signatures.
 
         A signature is an effect's change of the observations, less what a different pose of the sensor could explain. Near 1,
-        the survey can hardly tell two effects apart. Where an effect has several variants, such as one for each camera, the value
-        is the largest canonical correlation of the first variant of one effect with any variant of the other, whichever of the
-        two effects comes first.
+        the survey can hardly tell two effects apart. An effect may have several variants, such as one for each camera. The first
+        variant of each of the two is then compared with every variant of the other, and the largest canonical correlation
+        counts.
         """
         bases = [[self._basis(span) for span in variants] for variants in self.spans]
         count = len(bases)
@@ -234,12 +234,11 @@ class SurveyDesign:
 def signature_columns(view: SurveyView, wanted: list[Candidate]) -> FloatArray:
     """Return the signatures (changes of the observations) of given effects at the points of one station or stereo pair.
 
-    Waves have the periods of the given candidates, so that all stations of a survey use the same ones.
-
     Parameters
     ----------
     view : What the station or pair sees of the wall.
-    wanted : Effects, each with one choice of the values that are not fitted, such as the camera or a period.
+    wanted : Effects. What is not fitted is fixed in each: the camera it is in, or the period of a wave, for example. All
+        stations of a survey are to be given the same list, so that their columns belong together.
 
     Returns
     -------
