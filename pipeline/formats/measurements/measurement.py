@@ -99,11 +99,7 @@ class MeasurementBase(ABC):
 
     @property
     def fit(self) -> PointFit:
-        """How well the points fit the reference along the rays, which shows a wrong frame or unit.
-
-        It states the share of the points whose rays meet the reference, the share of these that are near it, and the median
-        distance behind it, m.
-        """
+        """How well points fit the reference along the rays: shares that meet it and are near it, median offset, m."""
         return PointFit.of(self.cloud.points, self.viewpoint, self.scene, self.sensor)
 
     def check_near(self, where: str) -> None:
