@@ -64,7 +64,7 @@ def merge_datasets(folders: Sequence[Path], out: Path) -> DatasetSummary:
 
 
 def _check_categories(sets: Sequence[tuple[Path, Record]]) -> None:
-    """Raise InputError if some sets annotate moved and deposited rock too and others do not, as one label would mean two things."""
+    """Raise InputError if only some of the sets annotate moved and deposited rock: one label would mean two things."""
     with_kinds, without = ([folder for folder, dataset in sets if has_kinds(dataset) is wanted] for wanted in (True, False))
     if with_kinds and without:
         raise InputError(

@@ -127,7 +127,7 @@ def test_kinds_are_categories_and_training_takes_the_missing_rock(tmp_path: Path
     assert {each["category_id"] for each in CocoFolder(tmp_path / "set/test").annotations} == {1}
     plain = tmp_path / "plain"
     make_dataset(config({"test": 1}), plain)
-    with pytest.raises(InputError, match="one category, block.*same `series.kinds`"):
+    with pytest.raises(InputError, match=r"one category, block.*same `series.kinds`"):
         merge_datasets([tmp_path / "set", plain], tmp_path / "merged")
     assert not (tmp_path / "merged").exists()
 
