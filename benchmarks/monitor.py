@@ -224,7 +224,7 @@ def cliff() -> Iterator[str]:
 
 
 def _between(before: TriangleMesh, after: TriangleMesh, view: WallView) -> tuple[float, float]:
-    """Return the volumes, m3, that are missing and added between two meshes along the direction of a view's map, without noise."""
+    """Return the volumes, m3, that are missing and added between two meshes along the direction of a map, without noise."""
     grid = view.raster.grid
     earlier, later = (
         cast_raster(RayCaster(mesh.with_vertices(view.frame.to_wall(mesh.vertices))), grid).heights for mesh in (before, after)
