@@ -30,7 +30,8 @@ class EdgeEffect:
     effect : the effect (of the known sensor effects) with its estimated parameters.
     std : standard deviations of its parameters, by parameter name.
     gain : log-likelihood ratio of the models with and without it.
-    touched : (n,) true for points that it moves by an amount that is uncertain by more than the noise.
+    touched : (n,) true for points that it moves by an amount that is uncertain by more than the noise; searches for other errors
+        leave them out.
     """
 
     effect: Effect
@@ -46,9 +47,10 @@ class EdgeEffect:
 
 @dataclass(frozen=True)
 class WallBlocks:
-    """Blocks of the wall with about a hundred points each. An edge effect is accepted only if they agree on it.
+    """Wall blocks: parts of the wall with about a hundred points each, to test whether an effect shows all over the wall.
 
-    Residuals are correlated within a block, so blocks and not points count as independent.
+    Residuals are correlated within a wall block, so blocks and not points count as independent. An effect at depth steps is
+    accepted only if the blocks agree on it.
 
     Attributes
     ----------
@@ -59,7 +61,14 @@ class WallBlocks:
 
     @classmethod
     def over(cls, at: FloatArray) -> WallBlocks:
-        """Divide the wall into blocks of about a hundred points. at: (n, 2) positions of the points, wall frame, m."""
+        """Divide the wall into parts (wall blocks) of about a hundred points, to test whether an effect shows in all of them.
+
+        at: (n, 2) positions of the points, x along the wall and y up, wall frame, m.
+
+        Returns
+        -------
+        WallBlocks : the number of the wall block in which each point lies.
+        """
         return cls(wall_blocks_by_points(at, _POINTS_PER_BLOCK))
 
     def sums(self, gains: FloatArray) -> FloatArray:
@@ -78,14 +87,15 @@ class WallBlocks:
     def total_if_agreed(self, gains: FloatArray, least_sigmas: float | None = None, *, by_signs: bool = False) -> float | None:
         """Return the total log-likelihood ratio of an effect if it is large enough and the wall blocks agree on it, else None.
 
-        Agreement is the sum of the blocks' ratios over the root of the sum of their squares, like a number of standard
-        deviations.
+        Wall blocks are parts of the wall with about a hundred points. Their agreement is the sum of the blocks' ratios over
+        the root of the sum of their squares, like a number of standard deviations.
 
         Parameters
         ----------
         gains : (n,) log-likelihood ratio of each point: model with the effect against model without it.
         least_sigmas : smallest agreement that is accepted; None: the threshold `edges.block_sigmas`.
-        by_signs : whether agreement of the signs alone is enough, for effects of which a few blocks hold most of the points.
+        by_signs : true: it is enough if the signs of the blocks' ratios agree, whatever their sizes. This suits effects that show
+            mainly in a few blocks.
         """
         by = thresholds().edges
         total, sums = float(gains.sum()), self.sums(np.clip(gains, -by.most_gain_of_a_point, by.most_gain_of_a_point))
@@ -100,8 +110,8 @@ class WallBlocks:
     def std(self, gains: Callable[[float], FloatArray], value: float, width: float | None = None) -> float:
         """Return the standard deviation of an edge effect's parameter at its maximum-likelihood value.
 
-        It is computed from the scatter of the derivatives of the log-likelihood between wall blocks (sandwich estimator), which
-        is valid if points in a block are correlated.
+        It is computed from the scatter of the derivatives of the log-likelihood between wall blocks, parts of the wall with
+        about a hundred points (sandwich estimator). That is valid if points in a block are correlated.
 
         Parameters
         ----------
@@ -116,12 +126,15 @@ class WallBlocks:
 
 
 def log_density(registered_residuals: FloatArray, shift: FloatArray, sigma: FloatArray) -> FloatArray:
-    """Return the log density of residuals that an effect shifts: a Gaussian plus a small constant for outliers.
+    """Return the log density of residuals that an edge effect shifts, to compare models with and without the effect.
+
+    The density is a Gaussian plus a small constant for outliers.
 
     Parameters
     ----------
     registered_residuals : (n,) residuals after a robust pose fit, m (ranges) or px (disparities).
-    shift : (n,) shift of each residual by the effect, same unit; its uncertainty of 15 % is added to the noise.
+    shift : (n,) shift of each residual by the effect, same unit; 0 without the effect. Its uncertainty, 15 % of the shift, is
+        added to the noise.
     sigma : (n,) standard deviations of the noise, same unit.
 
     Returns

@@ -176,10 +176,12 @@ def separate_white_and_grid_noise(
     """Decide whether noise that was taken for white is independent from point to point or correlated between grid nodes.
 
     Grid nodes are the widely spaced pixels between which a stereo matcher interpolates disparities and their noise. The
-    semivariogram of the residuals decides; where it supports neither kind over the other, both are reported as
-    indistinguishable. A noise term may also be empirical, that is, a variance fitted freely to a covariate such as the depth.
-    Where the points with one value of the covariate belong to few grid nodes, grid-correlated noise looks as if it depended
-    on the covariate, and therefore replaces such a term.
+    semivariogram of the residuals decides. Where it supports neither kind over the other, both are reported as
+    indistinguishable.
+
+    A noise term may also be empirical: a variance fitted freely to a covariate such as the depth. If points with the same value
+    of the covariate belong to few grid nodes, grid-correlated noise looks as if it depended on the covariate. It then replaces
+    such a term.
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ class HeavyTails:
     ----------
     share : share of all residuals beyond `limit_sigmas`.
     limit_sigmas : number of predicted standard deviations beyond which a residual is an outlier.
-    sigma : standard deviation that the residuals have in addition to the predicted one, relative to it.
+    sigma : standard deviation of white noise that would have to be added to explain the residuals, divided by the predicted one.
     gain : log-likelihood ratio of a mixture, in which this share of the residuals has larger noise, against normal noise.
     uniform : whether outliers lie all over the wall, as an instrument's own do. Edges, plants and moved rock leave them in
         parts of it.
@@ -47,8 +47,9 @@ def find_heavy_tails(z: FloatArray, block: NDArray[np.int64]) -> HeavyTails | No
 
     Parameters
     ----------
-    z : (n,) residuals over the standard deviation that the model with all named effects predicts.
-    block : (n,) number of each point's wall block, to see whether outliers lie all over the wall.
+    z : (n,) residuals, each divided by the standard deviation that the model with all named effects predicts for it.
+    block : (n,) number of the wall block (a part of the wall) in which each point lies, to see whether outliers lie all over the
+        wall.
     """
     by = thresholds().variance
     outlying = np.abs(z) > by.tail_sigmas

@@ -37,7 +37,7 @@ _LARGEST_LOG_POWER = 500.0
 
 @dataclass(frozen=True)
 class LossExplanation:
-    """An explanation of why m laser pulses did or did not return.
+    """An explanation of why some of m laser pulses did not return, such as a detection limit.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class LossData:
         ----------
         probability : function from the model's parameters and the covariate x to the probability of loss of each pulse.
         x : (m,) covariate of each pulse, such as its range.
-        starts : parameter vectors; the search begins at the most likely one.
+        starts : trial values of the model's parameters, a vector each; the search begins at the most likely one.
 
         Returns
         -------

@@ -46,14 +46,14 @@ _MOST_POINTS = 60_000
 
 @dataclass(frozen=True)
 class Locking:
-    """Pixel locking that was found: a matcher's systematic error that repeats with each pixel of the disparity.
+    """Pixel locking that was found: a stereo matcher's systematic error that repeats with each pixel of the disparity.
 
     Attributes
     ----------
-    amplitude_px, std_px : amplitude of the sine and its standard deviation, px.
+    amplitude_px, std_px : amplitude of the sinusoidal error and its standard deviation, px.
     period_px : size of a pixel of the image that was matched, px of the full image: above 1 if the image was reduced.
     phase_rad : phase of the sine at disparity 0, rad.
-    tilt_rad : rotation of the matcher's rectification about the base, rad.
+    tilt_rad : rotation, about the base, of the rectification in which the matcher worked, relative to the nominal one, rad.
     gain : log-likelihood ratio against no locking.
     """
 
@@ -81,7 +81,12 @@ class NoiseBounds:
     measured: float
 
     def in_matched_pixels(self, frequency: float) -> NoiseBounds:
-        """Convert the bounds of the noise to pixels of the (reduced) matched image. frequency: matched pixels per px."""
+        """Convert the bounds of the noise from px of the full image to pixels of the image that was matched.
+
+        A matcher may work on a reduced image; pixel locking repeats with the pixels of that one.
+
+        frequency: pixels of the matched image per px of the full image, such as 0.5 for half the resolution.
+        """
         return NoiseBounds(self.predicted * frequency, self.measured * frequency)
 
     def noise_range(self, amplitude: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -119,7 +124,8 @@ def find_locking(
     ----------
     disparity : (n,) measured disparities, px.
     reference : (n,) disparities of the reference, px. Crowding in these is due to the shape of the wall.
-    tangent : (n,) tangent of the angle between each point's rectified image row and the optical axis.
+    tangent : (n,) tangent of the angle between each point's rectified image row and the optical axis. With it a matcher is found
+        that worked in a rectification rotated about the base.
     infinity : disparity of a point at infinity, px, from which disparities are counted.
     noise : bounds of the matching noise, px; None if it is unknown.
     """

@@ -23,7 +23,7 @@ def null_p_value(squares: FloatArray, shapes: list[FloatArray], block: NDArray[n
     ----------
     squares : (n,) squared deviations of the residuals, over their predicted variance.
     shapes : for each candidate effect the (n,) variance that it adds at each point, divided by the predicted one.
-    block : (n,) number of each point's wall block.
+    block : (n,) number of the wall block (a part of the wall) in which each point lies.
     random : source of random numbers.
 
     Returns
@@ -38,13 +38,14 @@ def null_critical_score(squares: FloatArray, shapes: list[FloatArray], block: ND
     """Return the critical value for the test whether any candidate noise effect explains the squared deviations.
 
     The test statistic is the largest standardised score over the candidates. Its null distribution comes from random sign flips
-    of the scores of whole wall blocks; the critical value is its quantile at the threshold `variance.significance`.
+    of the scores of whole wall blocks; the critical value is its quantile at the threshold `variance.significance`. From it the
+    size follows from which on a noise effect would have been found.
 
     Parameters
     ----------
     squares : (n,) squared deviations of the residuals, over their predicted variance.
     shapes : for each candidate effect the (n,) variance that it adds at each point, divided by the predicted one.
-    block : (n,) number of each point's wall block.
+    block : (n,) number of the wall block (a part of the wall) in which each point lies.
     random : source of random numbers.
     """
     _, largest = _scores_with_flipped_signs(squares, shapes, block, random)

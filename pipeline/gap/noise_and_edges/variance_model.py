@@ -36,7 +36,10 @@ _FISHER_ROUNDS = 25
 
 @dataclass(frozen=True)
 class VarianceCandidate:
-    """A noise effect to fit: the variance that it adds at each of n points, by k fitted factors theta (one a parameter).
+    """A noise effect that may explain why residuals scatter more than predicted: the variance that it adds at n points.
+
+    It has k fitted parameters. The variance that a parameter adds is proportional to its square. Fitted is theta, the square of
+    each parameter relative to its typical size.
 
     Attributes
     ----------
@@ -56,18 +59,21 @@ class VarianceCandidate:
     fixed: Mapping[str, float] = field(default_factory=dict)
 
     def parameters(self, theta: FloatArray) -> dict[str, float]:
-        """Return a noise effect's parameters by name.
+        """Convert fitted variances of a noise effect to its parameters, by name: each is its typical size times sqrt(theta).
 
-        theta: (k,) fitted factors of the variance, one for each fitted parameter; 1 is the variance at its typical size.
+        theta: (k,) fitted variance of each parameter, relative to the variance at its typical size.
         """
         return dict(zip(self.names, map(float, np.sqrt(theta) * np.array(self.scale)), strict=True)) | dict(self.fixed)
 
     def standard_deviations(self, theta: FloatArray, error: FloatArray) -> dict[str, float]:
-        """Return the standard deviations of a noise effect's parameters by name; near 0, the size that it may have.
+        """Convert the standard deviations of fitted variances of a noise effect to those of its parameters, by name.
+
+        A parameter is its typical size times sqrt(theta). If theta is smaller than its standard deviation, the size is stated
+        that the parameter may have, typical size times sqrt(error).
 
         Parameters
         ----------
-        theta : (k,) fitted factors; 1 stands for the variance at a parameter's typical size.
+        theta : (k,) fitted variance of each parameter, relative to the variance at its typical size.
         error : (k,) standard deviations of theta.
         """
         root = np.sqrt(theta)
@@ -102,7 +108,10 @@ class VarianceTerm:
     variance: FloatArray
 
     def with_constant_variance(self, count: int) -> VarianceTerm:
-        """Return this noise term for `count` other points, each with the mean of its variances: noise alike everywhere."""
+        """Return a copy of this noise term that adds the same variance, its mean, at each of `count` points.
+
+        It serves to use a noise term for other points than those to which it was fitted.
+        """
         return replace(self, variance=np.full(count, float(self.variance.mean())))
 
 
@@ -163,10 +172,12 @@ def standardised_deviations(residuals: Residuals, cells: WallCells, value: Float
 
 
 def variance_candidates(residuals: Residuals) -> list[VarianceCandidate]:
-    """List the noise effects of the catalogue that can be fitted to residuals, given the fields that were recorded.
+    """List the noise effects of the catalogue that can be fitted to residuals.
 
-    An effect may need a field such as the intensity. Noise that neighbouring points share is left out, because it hardly shows
-    in deviations within small cells of the wall, to which the effects are fitted.
+    Effects that need a field which was not recorded, such as the intensity, are left out. So is noise that neighbouring points
+    share: it hardly shows in deviations within small cells of the wall, to which the effects are fitted.
+
+    residuals: residuals of n points, with their covariates and recorded fields.
     """
     found = []
     for effect in residuals.candidates:
@@ -311,12 +322,14 @@ def _unshared_share(residuals: Residuals, value: FloatArray, used: BoolArray, ad
 
 @dataclass(frozen=True)
 class NoiseRatio:
-    """Observed over predicted standard deviation of residuals, as deviations from planes in small cells of the wall.
+    """Observed over predicted standard deviation of residuals, to tell whether the predicted noise is right.
+
+    It is computed from deviations from planes in small cells of the wall, which hold noise and no error of the reference.
 
     Attributes
     ----------
     value : the ratio.
-    clearly_below : whether the ratio is significantly below 1, as judged by wall blocks.
+    clearly_below : whether the ratio is significantly below 1, as judged by its scatter between parts of the wall.
     """
 
     value: float
