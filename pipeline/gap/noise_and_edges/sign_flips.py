@@ -14,38 +14,39 @@ DRAWS = 1999
 
 
 def null_p_value(squares: FloatArray, shapes: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
-    """Test whether any candidate noise effect explains that residuals vary more than predicted.
+    """Test whether any candidate noise effect explains that residuals vary more than predicted, and return the p-value.
 
-    The test statistic is the largest standardised score over the candidates, which corrects for their number. Its null
-    distribution comes from N random sign flips of the scores of whole wall blocks.
+    A candidate's score is large if deviations are larger where it adds more variance. The test statistic is the largest
+    standardised score over the candidates, which corrects for their number. Its null distribution comes from random sign flips
+    of the scores of whole wall blocks (squares of the wall).
 
     Parameters
     ----------
     squares : (n,) squared deviations of the residuals, over their predicted variance.
     shapes : for each candidate effect the (n,) variance that it adds at each point, divided by the predicted one.
-    block : (n,) number of the wall block (a part of the wall) in which each point lies.
+    block : (n,) number of each point's wall block.
     random : source of random numbers.
 
     Returns
     -------
-    float : the p-value (1 + b) / (1 + N), if b of the N flips reach the observed statistic.
+    float : the p-value (1 + b) / (1 + N), if b of N sign flips reach the observed statistic.
     """
     observed, largest = _scores_with_flipped_signs(squares, shapes, block, random)
     return float((1 + np.sum(largest >= observed)) / (1 + DRAWS))
 
 
 def null_critical_score(squares: FloatArray, shapes: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
-    """Return the critical value for the test whether any candidate noise effect explains the squared deviations.
+    """Return the critical value of the test of `null_p_value`, to compute how large a noise effect must be to be found.
 
-    The test statistic is the largest standardised score over the candidates. Its null distribution comes from random sign flips
-    of the scores of whole wall blocks; the critical value is its quantile at the threshold `variance.significance`. From it the
-    size follows from which on a noise effect would have been found.
+    The test asks whether any candidate noise effect explains that residuals vary more than predicted. Its statistic is the
+    largest standardised score over the candidates. The null distribution comes from random sign flips of the scores of whole
+    wall blocks (squares of the wall). The critical value is its quantile at the significance level `variance.significance`.
 
     Parameters
     ----------
     squares : (n,) squared deviations of the residuals, over their predicted variance.
     shapes : for each candidate effect the (n,) variance that it adds at each point, divided by the predicted one.
-    block : (n,) number of the wall block (a part of the wall) in which each point lies.
+    block : (n,) number of each point's wall block.
     random : source of random numbers.
     """
     _, largest = _scores_with_flipped_signs(squares, shapes, block, random)
