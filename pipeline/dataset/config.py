@@ -277,7 +277,7 @@ def _wall(values: Any, where: str, folder: Path) -> Any:
     site, overrides = values["site"], values.get("set", [])
     if not isinstance(site, str) or not isinstance(overrides, list):
         raise InputError(
-            "expected `site: name` and `set: [key=value, ...]`",
+            "a wall needs `site` (a name or a YAML file) and may have `set` (a list of key=value)",
             where=where,
             remedy="see configs/datasets/small.yaml for an example",
         )
