@@ -174,7 +174,7 @@ class DatasetConfig(Config):
         return self
 
     def steps(self, wall: str) -> Sequence[int]:
-        """Return the numbers of the epochs after the reference in the time series of a wall; only 0 on a wall without one.
+        """Return the numbers of the epochs of a wall's time series, without the reference; (0,) for a wall without a time series.
 
         wall: name of the wall.
         """
