@@ -157,7 +157,7 @@ def _no_pattern(angle: str) -> InputError:
     return InputError(
         f"the points lie on no regular pattern in {angle}",
         where="scan",
-        remedy="use the raw points of one scan, not subsampled or merged, and the scanner's position and rotation",
+        remedy="give all raw points of one scan; if you did, correct the scanner's position and rotation",
     )
 
 

@@ -371,7 +371,7 @@ class Design:
         return float(np.sqrt(self.fit(candidates).cell_covariance.variance_ratio)) * self.model.typical_sigma
 
     def residuals_after(self, chosen: list[Candidate]) -> FloatArray:
-        """Return the (n,) residuals minus the fitted pose and some fitted errors.
+        """Return the (n,) residuals minus the fitted pose and some fitted errors, to see what these leave unexplained.
 
         They are in the unit of the observable (m, or px of disparity).
 

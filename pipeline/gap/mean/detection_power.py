@@ -49,7 +49,7 @@ class DetectableSize:
     parameter : Name of the effect's parameter that states the size; "" if the size is in the unit of the observable.
     size : Value of that parameter, in its unit; infinite if no size shows, NaN if it was not computed.
     at : Values that are not fitted and for which the size holds, by name, such as the period of a wave or the camera.
-    note : Condition or reason, in words.
+    note : Condition under which the size holds, or reason why there is none, in words; "" without any.
     """
 
     name: str
@@ -113,14 +113,18 @@ class Signature:
 def noncentrality(needed: float, columns: int, power: float = POWER) -> float:
     """Return how far an effect must stand out of the noise for a likelihood-ratio test to detect it with a given probability.
 
-    The measure is the noncentrality of a chi-square variable that exceeds twice the needed log-likelihood ratio with that
-    probability. It grows with the square of the effect's size, so that the detectable size follows from it.
+    Twice the log-likelihood ratio follows a noncentral chi-square distribution. Its noncentrality grows with the square of the
+    effect's size, so that the detectable size follows from it.
 
     Parameters
     ----------
     needed : Log-likelihood ratio from which the test is passed.
     columns : Number of design columns of the effect, the degrees of freedom.
     power : The probability, from 0 to 1.
+
+    Returns
+    -------
+    The noncentrality at which the needed ratio is exceeded with that probability.
     """
     at, rare = 2 * needed, 1e-9
     return float(brentq(lambda x: ncx2.sf(at, columns, x) - power, rare, 4 * (at + 10 * columns + 10)))

@@ -254,6 +254,9 @@ class MeanModel:
     def deviations(self, weighted: FloatArray, planes: FloatArray, rows: slice = slice(None)) -> FloatArray:
         """Return the deviations of design columns from their fitted plane (or mean) in each cell of the wall.
 
+        The error of the reference surface, which is correlated over metres, hardly affects them; their noise is nearly
+        independent.
+
         Parameters
         ----------
         weighted : (n, k) columns, divided by the standard deviation of each point.

@@ -355,8 +355,8 @@ class NormalEquations:
         Returns
         -------
         plain : (v,) log-likelihoods of the base model alone, for v columns of residuals.
-        added : (f, v) the same with each candidate added.
-        waves : (w, v) the same with each of the w trial sines added.
+        added : (f, v) log-likelihoods with each candidate added.
+        waves : (w, v) log-likelihoods with each of the w trial sines added.
         """
         parts = [self._part(slice(start, start + _AT_ONCE)) for start in range(0, len(self.covariances), _AT_ONCE)]
         found = map_in_threads(lambda part: part._profile_chunk(base, fixed), parts)

@@ -353,9 +353,9 @@ class MeanSearch:
         return [each for ratio, each in ranked if ratio >= least][:_MOST_LEADING]
 
     def selected_alone(self, candidate: Candidate) -> SelectedEffect:
-        """Describe a candidate effect as if it were the only selected one, with its p-value.
+        """Describe a candidate effect as if it were the only selected one, to refit it alone without linearisation.
 
-        The result also names the effects that cannot be distinguished from it.
+        The result has its p-value, and names the effects that cannot be distinguished from it.
 
         candidate: the effect, with the parameter values that are kept, such as its camera.
         """

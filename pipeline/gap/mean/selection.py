@@ -37,8 +37,8 @@ class FamilyScore:
     score : Log-likelihood ratio minus a penalty for what is fitted: an estimate of the ratio on new data.
     log_likelihood_ratio : Log-likelihood with the candidate minus that without it.
     candidate : The best variant.
-    negligible : Whether the ratio is tiny compared with that of the candidate without the other errors. The candidate may then
-        only correct the linearisation of those errors.
+    negligible : Whether the ratio is tiny compared with the one that the candidate reaches in a model without other errors. The
+        candidate may then only correct the linearisation of those errors.
     """
 
     name: str
@@ -67,8 +67,8 @@ class SelectedEffect:
     log_likelihood_ratio : Log-likelihood with the error minus that without it; the other selected effects are in the model
         both times.
     score : Log-likelihood ratio minus a penalty for what is fitted.
-    family_scores : Scores of all candidates, as alternatives to this error: beside the other selected effects. For a
-        non-parametric term: scores without any other error.
+    family_scores : Scores of all candidates in place of this error, with the other selected effects in the model. If the error
+        is a non-parametric term, no other effect is in the model.
     """
 
     candidate: Candidate

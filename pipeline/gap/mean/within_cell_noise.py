@@ -100,9 +100,9 @@ class WithinCellNoise:
     def solve(self, on_nodes: FloatArray) -> FloatArray:
         """Solve K a = b for k columns over the q nodes of the pixel grid: a step of weighting columns by the inverse of R.
 
-        R = w I + Z C Z' is the covariance of the noise within wall cells: w is the share of white noise, C the covariance of the
-        noise at the nodes, and Z (n, q) the weights with which it acts on the n points. The inverse of R is
-        (I - Z K^-1 Z') / w with K = w C^-1 + Z'Z.
+        R = w I + Z C Z' is the covariance of the noise within wall cells. The share of white noise is w. The noise at the
+        nodes has the covariance C and acts on the n points by the weights Z (n, q). The inverse of R is (I - Z K^-1 Z') / w with
+        K = w C^-1 + Z'Z.
 
         on_nodes: (q, k) columns b: design columns projected on the nodes by `to_nodes`.
 
@@ -115,9 +115,9 @@ class WithinCellNoise:
     def whiten(self, on_nodes: FloatArray) -> FloatArray:
         """Transform k columns b over the q nodes of the pixel grid to a = L^-1 b, so that a' a = b' K^-1 b.
 
-        It serves inner products of design columns that are weighted by the inverse of R. R = w I + Z C Z' is the covariance
-        of the noise within wall cells: w is the share of white noise, C the covariance of the noise at the nodes, and Z (n,
-        q) the weights with which it acts on the n points. The inverse of R is (I - Z K^-1 Z') / w with K = w C^-1 + Z'Z = L L'.
+        It serves inner products of design columns that are weighted by the inverse of R, where R = w I + Z C Z' is the covariance
+        of the noise within wall cells. The share of white noise is w. The noise at the nodes has the covariance C and acts on the
+        n points by the weights Z (n, q). The inverse of R is (I - Z K^-1 Z') / w with K = w C^-1 + Z'Z = L L'.
 
         on_nodes: (q, k) columns b: design columns projected on the nodes by `to_nodes`.
 
@@ -130,14 +130,13 @@ class WithinCellNoise:
     def draw(self, white: FloatArray, rows: slice, cell_sums: FloatArray, random: KeyedRandom) -> FloatArray:
         """Simulate noise that neighbouring points share, in a form that quickly gives its effect on any fitted coefficient.
 
-        The effect on the coefficient of a design column c (n,) follows from the inner product c' R^-1 r, with simulated noise
-        r and its covariance R. The noise r = sqrt(w) e + Z v consists of white noise e, whose share of the variance is w, and
-        of values v at the q nodes of a pixel grid with covariance C, interpolated by the weights Z (n, q). So R = w I + Z C
-        Z', and
+        The noise r = sqrt(w) e + Z v of n points consists of white noise e, whose share of the variance is w, and of values v
+        at the q nodes of a pixel grid, interpolated by the weights Z (n, q). With the covariance C of v, the covariance of r is
+        R = w I + Z C Z'. Its effect on the coefficient of a design column c (n,) follows from the inner product
 
-        c' R^-1 r = c' e / sqrt(w) + (Z' c)' f, with f = K^-1 (C^-1 v - Z' e / sqrt(w)) and K = w C^-1 + Z'Z.
+            c' R^-1 r = c' e / sqrt(w) + (Z' c)' f,  with  f = K^-1 (C^-1 v - Z' e / sqrt(w))  and  K = w C^-1 + Z'Z.
 
-        The vector f (q,) does not depend on the column, so it is drawn here once. `NoiseDraws.products` then adds both terms.
+        The vector f (q,) does not depend on the column, so it is drawn once, here. `NoiseDraws.products` then adds both terms.
 
         Parameters
         ----------

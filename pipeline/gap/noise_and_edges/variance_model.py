@@ -67,7 +67,8 @@ class VarianceCandidate:
     def standard_deviations(self, theta: FloatArray, error: FloatArray) -> dict[str, float]:
         """Return the standard deviations of a noise effect's parameters by name.
 
-        If a factor is smaller than its standard deviation, the size that the parameter may have is returned instead.
+        They follow from those of the fitted factors of the variance. If a factor is below its standard deviation, the parameter
+        may be 0; the returned value is then the size at which the factor equals its standard deviation.
 
         Parameters
         ----------

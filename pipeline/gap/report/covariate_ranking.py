@@ -35,10 +35,10 @@ def rank_disagreements(found: GapDiagnosis) -> list[dict[str, Any]]:
 
     Returns
     -------
-    list : at most ten entries of `where` in gap.json, the most significant first. Each has `covariate`; `statistic` ("mean",
+    list : at most ten entries of `where` in gap.json, the most significant first. Keys: `covariate`; `statistic` ("mean",
         "spread" for standard deviation, "shape" for outliers, "missing" for lost returns); `p_value`; `region`, the bin's
-        limits; and `size_m`, the difference in m, which for a mean is positive if the measured surface lies deeper than
-        predicted. Lost returns have the share of lost pulses, `share_lost`, instead.
+        limits; and `size_m`, the difference in m (0 for lost returns). That of a mean is positive if the measured surface lies
+        deeper than predicted. Entries on lost returns also have `share_lost` of the bin and `share_lost_overall`, 0 to 1.
     """
     residuals = found.residuals
     rows = [row for name, x, z in standardised_by_covariate(found) for row in _rank_statistics(name, x, z, residuals)]

@@ -113,7 +113,9 @@ class Identifiability:
         return _nameable_size(self.cosines, self.detectable_size)
 
     def best_extension(self, row: int) -> SurveyExtension:
-        """Find the additional measurement that helps most to tell one effect from all others: the effect may then be smallest.
+        """Find the additional measurement that helps most to tell one effect from all others.
+
+        With it, the effect can be told from the others at a smaller size than with any other additional measurement.
 
         Parameters
         ----------

@@ -35,11 +35,11 @@ def view_signatures(view: SurveyView) -> list[Candidate]:
 
 
 def group_by_effect(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
-    """Group candidates by sensor effect, and keep those few of each that show which effects a survey can distinguish.
+    """Group candidates by sensor effect, and keep the few of each that show which effects a survey can distinguish.
 
-    An effect may have several candidates (variants): one for each choice of what is not fitted, such as the camera. The first
-    variant represents the effect in tables. The others are kept because they may look like another effect. Of waves, only the
-    one with the middle of the trial periods is kept.
+    An effect has a candidate (variant) for each choice of what is not fitted, such as the camera. The first variant represents
+    the effect in tables. The others are kept because they may look like another effect. Of waves, only the one with the middle
+    of the trial periods is kept.
 
     Parameters
     ----------
@@ -103,7 +103,8 @@ class SurveyDesign:
     pose_basis : (n, p) orthonormal basis of the changes of the observations by the p pose parameters.
     spans : For each effect, the slice of the k columns that belongs to each of its variants.
     scales : For each effect, the value of its main parameter per unit of each coefficient.
-    cells : Squares of the wall; the error of the reference surface is correlated between their means.
+    cells : Squares of the wall. The error of the reference surface is modelled as one value for each square, correlated with
+        those of other squares.
     sigma : (n,) standard deviations, m or px, reduced so that a subsample has the weight of all points.
     unit_m : Median metres of range or depth per unit of the observations (m or px).
     wall_rows : How many of the n observations are points on the wall; those of points with known positions follow.
