@@ -69,8 +69,7 @@ _CURVE_POINTS = 60
 class DetectionLaw:
     """Give the probability P that `monitor` lists a change of volume V, by a logistic regression on simulated trial blocks.
 
-    For a block that has moved by u, ln(P / (1 - P)) = a + b ln V + c ln u. For rock that has fallen there is no term in
-    u.
+    For a block that has moved by u, ln(P / (1 - P)) = a + b ln V + c ln u. Rock that has fallen has no term in u.
 
     Attributes
     ----------
@@ -191,24 +190,18 @@ class SeriesPlan:
     def lead_h(self, volume_m3: float, every_h: float, promise: EpochPromise) -> tuple[float, float]:
         """Return how long before its fall a moving block is noticed, h, to choose the interval between epochs.
 
-        A block is noticed in the first epoch in which it has moved far enough to be listed. Both values are 0 if it falls
-        before.
-
         Parameters
         ----------
-        volume_m3 : float
-            Volume of the block, m3.
-        every_h : float
-            Interval between epochs, h.
+        volume_m3, every_h : float
+            Volume of the block, m3, and interval between epochs, h.
         promise : EpochPromise
             What an epoch is predicted to show. It gives the displacement from which a block of this volume is listed.
 
         Returns
         -------
         (float, float)
-            A cautious and a typical value. Cautious: the block moves until it is listed in 95 % of cases, and a whole
-            interval passes until the next epoch. Typical: it moves until it is listed in 50 % of cases, and half an interval
-            passes.
+            Cautious: the block moves until it is listed in 95 % of cases, and a whole interval passes until the next epoch.
+            Typical: it moves until it is listed in 50 % of cases, and half an interval passes. 0 if the block falls before.
         """
         late = self.motion.time_left(promise.moved.displacement_m(volume_m3)[0]) - every_h
         usual = self.motion.time_left(promise.moved.displacement_m(volume_m3, 0.5)[0]) - every_h / 2
@@ -263,8 +256,7 @@ def plan_series(config: SimulationConfig, sensor: SensorName, progress: Progress
     Parameters
     ----------
     config : SimulationConfig
-        A config with a section `series` in which rockfalls are simulated. A series of the user's own meshes (key
-        `surfaces`) has none.
+        A config with a section `series` in which rockfalls are simulated, and not meshes of the user (key `surfaces`).
     sensor : str
         "stereo" or "tls".
     progress : Progress, optional
@@ -273,8 +265,7 @@ def plan_series(config: SimulationConfig, sensor: SensorName, progress: Progress
     Raises
     ------
     InputError
-        If the config simulates no series of rockfalls, if the wall has no room for trial blocks, or if the sensor sees
-        too few of them.
+        If the config simulates no rockfalls over time, the wall has no room for trial blocks, or the sensor sees too few.
     """
     if config.series is None or config.series.surfaces:
         raise InputError(
