@@ -59,10 +59,10 @@ class Reliability:
 
     Attributes
     ----------
-    group : Name of the group.
+    group : Name of the group of images.
     classes : Score classes with at least one detection.
-    kind : Overlap of masks or boxes.
-    iou : Smallest overlap of a match.
+    kind : Overlap by which detections are matched with blocks: of masks ("segm") or boxes ("bbox").
+    iou : Smallest overlap of a match (intersection over union).
     """
 
     group: str

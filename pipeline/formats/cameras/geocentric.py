@@ -43,9 +43,10 @@ class Projection:
     where: str
 
     def pose(self, matrix: FloatArray) -> FloatArray:
-        """Convert the pose of a camera from geocentric coordinates to easting, northing and height in the projected system.
+        """Convert a camera's pose from geocentric coordinates to easting, northing and ellipsoidal height of the system.
 
-        matrix: (4, 4) from the camera's frame to geocentric coordinates, m. The height is ellipsoidal; a scale is kept.
+        matrix: (4, 4) from the camera's frame to geocentric coordinates, m. Returns (4, 4) from the camera's frame to the
+        projected coordinates, m. If the matrix has a scale, the result has it too.
         """
         position = matrix[:3, 3]
         shifted = position + _STEP_M * np.concatenate([np.eye(3), -np.eye(3)])
