@@ -25,9 +25,9 @@ _REMEDY = "in Metashape convert the chunk's reference to a projected or local co
 
 
 def is_geocentric(position: FloatArray) -> bool:
-    """Return whether a camera's position (3,), m, is near the Earth's surface if it is relative to the Earth's centre.
+    """Return whether a camera's position is geocentric (relative to the Earth's centre), so that it has to be projected.
 
-    If so, its coordinates are geocentric and have to be projected.
+    position: (3,) coordinates, m. They are taken for geocentric if they would then be near the Earth's surface.
     """
     return bool(_EARTH_M[0] < np.linalg.norm(position) < _EARTH_M[1])
 

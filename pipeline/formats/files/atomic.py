@@ -215,9 +215,9 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write `text` as UTF-8 with its own line ends, completely or not at all.
+    """Write `text` as UTF-8, with the line ends that it has, completely or not at all.
 
-    What is not a character, such as bytes of a file name in another encoding, is written as an escape sequence.
+    Bytes that are no characters, as in a file name of another encoding, are written as escape sequences.
     """
     write_bytes(path, text.encode(errors="backslashreplace"))
 
