@@ -326,10 +326,10 @@ def draw_partings(draw: np.random.Generator, start: float, stop: float, mean: fl
 
 
 def ramp_knots(edges: FloatArray, ramp: float | FloatArray) -> FloatArray:
-    """Return the positions (2 n,), m, between which each of n steps of the relief rises, two for each step.
+    """Return where the steps of the relief at beds or joints begin and end to rise: (2 n,) positions, m, two for each of n steps.
 
-    edges: (n,) positions of the steps (beds or joints), m, ascending. ramp: width over which a step rises, m; it is less where
-    edges are close together.
+    edges: (n,) positions of the steps (beds or joints), m, ascending. ramp: width over which a step rises, m, one number or (n,);
+    it is less where edges are close together.
     """
     half = np.broadcast_to(np.asarray(ramp) / 2, edges.shape).copy()
     gap = np.diff(edges)

@@ -46,7 +46,7 @@ class PixelLocking(Effect):
     )
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        """Add the sine of the matched disparity, px, to the noisy disparity.
+        """Return the matches with the sine of the matched disparity, px, added to the noisy disparity.
 
         state: the matched cells of the depth map before this effect. `random` is not used.
         """

@@ -44,7 +44,7 @@ class TileShift(Effect):
         return p.amplitude_px * (1 - 4 * (half - m.floor(half)))
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        """Shift the disparities, px, of each tile.
+        """Return the matches with the disparities, px, of each tile of the image shifted.
 
         state: the matched cells of the depth map before this effect. `random` is not used.
         """

@@ -36,7 +36,9 @@ _NOWHERE_M = 1e30
 
 @dataclass(frozen=True)
 class Echo:
-    """The echo of one ray of each of n pulses, or the return of each pulse, as arrays (n,) of the ray-tracing device.
+    """Echoes of n pulses, one for each pulse, as arrays (n,) of the ray-tracing device.
+
+    They are either what one ray of each pulse hits, or the returns that the receiver records of the pulses.
 
     Attributes
     ----------

@@ -69,9 +69,9 @@ def catalogue_families(measurement: Measurement, part: Residuals) -> list[Candid
 def candidate_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
     """List all regression terms that a forward selection tries as explanations of the systematic part of residuals.
 
-    They are the sensor errors of the catalogue that the sensor model lacks; non-parametric terms of each covariate (line,
-    spline, steps, waves), for errors that the catalogue lacks; and non-parametric terms along oblique directions on the wall.
-    No sensor causes the latter, so they show what an error of the reference surface can imitate.
+    They are of three kinds: sensor errors of the catalogue that the sensor model lacks; terms along each covariate that name no
+    cause (line, spline, steps, waves), for errors that the catalogue lacks; and such terms along oblique directions on the wall.
+    No sensor causes the last ones, so they show what an error of the reference surface can imitate.
 
     Parameters
     ----------

@@ -139,10 +139,9 @@ class RegisteredModel:
     Attributes
     ----------
     model : the sensor model.
-    pose : (6 k,) shift (m) and small rotation (rad) of each of k set-ups from the pose in the measurement, wall frame.
-        For a surface without cameras: (k,) amounts of those
-        combinations of shift, rotation and scale that its points determine, as the attribute `datum` of its residuals defines
-        them.
+    pose : (6 k,) shift (m) and small rotation (rad) of each of k set-ups from the pose in the measurement, wall frame. For a
+        surface without cameras: (q,) amounts of those combinations of shift, rotation and scale that its points determine, as
+        the attribute `datum` of its residuals defines them.
     """
 
     model: TlsModel | StereoModel

@@ -139,8 +139,9 @@ def aligned_with(
 
 
 def within_bounds(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
-    """Tell whether the config of a sensor model accepts a sensor error (effect) with certain parameter values.
+    """Tell whether the config of a sensor model accepts a fitted sensor error (effect) with its parameter values.
 
+    model: the sensor model that would contain the effect.
     entry: the effect as in the config's list `effects`: name and parameter values.
     """
     try:
@@ -153,6 +154,7 @@ def within_bounds(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
 def only_within_bounds(model: TlsModel | StereoModel, named: list[NamedEffect]) -> tuple[list[NamedEffect], list[str]]:
     """Keep the sensor errors (effects) whose fitted parameter values a config of the sensor model accepts.
 
+    model: the sensor model that would contain the effects.
     named: effects with their fitted values. Returns those that are kept, and a note for the report on each of the others.
     """
     kept = [item for item in named if within_bounds(model, item.entry)]
@@ -167,10 +169,8 @@ def is_plausible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
     It is if a config accepts its values and its size is at most `mean.largest_size` (a threshold, by default 100) times its
     typical size in the catalogue.
 
-    Parameters
-    ----------
-    model : the sensor model that would contain the effect.
-    entry : the effect as in the model's config: name and parameter values.
+    model: the sensor model that would contain the effect.
+    entry: the effect as in the model's config: name and parameter values.
     """
     if not within_bounds(model, entry):
         return False
@@ -191,11 +191,10 @@ def relative_size(entry: dict[str, Any]) -> float:
 def effect_from_range_step(comb: RangeStep, part: Residuals) -> NamedEffect:
     """Convert the rounding of a scanner's ranges to the named effect "range quantisation", as an entry of gap.json.
 
-    Its log-likelihood ratio is set to the number of ranges times the strength of the rounding, because rounded ranges leave no
-    doubt.
+    Its log-likelihood ratio is the number of ranges times the strength of the rounding, as rounded ranges leave no doubt.
 
-    comb: the step, such as 1 mm, to which ranges are rounded, and its strength from 0 to 1; part: residuals, one for each
-    range.
+    comb: the step, such as 1 mm, to which ranges are rounded, and its strength from 0 to 1.
+    part: residuals of the rounded ranges; only their number is used.
     """
     entry = {"name": RangeQuantization.tag(), "step_m": comb.step_m}
     name, gain = f"tls.{RangeQuantization.tag()}", float(len(part)) * comb.strength
@@ -232,8 +231,8 @@ def effect_from_seams(found: TileSeams) -> NamedEffect:
 def effect_from_variance(found: VarianceTerm, sensor: str) -> NamedEffect:
     """Convert a fitted noise term to a named effect (sensor error), as an entry of gap.json.
 
-    found: the noise term, which explains variance of the residuals that the sensor model does not predict; sensor: "tls" or
-    "stereo", the prefix of the name.
+    found: the noise term, which explains variance of the residuals that the sensor model does not predict.
+    sensor: "tls" or "stereo", the prefix of the name.
     """
     alike = tuple(f"{sensor}.{name}" for name in found.indistinguishable)
     empirical = found.empirical or effect_of(found.effect).empirical
@@ -308,7 +307,8 @@ def effect_from_estimate(found: Estimate, part: Residuals) -> NamedEffect:
 
     A non-parametric term is described by its values at evenly spaced places along its covariate.
 
-    found: the error as a regression term with fitted coefficients. part: residuals of the points to which it was fitted.
+    found: the error as a regression term with fitted coefficients.
+    part: residuals of the points to which it was fitted.
     """
     if found.candidate.empirical:
         return _empirical_effect(found.candidate, found.values, found.chosen, part)

@@ -169,7 +169,7 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     Parameters
     ----------
     given : points, residuals and candidate effects.
-    first : the search with the model linearised at the given residuals.
+    first : the linearised search, in which residuals change in proportion to the size of each effect.
 
     Returns
     -------

@@ -248,8 +248,11 @@ class PassInputs:
     def edge_effects_given(self, named: list[NamedEffect]) -> list[EdgeEffect]:
         """Search effects at depth steps (edge effects) again, with other errors in the model that can hide or imitate them.
 
-        named: sensor errors that a search found, to put into the model first. Returns the edge effects that the residuals then
-        show.
+        named: sensor errors that a search found, to put into the model first.
+
+        Returns
+        -------
+        list : the edge effects that the residuals then show.
         """
         seen = aligned_with(self.measurement, named, self.plain.index[~self.held_out_points[self.plain.index]])
         return _find_edge_effects(seen.measurement, seen.residuals, self.held_out_points)

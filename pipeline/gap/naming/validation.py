@@ -36,9 +36,8 @@ class ValidationResult:
     value : (n,) residuals against it after registration, in the unit of the observable (m or px); NaN where a ray misses the
         reference.
     pose : (6 k,) pose of that registration: shift (m) and small rotation (rad) of each of k set-ups from the pose in the
-        measurement, wall frame. For a surface without cameras: (k,) amounts of those
-        combinations of shift, rotation and scale that its points determine, as the attribute `datum` of its residuals defines
-        them.
+        measurement, wall frame. For a surface without cameras: (q,) amounts of those combinations of shift, rotation and
+        scale that its points determine, as the attribute `datum` of its residuals defines them.
     gap : scores of the model without and with the effects; None if too few points can be scored.
     """
 
@@ -106,9 +105,9 @@ class Validation:
     def pose(self) -> FloatArray:
         """Pose that registers the measurement to the model without named effects, relative to the pose in the measurement.
 
-        (6 k,) shift (m) and small rotation (rad) of each of k set-ups, wall frame. For a surface without cameras: (k,) amounts of
-        those combinations of shift, rotation and scale that its points determine, as the attribute `datum` of its residuals
-        defines them.
+        (6 k,) shift (m) and small rotation (rad) of each of k set-ups, wall frame. For a surface without cameras: (q,)
+        amounts of those combinations of shift, rotation and scale that its points determine, as the attribute `datum` of its
+        residuals defines them.
         """
         return fit_pose(self.residuals, self.registration_rows)
 

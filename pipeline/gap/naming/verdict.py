@@ -208,7 +208,10 @@ def verdict_sentence(verdict: str, named: Sequence[NamedEffect], evidence: Evide
 def describe_misfit(named: Sequence[NamedEffect], evidence: Evidence) -> str:
     """Return a sentence for the report on the misfit that the named effects (sensor errors) leave; "" if it may be chance.
 
-    named: the effects; without any, the sentence is "". evidence: numbers that decide the verdict, with the misfit's p-value.
+    Parameters
+    ----------
+    named : the effects; without any, the sentence is "".
+    evidence : numbers that decide the verdict, with the misfit's p-value.
     """
     if not named or not evidence.misfit_is_significant:
         return ""

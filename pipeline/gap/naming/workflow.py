@@ -83,10 +83,9 @@ class GapDiagnosis:
     held_out : (n,) true for validation points, which no fit used.
     before, after : (n,) residuals after registration, without and with the named effects in the model, in the unit of the
         observable: m for ranges and distances, px for disparities.
-    pose : (6 k,) shift (m) and rotation (rad) of each of k set-ups from its surveyed pose, wall frame.
-        For a surface without cameras: (k,) amounts of those
-        combinations of shift, rotation and scale that its points determine, as the attribute `datum` of its residuals defines
-        them.
+    pose : (6 k,) shift (m) and rotation (rad) of each of k set-ups from its surveyed pose, wall frame. For a surface without
+        cameras: (q,) amounts of those combinations of shift, rotation and scale that its points determine, as the attribute
+        `datum` of its residuals defines them.
     model_after : sensor model with the named effects.
     gap : scores of the model without and with the named effects; None if too few points could be scored.
     tried : scores of all systematic effects that were tried.
