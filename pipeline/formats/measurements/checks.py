@@ -99,7 +99,7 @@ class PointFit:
 
     @property
     def good(self) -> bool:
-        """Whether the points belong to the reference: 1 % of the rays meet it, and 25 % of those points are near it."""
+        """Whether the points belong to the reference: 1 % or more of the rays meet it, and 25 % or more of these points are near it."""
         return self.hits >= _FEWEST_HITS and self.near >= _FEWEST_NEAR
 
 
@@ -219,7 +219,7 @@ def check_pixels(left: Camera, cloud: PointCloud, where: str) -> None:
 
     Raises InputError if the left camera sees the points elsewhere. A cloud without pixels is accepted.
 
-    left: the left camera. cloud: the points, in the camera's frame of reference, m. where: name of the file, for errors.
+    left: the left camera. cloud: the points, in the frame of the camera's pose, m. where: name of the file, for errors.
     """
     if not {"pixel_x", "pixel_y"} <= set(cloud.extra):
         return
