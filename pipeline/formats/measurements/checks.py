@@ -99,7 +99,10 @@ class PointFit:
 
     @property
     def good(self) -> bool:
-        """Whether the points belong to the reference: 1 % or more of the rays meet it, and 25 % or more of these points are near it."""
+        """Whether the points belong to the reference surface.
+
+        They do if at least 1 % of the rays meet it, and at least 25 % of these points are near it.
+        """
         return self.hits >= _FEWEST_HITS and self.near >= _FEWEST_NEAR
 
 
