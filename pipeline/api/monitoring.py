@@ -182,7 +182,12 @@ class Monitoring:
         views = self.result.site.views
         if not 1 <= number <= len(views):
             allowed = f"1 to {len(views)}" if len(views) > 1 else "1: the wall has one view"
-            raise InputError(f"there is no view {number}", where="view", allowed=allowed, remedy="choose one of these views")
+            raise InputError(
+                f"there is no view {number} (a view is a direction from which the wall is mapped)",
+                where="view",
+                allowed=allowed,
+                remedy="choose one of these views",
+            )
         return views[number - 1]
 
     def _map(self, kind: str, place: str) -> xarray.DataArray:

@@ -106,7 +106,7 @@ def _check_given_once(names: Sequence[Given]) -> None:
             raise InputError(
                 f"the sensor is given twice{as_what}",
                 where=name,
-                remedy="name each sensor once; to vary its settings, copy the file",
+                remedy="name each sensor once; to compare two settings of one sensor, give a copy of its config file",
             )
         given[file] = name
 

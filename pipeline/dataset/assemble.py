@@ -156,9 +156,9 @@ def _info(dataset: Record, split: Split, complete: bool) -> dict[str, Any]:
 
 
 def has_kinds(dataset: Record) -> bool:
-    """Tell whether the annotations of a data set have categories for missing, moved and deposited rock.
+    """Tell whether a data set annotates missing, moved and deposited rock in separate categories, not missing rock alone.
 
-    dataset: the values of its dataset.json. They have if a time series of a wall sets `kinds`.
+    dataset: content of its dataset.json. It does so if the time series of a wall sets `kinds`.
     """
     walls = (wall for source in dataset["sources"].values() for wall in source["config"]["walls"].values())
     return any((wall.get("series") or {}).get("kinds") for wall in walls)

@@ -174,7 +174,7 @@ class DatasetConfig(Config):
         return self
 
     def steps(self, wall: str) -> Sequence[int]:
-        """Return the numbers of the epochs after the reference in the time series of a wall; only 0 on a wall without one.
+        """Return the numbers of the epochs of a wall's time series, without the reference; (0,) for a wall without a time series.
 
         wall: name of the wall.
         """
@@ -277,7 +277,7 @@ def _wall(values: Any, where: str, folder: Path) -> Any:
     site, overrides = values["site"], values.get("set", [])
     if not isinstance(site, str) or not isinstance(overrides, list):
         raise InputError(
-            "expected `site: name` and `set: [key=value, ...]`",
+            "a wall needs `site` (a name or a YAML file) and may have `set` (a list of key=value)",
             where=where,
             remedy="see configs/datasets/small.yaml for an example",
         )

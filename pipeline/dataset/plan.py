@@ -25,10 +25,10 @@ class PlannedEpoch:
     ----------
     index : Index in the plan.
     split : "train", "val" or "test".
-    sensor, wall, noise, size : The combination of sensor, wall, noise level and size class that it belongs to, by their names.
-    number : Number among the epochs of its combination and split, from 1.
+    sensor, wall, noise, size : Names of the sensor, the wall, the noise level and the size class that are combined in it.
+    number : Number from 1 among the epochs of this combination and split; on a wall with a time series, the number of the series.
     reference : Number of the reference epoch that it is compared with, from 1.
-    step : On a wall with a time series, the number of the epoch in it, from 1; `number` then counts the series. Otherwise 0.
+    step : Number of the epoch in its time series, from 1; 0 on a wall without one.
     """
 
     index: int
@@ -60,7 +60,8 @@ class PlannedEpoch:
 def planned_epochs(config: DatasetConfig) -> list[PlannedEpoch]:
     """List all epochs that a data set's config asks for, those that share a reference epoch next to each other.
 
-    On a wall with a time series, each epoch of its config is a whole series, of which all epochs after the reference are listed.
+    On a wall with a time series, the config's numbers of epochs are numbers of series. All epochs of each series but its
+    reference are listed.
     """
     found = [
         PlannedEpoch(0, split, sensor, wall, noise, size, number, (number - 1) % config.references + 1, step)

@@ -104,7 +104,9 @@ def triangulate_seen_points(points: FloatArray, viewpoint: FloatArray, rotation:
     faces = faces[_uncut(local, distance, plane, faces)]
     if not len(faces):
         raise InputError(
-            "no triangle is left between the points", where=where, remedy="give a denser cloud, or a triangle mesh instead"
+            "no triangle between neighbouring points lies on the wall: all span gaps in depth",
+            where=where,
+            remedy="give a denser cloud, or a triangle mesh instead",
         )
     faces = _towards(faces, local)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])

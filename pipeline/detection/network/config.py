@@ -20,8 +20,8 @@ Loss = Literal["proposal_class", "proposal_box", "class", "box", "mask"]
 class NormalisationConfig(Config):
     """How a difference map, m, becomes the network's input.
 
-    `minmax` maps the valid pixels of each image to 0...1, as the thesis does, and so loses the amplitude. `fixed` gives asinh(d /
-    scale_m), `level_of_detection` asinh(d / (1.96 NMAD of the image)); both keep the size of a difference, in metres or in
+    `minmax` maps the valid pixels of each image to 0...1, and so loses the size of a difference. `fixed` gives asinh(d /
+    scale_m), `level_of_detection` asinh(d / (1.96 NMAD of the image)); both keep the size of a difference d, in metres or in
     multiples of the level of detection. Pixels without data become 0 (`minmax`: the image's median).
     """
 

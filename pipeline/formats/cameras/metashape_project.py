@@ -69,7 +69,7 @@ def _document(archive: Path, tag: str) -> ElementTree.Element:
     where = f"{archive}: {_DOCUMENT}"
     root = parsed(_unpacked(archive), where)
     if root.tag != tag:
-        raise InputError(f"begins with <{root.tag}>", where=where, allowed=f"<{tag}>", remedy=_EXPORT)
+        raise InputError(f"the XML has <{root.tag}> as its outermost element", where=where, allowed=f"<{tag}>", remedy=_EXPORT)
     return root
 
 

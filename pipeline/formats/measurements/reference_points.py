@@ -14,13 +14,13 @@ _NOTICED = 0.3
 
 @dataclass(frozen=True)
 class ReferencePoints:
-    """Error of a reference surface whose vertices are themselves measured points.
+    """Error of a laser scan's reference surface whose vertices may be measured points with noise.
 
     Attributes
     ----------
     planes : Planes through the vertices, to which incidence angles refer; None: they refer to the triangles.
     error_m : Standard deviation of each vertex along the rays, m.
-    words : Notes for the report if these were estimated.
+    words : Notes for the report, if the error was estimated; else empty.
     """
 
     planes: PointPlanes | None = None

@@ -60,7 +60,7 @@ class GridCorrelatedNoise:
 
     Attributes
     ----------
-    effects : The noise terms of the sensor model that are of this kind, each with its standard deviation and node spacing.
+    effects : The terms of the sensor model for such noise, each with its standard deviation and node spacing.
     pixels : (n, 2) columns and rows of the points in the left image, px; None if there is no such noise.
     """
 

@@ -63,7 +63,7 @@ class DisparityRaster:
         Parameters
         ----------
         measurement : The stereo pair with its reference surface and sensor model.
-        geometry : The pixels of its n points.
+        geometry : The matched pixels of its n points; they determine the spacing of the raster.
 
         Returns
         -------

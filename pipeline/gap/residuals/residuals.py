@@ -261,8 +261,8 @@ class ExpectedPulses:
 def range_derivative(normal: FloatArray, direction: FloatArray, moved: FloatArray, distance: FloatArray) -> FloatArray:
     """Return how the range along a ray to a plane changes as the ray turns, for first-order effects of angle errors.
 
-    The plane goes through a point p, and the ray starts at o. With the range t = (p - o)·n / (u·n), the derivative is dt = -t
-    (du·n) / (u·n).
+    The plane goes through a point p, and the ray starts at o. With the range t = (p - o)·n / (u·n), the derivative is
+    dt = -t (du·n) / (u·n).
 
     Parameters
     ----------

@@ -160,7 +160,7 @@ def moved_share(residuals: Residuals, view: SensorView, eligible: BoolArray) -> 
     """Return the share of points that lie off the reference with their neighbours, to detect that much of the rock moved.
 
     A point counts if the median residual of it and its eight neighbours exceeds three predicted standard deviations and 2 cm
-    (defaults). Noise alone hardly ever does this: white noise gives this median a standard deviation of only 0.4 of a point's.
+    (defaults). White noise hardly ever does this: the median's standard deviation is only 0.4 times that of a single point.
 
     Parameters
     ----------

@@ -137,7 +137,7 @@ class SensorView:
         return np.asarray(self.reference_m[rows] * self.disparity[rows] / (self.disparity[rows] + residual))
 
     def points_at(self, rows: NDArray[np.int64], range_m: FloatArray) -> FloatArray:
-        """Return the positions at given ranges on the rays of some points.
+        """Convert ranges on the rays of some points to positions, to outline a surface that differs from the reference.
 
         Parameters
         ----------
@@ -153,7 +153,10 @@ class SensorView:
 
     @cached_property
     def scaled_coordinates(self) -> FloatArray:
-        """(n, 2) coordinates in the field of view, scaled so that the spacing of neighbouring points is 1 along both axes."""
+        """(n, 2) positions in the field of view, scaled so that neighbouring points are 1 apart along both axes.
+
+        Distances between them tell which points are neighbours.
+        """
         plane = (self.coordinates - self.coordinates.min(axis=0)) / np.maximum(np.ptp(self.coordinates, axis=0), 1e-300)
         rows = np.flatnonzero(self.epoch == self.epoch.min())
         apart = _axis_spacings(plane[rows])
@@ -204,7 +207,9 @@ class SensorView:
         return first[first != second], second[first != second]
 
     def neighbour_median(self, z: FloatArray) -> FloatArray:
-        """Return, for each point, the median of values over it and its eight nearest neighbours in the sensor's field of view.
+        """Return the median of values over each point and its eight nearest neighbours, to find changes that neighbours share.
+
+        Single outliers hardly influence it. Neighbours are those in the sensor's field of view.
 
         Parameters
         ----------

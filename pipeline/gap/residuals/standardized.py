@@ -95,7 +95,7 @@ def _local_median(view_xy: FloatArray, value: FloatArray, unchanged: NDArray[np.
 
 
 def group_medians(value: FloatArray, cell: NDArray[np.int64], count: int, fewest: int) -> FloatArray:
-    """Return the median of each group of values, such as of the points in each cell of a raster.
+    """Return the median of each group of values, such as the residuals of the points in each cell of a raster.
 
     Parameters
     ----------

@@ -85,10 +85,10 @@ class SurfaceResiduals(Residuals):
     Attributes
     ----------
     geometry : For each point the place on the reference below it.
-    pose_jacobian : (n, k) derivatives of the distances by the cloud's datum: those k combinations of shift, rotation and scale
-        that the relief of the reference can determine. It is evaluated at the places on the reference, because the noise of the
-        points would bias the scale.
-    datum : (7, k) these combinations, in terms of shift (m), rotation (rad) and scale.
+    pose_jacobian : (n, k) derivatives of the distances by the cloud's position, orientation and scale (its datum). There is a
+        column for each of the k combinations of shift, rotation and scale that the relief of the reference can determine. It is
+        evaluated at the places on the reference, because the noise of the points would bias the scale.
+    datum : (7, k) shift (m), rotation (rad) and scale that belong to a unit of each of these k combinations.
     """
 
     sensor = "stereo"
@@ -116,8 +116,8 @@ class SurfaceResiduals(Residuals):
 def surface_residuals(measurement: SurfaceMeasurement) -> SurfaceResiduals:
     """Compute the residuals of a cloud without cameras: the distances of its points from the reference along its normals.
 
-    They come with predicted standard deviations, covariates and the derivatives by the cloud's datum. Points from which a line
-    along the normal does not hit the reference nearby are left out.
+    They come with predicted standard deviations, covariates and the derivatives by the cloud's position, orientation and scale.
+    Points from which a line along the normal does not hit the reference nearby are left out.
     """
     points, model = measurement.cloud.points, measurement.model
     spacing = point_spacing_m(points)

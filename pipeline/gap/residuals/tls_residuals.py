@@ -42,10 +42,10 @@ class TlsResiduals(Residuals):
     Attributes
     ----------
     geometry : The rays of the points.
-    reference_error_m : Standard deviation of the error of each vertex of the reference surface along the rays, m; 0: no such
-        error.
-    error_is_relief : Whether that error is mostly relief between the reference's points, which is independent from ray to ray.
-        Otherwise rays that hit neighbouring triangles share the errors of common vertices.
+    reference_error_m : Standard deviation along the rays of the errors of the reference surface's vertices, m. Each vertex has
+        an error of its own. 0: the vertices have no such errors.
+    error_is_relief : Whether these errors stand mostly for relief between the vertices. They are then independent from ray to
+        ray. Otherwise rays that hit neighbouring triangles share the errors of common vertices.
     """
 
     sensor = "tls"
@@ -79,9 +79,10 @@ class TlsResiduals(Residuals):
         return replace(self, sigma=np.sqrt(variance))
 
     def reference_covariance_with(self, other: NDArray[np.int64]) -> FloatArray:
-        """Return the covariance of each ray's residual with that of another ray that hits a triangle with common vertices.
+        """Return the covariance of each ray's residual with that of another ray due to errors of the reference's vertices.
 
-        Only errors of the reference's vertices are considered.
+        Rays share such errors if they hit triangles with common vertices. It is needed for the variance of differences of
+        neighbouring residuals.
 
         Parameters
         ----------
@@ -346,7 +347,7 @@ def find_expected_pulses(measurement: TlsMeasurement, residuals: TlsResiduals) -
 
 
 def pulse_count(pattern: ScanPattern) -> int:
-    """Return the number of pulses of a scan pattern, a raster of azimuths and zenith angles: lines times pulses in a line."""
+    """Return the number of pulses of a scan pattern, to know how many returns to expect: scan lines times pulses in a line."""
     return int(np.prod([len(sweep) for sweep in _sweeps(pattern)]))
 
 
