@@ -107,7 +107,7 @@ def level_table(measured: Maps, levels: list[str], maps: int, reading: Reading =
     """Means over the maps, ranges, and the ratio to the thesis's figures; lengths in mm."""
     prefix = "independent_" if reading is AS_SIMULATED else ""
     rows = [
-                f"| level ({maps} maps) | StD | StD, thesis | StD, ratio "
+        f"| level ({maps} maps) | StD | StD, thesis | StD, ratio "
         "| RMSE | RMSE, thesis | RMSE, ratio | RMSE, range | median | NMAD |",
         "|" + "---|" * 10,
     ]
