@@ -77,7 +77,10 @@ class NoiseLevel(Config):
 
 
 class SizeClass(Config):
-    """Size and density of the fallen blocks in one size class of a data set."""
+    """Size and density of the fallen blocks in one size class of a data set.
+
+    `rockfall` has the sizes and shapes of the blocks, and where they break out.
+    """
 
     blocks_per_m2: float = Field(gt=0, le=1e6, description="blocks per area of the wall; replaces rockfall.count")
     rockfall: RockfallConfig = RockfallConfig()

@@ -11,9 +11,10 @@ class VarianceThresholds(ThresholdGroup):
     """Thresholds by which `gap` accepts noise terms: effects that change the variance of the residuals (variance model).
 
     A gain is a log-likelihood ratio of the models with and without a term; the score is the gain minus a penalty for the
-    parameters. Wall blocks are squares of the wall, which count as independent. They agree by the sum of their gains over the
-    root of the sum of squared gains. An empirical term is a variance that is fitted freely in bins of a covariate, such as the
-    range. The last text of each field states where its value comes from: tuning on development cases, or judgement.
+    parameters. Wall blocks are squares of the wall, which count as independent. Their agreement is measured like a number of
+    standard deviations: the sum of their gains over the root of the sum of squared gains. An empirical term is a variance that
+    is fitted freely in bins of a covariate, such as the range. The last text of each field states where its value comes from:
+    tuning on development cases, or judgement.
     """
 
     significance: PositiveFloat = threshold_field(
@@ -226,8 +227,8 @@ class LockingThresholds(ThresholdGroup):
 class QuantizationThresholds(ThresholdGroup):
     """Threshold of the test whether a scanner rounded its ranges to a step, such as 1 mm.
 
-    A phase is the remainder of a range after division by the step, as an angle. The mean resultant length is 1 if all are
-    alike.
+    A phase is the remainder of a range after division by the step, as an angle. The mean resultant length is 1 if all phases
+    are alike, as for rounded ranges, and near 0 if they are spread evenly.
     """
 
     least_resultant: PositiveFloat = threshold_field(
@@ -242,8 +243,9 @@ class EdgeThresholds(ThresholdGroup):
     """Thresholds of effects at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint.
 
     A gain is a log-likelihood ratio of the models with and without an effect. Wall blocks are squares of the wall, which count
-    as independent. They agree by the sum of their gains over the root of the sum of squared gains. A cell is a pixel of the
-    disparity raster. A selection pass is one search for all effects, with or without edge effects in the model.
+    as independent. Their agreement is measured like a number of standard deviations: the sum of their gains over the root of
+    the sum of squared gains. A cell is a pixel of the disparity raster. A selection pass is one search for all effects, with or
+    without edge effects in the model.
     """
 
     least_gain: PositiveFloat = threshold_field(

@@ -52,8 +52,8 @@ class StudyRow:
     epoch, repeat : int
         Number of the epoch, and of the repetition with another random subsample of its points.
     rms_m, inlier_share
-        RMS residual of those points within the outlier threshold, m, and their share. All points are considered, not only the
-        subsample.
+        RMS residual of the points within the outlier threshold, m, and the share of points within it. They are computed from
+        points of the whole cloud, not only of the subsample that was registered.
     normal_error_m, displacement_m
         RMS displacement of the reference's points by the error of the registration: along the surface normals, and in all, m.
     iterations, seconds

@@ -61,7 +61,10 @@ def predicted_level(model: TlsModel, reference: HeightRaster, epoch: HeightRaste
 
 
 def compared_in_words(measured_m: float, predicted_m: float) -> str:
-    """State the measured and the predicted level of detection, both m, and what to do if they differ by more than a third."""
+    """State the measured and the predicted level of detection as text, and what to do if they differ by more than a third.
+
+    measured_m, predicted_m: the two levels, m.
+    """
     told = f"Level of detection: measured {1e3 * measured_m:.1f} mm, predicted by the model {1e3 * predicted_m:.1f} mm"
     if abs(measured_m / predicted_m - 1) <= DISAGREES:
         return f"{told}. They agree within a third."

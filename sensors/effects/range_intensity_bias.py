@@ -49,9 +49,9 @@ class RangeIntensityBias(RangeEffect):
         return p.coefficient_m * m.log(at.power / p.reference_power)
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Add the range error, m. Without a given reference power, the median power of all pulses that return is taken.
+        """Return the pulses with the range error, m, added; the reference power is by default the median of all returns.
 
-        state: the pulses of a scan before this effect. random: source of random numbers.
+        state: the pulses of a scan before this effect. `random` is not used.
         """
         if self.reference_power:
             return super().evaluate(state, random)

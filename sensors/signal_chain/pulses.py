@@ -116,7 +116,7 @@ class Pulses:
     def normals(self, random: KeyedRandom) -> mi.Array4f:
         """Draw four independent standard normal numbers for each pulse, for noise.
 
-        random: source of random numbers; each of its children gives other ones.
+        random: source of random numbers. To draw more numbers for another purpose, pass one of its children.
         """
         return random.normals(self.pulse_key, self.line_key)
 

@@ -127,7 +127,7 @@ class ShapedSurface:
 
     @property
     def rim(self) -> NDArray[np.int64]:
-        """Numbers (k,) of the vertices on the mesh's open borders."""
+        """Indices (k,) of the mesh's vertices on its open borders, which are edges of the measured surface."""
         edges, uses = np.unique(self.mesh.edges, return_counts=True)
         return np.unique(np.concatenate(np.divmod(edges[uses == 1], len(self.mesh.vertices))))
 

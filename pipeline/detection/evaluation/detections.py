@@ -125,7 +125,7 @@ def without_duplicates(found: Iterable[Detection]) -> list[Detection]:
 
 
 def not_covered_by(found: Iterable[Detection], others: Sequence[Detection]) -> list[Detection]:
-    """Return the detections of `found` of which no detection in `others` covers most of the pixels."""
+    """Return the detections in `found` that are missing in `others`: none of these covers most of their pixels."""
     bounds = np.array([item.bounds for item in others]).reshape(-1, 4)
 
     def covered(item: Detection) -> bool:

@@ -109,7 +109,11 @@ class HeadConfig(Config):
 
 
 class DetectorConfig(Config):
-    """Settings of the network, a Mask R-CNN with a feature pyramid (He et al. 2017, Lin et al. 2017)."""
+    """Settings of the network, a Mask R-CNN with a feature pyramid (He et al. 2017, Lin et al. 2017).
+
+    `normalisation` has the settings of its input, `proposal` of the search for boxes that may hold a block, and `head` of the
+    parts that classify these boxes and draw masks.
+    """
 
     backbone: Literal["fine", "light", "resnet50", "resnet101"] = Field(
         "light", description="light and fine suit CPUs; fine suits blocks of a few pixels"

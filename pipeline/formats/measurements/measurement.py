@@ -204,9 +204,9 @@ class StereoMeasurement(MeasurementBase):
     Attributes
     ----------
     cameras : Nominal calibration and poses, world frame.
-    shaped_px : (n,) change of each point's disparity, px, by effects that depend on neighbouring pixels, such as smoothing, for
-        poses close to the present ones; None: not computed yet.
-    surroundings : What the cameras see around each point, also for such poses; None: not computed yet.
+    shaped_px : (n,) change of each point's disparity, px, by effects that depend on neighbouring pixels, such as smoothing.
+        Like `surroundings`, it holds for poses close to the present ones, and is None if it was not computed.
+    surroundings : What the cameras see around each point.
     """
 
     sensor = "stereo"

@@ -36,7 +36,7 @@ class ReferencePoints:
         config : Content of measurement.yaml.
         vertices : (n, 3) vertices of the reference, m.
         viewpoint : (3,) position of the scanner, m, in the same frame.
-        range_sigma_m : Range noise of the scanner, m.
+        range_sigma_m : Range noise of the scanner, m; an estimated error that is small beside it is neglected.
         """
         if config.incidence is not None or config.reference_error_m is not None:
             planes = PointPlanes.of(vertices, viewpoint) if config.incidence == "planes" else None
