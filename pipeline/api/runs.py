@@ -254,7 +254,10 @@ class Epoch:
 
     @property
     def m3c2(self) -> xarray.DataArray:
-        """Map of M3C2 distances (changes along the surface's normal), (y, x), m, if the run's config asked for them."""
+        """Map of M3C2 distances (changes along the surface's normal), (y, x), m; NaN without data.
+
+        Raises InputError if the run's config did not ask for them (key `m3c2`).
+        """
         values, grid = read_geotiff(self.file("m3c2", ".tif"))
         return data_array(values, grid, "m3c2", "M3C2 distance; missing rock positive", frame=self.run.frame)
 

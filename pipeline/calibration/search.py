@@ -242,10 +242,9 @@ class SearchResult:
 class NoiseSearch:
     """Search for the noise parameters with which simulated maps have the same summary statistics as the measured ones.
 
-    Parameters
-    ----------
-    simulate : Function of (k,) parameter values, a number of epochs and a random source; it returns the (m,) summary
-        statistics of the difference maps that it simulates.
+    Parameters ---------- simulate : Function that simulates difference maps from (k,) parameter values, a number of
+    epochs and a random source, and
+        returns the (m,) summary statistics of their noise.
     parameters : The k noise parameters and their bounds.
     epochs : Number of measured epochs.
     random : Source of random numbers; each simulation draws its own, by its number.

@@ -103,7 +103,7 @@ def surface_raster(mesh: TriangleMesh, grid: Grid) -> SurfaceRaster:
 
 
 def cast_raster(caster: RayCaster, grid: Grid) -> SurfaceRaster:
-    """Rasterise a mesh that is already prepared for ray casting.
+    """Rasterise a mesh that is already prepared for ray casting, by one ray through the centre of each pixel.
 
     caster: the mesh in the wall frame, m. grid: the pixels.
 

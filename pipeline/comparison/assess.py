@@ -382,7 +382,7 @@ def class_edges(values: FloatArray, classes: int = _SIZE_CLASSES) -> FloatArray:
 
     Returns
     -------
-    (classes + 1,) edges, ascending, in the unit of the values; 0.01 and 1 if there are no values.
+    (classes + 1,) edges, ascending, in the unit of the values. Without values there is a single class from 0.01 to 1.
     """
     if len(values) == 0:
         return np.array([0.01, 1.0])

@@ -51,10 +51,10 @@ def expand_shorthand(overrides: Sequence[str | Override]) -> list[Override]:
 
 
 def without_keys_of_preset(values: dict[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
-    """Remove from a config's values what a scanner preset sets, if the overrides name a preset.
+    """Remove from a config's values what a scanner preset sets, if the overrides name a preset, so that the preset wins.
 
-    The preset so replaces the keys of `scanner` that it knows, and the model of a laser scanner, in its place. Everything else
-    in the file stays. Keys among the overrides are applied afterwards and win.
+    A preset sets keys of `scanner` and the error model of the laser scanner. These go; everything else in the file stays.
+    Single keys among the overrides are applied afterwards and win over the preset.
 
     Parameters
     ----------

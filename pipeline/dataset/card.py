@@ -70,7 +70,7 @@ def write_card(
     folder : Folder of the set.
     dataset : Content of dataset.json.
     statistics : Statistics of the set.
-    digests : SHA-256 checksums of the other files, by name.
+    digests : SHA-256 checksums of all files of the set that are not written here, by name.
     complete : Whether the set is complete.
     """
     from pipeline.dataset.figures import noise_figure, sizes_figure

@@ -77,7 +77,10 @@ class NoiseLevel(Config):
 
 
 class SizeClass(Config):
-    """Size and density of the fallen blocks in one size class of a data set."""
+    """Size and density of the fallen blocks in one size class of a data set.
+
+    `rockfall` has the sizes and shapes of the blocks, and where they break out.
+    """
 
     blocks_per_m2: float = Field(gt=0, le=1e6, description="blocks per area of the wall; replaces rockfall.count")
     rockfall: RockfallConfig = RockfallConfig()
@@ -174,7 +177,7 @@ class DatasetConfig(Config):
         return self
 
     def steps(self, wall: str) -> Sequence[int]:
-        """Return the numbers of the epochs after the reference in the time series of a wall; only 0 on a wall without one.
+        """Return the numbers of the epochs of a wall's time series, without the reference; (0,) for a wall without a time series.
 
         wall: name of the wall.
         """
@@ -262,7 +265,7 @@ def _only_source(values: dict[str, Any], path: Path) -> dict[str, Any]:
         raise InputError(
             "the record of the data set is damaged: it has no config",
             where=str(path),
-            remedy="give the YAML file that the set was made with in its place",
+            remedy="give the YAML file that the set was made with instead of this record",
         )
     return dict(configs[0])
 
@@ -277,7 +280,7 @@ def _wall(values: Any, where: str, folder: Path) -> Any:
     site, overrides = values["site"], values.get("set", [])
     if not isinstance(site, str) or not isinstance(overrides, list):
         raise InputError(
-            "expected `site: name` and `set: [key=value, ...]`",
+            "a wall needs `site` (a name or a YAML file) and may have `set` (a list of key=value)",
             where=where,
             remedy="see configs/datasets/small.yaml for an example",
         )

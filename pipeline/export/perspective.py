@@ -109,18 +109,18 @@ class PerspectiveView:
 def draw_wall(
     view: PerspectiveView, mesh: TriangleMesh, difference: NDArray[np.floating] | None, grid: Grid | None, limit_m: float
 ) -> Image:
-    """Render the mesh (wall frame), lit from the upper left, on white, as (h, w, 3).
+    """Render a mesh in perspective, lit from the upper left, on white: an RGB picture (h, w, 3), 8 bits.
 
     Parameters
     ----------
     view : PerspectiveView
         The camera.
     mesh : TriangleMesh
-        The wall.
+        The wall, wall frame, m.
     difference : (h, w) array or None
         Difference map, m, that gives the colours (red where rock is missing, grey without data); None for bare rock.
     grid : Grid or None
-        Grid of the map.
+        Grid of the map; None without a map.
     limit_m : float
         Difference at which the colour scale ends, m.
     """

@@ -73,8 +73,9 @@ class MeanThresholds(ThresholdGroup):
 
     A log-likelihood ratio compares models with and without an effect; the score is this ratio minus a penalty for the
     parameters. The equivalence class holds effects that explain the residuals as well as the best one. A signature is the
-    change of the observations by an effect. A typical size is the value of an effect's parameter in the catalogue that
-    instruments commonly have. A non-parametric term is a spline of a covariate, such as the range.
+    change of the observations by an effect. A typical size is the value that an effect's parameter commonly has in instruments.
+    A non-parametric term is a spline of a covariate, such as the range. The last text of each field states where its value
+    comes from: tuning on development cases, or judgement.
     """
 
     significance: PositiveFloat = threshold_field(
@@ -353,7 +354,12 @@ class VerdictThresholds(ThresholdGroup):
 
 
 class Thresholds(ThresholdGroup):
-    """All thresholds by which `gap` decides when it diagnoses a measurement, in groups: one attribute for each test."""
+    """All thresholds by which `gap` decides when it diagnoses a measurement, in groups.
+
+    Each attribute is a group for one test: which points are used; systematic effects (mean); noise (variance, grid_noise);
+    pixel locking; effects at depth steps (edges); missing returns; rounded ranges (quantization); changes of the rock;
+    validation; and the verdict.
+    """
 
     points: PointThresholds = PointThresholds()
     mean: MeanThresholds = MeanThresholds()
@@ -373,7 +379,7 @@ _IN_USE: ContextVar[Thresholds] = ContextVar("thresholds", default=_DEFAULTS)
 
 
 def read_thresholds(overrides: Sequence[str]) -> Thresholds:
-    """Return the default thresholds with the values replaced that the user gave on the command line.
+    """Return the thresholds for a diagnosis by `gap`: the defaults, with those replaced that the user set on the command line.
 
     Parameters
     ----------
@@ -387,7 +393,7 @@ def read_thresholds(overrides: Sequence[str]) -> Thresholds:
 
 
 def thresholds() -> Thresholds:
-    """Return the thresholds of the diagnosis by `gap` that is running; the defaults if none is running."""
+    """Return the thresholds of the diagnosis by `gap` that is running now (see `use_thresholds`), or the defaults if none is."""
     return _IN_USE.get()
 
 

@@ -75,7 +75,10 @@ class PointNoise:
 
 
 def is_cloud(path: Path) -> bool:
-    """Return whether a file contains points without triangles. A PLY file is opened for this; others tell by their suffix."""
+    """Return whether a file contains points without triangles.
+
+    A PLY file is opened for this; others are known by their suffix.
+    """
     if path.suffix.lower() != ".ply":
         return path.suffix.lower() in SUFFIXES
     faces = read_elements(path).get("face")
@@ -214,7 +217,8 @@ def reference_from_half(scan: RawScan, station: Station) -> Reference:
 
     One half is every second scan line, or every second pulse of each line if pulses are much denser than lines.
 
-    scan: the whole scan. station: position of the scanner, and the scan lines of the points.
+    scan: the whole scan. station: position of the scanner, and the scan lines of the points. In the result, `rows` has the
+    indices of the other half.
     """
     even, what = _halves(scan, station)
     surface = triangulate_seen_points(scan.cloud.points[even], station.position, station.rotation, scan.name)

@@ -50,9 +50,10 @@ class Station:
 
     @property
     def pattern(self) -> dict[str, list[float]] | None:
-        """The scan's grid of azimuths and zenith angles, as the key `pattern` of measurement.yaml has it.
+        """The scan's nominal directions, to be written under the key `pattern` of measurement.yaml.
 
-        None without such a grid, and if lines are slanted or do not all begin at the same zenith angle.
+        The keys azimuth_rad and zenith_rad each have [start, stop, step], rad. None if the points lie on no regular grid of
+        angles, or if lines do not all begin at the same zenith angle.
         """
         return self.geometry.pattern if self.geometry is not None and self.geometry.synchronous else None
 

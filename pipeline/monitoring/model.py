@@ -61,7 +61,7 @@ def predicted_level(model: TlsModel, reference: HeightRaster, epoch: HeightRaste
 
 
 def compared_in_words(measured_m: float, predicted_m: float, next_step: str) -> str:
-    """State the measured and the predicted level of detection, and what to do if they differ by more than a third.
+    """State the measured and the predicted level of detection as text, and what to do if they differ by more than a third.
 
     measured_m, predicted_m: the two levels, m. next_step: sentence that says how to find the reason; empty if there is no way.
     """

@@ -157,7 +157,9 @@ class EpochData:
         return iter(np.array_split(self.points, -(-len(self.points) // CHUNK))) if self.large is None else self.large.chunks()
 
     def wall_points(self, frame: WallFrame, gsd_m: float, *, several: bool = False) -> WallPoints:
-        """Return the epoch's points in the wall frame, m; on a mesh, points are spread at about four a pixel.
+        """Return the epoch's points in the wall frame, m.
+
+        If the epoch is a mesh, points are made on its surface, about four for each pixel of the maps.
 
         Parameters
         ----------
@@ -166,7 +168,7 @@ class EpochData:
         gsd_m : float
             Side of a pixel of the maps, m.
         several : bool
-            Whether the wall has several views (separately mapped parts). On a mesh, points are then drawn at random on all
+            Whether the wall has several views (separately mapped parts). Points on a mesh are then drawn at random on all
             triangles, also on those that are steep in the wall frame.
         """
         if self.mesh is None:

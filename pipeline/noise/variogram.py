@@ -98,7 +98,7 @@ def variogram(
     rasters = values[None] if values.ndim == 2 else values
     if np.isfinite(rasters).sum(axis=(1, 2)).max(initial=0) < 2:
         raise InputError(
-            "fewer than two pixels have data, which determines no variogram",
+            "fewer than two pixels have data, so there is no variogram",
             where="variogram",
             remedy="give difference maps in which more pixels have data",
         )
@@ -143,7 +143,7 @@ def _averaged(
         wanted &= across <= _SECTOR * along
     if not wanted.any():
         raise InputError(
-            f"no two pixels with data lie within {reach:g} m of each other, which determines no variogram",
+            f"no two pixels with data lie within {reach:g} m of each other, so there is no variogram",
             where="variogram",
             remedy="allow a larger distance (largest_lag_m), or give maps with more data",
         )

@@ -21,8 +21,8 @@ _SIGMA_M = 0.01
 class TileResults:
     """A split of a data set (train, val or test), as `scarpsim view` shows it in the browser.
 
-    The user moves from tile to tile, the images of difference maps (a `step` of `Results`), and selects annotated blocks (an
-    `item` of `Results`).
+    The user moves from tile to tile, the images of difference maps, and selects annotated blocks. For the class
+    `Results`, the interface of the viewer, each tile is a `step`, and each block an `item`.
     """
 
     step_name = "tile"

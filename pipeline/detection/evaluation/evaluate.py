@@ -83,8 +83,8 @@ def match_detections(overlap: NDArray[np.float64], threshold: float, crowd: NDAr
     Parameters
     ----------
     overlap : (p, t) array
-        Intersection over union of detections by falling score with blocks. With crowd regions:
-        intersection over the detection's area.
+        Overlap of p detections, best score first, with t annotations: intersection over union with a block, and intersection
+        over the detection's area with a crowd region.
     threshold : float
         Smallest overlap of a match.
     crowd : (t,) bool array, optional

@@ -51,10 +51,10 @@ def detector_folder(model: str) -> Path:
 
 
 def detector(model: str, *, mirrored: bool = False) -> Detector:
-    """Load a detector.
+    """Load a detector as a function from a difference map (h, w), m, NaN without data, to its detections, best first.
 
     model: `baseline` (a threshold), `default` (the weights that come with scarpsim), or a folder made by `scarpsim train`.
-    mirrored: whether it also searches mirror images of the map, as its config says.
+    mirrored: whether it also searches mirror images of the map, as its config says. Raises InputError if it cannot be loaded.
     """
     if model == BASELINE:
         if mirrored:

@@ -63,7 +63,11 @@ class ScanPattern(Config):
 
 
 class MeasurementConfig(Config):
-    """Content of measurement.yaml, which describes measured points, reference surface and sensor model for `scarpsim gap`."""
+    """Content of measurement.yaml, which describes measured points, reference surface and sensor model for `scarpsim gap`.
+
+    A laser scan also needs the pose of the scanner: `scanner`, or `scanners` for several. `pattern` has the nominal directions of
+    its pulses, if they are known.
+    """
 
     sensor: Literal["tls", "stereo"]
     reference: Path = Field(description="reference surface, world frame, m")

@@ -14,7 +14,7 @@ _NOTICED = 0.3
 
 @dataclass(frozen=True)
 class ReferencePoints:
-    """Error of a reference surface whose vertices are themselves measured points.
+    """Error of a laser scan's reference surface whose vertices may be measured points with noise.
 
     Attributes
     ----------
@@ -22,7 +22,7 @@ class ReferencePoints:
     error_m : Standard deviation of each vertex along the rays, m.
     error_is_relief : Whether that error is mostly relief between the vertices, which is independent from ray to ray. Otherwise
         it is noise of the vertices, which rays to the same triangles share.
-    words : Notes for the report if these were estimated.
+    words : Notes for the report, if the error was estimated; else empty.
     """
 
     planes: PointPlanes | None = None
@@ -39,7 +39,7 @@ class ReferencePoints:
         config : Content of measurement.yaml.
         vertices : (n, 3) vertices of the reference, m.
         viewpoint : (3,) position of the scanner, m, in the same frame.
-        range_sigma_m : Range noise of the scanner, m.
+        range_sigma_m : Range noise of the scanner, m; an estimated error that is small beside it is neglected.
         """
         if config.incidence is not None or config.reference_error_m is not None:
             planes = PointPlanes.of(vertices, viewpoint) if config.incidence == "planes" else None

@@ -72,7 +72,7 @@ def _by_keys(header: laspy.LasHeader, where: str) -> AxisUnits | None:
     if keys.get(_MODEL) in (_IN_DEGREES, _GEOCENTRIC) or (keys.get(_GEOGRAPHIC) and not codes[_PROJECTED] and _MODEL not in keys):
         what = "from the Earth's centre" if keys.get(_MODEL) == _GEOCENTRIC else "in degrees"
         raise InputError(
-            f"has coordinates {what}, by its GeoTIFF keys (geographic system {keys.get(_GEOGRAPHIC, 'not named')})",
+            f"its GeoTIFF keys say that coordinates are {what} (geographic system {keys.get(_GEOGRAPHIC, 'none')})",
             where=where,
             allowed="projected coordinates",
             remedy=_PROJECT,

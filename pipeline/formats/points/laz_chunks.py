@@ -51,7 +51,7 @@ def read_chunks(path: Path, unit: str | None = None) -> Iterator[FloatArray]:
     Parameters
     ----------
     path : LAS or LAZ file.
-    unit : Name of the coordinates' unit, a key of METRES; None: as the file states, or metres.
+    unit : Name of the coordinates' unit, such as "mm"; None: as the file states, or metres.
 
     Raises
     ------

@@ -84,14 +84,17 @@ class GapDiagnosis:
     before, after : (n,) residuals after registration, without and with the named effects in the model, in the unit of the
         observable: m for ranges and distances, px for disparities.
     pose : (6 k,) shift (m) and rotation (rad) of each of k set-ups from its surveyed pose, wall frame. For a surface without
-        cameras: amounts of the combinations of shift, rotation and scale that can be determined (columns of `datum`).
+        cameras: (q,) amounts of those combinations of shift, rotation and scale that its points determine, as the attribute
+        `datum` of its residuals defines them.
     model_after : sensor model with the named effects.
-    gap : scores of the model without and with these; None if too few points could be scored.
-    tried, variance_tried : scores of all systematic effects and of all noise terms that were tried.
-    remaining : what the effects leave unexplained, as in the entry `remaining` of gap.json.
-    identifiability : `names` of systematic effects, `cosines` between their signatures (the patterns of residuals that they
-        make), and `survival`, the share of each signature that is left after the pose is fitted.
-    seconds, timings : duration of the whole diagnosis and of each step, s.
+    gap : scores of the model without and with the named effects; None if too few points could be scored.
+    tried : scores of all systematic effects that were tried.
+    variance_tried : scores of all noise terms that were tried.
+    remaining : what the effects leave unexplained: p-value, noise and outliers, as the entry `remaining` of gap.json.
+    identifiability : table with three keys: `names` of systematic effects; `cosines` between their signatures, the patterns of
+        residuals that they make; and `survival`, the share of each signature that is left after the pose is fitted.
+    seconds : duration of the whole diagnosis, s.
+    timings : duration of each step by its name, s.
     unseen : effects that were not named, each with the size that would have shown with a probability of 95 %.
     reference_sigma : estimated standard deviation of the reference's correlated error, in the unit of the observable.
     thresholds : thresholds of the tests.
