@@ -241,9 +241,9 @@ def _source(given: _Input, folder: Path) -> EpochSource:
                 remedy=f"run the command in the folder where scarpsim monitor wrote {folder.name}, or move the file back",
             )
     source = EpochSource(given.path, tuple(given.sha256), EpochTime(None, ""), _run_of(given.path))
-    for file, checksum in source.checksums().items():
-        if checksum != given.sha256[Path(file)]:
-            raise InputError(f"was changed after scarpsim monitor had read it as epoch {given.epoch}", where=file, remedy=_AGAIN)
+    for path, checksum in source.checksums().items():
+        if checksum != given.sha256[Path(path)]:
+            raise InputError(f"was changed after scarpsim monitor had read it as epoch {given.epoch}", where=path, remedy=_AGAIN)
     return source
 
 

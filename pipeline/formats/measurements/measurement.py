@@ -391,8 +391,7 @@ def _of_sensor(config: MeasurementConfig, material: Material, where: str, **shar
     station, vertices = _to_wall(pose, frame), shared["reference"].vertices
     points = ReferencePoints.of(config, vertices, station[0], material.model.noise.range_sigma_m)
     known: dict[str, Any] = {"planes": points.planes, "reference_error_m": points.error_m}
-    known["error_is_relief"] = points.error_is_relief
-    known["notes"] = (*shared.pop("notes"), *points.words)
+    known |= {"error_is_relief": points.error_is_relief, "notes": (*shared.pop("notes"), *points.words)}
     return TlsMeasurement(model=material.model, station=station, scans=scans, pattern=config.pattern, **known, **shared)
 
 
@@ -437,9 +436,7 @@ def _files(config: MeasurementConfig) -> list[Path]:
 
 
 def _cameras(config: MeasurementConfig, base: Path) -> CameraPair | None:
-    if config.sensor == "tls":
-        return None
-    if config.cameras is None:
+    if config.sensor == "tls" or config.cameras is None:
         return None
     return nominal_pair(base / config.cameras)
 
