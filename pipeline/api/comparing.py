@@ -103,7 +103,8 @@ class Comparison:
     def blocks(self) -> pandas.DataFrame:
         """All fallen blocks, one row per block and sensor; SI units.
 
-        The columns include the size, whether the block was in view and seen, and its true and measured volume.
+        The columns include size_m, in_view (whether the sensor saw at least half of its place before it fell), seen (whether
+        it was detected), volume_m3 (true) and measured_volume_m3.
         """
         found = self.figures.found
         return frame({"sensor": each.name, **block.to_dict()} for each in found for block in each.detection.blocks)

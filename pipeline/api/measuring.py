@@ -296,8 +296,10 @@ class Diagnosis:
     def plot(self, kind: str = "maps") -> Picture:
         """Return a figure of the report by its name, or a map of the residuals over the wall.
 
-        kind: maps, profiles, gap or identifiability for a figure of the report; before or after for the residuals without or
-        with the named effects in the prediction.
+        kind: a figure of the report, which is maps (mean and standard deviation of the residuals over the wall), profiles
+        (both over range and other quantities), gap (how much of the gap the named effects close) or identifiability (which
+        effects the measurement can tell apart); or before or after, for the residuals without or with the named effects in
+        the prediction.
         """
         if kind in ("before", "after"):
             points = self.residuals

@@ -250,10 +250,10 @@ class SeriesScene:
     scene : EpochScene
         The wall as the sensor observes it, with the records of the fallen blocks.
     state : WallState, optional
-        The wall without snow and plants, with the rocks that have moved or fallen; None, as is `rules`, if the user gives the
-        meshes of the wall (`surfaces`).
+        The wall without snow and plants, with the rocks that have moved or fallen. None if the user's own meshes
+        (`surfaces`) are the wall.
     rules : Rules, optional
-        All rockfalls of the series and the placement of their blocks.
+        All rockfalls of the series and the placement of their blocks. None with the user's own meshes.
     new : (k,) int32 array
         Labels of what has fallen, moved or come to rest since the epoch before.
     """
