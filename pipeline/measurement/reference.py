@@ -61,7 +61,7 @@ class Reference:
 
 
 @dataclass(frozen=True)
-class PointNoise:
+class MeasuredPointNoise:
     """Noise of the points of a reference, as it is known from elsewhere than their own scatter.
 
     Attributes
@@ -126,7 +126,7 @@ def reference_from_scans(
     position: FloatArray,
     rotation: FloatArray,
     seen_from: str = "from the scanner",
-    noise: PointNoise | None = None,
+    noise: MeasuredPointNoise | None = None,
 ) -> Reference:
     """Mesh the points of scans as the reference surface with which later scans are compared.
 

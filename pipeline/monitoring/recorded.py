@@ -33,43 +33,43 @@ MONITOR_FILE, ANNOTATIONS_FILE = "monitor.json", "annotations.json"
 _AGAIN = "run scarpsim monitor again with another --out"
 
 
-class _Part(BaseModel):
+class _StatedPart(BaseModel):
     """A part of monitor.json, which may have more keys."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
 
-class _Input(_Part):
+class _StatedInput(_StatedPart):
     epoch: int
     path: Path
     sha256: dict[Path, str] = Field(min_length=1)
 
 
-class _Motion(_Part):
+class _StatedMotion(_StatedPart):
     rotation: list[list[float]]
     translation_m: list[float]
 
 
-class _Epoch(_Part):
+class _StatedEpoch(_StatedPart):
     epoch: int
-    registration: _Motion
+    registration: _StatedMotion
 
 
-class _Frame(_Part):
+class _StatedFrame(_StatedPart):
     rotation: list[list[float]]
     origin_m: list[float]
 
 
-class _View(_Part):
+class _StatedView(_StatedPart):
     suffix: str
-    wall_frame: _Frame
+    wall_frame: _StatedFrame
 
 
-class _Monitoring(_Part):
-    inputs: list[_Input] = Field(min_length=2)
+class _StatedMonitoring(_StatedPart):
+    inputs: list[_StatedInput] = Field(min_length=2)
     options: dict[str, Any]
-    views: list[_View] = Field(min_length=1)
-    epochs: list[_Epoch] = Field(min_length=1)
+    views: list[_StatedView] = Field(min_length=1)
+    epochs: list[_StatedEpoch] = Field(min_length=1)
 
 
 @dataclass(frozen=True)
@@ -212,7 +212,7 @@ def read_monitoring(folder: Path) -> RecordedMonitoring:
             remedy="finish it first: repeat the command scarpsim monitor with --resume",
         )
     values = read_json(where, remedy=_AGAIN)
-    record = parse(_Monitoring, values, str(where))
+    record = parse(_StatedMonitoring, values, str(where))
     try:
         options = MonitorOptions.from_dict(record.options)
         views = tuple((each.suffix, _frame(each.wall_frame)) for each in record.views)
@@ -231,7 +231,7 @@ def read_monitoring(folder: Path) -> RecordedMonitoring:
     )
 
 
-def _source(given: _Input, folder: Path) -> EpochSource:
+def _source(given: _StatedInput, folder: Path) -> EpochSource:
     """Return the files of an epoch, and the record of the run of `simulate` that it is from."""
     for file in given.sha256:
         if not file.is_file():
@@ -267,11 +267,11 @@ def _event_masks(path: Path) -> dict[str, NDArray[np.bool_]]:
     return found
 
 
-def _frame(stated: _Frame) -> WallFrame:
+def _frame(stated: _StatedFrame) -> WallFrame:
     return WallFrame(_matrix(stated.rotation), np.array(stated.origin_m, dtype=np.float64).reshape(3))
 
 
-def _transform(stated: _Motion) -> RigidTransform:
+def _transform(stated: _StatedMotion) -> RigidTransform:
     return RigidTransform(_matrix(stated.rotation), np.array(stated.translation_m, dtype=np.float64).reshape(3))
 
 

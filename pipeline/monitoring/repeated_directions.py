@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.change.robust import nmad
-from pipeline.measurement.reference import PointNoise
+from pipeline.measurement.reference import MeasuredPointNoise
 from scene.geometry.mesh import FloatArray
 
 _SAMPLE, _REPEATED = 5_000, 0.15
@@ -28,7 +28,7 @@ _LEAST = 0.1
 """Least noise of the reference, as a share of the scatter of the differences."""
 
 
-def repeated_noise(reference: FloatArray, later: Sequence[FloatArray], position: FloatArray) -> PointNoise | None:
+def repeated_noise(reference: FloatArray, later: Sequence[FloatArray], position: FloatArray) -> MeasuredPointNoise | None:
     """Estimate the noise along the beams of a reference scan, from later scans that repeat its directions.
 
     Parameters
@@ -64,7 +64,7 @@ def repeated_noise(reference: FloatArray, later: Sequence[FloatArray], position:
     sigma = float(np.sqrt(variance))
     source = "what the later epochs have in common" if len(found) > 1 else "half of the variance of the later epoch's differences"
     told = "later scans repeat its directions, so relief between its points does not show"
-    return PointNoise(sigma, f"{told}: {1e3 * sigma:.2g} mm is used as the error of each point, from {source}")
+    return MeasuredPointNoise(sigma, f"{told}: {1e3 * sigma:.2g} mm is used as the error of each point, from {source}")
 
 
 def _polar(rays: FloatArray) -> tuple[FloatArray, FloatArray]:

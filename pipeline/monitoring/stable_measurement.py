@@ -35,7 +35,7 @@ _LIMIT = "what monitor found to have changed is left out, and with it a sensor e
 
 
 @dataclass(frozen=True)
-class _Scan:
+class _StableScan:
     """A scan of an epoch on the reference: its stable points and the place of its scanner. words: how many these are."""
 
     scan: RawScan
@@ -118,7 +118,7 @@ def _check_laser(monitoring: RecordedMonitoring) -> None:
     )
 
 
-def _stable_scans(monitoring: RecordedMonitoring, epoch: RecordedEpoch, position: FloatArray | None) -> list[_Scan]:
+def _stable_scans(monitoring: RecordedMonitoring, epoch: RecordedEpoch, position: FloatArray | None) -> list[_StableScan]:
     """Return the scans of an epoch, moved onto the reference, with their points on stable rock."""
     found = []
     most = _MOST_POINTS // len(monitoring.epochs)
@@ -144,7 +144,7 @@ def _stable_scans(monitoring: RecordedMonitoring, epoch: RecordedEpoch, position
             rows = np.sort(random.choice(rows, most, replace=False))
             words += f"; {most:,} of those on stable rock are used"
         moved = replace(scan, name=name, cloud=replace(scan.cloud, points=points))
-        found.append(_Scan(moved.part(rows), _moved(monitoring, epoch, station.part(rows)), words))
+        found.append(_StableScan(moved.part(rows), _moved(monitoring, epoch, station.part(rows)), words))
     return found
 
 
@@ -167,7 +167,7 @@ def _station(scan: RawScan, position: FloatArray | None) -> Station:
         ) from None
 
 
-def _reference(monitoring: RecordedMonitoring, given: FloatArray | None, later: Sequence[_Scan]) -> Reference:
+def _reference(monitoring: RecordedMonitoring, given: FloatArray | None, later: Sequence[_StableScan]) -> Reference:
     """Return the reference epoch as a surface, as seen from its scanner; of a mesh or DEM, from that of the first later scan."""
     source = monitoring.reference
     if source.is_surface:
