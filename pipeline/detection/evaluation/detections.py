@@ -146,7 +146,7 @@ def bounds_overlap(bounds: NDArray[np.int64], other: tuple[int, int, int, int]) 
 
 
 def shared_pixels(one: Detection, other: Detection) -> int:
-    """Count the pixels of a map that are in the masks of both detections."""
+    """Count the pixels of a map that are in the masks of both detections, to tell whether they are of one block."""
     top, bottom = max(one.row, other.row), min(one.bounds[1], other.bounds[1])
     first, last = max(one.column, other.column), min(one.bounds[3], other.bounds[3])
     if top >= bottom or first >= last:

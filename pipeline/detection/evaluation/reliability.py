@@ -93,7 +93,7 @@ def reliability(
     groups: Mapping[str, Iterable[int]],
     kind: Overlap = "segm",
 ) -> list[Reliability]:
-    """Compare the scores of detections with how many of them are blocks, for groups of images.
+    """Compare the scores of detections with how many of them are blocks, for groups of images; return the result of each group.
 
     A detection is a block if their intersection over union is at least OVERLAP (0.25).
 
@@ -101,7 +101,7 @@ def reliability(
     ----------
     truth, predictions : COCO annotations and detections, as in `evaluate`.
     groups : Image ids by the name of their group.
-    kind : Overlap of masks or boxes.
+    kind : Overlap of masks ("segm") or boxes ("bbox").
     """
     return [
         _group_reliability(group, *matched_scores(truth, predictions, images, OVERLAP, kind), kind)

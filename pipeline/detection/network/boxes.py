@@ -106,7 +106,10 @@ def decode(code: Tensor, reference: Tensor) -> Tensor:
 
 
 def widened(boxes: Tensor, margin: float) -> Tensor:
-    """Move all edges of boxes (..., 4), top, left, bottom, right, outwards by `margin`, px."""
+    """Return boxes with all edges moved outwards by `margin`, px, to predict masks with a margin.
+
+    boxes: (..., 4) top, left, bottom, right, px.
+    """
     return boxes + margin * np.array([-1, -1, 1, 1], np.float32)
 
 

@@ -31,7 +31,7 @@ class NormalisationConfig(Config):
 
     @property
     def channels(self) -> int:
-        """Number of channels of the network's input: the difference, and where there is data if that is added."""
+        """Number of channels of the network's input: 1 for the differences, and 1 for where there is data, if that is added."""
         return 2 if self.validity_channel else 1
 
 
@@ -100,7 +100,7 @@ class HeadConfig(Config):
     def shifts(self) -> tuple[float, float]:
         """What detection adds to the log odds of a block of 16 px, and for each doubling of its side, to calibrate scores.
 
-        With mirrored views these are the values fitted with them.
+        If `mirrored` names views, these are the values that were fitted with them.
         """
         if self.mirrored == "none":
             return self.score_shift, self.score_per_doubling
@@ -129,9 +129,9 @@ class DetectorConfig(Config):
 
     @property
     def strides(self) -> tuple[int, ...]:
-        """Pixels of the image per cell of each level of the feature pyramid, P2 to P6.
+        """Distance of neighbouring features in each level of the feature pyramid, P2 to P6, px of the image.
 
-        Larger blocks are detected in levels with larger cells.
+        Larger blocks are detected in levels with larger distances.
         """
         finest = 2 if self.backbone == "fine" else 4
         return tuple(finest << level for level in range(5))

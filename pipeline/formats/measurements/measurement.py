@@ -283,7 +283,7 @@ class SurfaceMeasurement(MeasurementBase):
         return other
 
     def moved(self, pose: FloatArray) -> Self:
-        """Shift (m), rotate (rad) and scale the points about `centre`; pose (k,): factors of the k columns of `datum`, summed."""
+        """Shift (m), rotate (rad) and scale the points about `centre`; pose (k,): a factor for each column of `datum`."""
         whole = self.datum @ pose
         turn = (1 + whole[6]) * rotation_matrix(whole[3:6])
         points = (self.cloud.points - self.centre) @ turn.T + self.centre + whole[:3]
