@@ -263,7 +263,7 @@ def _failures(failures: list[Json]) -> str:
             f["stratum"],
             f["wrong"],
             "; ".join(f["true"]),
-            f"{f['verdict']}: {'; '.join(f['said'])}" + _last(f["error"]),
+            f"{f['verdict']}: {'; '.join(f['said']) or 'nothing named'}" + _last(f["error"]),
         )
         for f in sorted(failures, key=lambda f: (f["wrong"], f["sensor"]))
     )

@@ -77,10 +77,10 @@ class CalibrationInputs:
 
 
 def config_of(paths: Sequence[Path]) -> Path | None:
-    """Find a config among the inputs of a calibration, for a user who gives none.
+    """Find a config among the inputs of a calibration, for a user who names none.
 
-    Returns the path of the first `run.json` in the input folders, the record of a simulation, which contains its config; None
-    if no folder has one.
+    paths: the input folders and files. Returns the path of the first `run.json` in the folders, the record of a
+    simulation, which contains its config; None if no folder has one.
     """
     return next((path / RUN_FILE for path in paths if (path / RUN_FILE).is_file()), None)
 

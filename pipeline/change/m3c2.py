@@ -93,9 +93,11 @@ class M3c2Map:
 
 
 def core_grid(grid: Grid, step: int) -> tuple[Grid, slice]:
-    """Return the coarser grid of M3C2's core points, one in the middle of every `step` x `step` pixels of `grid`.
+    """Return the coarser grid of M3C2's core points, one in the middle of every `step` x `step` pixels of a grid.
 
-    Also returns the slice that selects these middle rows and, likewise, columns from a raster on `grid`.
+    grid: the pixels of the difference map. step: distance of the core points, px.
+
+    Returns the coarser grid, and a slice that selects the rows (and, used again, the columns) of these middle pixels.
     """
     width, height = (max(size // step, 1) for size in (grid.width, grid.height))
     return replace(grid, gsd=grid.gsd * step, width=width, height=height), slice(step // 2, None, step)

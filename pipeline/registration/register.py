@@ -274,7 +274,7 @@ def register_to(
 ) -> Registration:
     """Find the rigid transform that brings a cloud to a reference whose search tree exists already, by ICP.
 
-    It saves time over `register` when many clouds are registered to one reference, and raises the same errors.
+    It saves time over `register` when many clouds are registered to one reference, and raises InputError as that does.
 
     Parameters
     ----------

@@ -99,7 +99,8 @@ class Series:
     conditions : SeriesConditions
         Pose and effects of the sensor, snow and vegetation at each epoch.
     plants : KeyedRandom, optional
-        Source of the places where plants grow, to have them alike in several series; None: `random` decides.
+        Source of random numbers for the places where plants grow. Several series with the same one have the same plants.
+        None: `random`.
     """
 
     config: SimulationConfig

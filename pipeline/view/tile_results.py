@@ -62,7 +62,7 @@ class TileResults:
         return Patch(*centres(grid, rows, columns, factor), -shown, shown * _MM, np.zeros(shown.shape, int), factor)
 
     def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
-        """Return None, as a data set contains difference maps but no measured points; the arguments have no effect."""
+        """Return None, as a data set contains difference maps but no measured points; all arguments have no effect."""
         return None
 
     def items(self, step: str) -> list[Item]:
