@@ -72,7 +72,7 @@ class NoiseLevel(Config):
     tls: ScaledModel | None = Field(None, description="model of the laser scanner")
 
     def of(self, sensor: SensorName) -> ScaledModel | None:
-        """Return the model of a sensor at this level of noise, with the factor of its noise; None if the level has no model of it."""
+        """Return the model of a sensor at this level, with the factor of its noise; None if the level has none."""
         return self.stereo if sensor == "stereo" else self.tls
 
 
