@@ -35,8 +35,7 @@ class ReferenceError:
         """
         if not isinstance(measurement, TlsMeasurement) or not measurement.reference_error_m:
             return None
-        planes = measurement.planes
-        return cls(measurement.reference_error_m, planes is None or planes.noise_dominates, measurement.viewpoint)
+        return cls(measurement.reference_error_m, not measurement.error_is_relief, measurement.viewpoint)
 
     def moved(self, points: FloatArray, wall: RayCaster, random: KeyedRandom) -> FloatArray:
         """Shift points along their rays so that their distances from the reference surface contain its simulated errors.
