@@ -86,7 +86,10 @@ class Simulations:
     s: FloatArray
 
     def with_more(self, other: Simulations) -> Simulations:
-        """Return the simulations of this set followed by those of another, to fit a response surface to both."""
+        """Return the simulations of this set followed by those of another, to fit a response surface to both.
+
+        other: the further simulations, of the same parameters and statistics.
+        """
         return Simulations(np.concatenate([self.x, other.x]), np.concatenate([self.s, other.s]))
 
     def at(self, rows: NDArray[Any]) -> Simulations:
