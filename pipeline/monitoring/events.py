@@ -48,8 +48,8 @@ _ISLAND = 0.3
 _EDGE_PX = 5
 """Side of the square about a pixel in which an edge of the rock would be spread."""
 _NOISE_LEVELS, _NOISE_SHARE = 2.0, 0.35
-"""Times the level of detection, and share of the region's largest depth: a pixel below both is noise beside the region, over which
-it grew, and not part of the outline."""
+"""Times the level of detection, and share of the region's largest depth: a pixel below both is noise beside the region, over
+which it grew, and not part of the outline."""
 _EDGE_SHARE = 0.35
 """Share of the largest depth in that square from which a pixel belongs to the outline. A vertical face, spread over 3 x 3 pixels,
 then keeps its place, and blocks that taper off towards their outline lose about 10 % of their area."""
