@@ -281,7 +281,7 @@ def test_what_is_not_ours_is_left_alone(made: Path, tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(InputError, match="exists and is not empty"):
         make_dataset(tiny(), tmp_path)
-    with pytest.raises(InputError, match="but the config gives"):
+    with pytest.raises(InputError, match="but the given config makes the set"):
         make_dataset(tiny(seed=5), made)
     known = json.loads((made / "dataset.json").read_text())
     with pytest.raises(InputError, match="is not a data set"):

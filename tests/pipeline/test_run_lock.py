@@ -156,7 +156,7 @@ def test_a_folder_in_the_place_of_a_product_is_named(finished: Path, tmp_path: P
     out = copied(finished, tmp_path / "run")
     (out / "difference_001.tif").unlink()
     (out / "difference_001.tif").mkdir()
-    with pytest.raises(InputError, match=r"difference_001.tif: cannot be a file \(Is a directory\)"):
+    with pytest.raises(InputError, match=r"difference_001.tif: the path cannot be a file \(Is a directory\)"):
         simulate(config(**COARSE), "tls", out, resume=True)
 
 
