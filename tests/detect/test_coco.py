@@ -160,7 +160,7 @@ OF_BOTH = {
     "an image's id is a list": (_change("images", "id", [1]), "image 0 of the list: 'id'"),
     "images without file name": (_change("images", "file_name", ...), "image 1: 'file_name' is missing"),
     "an image twice": (_change("images", "id", 2), "image 2: the id of the entry occurs twice"),
-    "a file twice": (_change("images", "file_name", "2.tif"), "its file_name '2.tif' occurs twice"),
+    "a file twice": (_change("images", "file_name", "2.tif"), "the file_name '2.tif' occurs twice"),
     "an annotation twice": (_change("annotations", "id", 2), "2: the id of the entry occurs twice"),
     "an id of half": (_change("annotations", "id", 1.5), "'id': input should be a valid integer, got 1.5"),
     "another image": (_change("annotations", "image_id", 77), "77"),

@@ -50,7 +50,7 @@ def test_a_run_is_not_resumed_while_it_goes_on(tmp_path: Path, monkeypatch: pyte
 
     def meanwhile(*arguments: Any) -> Any:
         for resume in (True, False):
-            with pytest.raises(InputError, match=rf"in use by process {os.getpid()} on .*wait for it") as caught:
+            with pytest.raises(InputError, match=rf"in use by process {os.getpid()} on .*wait for that process") as caught:
                 simulate(config(**COARSE), "tls", out, resume=resume)
             answers.append(caught.value)
         return real(*arguments)
