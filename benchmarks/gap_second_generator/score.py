@@ -247,7 +247,7 @@ def _not_right(results: list[Result]) -> str:
     rows = ["| case | truth | ratio (apart from) | outcome | answer | p of what remains |", "|---|---|---|---|---|---|"]
     for each in results:
         if not each.right or each.outside:
-            named = "; ".join(_said(effect) for effect in each.answer["effects"]) or each.answer["verdict"]
+            named = "; ".join(_said(effect) for effect in each.answer["effects"]) or "nothing named"
             outside = f" outside: {'; '.join(each.outside)}" if each.outside else ""
             p = each.answer.get("remaining", {}).get("p_value")
             case = f"{each.truth['number']:04d} {each.truth['kind']}"

@@ -53,12 +53,13 @@ def detect(
         "default" (the network that comes with scarpsim), "baseline" (a threshold, no network), or the folder of a trained
         detector.
     confidence : float or sequence of floats
-        Smallest score to accept. The result uses the smallest of several.
+        Smallest score, 0 to 1, of a detection that is accepted. Of several values, the returned result uses the smallest.
     out : path, optional
         Folder for COCO files, tables, masks and overlays. Default: a temporary folder, which is deleted together with the
         result.
     mirrored : bool
-        Also show the network the mirror images of the maps. This takes three to four times as long and draws blocks better.
+        Also search mirror images of the maps with the network. This takes three to four times as long and gives better
+        outlines.
     progress : "auto" or bool
         Whether progress is shown; "auto": in notebooks and on terminals.
 

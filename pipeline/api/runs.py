@@ -183,8 +183,9 @@ class Run:
     def plot(self, kind: str = "difference", epoch: int = 1) -> Picture:
         """Return a figure of one epoch of the run, as in the report.
 
-        kind: difference, blocks, hillshade, histogram, icp or m3c2. epoch: its number; 0 is the reference, which has only its
-        hillshade.
+        kind: difference (map), blocks (the map enlarged around each block), hillshade (shaded relief), histogram (of the
+        differences), icp (convergence of the registration) or m3c2 (M3C2 distances). epoch: its number; 0 is the reference,
+        which has only its hillshade.
         """
         return self[epoch].plot(kind)
 
@@ -254,7 +255,10 @@ class Epoch:
 
     @property
     def m3c2(self) -> xarray.DataArray:
-        """Map of M3C2 distances (changes along the surface's normal), (y, x), m, if the run's config asked for them."""
+        """Map of M3C2 distances (changes along the surface's normal), (y, x), m; NaN without data.
+
+        Raises InputError if the run's config did not ask for them (key `m3c2`).
+        """
         values, grid = read_geotiff(self.file("m3c2", ".tif"))
         return data_array(values, grid, "m3c2", "M3C2 distance; missing rock positive", frame=self.run.frame)
 
@@ -307,7 +311,8 @@ class Epoch:
     def plot(self, kind: str = "difference") -> Picture:
         """Return a figure of the epoch as in the report.
 
-        kind: difference, blocks, hillshade, histogram, icp or m3c2; the reference has only its hillshade.
+        kind: difference (map), blocks (the map enlarged around each block), hillshade (shaded relief), histogram (of the
+        differences), icp (convergence of the registration) or m3c2 (M3C2 distances). The reference has only its hillshade.
         """
         if self.number == 0:
             return Picture((self.run.folder / "reference.png").read_bytes())

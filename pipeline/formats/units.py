@@ -72,7 +72,7 @@ def agreed_units(stated: AxisUnits | None, given: str | None, where: str, option
     Parameters
     ----------
     stated : The file's statement; None: it states nothing.
-    given : Name of the unit that the user gives, a key of METRES; None: the user gives nothing.
+    given : Name of the unit that the user gives, such as "mm"; None: the user gives nothing.
     where : Name of the file, for errors.
     option : Command-line option that gives the unit, for errors.
 

@@ -140,7 +140,11 @@ class GridNoiseThresholds(ThresholdGroup):
     """
 
     margin: PositiveFloat = threshold_field(
-        6.0, "chi^2", "White or grid-correlated noise is named alone if its semivariogram fits better by this.", JUDGEMENT
+        6.0,
+        "chi^2",
+        "White noise is named alone if its chi^2 against the measured semivariogram is smaller by this than that of "
+        "grid-correlated noise, and the reverse. Otherwise both are named as a class.",
+        JUDGEMENT,
     )
     least_gain: PositiveFloat = threshold_field(
         12.0,
@@ -214,7 +218,8 @@ class LockingThresholds(ThresholdGroup):
     good_fit: PositiveFloat = threshold_field(
         20.0,
         "chi^2 of four values",
-        "If no amplitude fits better than this, the best small amplitude is taken: one that keeps the order of the disparities.",
+        "If even the best amplitude of pixel locking has a larger chi^2 than this, the best small amplitude is taken: one that "
+        "keeps the order of the disparities.",
         DEVELOPMENT,
     )
 
@@ -280,8 +285,8 @@ class EdgeThresholds(ThresholdGroup):
     overdispersion: PositiveFloat = threshold_field(
         2.0,
         "ratio of standard deviations",
-        "If the residuals have more than this times the predicted noise, each trial of edge fattening gets its own registration "
-        "and noise. It must then lower the noise by this factor.",
+        "If the residuals have more than this times the predicted noise, registration and noise are fitted anew for each trial "
+        "value of edge fattening. A value is then accepted only if the noise falls at least by this factor.",
         JUDGEMENT,
     )
     clear_step: PositiveFloat = threshold_field(

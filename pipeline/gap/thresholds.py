@@ -129,22 +129,23 @@ class MeanThresholds(ThresholdGroup):
     null_wave_ratio: PositiveFloat = threshold_field(
         2.0,
         "ratio of scores",
-        "A wave along a covariate must score this many times as much as the best oblique wave on the wall (spatial null "
-        "candidate).",
+        "A wave along a covariate must score this many times as much as the best wave that runs obliquely across the wall. No "
+        "sensor effect is oblique, so that wave shows what an error of the reference can score.",
         DEVELOPMENT,
     )
     most_effects: PositiveInt = threshold_field(3, "effects", "At most this many systematic effects are selected.", JUDGEMENT)
     absorbed_size: PositiveFloat = threshold_field(
         10.0,
         "typical sizes of the effect",
-        "An effect that the registration absorbs nearly, and that is larger than this, is accepted only if no misfit is left.",
+        "An effect that the registration nearly absorbs (`absorbed_share`), and that is larger than this, is accepted only if no "
+        "misfit is left.",
         JUDGEMENT,
     )
     absorbed_share: PositiveFloat = threshold_field(
         0.1,
         "share of the signature's sum of squares",
-        "An effect counts as nearly absorbed if the registration, or a curve of an angle's error, leaves less than this of its "
-        "signature.",
+        "If the registration leaves less than this of an effect's signature, it nearly absorbs the effect. The same share "
+        "decides whether a curve of an angle's error, stated in the model, makes the effect superfluous.",
         JUDGEMENT,
         lt=1,
     )

@@ -122,7 +122,7 @@ class PointSums:
 
     @classmethod
     def over(cls, grid: Grid) -> PointSums:
-        """Return sums that are still zero for the pixels of a raster, so that points can be added to them."""
+        """Return sums that are still zero for the pixels of a raster, so that points can be added to them. grid: the raster."""
         return cls(grid, np.zeros((10, grid.height * grid.width)))
 
     def add(self, points: FloatArray) -> None:

@@ -26,7 +26,7 @@ _MOST_WAITING = 2
 def write_points_once(
     epoch: Followed, data: EpochData | None, site: ReferenceSite, out: Path, fingerprint: str, options: MonitorOptions
 ) -> None:
-    """Write an epoch's registered points with the event at each point, unless the folder of results has just these already.
+    """Write an epoch's registered points with the event at each point, unless the folder of results has them already.
 
     They are written again if the epoch's files, the reference, the options or the numbers of its events have changed.
 

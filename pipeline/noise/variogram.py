@@ -237,12 +237,14 @@ class VariogramModel:
 
 
 def fit_variogram(found: Variogram) -> VariogramModel:
-    """Fit a variogram model to an empirical variogram, to describe how far the noise of a map is correlated.
+    """Fit a variogram model to an empirical variogram, to describe over which distances the noise of a map is correlated.
 
     The model has a nugget (uncorrelated noise) and up to two correlated parts (structures). It has the smallest relative
-    misfit over all bins of distance. Each further structure must reduce the squared misfit by at least 20 %. All bins have
-    equal weight except those with few pairs of pixels: the model is assumed accurate to 3 %, and n pairs determine a
+    misfit over all bins of distance. Each further structure must reduce the squared misfit by at least 20 %. All bins
+    have equal weight except those with few pairs of pixels: the model is assumed accurate to 3 %, and n pairs determine a
     semivariance to sqrt(2 / n).
+
+    found: the empirical variogram.
     """
     if not found.semivariance_m2.max() > 0:
         return VariogramModel(0.0, ())

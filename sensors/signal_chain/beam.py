@@ -87,8 +87,9 @@ class SubRays:
     def over(self, step: Callable[..., tuple[Any, ...]], *state: Any) -> tuple[Any, ...]:
         """Run a function once for each sub-ray, for all pulses together, to combine the echoes of each pulse.
 
-        step(echo, *state) gets the echo of one sub-ray of all pulses, and the state so far; it returns the new state. Returns
-        the final state. The sub-rays follow one another in a loop of the compiled kernel.
+        step: function step(echo, *state) that gets the echo of one sub-ray of all pulses, and the state so far; it returns the
+        new state, a tuple. state: the state before the first sub-ray, such as sums of 0. Returns the state after the last one.
+        The sub-rays follow one another in a loop of the compiled kernel.
         """
         many = dr.opaque(mi.UInt32, self.many)
         first = many * dr.arange(mi.UInt32, dr.width(self.echoes.range_m) // self.many)

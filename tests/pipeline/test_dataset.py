@@ -290,7 +290,7 @@ def test_what_is_not_ours_is_left_alone(made: Path, tmp_path: Path) -> None:
     changed = {known["fingerprint"]: {**source, "versions": {**source["versions"], "numpy": "0.1"}}}
     copy = tmp_path / "copy"
     write_dataset_file(copy, known["name"], changed, known["epochs"])
-    with pytest.raises(InputError, match=r"started with other versions: numpy 0.1 \(here"):
+    with pytest.raises(InputError, match=r"started with other versions of packages: numpy 0.1 \(here"):
         make_dataset(tiny(), copy)
 
 

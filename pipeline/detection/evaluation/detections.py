@@ -125,7 +125,7 @@ def without_duplicates(found: Iterable[Detection]) -> list[Detection]:
 
 
 def not_covered_by(found: Iterable[Detection], others: Sequence[Detection]) -> list[Detection]:
-    """Return the detections of `found` of which no detection in `others` covers most of the pixels."""
+    """Return the detections in `found` that are missing in `others`: none of these covers most of their pixels."""
     bounds = np.array([item.bounds for item in others]).reshape(-1, 4)
 
     def covered(item: Detection) -> bool:
@@ -146,7 +146,7 @@ def bounds_overlap(bounds: NDArray[np.int64], other: tuple[int, int, int, int]) 
 
 
 def shared_pixels(one: Detection, other: Detection) -> int:
-    """Count the pixels of a map that are in the masks of both detections."""
+    """Count the pixels of a map that are in the masks of both detections, to tell whether they are of one block."""
     top, bottom = max(one.row, other.row), min(one.bounds[1], other.bounds[1])
     first, last = max(one.column, other.column), min(one.bounds[3], other.bounds[3])
     if top >= bottom or first >= last:

@@ -31,7 +31,7 @@ class NormalisationConfig(Config):
 
     @property
     def channels(self) -> int:
-        """Number of channels of the network's input: the difference, and where there is data if that is added."""
+        """Number of channels of the network's input: 1 for the differences, and 1 for where there is data, if that is added."""
         return 2 if self.validity_channel else 1
 
 
@@ -100,7 +100,7 @@ class HeadConfig(Config):
     def shifts(self) -> tuple[float, float]:
         """What detection adds to the log odds of a block of 16 px, and for each doubling of its side, to calibrate scores.
 
-        With mirrored views these are the values fitted with them.
+        If `mirrored` names views, these are the values that were fitted with them.
         """
         if self.mirrored == "none":
             return self.score_shift, self.score_per_doubling
@@ -109,7 +109,11 @@ class HeadConfig(Config):
 
 
 class DetectorConfig(Config):
-    """Settings of the network, a Mask R-CNN with a feature pyramid (He et al. 2017, Lin et al. 2017)."""
+    """Settings of the network, a Mask R-CNN with a feature pyramid (He et al. 2017, Lin et al. 2017).
+
+    `normalisation` has the settings of its input, `proposal` of the search for boxes that may hold a block, and `head` of the
+    parts that classify these boxes and draw masks.
+    """
 
     backbone: Literal["fine", "light", "resnet50", "resnet101"] = Field(
         "light", description="light and fine suit CPUs; fine suits blocks of a few pixels"
@@ -125,9 +129,9 @@ class DetectorConfig(Config):
 
     @property
     def strides(self) -> tuple[int, ...]:
-        """Pixels of the image per cell of each level of the feature pyramid, P2 to P6.
+        """Distance of neighbouring features in each level of the feature pyramid, P2 to P6, px of the image.
 
-        Larger blocks are detected in levels with larger cells.
+        Larger blocks are detected in levels with larger distances.
         """
         finest = 2 if self.backbone == "fine" else 4
         return tuple(finest << level for level in range(5))

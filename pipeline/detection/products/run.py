@@ -76,7 +76,7 @@ def detector(model: str, *, mirrored: bool = False) -> Detector:
 def sorted_confidences(values: Sequence[float]) -> tuple[float, ...]:
     """Return the confidences (smallest scores) at which detections are written, in rising order without repetition.
 
-    values: those that the user gives. Raises InputError unless they are between the lowest score that detections keep and 1.
+    values: those that the user gives. Raises InputError unless they are between 0.05, the lowest score of a detection, and 1.
     """
     for value in values:
         if not LOWEST_SCORE <= value <= 1:

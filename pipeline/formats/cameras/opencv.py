@@ -67,7 +67,8 @@ class OpencvInterior:
     def of(cls, camera: Camera, where: str) -> OpencvInterior:
         """Convert the interior orientation of a camera to OpenCV's terms.
 
-        where: name of the file to be written, for errors. Raises InputError if OpenCV's model lacks one of its parameters.
+        where: name of the file to be written, for errors. Raises InputError if the camera has skew (b2) or k4, which OpenCV's
+        model lacks.
         """
         for name, meaning in (("b2", "skew"), ("k4", "radial distortion, r^8")):
             if getattr(camera, name) != 0:

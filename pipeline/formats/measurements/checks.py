@@ -99,14 +99,17 @@ class PointFit:
 
     @property
     def good(self) -> bool:
-        """Whether the points belong to the reference: 1 % of the rays meet it, and 25 % of those points are near it."""
+        """Whether the points belong to the reference surface.
+
+        They do if at least 1 % of the rays meet it, and at least 25 % of these points are near it.
+        """
         return self.hits >= _FEWEST_HITS and self.near >= _FEWEST_NEAR
 
 
 def finite(cloud: PointCloud, where: str) -> PointCloud:
-    """Return the points of a cloud whose coordinates and recorded values are finite.
+    """Return the points of a cloud without those that have NaN or infinity as a coordinate, intensity, time or pixel.
 
-    where: name of the file, for errors. Raises InputError if there are none, or all are at one place or on one line.
+    where: name of the file, for errors. Raises InputError if no points remain, or all are at one place or on one line.
     """
     channels = [cloud.intensity, cloud.gps_time, *(cloud.extra.get(name) for name in ("pixel_x", "pixel_y"))]
     points = cloud.points
@@ -215,9 +218,11 @@ def check_seen(pair: CameraPair, points: FloatArray, where: str) -> float:
 
 
 def check_pixels(left: Camera, cloud: PointCloud, where: str) -> None:
-    """Raise InputError if the pixels stored with a cloud's points are not those in which the left camera sees them.
+    """Check the pixels (channels pixel_x and pixel_y) that a photogrammetric cloud states for its points.
 
-    where: name of the file, for errors. A cloud without pixels is accepted.
+    Raises InputError if the left camera sees the points elsewhere. A cloud without pixels is accepted.
+
+    left: the left camera. cloud: the points, in the frame of the camera's pose, m. where: name of the file, for errors.
     """
     if not {"pixel_x", "pixel_y"} <= set(cloud.extra):
         return
@@ -234,9 +239,9 @@ def check_pixels(left: Camera, cloud: PointCloud, where: str) -> None:
 
 
 def check_power(cloud: PointCloud, where: str) -> PointCloud:
-    """Return the cloud if its intensity can be a received power; raise InputError for negative or huge values.
+    """Check that a cloud's intensity, if it has one, can be a relative received power, on which errors of scanners depend.
 
-    where: name of the file, for errors.
+    where: name of the file, for errors. Returns the cloud. Raises InputError for negative values, or values above 1e12.
     """
     power = cloud.intensity
     if power is None or (power.min(initial=0.0) >= 0 and power.max(initial=0.0) <= _LARGEST_POWER):

@@ -140,6 +140,7 @@ class TlsMeasurement(MeasurementBase):
     order : (n,) scan line and (n,) elapsed share of the scan's duration of each point, if known.
     planes : Planes through the reference's vertices, to which incidence angles refer; None: its triangles.
     reference_error_m : Standard deviation of each vertex of the reference along the rays, m.
+    error_is_relief : Whether that error is mostly relief between the vertices, which is independent from ray to ray.
     """
 
     sensor = "tls"
@@ -152,6 +153,7 @@ class TlsMeasurement(MeasurementBase):
     order: tuple[FloatArray | None, FloatArray | None] | None = None
     planes: PointPlanes | None = None
     reference_error_m: float = 0.0
+    error_is_relief: bool = False
 
     @property
     def viewpoint(self) -> FloatArray:
@@ -204,9 +206,9 @@ class StereoMeasurement(MeasurementBase):
     Attributes
     ----------
     cameras : Nominal calibration and poses, world frame.
-    shaped_px : (n,) change of each point's disparity, px, by effects that depend on neighbouring pixels, such as smoothing, for
-        poses close to the present ones; None: not computed yet.
-    surroundings : What the cameras see around each point, also for such poses; None: not computed yet.
+    shaped_px : (n,) change of each point's disparity, px, by effects that depend on neighbouring pixels, such as smoothing.
+        Like `surroundings`, it holds for poses close to the present ones, and is None if it was not computed.
+    surroundings : What the cameras see around each point.
     """
 
     sensor = "stereo"
@@ -281,7 +283,7 @@ class SurfaceMeasurement(MeasurementBase):
         return other
 
     def moved(self, pose: FloatArray) -> Self:
-        """Shift (m), rotate (rad) and scale the points about `centre`; pose (k,): factors of the k columns of `datum`, summed."""
+        """Shift (m), rotate (rad) and scale the points about `centre`; pose (k,): a factor for each column of `datum`."""
         whole = self.datum @ pose
         turn = (1 + whole[6]) * rotation_matrix(whole[3:6])
         points = (self.cloud.points - self.centre) @ turn.T + self.centre + whole[:3]
@@ -389,7 +391,7 @@ def _of_sensor(config: MeasurementConfig, material: Material, where: str, **shar
     station, vertices = _to_wall(pose, frame), shared["reference"].vertices
     points = ReferencePoints.of(config, vertices, station[0], material.model.noise.range_sigma_m)
     known: dict[str, Any] = {"planes": points.planes, "reference_error_m": points.error_m}
-    known["notes"] = (*shared.pop("notes"), *points.words)
+    known |= {"error_is_relief": points.error_is_relief, "notes": (*shared.pop("notes"), *points.words)}
     return TlsMeasurement(model=material.model, station=station, scans=scans, pattern=config.pattern, **known, **shared)
 
 
@@ -434,9 +436,7 @@ def _files(config: MeasurementConfig) -> list[Path]:
 
 
 def _cameras(config: MeasurementConfig, base: Path) -> CameraPair | None:
-    if config.sensor == "tls":
-        return None
-    if config.cameras is None:
+    if config.sensor == "tls" or config.cameras is None:
         return None
     return nominal_pair(base / config.cameras)
 

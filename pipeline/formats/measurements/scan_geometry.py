@@ -54,7 +54,7 @@ is one.
 
 @dataclass(frozen=True)
 class AngularGrid:
-    """Equally spaced angles of a scan pattern: first angle and step, rad, and their number."""
+    """Equally spaced angles of a scan pattern: the first (`start`) and the `step`, rad, and their number, `count`."""
 
     start: float
     step: float

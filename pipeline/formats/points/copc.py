@@ -67,8 +67,8 @@ class Octree:
 def write_copc(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, header: LazHeader = _USUAL) -> None:
     """Write a point cloud as COPC, a LAZ file that viewers can load part by part; equal arguments give equal bytes.
 
-    The file is an octree. Each level halves the spacing of the points: level k has at most one point in each cube with a side of
-    the whole cloud's / (128 * 2^k). A node with at most 16,384 remaining points takes all of them.
+    The file is an octree, each level of which adds points. Level k adds one point for each cube whose side is that of the whole
+    cloud divided by 128 * 2^k. A node with at most 16,384 remaining points takes all of them.
 
     Parameters
     ----------

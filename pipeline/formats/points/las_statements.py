@@ -111,10 +111,13 @@ def _agreed(by_system: float | None, unit_code: int | None, what: str, where: st
 
 
 def check_box(header: laspy.LasHeader, points: FloatArray, where: str) -> tuple[str, ...]:
-    """Compare the bounding box in a LAS file's header with its points; return a note if the box is much larger.
+    """Compare the bounding box in a LAS file's header with its points, to find files with a wrong scale or missing points.
 
-    points: (n, 3), in the file's unit. where: name of the file, for errors. Raises InputError if points are outside of the box.
-    A box of zeros, or turned inside out, states nothing.
+    Returns a note if the box is much larger than the points, else nothing. A box of zeros, or with minimum above maximum, is
+    ignored.
+
+    header: of the file. points: (n, 3), in the file's unit. where: name of the file, for errors. Raises InputError if points
+    are outside the box.
     """
     low, high = np.array(header.mins), np.array(header.maxs)
     if not len(points) or not np.isfinite([low, high]).all() or (low > high).any() or not (low.any() or high.any()):

@@ -131,9 +131,9 @@ class StoredCloud:
         return cls(las, cloud, present | dict(cloud.extra), full_scale)
 
     def with_points(self, cloud: PointCloud) -> StoredCloud:
-        """Return other points prepared for writing with the same header and extra dimensions, such as the next part of a file.
+        """Prepare further points of a file that is written part by part, with the header and extra dimensions of this cloud.
 
-        cloud: the other points; their intensity and time are left out.
+        cloud: the further points, without intensity. Their time is not written.
         """
         return replace(self, cloud=cloud, fields={"bit_fields": self.fields["bit_fields"], **cloud.extra})
 

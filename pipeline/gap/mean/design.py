@@ -168,7 +168,7 @@ class Design:
         )  # few non-parametric ones are held
         waves = SineProducts.of(model, grids, fixed.within_weighted[:, :held_count], value, noise)
         known = [np.zeros(count), *(prior_precision(each, each.columns.shape[1]) for each in chosen.plain)]
-        equations = assemble(model, covariances, fixed, value, waves).with_precision(np.concatenate(known))
+        equations = assemble(covariances, fixed, value, waves).with_precision(np.concatenate(known))
         drawn = noise.products(fixed.within[noise.rows], model.within_noise.to_nodes(fixed.within))
         found = cls(
             residuals, chosen, cells, model, pose, turn, precision, grids, value, fixed, None, place, waves, drawn, equations

@@ -408,16 +408,13 @@ def _explained(rest: FloatArray, own: FloatArray, left: FloatArray) -> FloatArra
     return np.asarray(0.5 * np.einsum("cfk,cfkv->cfv", share, turned**2))
 
 
-def assemble(
-    model: MeanModel, at: list[CellCovariance], fixed: ProjectedColumns, value: ProjectedColumns, waves: SineProducts
-) -> NormalEquations:
+def assemble(at: list[CellCovariance], fixed: ProjectedColumns, value: ProjectedColumns, waves: SineProducts) -> NormalEquations:
     """Build the normal equations of pose and candidate errors under each of C trial covariances.
 
     From them, any set of candidates is scored without returning to the points.
 
     Parameters
     ----------
-    model : The mean model with the cells to which all products belong; its values are not used.
     at : The C trial covariances of the mean residuals in the cells of the wall.
     fixed : The k design columns of the pose and of all candidates but the sines of unknown period.
     value : v columns of residuals: one of measured residuals, or several of simulated ones.

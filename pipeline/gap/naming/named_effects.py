@@ -347,7 +347,7 @@ def _empirical_effect(candidate: Candidate, values: FloatArray, item: SelectedEf
     if candidate.angle and isinstance(part, TlsResiduals):
         return _angle_term(candidate, error, item, part)
     term, key = part.empirical_term
-    found = _surface_nodes(candidate, error, part) if candidate.form == POLYNOMIAL else _curve_nodes(candidate, error, part)
+    found = _surface_nodes(error, part) if candidate.form == POLYNOMIAL else _curve_nodes(candidate, error, part)
     rows = _rounded_rows(found.pop("values"))
     entry = {"name": term.tag(), **found, key: rows}
     return NamedEffect(f"{part.sensor}.{term.tag()}", "empirical", entry, {}, (), item.p_value, item.log_likelihood_ratio)
@@ -422,7 +422,7 @@ def _curve_nodes(candidate: Candidate, error: FloatArray, part: Residuals, rows:
     return {"covariate": candidate.name, "along": {"low": low, "high": high, "period": cycle}, "values": [curve]}
 
 
-def _surface_nodes(candidate: Candidate, error: FloatArray, part: Residuals) -> dict[str, Any]:
+def _surface_nodes(error: FloatArray, part: Residuals) -> dict[str, Any]:
     """Fit the polynomial of two covariates to its values at the points and evaluate it on a grid of nodes."""
     first, second = part.position_covariates
     x, y = part.covariates[first], part.covariates[second]

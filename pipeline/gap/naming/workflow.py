@@ -324,7 +324,8 @@ def _select_and_validate(
     words += [f"{item.name} dropped: it only describes the misfit of the empirical term" for item in left]
     rows_of_tails = subsample_rows(np.flatnonzero(given.stable & ~given.held_out))
     kept = [item for item in scored.named if item not in left]
-    found, tails = _with_heavy_tails(*subsample(aligned, given.residuals, rows_of_tails), kept, given.cells.side_m)
+    fewer, _ = subsample(aligned, given.residuals, rows_of_tails)
+    found, tails = _with_heavy_tails(fewer, kept, given.cells.side_m)
     words += [tails.note] if tails else []
     return _ValidatedSelection(given, selection, losses, with_separating_measurements(aligned, found), tails, words)
 
@@ -338,7 +339,7 @@ def _validate(aligned: Measurement, given: PassInput, named: list[NamedEffect], 
 
 
 def _with_heavy_tails(
-    measurement: Measurement, residuals: Residuals, named: list[NamedEffect], side_m: float
+    measurement: Measurement, named: list[NamedEffect], side_m: float
 ) -> tuple[list[NamedEffect], HeavyTails | None]:
     """Add heavy tails to the named effects if outliers lie all over the wall.
 

@@ -74,7 +74,7 @@ class DisparityRaster:
         if step is None or raster_cell_count(geometry.u, geometry.v, step) > MOST_CELLS:
             return None
         nominal = NominalPair.of(measurement)
-        real = real_pair(nominal, measurement.model.effects, measurement)
+        real = real_pair(measurement.model.effects, measurement)
         left, right = real.left, real.right
         (columns, column), (rows, row) = (
             _raster_axis(x, step, size) for x, size in ((geometry.u, left.width), (geometry.v, left.height))

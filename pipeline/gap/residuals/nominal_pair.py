@@ -334,12 +334,11 @@ def moved_pair(pair: CameraPair, centre: FloatArray, vector: FloatArray, *, turn
     return CameraPair(*sides)
 
 
-def real_pair(nominal: NominalPair, effects: tuple[Effect, ...], measurement: StereoMeasurement) -> CameraPair:
+def real_pair(effects: tuple[Effect, ...], measurement: StereoMeasurement) -> CameraPair:
     """Return the cameras of a stereo pair as a sensor model says they really are: with its errors of calibration and pose.
 
     Parameters
     ----------
-    nominal : Not used; the stated cameras are taken from `measurement`.
     effects : Effects of the sensor model; those that do not change the cameras are ignored.
     measurement : The measurement with its stated cameras, and the wall frame.
 

@@ -127,7 +127,7 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
     nominal, model = NominalPair.of(measurement), measurement.model
     u, v, points = _pixels(nominal, measurement)
     measured = nominal.disparity(project(nominal.pair.left, points), project(nominal.pair.right, points))
-    real = real_pair(nominal, model.effects, measurement)
+    real = real_pair(model.effects, measurement)
     geometry, depth = _reference(nominal, real, measurement.scene, u, v, measured)
     about = _surroundings(measurement, nominal, real, geometry, depth)
     geometry = replace(geometry, shaped=_shaped_px(measurement, geometry))

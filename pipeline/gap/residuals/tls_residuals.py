@@ -174,7 +174,7 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
         geometry=geometry,
         notes=_notes(measurement),
         reference_error_m=measurement.reference_error_m,
-        error_is_relief=measurement.planes is not None and not along_planes,
+        error_is_relief=measurement.error_is_relief,
     )
     return whole.part(hit)
 

@@ -156,7 +156,7 @@ def _check_points(view: StereoView) -> KnownPoints:
     def column(effect: type[Effect], camera: str, key: str) -> FloatArray:
         extra: Any = effect.model_fields[key].json_schema_extra
         step = _STEP * float(extra["typical"] or 1e-3)
-        real = real_pair(nominal, (effect(**{"camera": camera, key: step}),), view.measurement)
+        real = real_pair((effect(**{"camera": camera, key: step}),), view.measurement)
         return np.asarray((seen(real) - base) / step)
 
     def columns(wanted: list[Candidate]) -> FloatArray:
