@@ -39,7 +39,9 @@ def _cut(path: Path) -> Path:
 def test_an_image_that_claims_gigabytes_is_refused_before_it_is_read(tmp_path, monkeypatch):
     monkeypatch.setattr(tifffile.TiffPage, "asarray", lambda *_, **__: pytest.fail("it was read"))
     for read in (read_tiff, read_geotiff):
-        with pytest.raises(InputError, match=r"30000 x 30000 px, which take 3.6 GB of memory; allowed: at most 250,000,000 px; cut the raster"):
+        with pytest.raises(
+            InputError, match=r"30000 x 30000 px, which take 3.6 GB of memory; allowed: at most 250,000,000 px; cut the raster"
+        ):
             read(_claiming(tmp_path / "bomb.tif", 30000, 30000))
 
 

@@ -153,7 +153,9 @@ def test_commas_between_values_are_no_decimal_marks(tmp_path: Path) -> None:
 def test_thousands_separators_are_refused_by_name(tmp_path: Path, line: str, place: str) -> None:
     decimal = "," if ",1" in line and "." not in line.split(";")[2] and line.endswith(",125") else "."
     before = "" if place == "first" else rows(";", decimal) * 200
-    with pytest.raises(InputError, match=r"line \d+.*digits of .* are grouped by a thousands separator.*without thousands separators"):
+    with pytest.raises(
+        InputError, match=r"line \d+.*digits of .* are grouped by a thousands separator.*without thousands separators"
+    ):
         read_points(written(tmp_path, before + line + "\n" + rows(";", decimal)))
 
 
