@@ -245,9 +245,10 @@ class SearchResult:
 class NoiseSearch:
     """Search for the noise parameters with which simulated maps have the same summary statistics as the measured ones.
 
-    Parameters ---------- simulate : Function that simulates difference maps from (k,) parameter values, a number of
-    epochs and a random source, and
-        returns the (m,) summary statistics of their noise.
+    Parameters
+    ----------
+    simulate : Function that simulates difference maps from (k,) parameter values, a number of epochs and a random source,
+        and returns the (m,) summary statistics of their noise.
     parameters : The k noise parameters and their bounds.
     epochs : Number of measured epochs.
     random : Source of random numbers; each simulation draws its own, by its number.
