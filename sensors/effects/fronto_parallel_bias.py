@@ -31,6 +31,7 @@ class FrontoParallelBias(Effect):
     needs = ("along_row", "along_column")
     order = 5
     sets = (("slope_px",), ("row_px",))
+    trials = ("limit_px", (0.25, 0.5, 1.0, 2.0, 4.0))
     slope_px: float = parameter(
         "bias per unit of the gradient's length",
         unit="px",

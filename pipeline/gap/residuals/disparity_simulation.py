@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import StereoMeasurement
-from pipeline.gap.residuals.disparity_raster import DisparityRaster
+from pipeline.gap.residuals.disparity_raster import DisparityRaster, raster_cell_px
 from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, project
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
-from sensors.effects.base import Stage
+from sensors.effects.base import ShowsIn, Stage
 from sensors.effects.raster_effect import RasterEffect
 from sensors.models.sensor_model import StereoModel
 from sensors.stereo.stereo_pair import REDUCTION, StereoPair
@@ -31,8 +31,8 @@ def simulate_disparities(
 
     The full simulation produces depth maps of three qualities, with cells of 2, 4 or 8 px. The one is used whose cell centres
     are nearest to the pixels on average, and only the cells in which measured pixels lie are traced. As a pixel is not at the
-    centre of its cell, the difference of the reference's nominal disparity between pixel and centre is added. Edge fattening
-    and smoothing are applied on the measurement's own raster if its spacing differs from that of the depth map.
+    centre of its cell, the difference of the reference's nominal disparity between pixel and centre is added. Effects that depend
+    on neighbouring cells are applied on the measurement's own raster if its spacing differs from that of the depth map.
 
     Parameters
     ----------
@@ -69,13 +69,19 @@ def _on_own_raster(
     Returns the other pair and what these effects add to the disparities, (n,), px. Edge fattening grows by whole cells, so that
     it depends on their size.
     """
-    shapes = [effect for effect in pair.model.effects if isinstance(effect, RasterEffect) and effect.stage == Stage.MATCH]
-    raster = DisparityRaster.of(measurement.changed(model=pair.model), geometry) if shapes else None
-    if raster is None or abs(raster.step - step) < _SAME_STEP:
+    matching = (effect for effect in pair.model.effects if effect.stage == Stage.MATCH and effect.looks_at == "neighbours")
+    own = [effect for effect in matching if effect.shows_in != ShowsIn.SPREAD]
+    step_px = raster_cell_px(geometry.u, geometry.v)
+    if not own or step_px is None or abs(step_px - step) < _SAME_STEP:
         return pair, np.zeros(len(geometry))
-    others = tuple(effect for effect in pair.model.effects if effect not in shapes)
+    shapes = [effect for effect in own if isinstance(effect, RasterEffect)]
+    raster = DisparityRaster.of(measurement.changed(model=pair.model), geometry) if shapes else None
+    if shapes and raster is None:
+        return pair, np.zeros(len(geometry))
+    others = tuple(effect for effect in pair.model.effects if effect not in own)
     without = replace(pair, model=pair.model.model_copy(update={"effects": others}))
-    return without, raster.added_by(shapes, geometry.disparity)
+    added = np.asarray(sum((effect.mean(geometry) for effect in own if effect not in shapes), np.zeros(len(geometry))))
+    return without, added if raster is None else added + raster.added_by(shapes, geometry.disparity)
 
 
 def _points(
