@@ -136,9 +136,16 @@ class _EdgeData:
         """(n,) the same with the known effects alone."""
         return self.registered_density([])
 
-    def registered_gains(self, effect: Effect) -> FloatArray:
-        """(n,) log-likelihood ratio of an effect beside the known ones; pose and noise are fitted to either model."""
-        return self.registered_density([effect]) - self.registered_density_without
+    def clear_gains(self, effect: EdgeFattening) -> FloatArray:
+        """(n,) log-likelihood ratio of an effect beside the known ones; pose and noise are fitted to either model.
+
+        It is 0 at points that the effect does not move; for a rim, also where it moves them little, because matchers disagree on
+        small steps.
+        """
+        by = thresholds().edges
+        least = np.maximum(by.clear_sigmas * self.sigma, by.clear_step * self.raster.depth_step_px)
+        clear = np.abs(self.shift([effect]) - self.shift_without) > (least if effect.window == "rim" else 0.0)
+        return (self.registered_density([effect]) - self.registered_density_without) * clear
 
     def edge_effect(self, effect: Effect, std: dict[str, float], gain: float) -> EdgeEffect:
         """Return the result for an effect that was accepted beside the known ones."""
@@ -307,9 +314,11 @@ def _find_fattening(data: _EdgeData) -> EdgeEffect | None:
     """
     best = most_likely_fattening(data)
 
-    def gains(radius: float) -> FloatArray:
-        changed = best.model_copy(update={"radius_px": (radius + _ROUNDED_CELLS[0]) * data.raster.step})
-        return data.registered_gains(changed) if radius >= 1 else np.zeros(len(data.residuals))
+    def of_radius(cells: float) -> EdgeFattening:
+        return best.model_copy(update={"radius_px": (cells + _ROUNDED_CELLS[0]) * data.raster.step})
+
+    def gains(cells: float) -> FloatArray:
+        return data.clear_gains(of_radius(cells)) if cells >= 1 else np.zeros(len(data.residuals))
 
     radius = float(int(best.radius_px / data.raster.step))
     gain = data.blocks.total_if_agreed(gains(radius), by_signs=True)  # depth steps may occur in few places only
