@@ -270,13 +270,6 @@ class EdgeThresholds(ThresholdGroup):
         "A selection pass is rejected if its residuals have more than this times the noise of the best pass.",
         JUDGEMENT,
     )
-    overdispersion: PositiveFloat = threshold_field(
-        2.0,
-        "ratio of standard deviations",
-        "If the residuals have more than this times the predicted noise, each trial of edge fattening gets its own registration "
-        "and noise. It must then lower the noise by this factor.",
-        JUDGEMENT,
-    )
     clear_step: PositiveFloat = threshold_field(
         1.3,
         "ratio of depth steps",
