@@ -1,7 +1,7 @@
 # `make demo` and `make test` work from an empty clone on a bare Debian or Ubuntu with Python 3.11 to 3.13; see tools/setup.sh.
 BIN := .venv/bin
 
-.PHONY: help setup setup-all demo test validate docs format benchmarks nightly
+.PHONY: help setup setup-all demo test types short-tests validate docs format benchmarks nightly
 
 help:
 	@echo 'make setup       what the program runs on: environment and system libraries (seconds when they are there)'
@@ -31,7 +31,12 @@ test: setup-all
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/codespell
+	@$(MAKE) --no-print-directory --jobs 2 types short-tests  # mypy uses one core: beside the tests it takes half the time
+
+types:
 	$(BIN)/mypy
+
+short-tests:
 	$(BIN)/pytest -n 2 --dist worksteal -m 'not validation'
 
 validate: setup-all

@@ -170,7 +170,7 @@ def summary(network: dict[str, Score], baseline: dict[str, Score]) -> str:
 def means(every: Sequence[Cells]) -> Iterator[str]:
     """Yield lines of Markdown: means over the walls, and the components of the difference from the thesis."""
     heads = ("placement", "sensor", "size", "noise", "masks: 0.25, 0.75", "boxes: 0.25, 0.75", "baseline, masks: 0.25, 0.75")
-    yield f"| {' | '.join((*heads, 'bound', 'thesis', 'lacks: map, found, drawn'))} |"
+    yield f"| {' | '.join((*heads, 'bound', 'thesis', 'lacks, points: map, found, drawn'))} |"
     yield "|---|---|---|---|---|---|---|---|---|---|"
     for cells in every:
         network, baseline = [cells.network(bar) for bar in BARS], [cells.baseline(bar) for bar in BARS]

@@ -242,6 +242,10 @@ _WORDS = """## What the thresholds decide
 | log-likelihood | unit of a difference: 3 means a factor of 20 in likelihood |
 | gain, log-likelihood ratio | by how much the logarithm of the likelihood is larger with the effect than without it |
 | score | gain minus a penalty for the number of parameters |
+| score, in the groups `validation` and `verdict` | how well validation blocks are predicted: log score, or a distance in metres |
+| signature | the pattern of residuals that an effect makes |
+| class, equivalence class | effects that the measurement cannot tell apart |
+| semivariogram | how much the residuals of two points differ, by their distance |
 | wall blocks | parts into which the wall is divided, not fallen rock |
 | root sums of squares of the wall blocks' gains | their sum over the root of their sum of squares; four equal gains give 2 |
 | non-parametric, empirical term | a curve that describes residuals without naming a cause |
@@ -257,7 +261,8 @@ who wonder whether a default decides their case. `--set` changes a threshold for
     scarpsim gap my_measurement --set mean.class_margin=4 --set points.fewest=500 --out diagnosis
 
 Each threshold of `pipeline/gap/thresholds.py` was set to 0.7 and 1.4 times its value, on development cases of some thousand
-points of the [closed-form generator](gap_closed_form.md). For each of both values ("x 0.7", "x 1.4") the table has four columns:
+points of the [closed-form generator](gap_closed_form.md). The table has four columns for each of both values ("x 0.7",
+"x 1.4"):
 
 | column | cases that it counts |
 |---|---|

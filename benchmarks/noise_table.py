@@ -107,7 +107,8 @@ def level_table(measured: Maps, levels: list[str], maps: int, reading: Reading =
     """Means over the maps, ranges, and the ratio to the thesis's figures; lengths in mm."""
     prefix = "independent_" if reading is AS_SIMULATED else ""
     rows = [
-        f"| level ({maps} maps) | StD | thesis | ratio | RMSE | thesis | ratio | range of RMSE | median | NMAD |",
+        f"| level ({maps} maps) | StD | StD, thesis | StD, ratio "
+        "| RMSE | RMSE, thesis | RMSE, ratio | RMSE, range | median | NMAD |",
         "|" + "---|" * 10,
     ]
     for level in levels:
@@ -128,7 +129,7 @@ def _compared(value: float, target: float | None) -> str:
 
 def parameter_table(measured: Maps, maps: int) -> list[str]:
     """Root mean square over the maps of the StD (and NMAD), mm, of each parameter's noise alone, as printed and as calibrated."""
-    rows = [f"| alone ({maps} maps) | printed StD | NMAD | calibrated StD | NMAD |", "|" + "---|" * 5]
+    rows = [f"| alone ({maps} maps) | printed, StD | printed, NMAD | calibrated, StD | calibrated, NMAD |", "|" + "---|" * 5]
     models = [single_parameters(bundled_model(name)) for name in ("printed", "independent_high")]
     for name in models[0]:
         cells = [_root_mean_square(measured.of(model[name], maps)) for model in models]
@@ -139,7 +140,11 @@ def parameter_table(measured: Maps, maps: int) -> list[str]:
 
 def reading_table(measured: Maps, maps: int) -> list[str]:
     """Mean StD, mm, and its range of the printed noise and of its orientation part alone, under each reading of the thesis."""
-    rows = [f"| noise drawn for ({maps} maps) | printed, all | range | its orientation alone | range |", "|" + "---|" * 5]
+    rows = [
+        f"| noise drawn for ({maps} maps) | all noise, mean | all noise, range | orientation alone, mean "
+        "| orientation alone, range |",
+        "|" + "---|" * 5,
+    ]
     models = single_parameters(bundled_model("printed"))
     for reading in READINGS:
         found = (measured.of(models[name], maps, reading) for name in ("all", "orientation"))

@@ -63,6 +63,7 @@ def main() -> None:
     print(f"observation with the beam             {beams:6.3f} s   {count / beams / 1e6:6.2f} M pulses/s")
     print(f"observation with one ray              {pulses:6.3f} s   {count / pulses / 1e6:6.2f} M pulses/s")
     print(f"share of the bare rate, beam          {cast / beams:6.2f}     (target: at least 0.5)")
+    print(f"over the bare rate, set by set        {slow / beams:6.2f}     (target: at least 0.75)")
     print("mean range with the beam less mean range")
     axis, dense = (differences(scanner, step, beam, other, caster, random) for other in ([], [{**beam, "sub_rays": 61}]))
     for name, values in (

@@ -4,7 +4,8 @@
 
 The scene is that of tls.py: 5 M pulses on 1.3 M triangles. Each row does what the row above does and one thing more. Processor
 time of all threads is counted, as it depends little on other work on the machine. Shares are of the whole scan. The second table
-lists the kernels of one scan, from Dr.Jit's kernel history.
+does the same for a wide beam, the scene of tls_beam.py: 1 M pulses of 19 sub-rays. The third lists the kernels of one scan of the
+first kind, from Dr.Jit's kernel history.
 """
 
 from __future__ import annotations
@@ -12,16 +13,22 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from measure import bare_cast, narrow_vectors
 from tls import prepared
+from tls_beam import DIVERGENCE_RAD, SUB_RAYS, pulse_by_pulse
 
 from scene.common.backend import VARIANT, dr, mi
+from scene.common.config import parse
+from scene.common.keyed_random import KeyedRandom
+from sensors.laser.tls import LaserScanner
+from sensors.models.sensor_model import TlsModel
 from sensors.numerics.device import rotated, vector
 from sensors.signal_chain.beam import Beam
 from sensors.signal_chain.pulses import direction
 
-PULSES, ROUNDS = 5_000_000, 5
+PULSES, WIDE_PULSES, ROUNDS = 5_000_000, 1_000_000, 5
 
 
 def processor_seconds(works: dict[str, Callable[[], object]]) -> dict[str, float]:
@@ -62,18 +69,75 @@ def main() -> None:
         ),
         "noise, points, offsets, as NumPy arrays: the scan": lambda: scanner.observe(caster, random),
     }
-    found = processor_seconds(works)
-    whole, count = list(found.values())[-1], scanner.pattern.lines * scanner.pattern.pulses
+    count = scanner.pattern.lines * scanner.pattern.pulses
     print(f"{VARIANT}{lanes}, {dr.thread_count()} threads, {len(caster.mesh.faces):,} triangles, {count:,} pulses")
-    print("| step | processor ns a pulse | share of the scan |\n|---|---|---|")
-    for name, seconds in found.items():
-        print(f"| {name} | {1e9 * seconds / count:.0f} | {seconds / whole:.2f} |")
+    print_steps(works, count)
+    print_unavoidable(scanner, random)
+    wide_beam()
     print("\n| kernel of one scan | rays | operations | share of the kernels' time |\n|---|---|---|---|")
     kernels = history(lambda: scanner.observe(caster, random))
     total = sum(each["execution_time"] for each in kernels)
     for number, each in enumerate(kernels, start=1):
         share = each["execution_time"] / total
         print(f"| {number} | {each['size']:,} | {each.get('operation_count', 0):,} | {share:.2f} |")
+
+
+def print_steps(works: dict[str, Callable[[], object]], rays: int) -> None:
+    """Print the table of processor times of works, the last of which is a whole scan of so many rays."""
+    found = processor_seconds(works)
+    bare, *_, whole = found.values()
+    print("| step | processor ns a ray | share of the scan | bare cast over this |\n|---|---|---|---|")
+    for name, seconds in found.items():
+        print(f"| {name} | {1e9 * seconds / rays:.1f} | {seconds / whole:.2f} | {bare / seconds:.2f} |")
+
+
+def print_unavoidable(scanner: LaserScanner, random: KeyedRandom) -> None:
+    """Print the processor time of what a noisy scan must do besides its casts: draw random numbers, and write its arrays."""
+    pulses, count = scanner.emit(), scanner.pattern.lines * scanner.pattern.pulses
+    dr.eval(pulses.pulse_key, pulses.line_key)
+    sizes = {mi.Float64: (3, 1), mi.Float32: (2, 1), mi.Int32: (1,)}  # points, depth; offset, intensity; block
+
+    def drawn() -> None:
+        angles, ranges = (pulses.normals(random.child(name)) for name in ("angles", "ranges"))
+        dr.eval(angles.x + angles.y + ranges.x)
+
+    def written() -> None:
+        arrays = [dr.arange(kind, size * count) for kind, each in sizes.items() for size in each]
+        dr.eval(arrays)
+        for array in arrays:
+            array.numpy()
+
+    for name, seconds in processor_seconds({"three normal random numbers": drawn, "writing the arrays": written}).items():
+        print(f"{name} of each pulse: {1e9 * seconds / count:.1f} ns of processor time")
+
+
+def wide_beam() -> None:
+    """Print the steps from the bare cast of all sub-rays of a wide beam to a scan with it."""
+    pencil, caster, random = prepared(WIDE_PULSES)
+    spread = parse(
+        TlsModel, {"effects": [{"name": "beam_divergence", "divergence_rad": DIVERGENCE_RAD, "sub_rays": SUB_RAYS}]}, ""
+    )
+    scanner = replace(pencil, model=spread)
+    origin, rays = vector(scanner.position), pulse_by_pulse(scanner)
+    dr.eval(rays)
+    pulses, beam = scanner.emitted(scanner.emit(), random)
+    first = dr.arange(mi.UInt32, 1)
+    count = SUB_RAYS * scanner.pattern.lines * scanner.pattern.pulses
+    print(f"\n{count:,} rays of {SUB_RAYS} sub-rays a pulse")
+    print_steps(
+        {
+            "bare cast of rays that are ready in memory, the sub-rays of a pulse side by side": bare_cast(caster, origin, *rays),
+            "distance, normal, albedo and block of the triangle, in float64": lambda: [
+                dr.eval(caster.intersect(origin, ray, exact=True)) for ray in rays
+            ],
+            "sub-rays made from the beam, limits of range and power: their echoes, in memory": lambda: scanner.echo(
+                caster, pulses, beam, lambda echoes: echoes.echoes.at(first)
+            ),
+            "echoes of a pulse combined to one": lambda: scanner.echo(caster, pulses, beam, beam.combine_echoes),
+            "noise, points and offsets as arrays: the scan": lambda: scanner.observe(caster, random),
+        },
+        count,
+    )
 
 
 def history(work: Callable[[], object]) -> list[dict[str, float]]:

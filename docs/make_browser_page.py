@@ -57,7 +57,9 @@ them. The tests in `tests/browser` make small outputs with each command, and ope
 Debian's Chromium {record["chromium"]}. The browser has no access to the network. `make test` runs these tests where Chromium is
 installed.
 
-Of {len(record["tests"])} tests, {passed} passed. They opened {pages} different pages and loaded {total["files"]} files. They
+Of {len(record["tests"])} tests, {passed} passed. The [table of what was found](#what-was-found) has {len(rows)} rows, because the
+two tests of each report share a row: one looks at the report, the other uses it by keyboard. The tests opened {pages} different
+pages, fewer than rows, because the search and the controls are tested on pages of other rows. They loaded {total["files"]} files,
 clicked {total["clicks"]} times, pressed {total["keys"]} keys, and saw {total["console errors"]} console errors and
 {total["missing files"]} missing files. In {total["axe runs"]} runs, axe-core found {total["severe violations"]} serious or
 critical violations and {total["lesser violations"]} lesser ones.
@@ -81,8 +83,8 @@ Axe-core runs at both widths, except in the viewer, where it runs at {wide} px.
 ## What was found
 
 Clicks and keys are those of the tests; they do not include a search text that is typed. The severe violations are those that
-axe-core grades serious or critical. The lesser ones are moderate or minor and fail no test. A report
-without keys has no wide table, no link and nothing that folds, so that Tab has nothing to reach.
+axe-core grades serious or critical. The lesser ones are moderate or minor and fail no test. Where
+the table has 0 keys for a report, Tab has nothing to reach in it: no link, no table to scroll and no part that folds.
 
 | {head} |
 |{"---|" * (len(COUNTS) + 1)}

@@ -248,8 +248,13 @@ A residual is a measured minus a predicted disparity. `before` and `after` say h
 the model predicts, without and with the named effects, as a distance along the line of sight
 ([how](../explanation/gap_verdict.md#the-gap)). `floor` is what the noise alone would leave, and `closed` the share of the way
 from `before` to `floor`. An effect named "as a description" describes the residuals, but is no known physical
-cause. The [catalogue](../reference/effects/README.md) explains the effects and their parameters. The verdict of the first row is
-`unknown` because residuals are left that the named effects do not explain; `several` means that several effects are named.""",
+cause. The
+[catalogue](../reference/effects/README.md) explains the effects and their parameters; values are printed in a handy unit, such as
+mrad, whatever unit a parameter's name has.
+
+The verdict does not follow from `closed` alone. In the first row it is `unknown` because one of the terms is only a description.
+In the second row it is `several`, because all terms are effects with a known cause and they close more than half of the gap, the
+least share that `gap` asks for.""",
     "sgbm": """\
 This page shows what `scarpsim gap` says of a real matcher on rendered photographs, where the truth is known: the cameras are
 perfect and the surface is exact, so whatever is found is due to the matcher. It is for users of photogrammetric surfaces.
@@ -272,8 +277,13 @@ A residual is a measured minus a predicted disparity. `before` and `after` say h
 the model predicts, without and with the named effects, as a distance along the line of sight
 ([how](../explanation/gap_verdict.md#the-gap)). `floor` is what noise alone would leave, and `closed` is the share of the way from
 `before` to `floor`. An effect named "as a description" describes the residuals, but is no known physical
-cause. The [catalogue](../reference/effects/README.md) explains the effects and their parameters. The verdict `unknown` means that
-residuals are left that the named effects do not explain, and `several` that several effects are named.""",
+cause. The
+[catalogue](../reference/effects/README.md) explains the effects and their parameters; values are printed in a handy unit, such as
+µrad, whatever unit a parameter's name has.
+
+The verdict does not follow from `closed` alone. In the first row it is `unknown` because one of the terms is only a description.
+In the second row it is `several`, because all terms are effects with a known cause and they close more than half of the gap, the
+least share that `gap` asks for.""",
 }
 """What each page has before its table: what was evaluated, what it means, and how the table is read."""
 

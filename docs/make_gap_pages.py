@@ -27,7 +27,7 @@ from PIL import Image
 from pipeline.config.simulation import SimulationConfig
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, TlsMeasurement, read_measurement
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.gap.naming.verdict import MUCH_MOVED, VERDICTS
+from pipeline.gap.naming.verdict import MUCH_MOVED, NOT_DESCRIBED, PARTLY_EXPLAINED, STILL_OPEN, VERDICTS
 from pipeline.gap.naming.workflow import GapDiagnosis, diagnose
 from pipeline.gap.report.covariate_ranking import quantile_bins, rank_disagreements
 from pipeline.gap.report.figures import gap_figure, maps_figure
@@ -334,32 +334,40 @@ def verdicts() -> dict[str, Verdict]:
             "Make the measurement that `split_by` in gap.json names. `scarpsim gap --identifiability` shows what would separate "
             "the effects at your site. You can use model_after.yaml for surveys of this wall from this place, whichever effect "
             "is true. Elsewhere it may be wrong.",
-            "All ranges of a scanner are too long by 2 mm. On this wall most of that looks like a shift of the scanner, and the "
-            "rest like a wrong scale.",
-                        _case(seed=13, ranges=lambda scan: scan.R + 0.002),
-            "A misfit remains, but the effect closes more than half of the gap, so the verdict is not [unknown](unknown.md). "
-            "The size is "
-            "1.6 "
-            "mm instead of 2 mm because it is uncertain, by the ± 0.3 mm that the report states.",
+            "All ranges of a scanner are too long by 2 mm. On this wall most of that looks like a shift of the scanner, which is "
+            "fitted first. What is left of it resembles what is left of two other effects, which the report names.",
+            _case(seed=13, ranges=lambda scan: scan.R + 0.002),
+            "The report proposes two measurements, and one of them suffices: targets around the station, whose positions are "
+            "known to 1 mm, or a second station.\n\n"
+            "The estimate is 1.6 mm, and the true value 2 mm. They differ by 1.3 times the standard error of 0.3 mm, which is "
+            "within chance. A misfit remains, but the effect closes more than half of the gap, so the verdict is not "
+            "[unknown](unknown.md).",
         ),
         "unknown": Verdict(
-            "The model is rejected, but the catalogue does not explain why. There are three cases:\n\n"
-            "1. An empirical curve of one covariate, such as the azimuth or the time, explains clearly more (a penalised "
-            "log-likelihood ratio higher by 5) than any effect of the catalogue.\n"
-            "2. Nothing that was tried passes the test on validation blocks, although the gap exceeds the floor by more than "
-            "its uncertainty, or the misfit has a p-value of at most 0.01. The report then says where the misfit is and how "
-            "large.\n"
-            "3. Effects were named, but they leave most of the gap open. Or they leave a misfit with a p-value of at most 0.01, "
-            "and the gap is so small that one cannot tell how much of it they close.",
-            "See in the report on which covariate the disagreement depends, and in what form. model_after.yaml holds an "
-            "empirical term that reproduces it in simulations, but only within the measured range of the covariate "
-            "(`along`, in the unit of the covariate: rad for angles).",
+            "The model is rejected, but the catalogue does not explain why. There are three cases, and the report begins with "
+            "another sentence in each:\n\n"
+            "1. *An empirical term describes the misfit.* A curve of one covariate, such as the azimuth or the time, explains "
+            "clearly more (a penalised log-likelihood ratio higher by 5) than any effect of the catalogue. The report says the "
+            "sentence above. If effects of the catalogue are named beside the curve, it says instead: \"" + PARTLY_EXPLAINED
+            + "\"\n"
+            "2. *Nothing describes it.* Nothing that was tried passes the test on validation blocks, although the gap exceeds "
+            "the floor by more than its uncertainty, or the misfit has a p-value of at most 0.01. The report says: \""
+            + NOT_DESCRIBED + "\" It also says where the misfit is and how large.\n"
+            "3. *The named effects do not help enough.* They leave most of the gap open. Or they leave a misfit with a p-value "
+            "of at most 0.01, and the gap is so small that one cannot tell how much of it they close. The report says, for "
+            "example: \"" + STILL_OPEN + "\"",
+            "See in the report on which covariate the disagreement depends, and in what form. In case 1, model_after.yaml holds "
+            "the empirical term, which reproduces the disagreement in simulations, but only within the measured range of the "
+            "covariate (`along`, in the unit of the covariate: rad for angles). In case 2 it holds no further effect, in case 3 "
+            "the named effects, which explain too little.",
             "The ranges of a scanner jump by 4 mm in the middle of the scan, as after a knock.",
             _case(seed=18, ranges=lambda scan: scan.R + 0.002 * np.where(scan.az > 1.6, 1.0, -1.0)),
-            "The second line of the terminal is the empirical term: a curve through 65 points between the azimuths 0.9508 and "
-            "2.049 rad, with values from -1.53 to 3.75 mm. The curve closes the whole gap, which compares means and standard "
-            "deviations over patches of the wall. The p-value tests for finer patterns. One remains, because a curve through 65 "
-            "points cannot follow a jump exactly.",
+            "This is case 1. The second line of the terminal is the empirical term: a curve through 65 points between the "
+            "azimuths 0.9508 and 2.049 rad, with values from -1.53 to 3.75 mm.\n\n"
+            "The curve is smooth, so it cannot follow a jump exactly: the map on the right still shows two bands beside the "
+            "jump. Even so 100 % of the gap is closed. The gap is a mean over all validation blocks, and most of them lie away "
+            "from the jump, so the bands hardly change it. The p-value of 0.008 belongs to a test that looks for such local "
+            "patterns, and says that something remains.",
         ),
         "no_gap": Verdict(
             "Three things hold. No effect was named. The gap differs from the floor by no more than its uncertainty. The misfit "

@@ -202,6 +202,8 @@ PARSED = (
     "scarpsim view april",
     "scarpsim view june",
     "scarpsim monitor march.laz april.laz --out april",
+    "scarpsim gap april --out april_gap",
+    "scarpsim calibrate april_gap/measurement --out april_calibration",
     "scarpsim monitor scans/2026-*.laz --workers 2 --out year",
     "scarpsim monitor scans/2026-*.laz --workers 2 --out year --resume",
     "scarpsim monitor reference.laz --follow incoming --out live",

@@ -192,12 +192,27 @@ This page is for users who install scarpsim, from its repository or without it. 
 it.
 
 Each trial started with an empty environment and an empty folder, and with no variable of the shell but the path, the home and the
-package index. A fresh clone carried out the commands of the README with that Python first in the path, and the trial then checked
-that both reports of the demonstration were there. The system libraries were already on the machine. In the other trials the
-program simulated a small wall with the laser scanner, or imported what the extra adds. Times include the installation, mostly
-from a local cache of packages. Other programs ran on the machine meanwhile, so that times are upper limits. An *extra* is a named
-group of optional packages, such as `detect` for the detector. {works}
+package index. The system libraries were already on the machine. There are three kinds of trials:
+
+- *Fresh clone*: the repository is cloned, and the commands of the README (`make setup`, `make demo`) are carried out. The Python
+  that the row names stands first in the path, so that they use it. The demonstration must write both its reports.
+- *Extra*: the wheel (the built package) is installed with an extra, a named group of optional packages. These must be importable.
+- All others: after the installation, the command `simulate` must simulate a small wall with the laser scanner.
+
+`simulate` is a command of its own; `uvx` and `pipx` run it straight from the wheel (`WHEEL` is its path), without an installation
+that stays. Times include the installation, mostly
+from a local cache of packages. Other programs ran on the machine meanwhile, so that times are upper limits. {works}
 "Glibc" in the name of a machine is the version of its C library.
+
+| extra | what it is for |
+|---|---|
+| `colmap` | surfaces by COLMAP from depth maps |
+| `dataset` | data sets and epochs by several workers |
+| `detect` | the detector |
+| `huggingface` | data sets for Hugging Face's library `datasets` |
+| `m3c2` | M3C2 distances of point clouds |
+| `notebook` | tables, maps and 3D views in notebooks |
+| `poisson` | Poisson surfaces from points |
 
 Tried at commit {machines}.
 

@@ -33,21 +33,23 @@ that the catalogue states."""
 
 _LABELS = {
     "false alarms on no-effect cases": "false alarms: the verdict is not `no_gap`, though there is no effect",
-    "right class at S/N x sin(angle) of 8 or more": "clear effects in the right class",
+    "right class at S/N x sin(angle) of 8 or more": "clear effects in the right class, in measurements with one effect",
     "wrong names among committed answers": "wrong names among the answers that name an effect",
-    "the class contains the truth": "named classes that contain the true effect",
+    "the class contains the truth": "named classes that contain the true effect, in measurements with one effect",
     "median size of the class": "median number of effects in a class",
-    "off-catalogue effects answered unknown": "errors outside the catalogue that are answered `unknown`",
+    "off-catalogue effects answered unknown": "clear errors outside the catalogue that are answered `unknown`",
+    "two effects at once, both classes right": "two clear effects at once, both classes right",
     "real change blamed on the sensor": "false alarms where only rock fell",
-    "gap closed on held-out data, effects named (median)": "share of the gap that the named effects close on validation blocks "
-    "(median)",
+    "gap closed on held-out data, effects named (median)": "share of the gap that the named effects close on validation blocks, "
+    "if all true effects are named (median)",
     "gap closed, all cases' metres summed": "the same share, of the gaps of all measurements added up",
     "gap closed by the best wrong effect outside the class (median)": "share of the gap that the best wrong effect outside the "
-    "class closes (median)",
+    "class closes, if one clear effect was to be named (median)",
     "the same, as the angle to the nearest other effect lets it (1 - sin^2, median)": "its expectation from the angle to the "
     "nearest other effect, 1 - sin^2 (median)",
     "the same, where that angle leaves it 5 % at most": "the share that it closes where the expectation is 5 % at most",
-    "rightly named, but the gap is within its uncertainty": "right names where the gap is too small to be told from none",
+    "rightly named, but the gap is within its uncertainty": "answers that name all true effects although the gap is "
+    "too small to be told from none",
     "the same, where every true effect was named": "the same intervals, where every true effect was named",
 }
 """Rows of the results whose names need more words on the page."""
@@ -69,16 +71,18 @@ _OUTSIDE = """| error outside the catalogue | what it is |
 _HOW_TO_READ = """Each cell has a share with its counts and its 95 % interval (Wilson) in brackets, or a median with the
 number of values in brackets; "(of 1)" is one value for all measurements together. Then it says whether the goal was met:
 "yes", "no", or "undecided", which means that the interval contains values that reach the goal and values that do not. So few
-measurements leave most goals undecided."""
+measurements leave most goals undecided. The number after "of" is smaller than that of all measurements where a row is about some
+of them alone, such as the clear ones."""
 
-_READING = """The "share of the gap" is 100 % if nothing but noise is left. The best wrong effect closes much of the gap wherever
-two signatures are alike: fitted freely, an effect at the angle a to the true one takes 1 - sin^2 a of its square, whatever the
-method. Where no other effect is alike, it closes next to nothing."""
+_READING = """The "share of the gap" is 100 % if nothing but noise is left. The rows on "the best wrong effect" put another effect
+in place of the true one, to see whether it would do as well. It closes much of the gap wherever two signatures are alike: fitted
+freely, an effect whose signature has the angle a to the true one explains 1 - sin^2 a of its sum of squares, whatever the method.
+Where no other effect is alike, it closes next to nothing."""
 
 _ANSWERS_READ = """| column or name | meaning |
 | --- | --- |
 | (none), (change) | measurements without an effect; those in which only rock fell |
-| (off ...) | an error outside the catalogue |
+| (off ...) | an error outside the catalogue, clear or weak; if it is answered `no_gap` and not among the failures, it is weak |
 | right, alone; right, in a class | the true effect is named; it is one of those that cannot be told from a named one |
 | other effect only | the measurement has two effects, and only the other one is named |
 | wrong name | an effect is named that is not there |
@@ -133,7 +137,7 @@ truth it cannot see. It is for users who want to know how far to trust an answer
 works in closed form: surfaces and sensors are formulas, without meshes or ray casting. It shares no code with the sensors or
 the diagnosis.
 
-- {counted("right class")} clear effects are in the right class.
+- {counted("right class")} clear effects are in the right class (measurements with one effect).
 - {counted("wrong names among committed answers")} answers that name an effect contain a wrong name.
 - {counted("false alarms on no-effect cases")} measurements without an effect raise a false alarm.
 
@@ -148,7 +152,7 @@ the diagnosis.
 | gap | how much farther than the floor it departs |
 | S/N | strength of an effect: signal-to-noise ratio of its signature after the pose fit; noise includes the reference's error |
 | S/N x sin(angle) | what is left of S/N when the most similar effect of another class is fitted too |
-| clear | an effect whose S/N x sin(angle) is 8 or more, in a measurement with no other effect |
+| clear | an effect, or an error outside the catalogue, whose S/N x sin(angle) is 8 or more |
 | validation blocks | parts of the wall that were not used to find effects |
 | reference | the surface with which the measurement is compared |
 | false alarm | an effect is named, or the verdict is `unknown`, though the sensor has no error |
@@ -259,7 +263,7 @@ def _failures(failures: list[Json]) -> str:
             f["stratum"],
             f["wrong"],
             "; ".join(f["true"]),
-            f"{f['verdict']}: {'; '.join(f['said'])}" + _last(f["error"]),
+            f"{f['verdict']}: {'; '.join(f['said']) or 'nothing named'}" + _last(f["error"]),
         )
         for f in sorted(failures, key=lambda f: (f["wrong"], f["sensor"]))
     )

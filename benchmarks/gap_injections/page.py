@@ -180,31 +180,31 @@ def _counts(rows: list[Json]) -> str:
 
 
 def _in_short(rows: list[Json]) -> str:
-    """Summarise the counts in sentences."""
+    """Summarise the counts in a table and in sentences."""
     good = [row for row in rows if row["judgement"] in ("right", "class")]
     known = [row for row in good if not row["effect"].startswith("off_")]
     spoiled = [row for row in known if row["verdict"] == "unknown"]
-    said = []
+    said = [
+        "| measurements | effects of the catalogue that are named with their size, or listed among those that cannot be told "
+        "from a named one | errors outside the catalogue with the right answer, `unknown` | a wrong effect is named, all cases |",
+        "| --- | --- | --- | --- |",
+    ]
     for words, on_disparities in (("laser scans", False), ("disparities", True)):
         group = [row for row in rows if (row["base"] in _DISPARITIES) is on_disparities]
         outside = [row for row in group if row["effect"].startswith("off_")]
         inside = [row for row in group if row not in outside]
         right, unknown = (sum(row in good for row in part) for part in (inside, outside))
         wrong = sum(row["judgement"] == "wrong" for row in group)
-        said.append(
-            f"On {words}, {right} of {len(inside)} effects of the catalogue are named with their size or listed among those that "
-            f"cannot be told apart; {unknown} of {len(outside)} errors outside the catalogue get the right answer, `unknown`. "
-            f"A wrong effect is named in {wrong} of all {len(group)} cases, where the goal for simulated "
-            f"measurements is 2 %."
-        )
+        said.append(f"| {words} | {right} of {len(inside)} | {unknown} of {len(outside)} | {wrong} of {len(group)} |")
     said.append(
+        "\nFor simulated measurements the goal is to name a wrong effect in 2 % of the cases at most. "
         f"In {len(spoiled)} of the {len(known)} good answers on effects of the catalogue the verdict is still `unknown`, because "
-        "the measurement disagreed with its model before the injection already.\n\nIn the table each row is a group of "
+        "the measurement disagreed with its model before the injection already.\n\nIn the next table each row is a group of "
         'injections: by their signal-to-noise ratio S/N, or by the measurement (both are explained below). "Number" is the '
-        "size "
-        "of the group, and the other columns count [the outcomes](#how-answers-are-scored). Right and class are good outcomes."
+        "size of the group, and the other columns count [the outcomes](#how-answers-are-scored). Right and class are good "
+        "outcomes."
     )
-    return " ".join(said)
+    return "\n".join(said)
 
 
 def _rows(rows: list[Json]) -> str:

@@ -232,7 +232,9 @@ def _rates(results: list[Result]) -> str:
         "p-values of what remains below 0.01, without an effect": share(sum(each < 0.01 for each in p), len(p)),
         "median time of a diagnosis, s": f"{np.median([each.answer['said']['seconds'] for each in results]):.0f}",
     }
-    return "| | |\n|---|---|\n" + "".join(f"| {key} | {value} |\n" for key, value in rows.items())
+    return "| what | share (95 % interval), or value |\n|---|---|\n" + "".join(
+        f"| {key} | {value} |\n" for key, value in rows.items()
+    )
 
 
 def _alarmed(result: Result) -> bool:
@@ -247,7 +249,7 @@ def _not_right(results: list[Result]) -> str:
     rows = ["| case | truth | ratio (apart from) | outcome | answer | p of what remains |", "|---|---|---|---|---|---|"]
     for each in results:
         if not each.right or each.outside:
-            named = "; ".join(_said(effect) for effect in each.answer["effects"]) or each.answer["verdict"]
+            named = "; ".join(_said(effect) for effect in each.answer["effects"]) or "nothing named"
             outside = f" outside: {'; '.join(each.outside)}" if each.outside else ""
             p = each.answer.get("remaining", {}).get("p_value")
             case = f"{each.truth['number']:04d} {each.truth['kind']}"

@@ -52,7 +52,8 @@ def make_wall(seed: int = 1, **keys: Any) -> Mesh:
     seed : int
         Seed of the random shape. The same seed gives the same wall.
     **keys
-        Keys of a config's `wall` section: style="glendale", width_m, height_m, resolution_m, ...
+        Keys of a config's `wall` section, such as style="glendale" (whose rock it resembles), width_m, height_m, and
+        resolution_m (distance of its vertices).
 
     Returns
     -------
@@ -63,19 +64,23 @@ def make_wall(seed: int = 1, **keys: Any) -> Mesh:
 
 
 def open_wall(path: Path | str | Sequence[Path | str], **keys: Any) -> Mesh:
-    """Read a wall from mesh files and repair it as a simulation does.
+    """Read a wall of your own from mesh files, to simulate on.
+
+    Duplicate vertices and triangles and wrong winding are repaired, as the command `simulate` does.
 
     Parameters
     ----------
     path : path, or list of paths
         A mesh file, or the several files that make up the scene.
     **keys
-        Keys of a config's `wall` section: unit, flipped, albedo.
+        Keys of a config's `wall` section: unit (of the coordinates, such as "ft"; default "m"), flipped (True if the
+        triangles are clockwise seen from the sensor's side), albedo (share of light reflected, 0 to 1; default: the
+        file's own).
 
     Returns
     -------
     Mesh
-        The wall in the files' coordinates, m.
+        The wall in the files' coordinate system, m.
     """
     mesh = str(path) if isinstance(path, Path | str) else [str(each) for each in path]
     return Mesh.of(parse(ImportedWall, {"mesh": mesh, **keys}, "open_wall").load()[0])
@@ -105,7 +110,9 @@ def stage(
     Returns
     -------
     SensorSite
-        `.mesh` (wall frame), `.frame` (the wall frame, whose z axis points to the sensor), `.sensor`, `.viewpoints`.
+        `.mesh` is the wall, wall frame, and `.sensor` the sensor: the arguments of `observe`. `.frame` converts between
+        world and wall frame, whose z axis points to the sensor. `.viewpoints` has the positions (3,) of scanner or
+        cameras by name, wall frame, m.
     """
     resolved = configure(config, sensor, seed=seed, model=model, **overrides)
     given = None if wall is None else Wall(wall, (), "wall")
@@ -120,7 +127,7 @@ def make_blocks(
     shape: Literal["cube", "sphere"] = "cube",
     subdivisions: int = 2,
 ) -> solids.Blocks:
-    """Make blocks of given positions and sizes, labelled from 1.
+    """Make blocks of given positions and sizes, to be removed from a wall by `carve`; they are labelled 1 to k.
 
     Parameters
     ----------
@@ -129,16 +136,16 @@ def make_blocks(
     sizes : (k, 3) or (k,) array
         Lengths of the three axes, or one length for all three, m.
     rotations_rad : (k, 3) array, optional
-        Rotation angles about x, then y, then z. Default: no rotation.
+        Rotation angles about x, then y, then z, rad. Default: no rotation.
     shape : "cube" or "sphere"
         Shape of all blocks.
     subdivisions : int
-        How often the faces of the basic shape are subdivided.
+        How often each triangle of the basic shape is divided into smaller ones: the more often, the finer the blocks.
 
     Returns
     -------
     Blocks
-        The blocks as closed meshes, wall frame.
+        The blocks as closed meshes, wall frame, m.
 
     Raises
     ------
@@ -192,7 +199,7 @@ def carve(mesh: TriangleMesh, blocks: solids.Blocks) -> carving.Carved:
 
 
 def observe(mesh: TriangleMesh, sensor: Sensor, seed: int = 1) -> Observation:
-    """Observe a mesh once with a sensor.
+    """Simulate one measurement of a mesh by a sensor, with noise.
 
     Parameters
     ----------
@@ -206,20 +213,21 @@ def observe(mesh: TriangleMesh, sensor: Sensor, seed: int = 1) -> Observation:
     Returns
     -------
     Observation
-        The points on the sensor's grid.
+        The measured points in the frame of the mesh, m, one for each pulse of the scanner or pixel of the depth map.
     """
     return sensor.observe(RayCaster(mesh), KeyedRandom(seed))
 
 
 def reconstruct(observation: Observation, **keys: Any) -> Mesh:
-    """Mesh an observation through its grid of points.
+    """Make a surface of what a sensor observed, by joining points that are neighbours in its grid of pulses or pixels.
 
     Parameters
     ----------
     observation : Observation
         Result of `observe`.
     **keys
-        Keys of a config's `surface` section: method, depth_step_m, ...
+        Keys of a config's `surface` section, such as method ("grid" or "poisson") and depth_step_m (m; edges with a
+        smaller difference of range are never cut).
 
     Returns
     -------
@@ -230,7 +238,7 @@ def reconstruct(observation: Observation, **keys: Any) -> Mesh:
 
 
 def mesh_points(points: ArrayLike, viewpoint: ArrayLike, **keys: Any) -> Mesh:
-    """Mesh unorganised points as they are seen from a viewpoint.
+    """Make a surface of points that are in no order, as they are seen from one place.
 
     Parameters
     ----------
@@ -239,8 +247,9 @@ def mesh_points(points: ArrayLike, viewpoint: ArrayLike, **keys: Any) -> Mesh:
     viewpoint : (3,) array
         Where the sensor stood, in the same frame, m.
     **keys
-        method ("triangulation" between the points, or "poisson", which needs the extra `poisson`), poisson_depth,
-        poisson_trim_spacings.
+        method: "triangulation" between the points, or "poisson" (reconstruction by Open3D, which the extra `poisson`
+        installs). poisson_depth: depth of its octree. poisson_trim_spacings: how far its surface reaches beyond the
+        points, in median point spacings.
 
     Returns
     -------

@@ -41,14 +41,15 @@ def calibrate(
     Parameters
     ----------
     measured : path, Run, or a list of them
-        A folder with measurement.yaml, a folder with difference maps, difference maps (GeoTIFF), or a run.
+        The measured epochs: a folder with measurement.yaml, a folder with difference maps, difference maps
+        (GeoTIFF), or a run.
     config : optional
-        The config of the site (file, name or values); see `configure`. Default: the config of a run among
+        The config of the site to simulate (file, name or values); see `configure`. Default: the config of a run among
         `measured`, or else the demo.
     sensor : "tls" or "stereo", optional
-        What measured. Default: as the inputs say.
+        The sensor that measured. Default: as the inputs say.
     greedy : bool
-        Also run the simple search of the thesis, which lowers one parameter at a time, for comparison.
+        Also run a simple search, which lowers one parameter at a time, for comparison.
     out : path, optional
         Folder for the report and files. Default: nothing is written.
     seed, model, **overrides
@@ -94,10 +95,10 @@ class Calibration:
 
     @property
     def parameters(self) -> pandas.DataFrame:
-        """The fitted noise of the sensor, one row per parameter.
+        """The fitted noise of the sensor, one row per parameter, such as range_sigma_m.
 
-        The columns are the value and the low and high end of its confidence interval, in the unit with which the parameter's
-        name ends.
+        The columns are value, and low and high, the ends of its confidence interval (95 % unless the config says otherwise),
+        in the unit with which the parameter's name ends.
         """
         found = self.figures.found
         values = {name: np.exp(each) for name, each in (("value", found.x), ("low", found.low), ("high", found.high))}
@@ -123,9 +124,9 @@ class Calibration:
     def plot(self, kind: str = "windows") -> Picture:
         """Return a figure of the report by its name.
 
-        kind: windows (the last measured map and a simulated one in the compared windows), measured (the last measured map),
-        systematic (the mean of all), distribution (of the differences), statistics (measured over expected) or epochs. Raises
-        InputError for another name.
+        kind: windows (the last measured and a simulated map in the square parts that were compared), measured (the last
+        measured map), systematic (the mean of all), distribution (of the differences), statistics (measured over expected
+        ones) or epochs (median and noise of each). Raises InputError for another name.
         """
         return Picture(pick({name: png for name, _, png in pictures(self.figures, None)}, kind, "plot"))
 

@@ -41,8 +41,8 @@ def compare(
     Parameters
     ----------
     *sensors : config, path, name, Run, or one mapping of names to these
-        Configs or their values or files, runs, bundled sites, scanners ("riegl_vz400i") or noise models. A config with both
-        kinds of sensor counts as two.
+        The sensors. Each is a config (its values, its file or a bundled site's name), a run, the name of a scanner
+        ("riegl_vz400i"), or a noise model (file or name). A config with both kinds of sensor counts as two.
     epochs : int
         Number of epochs with rockfall.
     sizes_m : (float, float) or None
@@ -95,7 +95,10 @@ class Comparison:
     def table(self) -> pandas.DataFrame:
         """Main results of the compared sensors, one row per sensor, indexed by name; SI units.
 
-        The columns include noise, level of detection, smallest block that is detected, and completeness.
+        The columns include nmad_m (noise over stable ground), level_of_detection_m (median of the wall), smallest_block_m
+        (size from which 95 % of the blocks are detected), blocks_in_view and blocks_seen (numbers of blocks in the sensor's
+        view, and of those detected), visible (share of the wall that the sensor can see) and complete (share of the map with
+        data).
         """
         return frame(map(_row, self.figures.found)).set_index("name")
 
@@ -103,7 +106,8 @@ class Comparison:
     def blocks(self) -> pandas.DataFrame:
         """All fallen blocks, one row per block and sensor; SI units.
 
-        The columns include the size, whether the block was in view and seen, and its true and measured volume.
+        The columns include size_m, in_view (whether the sensor saw at least half of its place before it fell), seen (whether
+        it was detected), volume_m3 (true) and measured_volume_m3.
         """
         found = self.figures.found
         return frame({"sensor": each.name, **block.to_dict()} for each in found for block in each.detection.blocks)
@@ -126,7 +130,10 @@ class Comparison:
 
     @property
     def level_of_detection(self) -> xarray.Dataset:
-        """Smallest change that is significant (95 %) at each pixel of the wall, m; one map (y, x) per sensor, by its name."""
+        """Level of detection at each pixel of the wall: the change that noise alone exceeds in 5 % of cases, m.
+
+        One variable per sensor, by its name: a map (y, x).
+        """
         grid = self.figures.trial.grid
         return dataset({
             each.name: data_array(each.noise.level, grid, each.name, "95 % level of detection") for each in self.figures.found

@@ -98,7 +98,10 @@ def keywords(values: Mapping[str, Any]) -> list[Override]:
 
 
 def plain(value: Any) -> Any:
-    """Return a value in the types of a YAML file: models become mappings, paths text, arrays lists."""
+    """Convert a value from Python to the types of a YAML file, so that it is read like a config file.
+
+    value: anything that a config can contain. Models become mappings, paths become text, arrays become lists.
+    """
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")
     if isinstance(value, Mapping):

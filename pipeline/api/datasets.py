@@ -94,16 +94,22 @@ class DataSet:
         return read_dataset_file(self.folder)
 
     def tiles(self, split: str = "train", **filters: str) -> Tiles:
-        """Return the tiles of a split, to be read one by one as arrays.
+        """Return the tiles of a split, to be read one by one as arrays, for example to train a detector.
 
-        split: train, val or test. filters: values of sensor, wall, noise or size_class that a tile must have, such as
-        sensor="stereo". Raises InputError for an unknown filter, or if no tile matches.
+        split: train, val or test. filters: what the tiles must have, by name. The names are sensor ("tls" or "stereo"), and
+        wall, noise (noise level) and size_class (of the blocks), whose values the set's config names. Raises InputError for
+        an unknown filter, or if no tile matches.
         """
         return Tiles(self.folder / pick({name: name for name in self.splits}, split, str(self.folder)), **filters)
 
     @property
     def table(self) -> pandas.DataFrame:
-        """Description of all tiles, one row per tile: split, file_name, sensor, wall, noise, size_class, blocks, ..."""
+        """Description of all tiles, one row per tile, to count or select them.
+
+        The columns include split (train, val or test), file_name, sensor, wall, noise (level) and size_class (of blocks) as
+        the set's config names them, noise_sigma_m (standard deviation of the noise, m), and blocks (number of annotated
+        blocks).
+        """
         rows = []
         for split in self.splits:
             content = read_coco(self.folder / split / "annotations.json")

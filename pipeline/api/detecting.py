@@ -53,12 +53,13 @@ def detect(
         "default" (the network that comes with scarpsim), "baseline" (a threshold, no network), or the folder of a trained
         detector.
     confidence : float or sequence of floats
-        Smallest score to accept. The result uses the smallest of several.
+        Smallest score, 0 to 1, of a detection that is accepted. Of several values, the returned result uses the smallest.
     out : path, optional
         Folder for COCO files, tables, masks and overlays. Default: a temporary folder, which is deleted together with the
         result.
     mirrored : bool
-        Also show the network the mirror images of the maps. This takes three to four times as long and draws blocks better.
+        Also search mirror images of the maps with the network. This takes three to four times as long and gives better
+        outlines.
     progress : "auto" or bool
         Whether progress is shown; "auto": in notebooks and on terminals.
 
@@ -108,9 +109,11 @@ class Detections:
 
     @property
     def events(self) -> geopandas.GeoDataFrame:
-        """The detected rockfalls, one row per event: image, number, position, area, depth, volume, score; SI units.
+        """The detected rockfalls, one row per event; SI units.
 
-        The geometry of a row is the event's bounding rectangle, wall frame, m.
+        The columns include image and number (of the map, and of the event in it), x_m and y_m (centre, wall frame), area_m2,
+        depth_m (largest), volume_m3 and score (confidence, 0 to 1). The geometry of a row is the event's bounding rectangle,
+        wall frame, m.
         """
         bounds = [
             [each.x_m - each.width_m / 2, each.y_m - each.height_m / 2, each.x_m + each.width_m / 2, each.y_m + each.height_m / 2]

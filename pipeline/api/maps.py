@@ -71,10 +71,11 @@ def dataset(rasters: Mapping[str, xarray.DataArray]) -> xarray.Dataset:
 
 
 def raster_of(array: Any, where: str) -> tuple[NDArray[np.float32], Grid]:
-    """Return the values of a DataArray, (h, w) float32 with row 0 at the largest y, and the grid of its coordinates.
+    """Convert a user's difference map from a DataArray to an array and a grid, to be used by functions such as `detect`.
 
     array: a map with the dimensions y and x, whose coordinates are pixel centres in the wall frame, m. where: what errors
-    should call it. Raises InputError if it has other dimensions, fewer than 2 x 2 pixels, or pixels that are not square.
+    should call it. Returns the values, (h, w) float32 with row 0 at the largest y, and the grid of the pixels. Raises
+    InputError if it has other dimensions, fewer than 2 x 2 pixels, or pixels that are not square.
     """
     if set(array.dims) != {"y", "x"}:
         raise InputError(

@@ -60,28 +60,28 @@ def measure(
     cameras: Any = None,
     **keys: Any,
 ) -> Measurement:
-    """Load a measurement from a folder, from its parts, or from a simulated run.
-
-    A run gives its reference epoch, measured against its own wall.
+    """Load a measurement, to compare it with its sensor model by `diagnose`: from a folder, from its parts, or from a run.
 
     Parameters
     ----------
     given : path or Run, optional
-        A folder with measurement.yaml, or a run. Not needed if `reference` and `points` are given.
+        A folder with measurement.yaml, or a simulated run, whose reference epoch is compared with its true wall. Not
+        needed if `reference` and `points` are given.
     sensor : "tls" or "stereo"
-        What measured the points.
+        What measured the points: laser scanner or stereo pair.
     reference : mesh or path, optional
         The known surface, world frame, m.
     points : (n, 3) array, Points, path, or a list of them, optional
         The measured points, m; one entry of a list per epoch.
     model : model, mapping, path or name, optional
-        The sensor model to test. With a run it may differ from the model that made the run. Default: the run's model, or else
-        the default model of the sensor.
+        The sensor model to test. With a run it may differ from the model that made the run. Default: the run's model, or
+        else the default model of the sensor.
     cameras : CameraPair or path, optional
         The nominal camera pair (stereo only).
     **keys
-        Further keys of measurement.yaml: frame ("world", or "scanner", of the points), scanner={"position_m": ..., "rotation":
-        ...}, pattern, stable_areas.
+        Further keys of measurement.yaml: frame ("world" or "scanner": the frame of the points), scanner={"position_m":
+        ..., "rotation": ...} (its pose in the world frame), pattern (start, stop and step of the scanner's angles),
+        stable_areas (where nothing moved).
 
     Returns
     -------
@@ -231,9 +231,9 @@ class Diagnosis:
     def effects(self) -> pandas.DataFrame:
         """Effects that explain why measurement and sensor model disagree.
 
-        One row per parameter of each effect, SI units. The columns include the fitted value, its standard deviation (std), the
-        kind of effect, the effects that the data cannot distinguish from it (cannot_be_told_from), and the p-value of the
-        effect.
+        One row per parameter of each effect, SI units. The columns are effect and parameter (names), value (fitted), std (its
+        standard deviation), kind ("physical", or "empirical" if its cause is unknown), cannot_be_told_from (effects that
+        explain the data as well), split_by (a further measurement that would tell them apart) and p_value (of the effect).
         """
         rows = []
         for each in self.found.effects:
@@ -277,10 +277,11 @@ class Diagnosis:
 
     @property
     def gap(self) -> dict[str, Any] | None:
-        """How much worse the measurement fits the sensor model than it should, on points kept from the fit.
+        """How much worse the measurement fits the sensor model than it should, on points that the fit did not use.
 
-        The keys include before and after (without and with the named effects), floor (what data simulated from the model itself
-        reach), unit, and closed (how much of the gap the effects explain). None if it was not measured.
+        The keys include before and after (the misfit without and with the named effects in the model), floor (the misfit that
+        data simulated from the model itself have), unit (of these numbers), and closed (share of the gap that the effects
+        explain). None if it was not measured.
         """
         return self.found.gap.to_dict() if self.found.gap else None
 
@@ -295,8 +296,10 @@ class Diagnosis:
     def plot(self, kind: str = "maps") -> Picture:
         """Return a figure of the report by its name, or a map of the residuals over the wall.
 
-        kind: maps, profiles, gap or identifiability for a figure of the report; before or after for the residuals without or
-        with the named effects in the prediction.
+        kind: a figure of the report, which is maps (mean and standard deviation of the residuals over the wall), profiles
+        (both over range and other quantities), gap (how much of the gap the named effects close) or identifiability (which
+        effects the measurement can tell apart); or before or after, for the residuals without or with the named effects in
+        the prediction.
         """
         if kind in ("before", "after"):
             points = self.residuals

@@ -72,7 +72,10 @@ class Mesh(TriangleMesh):
 
     @classmethod
     def read(cls, path: Path | str) -> Self:
-        """Read a mesh from a PLY file that `save` wrote. Unlike `open_wall` it repairs nothing."""
+        """Read a mesh from a PLY file that `save` wrote.
+
+        path: the file. Nothing is repaired; `open_wall` reads and repairs meshes of other programs.
+        """
         return cls.of(read_ply(Path(path)))
 
     def save(self, path: Path | str) -> Path:

@@ -58,11 +58,16 @@ def monitor(
     progress : "auto" or bool
         Whether progress is shown; "auto": in notebooks and on terminals.
     **options
-        Fields of `MonitorOptions`. Position (of the sensor) and direction (of change): survey coordinates, m. Views: number
-        of planes on which a wall that turns or overhangs is mapped, each with difference maps of its own. gsd_m: side of a
-        pixel, m. Stable: areas of stable rock, m. Targets: file of measured targets, used instead of ICP. Unit and columns
-        of the files. Scanner, model or photographs: what measured. Detector: name or file of a trained detector, whose
-        finds are then the events in place of significant regions. Seed of random numbers. Default: found from the files.
+        Fields of `MonitorOptions`, which are otherwise found from the files. The main ones:
+
+        - position, direction: where the sensor stood, m, and the direction along which change is measured, survey coordinates
+        - views: number of parts of the wall that are mapped along directions of their own, for a wall that turns or overhangs
+        - gsd_m: side of a pixel, m
+        - stable: areas of stable rock, m
+        - targets: file of measured targets, which replace ICP
+        - unit, columns: unit of the coordinates, and columns of text files
+        - scanner, model or photographs: what measured the epochs
+        - detector: name or folder of a trained detector that finds the events, in place of the level of detection
 
     Returns
     -------
@@ -99,12 +104,13 @@ def monitor(
 
 @dataclass(frozen=True, repr=False)
 class Monitoring:
-    """Result of `monitor`.
+    """Result of `monitor`: what changed on a wall, with access to its maps and events as arrays and tables.
 
     Attributes
     ----------
     result : pipeline.monitoring.products.Result
-        Folder, sources, site and epochs, as `pipeline.monitoring` computes them.
+        All results as `pipeline.monitoring` computes them: the folder, the files and times of the epochs (sources), the
+        reference epoch with its frames and rasters (site), and the results of each later epoch (epochs).
     """
 
     result: Result
@@ -116,17 +122,18 @@ class Monitoring:
 
     @property
     def differences(self) -> xarray.DataArray:
-        """Difference maps, (epoch, y, x), m: reference minus epoch along the wall's normal.
+        """Difference maps of all epochs, (epoch, y, x), m: reference minus epoch along the wall's normal.
 
-        Missing rock is positive; pixels without data are NaN. Of several views these are the maps of the first; see
-        `differences_in` for the others.
+        Missing rock is positive; pixels without data are NaN. A wall that turns or overhangs is mapped in several parts
+        (views), each along a direction of its own. This is the first view; see `differences_in` for the others.
         """
         return self.differences_in(1)
 
     def differences_in(self, view: int) -> xarray.DataArray:
-        """Return the difference maps of one view of the wall, (epoch, y, x), m, as `differences` has those of the first.
+        """Return the difference maps of one view of the wall, (epoch, y, x), m: reference minus epoch, NaN without data.
 
-        view: number of the view, from 1 on; a wall that turns no corner has one. Raises InputError if there is no such view.
+        view: number of the view, from 1. A view is a part of the wall that is mapped along a direction of its own; a wall
+        that neither turns nor overhangs has one. Raises InputError if there is no such view.
         """
         xarray = library("xarray")
         suffix = self._view(view).suffix
@@ -135,9 +142,12 @@ class Monitoring:
 
     @property
     def events(self) -> geopandas.GeoDataFrame:
-        """Detected rockfalls and other changes, one row per event and epoch, with the columns of events.csv.
+        """Detected rockfalls and other changes, one row per event and epoch, with the columns of events.csv; SI units.
 
-        The geometry of a row is the event's outline in survey coordinates, m.
+        The columns include id (one event has the same in all epochs), epoch, kind ("missing" or "added" rock), area_m2,
+        depth_median_m, volume_m3 with its standard deviation volume_std_m3, first_seen_after and first_seen_by (the epochs
+        between which it began), and the position in the wall frame (x_m, y_m) and in survey coordinates (world_x_m, ...). The
+        geometry of a row is its outline in survey coordinates, m.
         """
         geopandas, shapely = library("geopandas"), library("shapely")
         outlines = [shapely.MultiPolygon([shapely.Polygon(ring) for ring in each]) for each in self.result.outlines()]
@@ -146,14 +156,18 @@ class Monitoring:
 
     @property
     def registration(self) -> dict[int, dict[str, Any]]:
-        """Registration of each epoch on the reference, wall frame, as in monitor.json; keyed by the epoch's number."""
+        """Registration of each epoch on the reference, by the epoch's number, as in monitor.json.
+
+        The keys of each include rotation (3, 3) and translation_m (3,) in the wall frame, x_reference = rotation x_epoch +
+        translation, their standard deviations, and rms_m, the RMS of the residuals on stable rock.
+        """
         return {epoch.number: epoch.record.registration for epoch in self.result.epochs}
 
     def plot(self, epoch: int | None = None, view: int = 1) -> Picture:
-        """Return the difference map of an epoch in one view of the wall, with the outlines of its events.
+        """Return the difference map of an epoch with the outlines of its events.
 
-        epoch, view: their numbers, from 1 on; by default the last epoch in the first view. Raises InputError if there is no
-        such epoch or view.
+        epoch: its number, from 1; by default the last. view: number, from 1, of the part of the wall, if the wall turns or
+        overhangs and is mapped in several parts. Raises InputError if there is no such epoch or view.
         """
         number = self.result.epochs[-1].number if epoch is None else epoch
         path = self.folder / f"map_{number:03d}{self._view(view).suffix}.png"
@@ -182,7 +196,12 @@ class Monitoring:
         views = self.result.site.views
         if not 1 <= number <= len(views):
             allowed = f"1 to {len(views)}" if len(views) > 1 else "1: the wall has one view"
-            raise InputError(f"there is no view {number}", where="view", allowed=allowed, remedy="choose one of these views")
+            raise InputError(
+                f"there is no view {number} (a view is a direction from which the wall is mapped)",
+                where="view",
+                allowed=allowed,
+                remedy="choose one of these views",
+            )
         return views[number - 1]
 
     def _map(self, kind: str, place: str) -> xarray.DataArray:

@@ -51,10 +51,10 @@ class Picture:
 
 
 def pick(pictures: Mapping[str, Any], kind: str | None, where: str) -> Any:
-    """Return the picture called `kind`, or the first if `kind` is None.
+    """Return the picture that a user asks for by name, called `kind`, or the first if `kind` is None.
 
-    pictures: pictures by name. where: what errors should call the call or its result. Raises InputError, with the available
-    names, if there is none.
+    pictures: pictures by name. where: what errors should call the call or its result. Raises InputError, with the
+    available names, if there is none.
     """
     if not pictures:
         raise InputError(

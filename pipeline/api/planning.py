@@ -76,7 +76,10 @@ class SensorPlan:
     def maps(self) -> xarray.Dataset:
         """Maps of the predicted performance over the wall, by name, in SI units.
 
-        Names are smallest_block_m, normal_sigma_m, incidence_rad and others. Values are NaN where the sensor sees nothing.
+        Among them are smallest_block_m (side of the smallest block whose fall is detected), normal_sigma_m (standard
+        deviation of a point along the surface's normal), incidence_rad (angle of incidence) and, for a scanner, range_m and
+        the point spacing; `table` lists all names. Values are NaN where the sensor sees nothing; probabilities and counts are
+        0 there.
         """
         raster = self.promise.raster
         return dataset({
@@ -86,7 +89,11 @@ class SensorPlan:
 
     @property
     def figures(self) -> dict[str, float]:
-        """Single predicted numbers by name: visible share of the wall, pulses, seconds_to_scan, base_m, ...; SI units."""
+        """Single predicted numbers by name, in SI units, to compare set-ups.
+
+        For a scanner they include seen (share of the wall that is visible), pulses (their number) and seconds_to_scan. For a
+        stereo pair they include seen_by_both (share that both cameras see), overlap, and base_m (distance of the cameras).
+        """
         return dict(self.promise.figures)
 
     @property
@@ -100,7 +107,7 @@ class SensorPlan:
         return summary(self.promise)
 
     def plot(self, kind: str = "smallest_block_m") -> Picture:
-        """Return a figure of one map.
+        """Return a picture of one map of the predicted performance over the wall.
 
         kind: name of the map, as in `maps`: smallest_block_m, normal_sigma_m, ... Raises InputError for another name.
         """

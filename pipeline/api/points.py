@@ -31,7 +31,10 @@ class Points(np.ndarray[Any, Any]):
 
     @classmethod
     def of(cls, cloud: PointCloud) -> Self:
-        """Return the points of a PointCloud as a structured array, in its frame; the recorded values keep their types."""
+        """Return a point cloud of the simulator as a structured array, in its frame; the recorded values keep their types.
+
+        cloud: the PointCloud, m.
+        """
         channels = {name: cloud.points[:, axis] for axis, name in enumerate(_AXES)}
         optional = {"intensity": cloud.intensity, "gps_time": cloud.gps_time}
         channels |= {name: np.asarray(values) for name, values in (optional | cloud.extra).items() if values is not None}

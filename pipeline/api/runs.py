@@ -175,16 +175,17 @@ class Run:
     def statistics(self) -> pandas.DataFrame:
         """Noise of the run, one row per epoch.
 
-        The columns are statistics of the difference map outside the fallen blocks (count, median_m, nmad_m, ...) and the RMS of
-        the epoch's registration.
+        The columns are statistics of the difference map outside the fallen blocks (count, median_m, nmad_m, ...) and
+        registration_rms_m (RMS of the residuals of the epoch's registration).
         """
         return frame(each.statistics for each in self.epochs)
 
     def plot(self, kind: str = "difference", epoch: int = 1) -> Picture:
         """Return a figure of one epoch of the run, as in the report.
 
-        kind: difference, blocks, hillshade, histogram, icp or m3c2. epoch: its number; 0 is the reference, which has only its
-        hillshade.
+        kind: difference (map), blocks (the map enlarged around each block), hillshade (shaded relief), histogram (of the
+        differences), icp (convergence of the registration) or m3c2 (M3C2 distances). epoch: its number; 0 is the reference,
+        which has only its hillshade.
         """
         return self[epoch].plot(kind)
 
@@ -254,7 +255,10 @@ class Epoch:
 
     @property
     def m3c2(self) -> xarray.DataArray:
-        """Map of M3C2 distances (changes along the surface's normal), (y, x), m, if the run's config asked for them."""
+        """Map of M3C2 distances (changes along the surface's normal), (y, x), m; NaN without data.
+
+        Raises InputError if the run's config did not ask for them (key `m3c2`).
+        """
         values, grid = read_geotiff(self.file("m3c2", ".tif"))
         return data_array(values, grid, "m3c2", "M3C2 distance; missing rock positive", frame=self.run.frame)
 
@@ -275,17 +279,20 @@ class Epoch:
 
     @property
     def blocks(self) -> geopandas.GeoDataFrame:
-        """The blocks that fell in this epoch, one row each: true values, and what the difference map shows.
+        """The blocks that fell in this epoch, one row each, to compare the measured sizes with the true ones.
 
-        The geometry of a row is the bounding rectangle of the block's niche, wall frame, m.
+        The columns include volume_m3 and size_x_m, ... (true), measured_volume_m3 (in the difference map), position_x_m, ...
+        (wall frame) and annotated (whether it is labelled for training). The geometry of a row is the bounding rectangle of
+        the block's niche, wall frame, m.
         """
         return _blocks([self])
 
     @property
     def statistics(self) -> dict[str, Any]:
-        """Noise of the epoch, SI units.
+        """Noise of the epoch by name, SI units.
 
-        It has the statistics of the difference map outside the blocks, and the RMS of the epoch's registration.
+        The names are statistics of the difference map outside the fallen blocks (count, median_m, nmad_m, ...) and
+        registration_rms_m (RMS of the residuals of the epoch's registration).
         """
         outside = self.record.get("statistics", {}).get("outside_blocks")
         if outside is None:
@@ -307,7 +314,8 @@ class Epoch:
     def plot(self, kind: str = "difference") -> Picture:
         """Return a figure of the epoch as in the report.
 
-        kind: difference, blocks, hillshade, histogram, icp or m3c2; the reference has only its hillshade.
+        kind: difference (map), blocks (the map enlarged around each block), hillshade (shaded relief), histogram (of the
+        differences), icp (convergence of the registration) or m3c2 (M3C2 distances). The reference has only its hillshade.
         """
         if self.number == 0:
             return Picture((self.run.folder / "reference.png").read_bytes())

@@ -75,9 +75,10 @@ class SeriesForecast:
 
     @property
     def smallest(self) -> pandas.DataFrame:
-        """Smallest rockfall that is listed in 95 % of cases, one row per number of scans in an epoch.
+        """Smallest rockfall that `monitor` lists in 95 % of cases, to judge a planned time series.
 
-        Columns are volume_m3, the ends low_m3 and high_m3 of its 95 % interval, and level_of_detection_m.
+        One row per number of scans that are joined to one epoch. Columns are volume_m3, the ends low_m3 and high_m3 of its 95
+        % confidence interval, and level_of_detection_m.
         """
         rows = []
         for each in self.promise.promises:
@@ -93,10 +94,11 @@ class SeriesForecast:
 
     @property
     def leads(self) -> pandas.DataFrame:
-        """How early a moving block is noticed before it falls, one row per number of scans, volume and interval of epochs.
+        """How early `monitor` notices a moving block before it falls, to choose the interval of epochs.
 
-        Columns are scans, volume_m3, every_h, shows_from_m (the displacement that is listed in 95 % of cases), lead_h_95 (the
-        lead time in 95 % of cases) and lead_h_median; a lead of 0 means that the block is not noticed before.
+        One row for each combination of scans (joined to one epoch), volume_m3 (of the block) and every_h (interval of
+        epochs). Further columns are shows_from_m (the displacement that is listed in 95 % of cases), lead_h_95 (the lead time
+        that is reached in 95 % of cases) and lead_h_median; a lead of 0 means that the block is not noticed before its fall.
         """
         return frame(
             {
@@ -112,9 +114,10 @@ class SeriesForecast:
         )
 
     def probability(self, volume_m3: float, moved_m: float | None = None, *, scans: int = 1) -> float:
-        """Return the probability that a change is listed: of rock that fell, or of a block that has moved by `moved_m`.
+        """Return the probability that `monitor` lists a change: of rock that fell, or of a block that has moved.
 
-        volume_m3: volume of the rock, m3. scans: number of scans in an epoch, 1 or 4. Raises InputError for another number.
+        volume_m3: volume of the rock, m3. moved_m: how far the block has moved, m; None: it fell. scans: number of scans that
+        are joined to one epoch, 1 or 4. Raises InputError for another number.
         """
         promises = {each.scans: each for each in self.promise.promises}
         if scans not in promises:
@@ -173,7 +176,10 @@ class SeriesPlans:
         return iter(self.plans)
 
     def summary(self) -> str:
-        """Return the main predictions for all sensors as lines of text."""
+        """Return what the series would show with each sensor, as lines of text.
+
+        They state from which volume on a rockfall is listed in 95 % of cases, and how long before its fall a moving block is.
+        """
         return "\n\n".join(each.summary() for each in self.plans)
 
     def plot(self, kind: str = "curves") -> Picture:

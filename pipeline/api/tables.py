@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def frame(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> pandas.DataFrame:
-    """Return a DataFrame of rows. rows: values by column. columns: their order, needed for a table without rows."""
+    """Return a DataFrame from its rows. rows: values by column's name. columns: their order, needed for a table without rows."""
     return library("pandas").DataFrame(list(rows), columns=columns)
 
 
@@ -47,7 +47,7 @@ def spread_out(name: str, values: Sequence[float], axes: str = "xyz", unit: str 
 
 
 def frame_of(columns: Mapping[str, Any], index: Sequence[str], name: str) -> pandas.DataFrame:
-    """Return a DataFrame of columns.
+    """Return a DataFrame from its columns.
 
     columns: values by the column's name. index: label of each row. name: name of the index.
     """

@@ -50,11 +50,11 @@ _GREEDY_OBSERVATIONS = 300
 
 @dataclass(frozen=True)
 class OrientationPatterns:
-    """Size and similarity of the difference maps that errors of single orientation parameters of a camera cause.
+    """Tell which orientation parameters (angles or coordinates) of a stereo pair's cameras a calibration can tell apart.
 
-    Two parameters (angles or coordinates of the camera) with similar maps cannot be told apart by a calibration. Each map is
-    that of an error of the left camera, or of both cameras if the sensor model moves them alike, after registration of the
-    epoch.
+    An error of each parameter causes a difference map of its own. Parameters with similar maps cannot be told apart. A
+    map is that of an error of the left camera, or of both cameras if the sensor model moves them alike, after
+    registration of the epoch.
 
     Attributes
     ----------

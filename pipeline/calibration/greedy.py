@@ -50,7 +50,8 @@ def greedy_search(
 
     Parameters
     ----------
-    simulate : Function that simulates epochs and returns the logarithms of summary statistics of their noise.
+    simulate : Function that simulates difference maps from (k,) parameter values, a number of epochs and a random source,
+        and returns the logarithms of the summary statistics of their noise.
     parameters : Names and bounds of the k noise parameters.
     start : (k,) parameter values. The search begins at a multiple of them that gives four times the measured noise.
     std : Index of the standard deviation among the summary statistics.

@@ -49,9 +49,10 @@ class CalibrationInputs:
     grid : Raster that all maps share.
     maps : (e, h, w) differences, m; NaN without data.
     stable : (h, w) true on stable ground (where nothing fell) that has data in every map.
-    drawn : Whether the config or the measurement gives the stable areas; otherwise they were detected in the maps.
+    drawn : Whether the config or the measurement states the stable areas; otherwise they were detected in the maps.
     site : The wall or reference surface, with the sensor in front of it.
-    of_points : Whether a pixel is the mean distance of its points from the reference; otherwise maps compare two surfaces.
+    of_points : True if a pixel's value is the mean distance of the points in it from the reference surface; false if it
+        is the difference between two reconstructed surfaces.
     reference_error : Error of a reference surface that is made of points; None if it is unknown or zero.
     """
 
@@ -80,10 +81,10 @@ class CalibrationInputs:
 
 
 def config_of(paths: Sequence[Path]) -> Path | None:
-    """Find a config among the inputs of a calibration, for a user who gives none.
+    """Find a config among the inputs of a calibration, for a user who names none.
 
-    Returns the path of the first `run.json` in the input folders, the record of a simulation, which contains its config; None
-    if no folder has one.
+    paths: the input folders and files. Returns the path of the first `run.json` in the folders, the record of a
+    simulation, which contains its config; None if no folder has one.
     """
     return next((path / RUN_FILE for path in paths if (path / RUN_FILE).is_file()), None)
 

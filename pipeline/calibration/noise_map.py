@@ -30,7 +30,7 @@ def with_model(site: SensorSite, model: StereoModel) -> SensorSite:
     """
     if not isinstance(site.sensor, StereoPair):
         raise InputError(
-            "noise can only be varied for a stereo pair with simulated matching",
+            "a map of the noise under another sensor model needs a stereo pair with simulated matching",
             where="sensor, matcher",
             remedy="use the stereo sensor with matcher: simulated",
         )

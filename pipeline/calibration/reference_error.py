@@ -19,8 +19,9 @@ class ReferenceError:
     Attributes
     ----------
     sigma_m : Standard deviation of a vertex's error along the ray from the sensor, m.
-    shared : True if all points in a triangle share its three vertices' errors, as for measuring noise. False if each point has
-        an error of its own, as for relief of the rock that the mesh misses between its vertices.
+    shared : Whether errors are shared within a triangle. True: a vertex has one error, and the surface between three
+        vertices interpolates theirs, as if the vertices are noisy. False: each compared point has an error of its own, as
+        if the mesh misses relief of the rock between its vertices.
     eye : (3,) position of the sensor, wall frame, m.
     """
 
@@ -36,14 +37,14 @@ class ReferenceError:
         """
         if not isinstance(measurement, TlsMeasurement) or not measurement.reference_error_m:
             return None
-        planes = measurement.planes
-        return cls(measurement.reference_error_m, planes is None or planes.noise_dominates, measurement.viewpoint)
+        return cls(measurement.reference_error_m, not measurement.error_is_relief, measurement.viewpoint)
 
     def moved(self, points: FloatArray, wall: RayCaster, random: KeyedRandom) -> FloatArray:
-        """Shift points along their rays so that their distances from a surface contain simulated errors of its vertices.
+        """Shift points along their rays so that their distances from the reference surface contain its simulated errors.
 
-        In a triangle whose vertices have the errors e, the surface has the error sum(w e), with the barycentric weights w of
-        the point. The point is shifted by the opposite amount, which changes its distance as the erroneous surface would.
+        The surface errs by sum(w e) at a point, where e are the errors of the three vertices around it and w the point's
+        barycentric weights. The point is shifted by the opposite amount, so that its distance changes as that from the
+        erroneous surface would.
 
         Parameters
         ----------

@@ -83,9 +83,9 @@ def warnings(result: CalibrationResult) -> list[str]:
 
 
 def scale_m(result: CalibrationResult) -> float:
-    """Return the size of the noise from which the colour scale of all maps of a calibration's report is derived, m.
+    """Return the size of the noise by which all maps in a calibration's report are coloured, m, so that they can be compared.
 
-    It is the NMAD of the last measured map in the compared windows.
+    It is the NMAD of the last measured map in the compared windows (square parts).
     """
     return max(statistics(result.windows.cut(result.inputs.maps[-1])).nmad, 1e-6)
 

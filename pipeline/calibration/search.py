@@ -86,7 +86,10 @@ class Simulations:
     s: FloatArray
 
     def with_more(self, other: Simulations) -> Simulations:
-        """Return the simulations of this set followed by those of another, to fit a response surface to both."""
+        """Return the simulations of this set followed by those of another, to fit a response surface to both.
+
+        other: the further simulations, of the same parameters and statistics.
+        """
         return Simulations(np.concatenate([self.x, other.x]), np.concatenate([self.s, other.s]))
 
     def at(self, rows: NDArray[Any]) -> Simulations:
@@ -244,8 +247,8 @@ class NoiseSearch:
 
     Parameters
     ----------
-    simulate : Function of (k,) parameter values, a number of epochs and a random source; it returns the (m,) summary
-        statistics of the difference maps that it simulates.
+    simulate : Function that simulates difference maps from (k,) parameter values, a number of epochs and a random source,
+        and returns the (m,) summary statistics of their noise.
     parameters : The k noise parameters and their bounds.
     epochs : Number of measured epochs.
     random : Source of random numbers; each simulation draws its own, by its number.

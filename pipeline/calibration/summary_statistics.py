@@ -40,6 +40,8 @@ _LEAST_IN_CLASS = 10
 class SummaryStatistics:
     """Summarises the noise of difference maps by a few statistics, in which a calibration compares measured and simulated maps.
 
+    Heights and line of sight serve to compute the noise at edges and by the angle of incidence.
+
     Attributes
     ----------
     windows : The k square parts of the maps, n by n pixels each, in which maps are compared.

@@ -61,21 +61,22 @@ class _Patch:
 class WindowSimulator:
     """Simulates difference maps that contain only noise, in a few square windows of the wall, much faster than whole maps.
 
-    A calibration needs hundreds of such maps. Only the sensor's cells (depth-map pixels or laser pulses) around the windows
-    are traced, and some over the whole view for the registration.
+    A calibration needs hundreds of such maps. Only the sensor's samples (depth-map pixels or laser pulses) around the
+    windows are traced, and some over the whole view for the registration.
 
     Parameters
     ----------
     config, site : Config, and wall with its sensor, as for a whole simulation.
     windows : The k windows of n x n pixels, on the grid of the measured maps, in which measured and simulated maps are
         compared.
-    of_points : Whether a pixel is the mean distance of its points from the wall; otherwise two surfaces are compared.
+    of_points : True if a pixel's value is the mean distance of the points in it from the wall; false if it is the
+        difference between two surfaces.
     reference_error : Error of the surface that the points are compared with; None for none.
 
     Attributes
     ----------
     observations : Number of observations (measurements of the wall) simulated so far.
-    cells : Indices of the traced cells, counted row by row over the sensor's whole view.
+    cells : Indices of the traced samples, counted row by row over the sensor's whole view.
     caster : The wall, for ray casting.
     noiseless_model : The sensor model with its effects but without noise.
 

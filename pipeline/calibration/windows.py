@@ -70,10 +70,10 @@ class Windows:
 def stable_ground(maps: Sequence[NDArray[np.floating]]) -> BoolArray:
     """Detect stable ground, where no difference map shows a change of the wall, for a user who drew no stable areas.
 
-    A change is looked for in the medians of cells of 5 x 5 pixels, after subtraction of their running median over 15 x 15
-    cells. Three or more adjacent cells beyond four NMADs of all cells are a change, with a margin of one cell. So are compact
-    patches of 3 x 3 pixels or more beyond four NMADs of all pixels. Single gross errors, and thin strips along edges, count as
-    noise.
+    A change is large in extent or in size. First, the medians of squares of 5 x 5 pixels are compared with their running
+    median over 15 x 15 squares: three or more adjacent squares that deviate by more than four NMADs are a change, with
+    one square around them. Second, places of at least 3 x 3 pixels that all deviate by more than four NMADs are a change.
+    Single gross errors, and thin strips along edges, count as noise.
 
     Parameters
     ----------

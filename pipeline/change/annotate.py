@@ -104,8 +104,11 @@ def coco(images: Iterable[LabelledImage], config: AnnotationConfig, info: dict[s
 def by_kind(data_set: dict[str, Any], rockfalls: int) -> dict[str, Any]:
     """Give the annotations of a time series a category for each kind of change: missing, moved and deposited rock.
 
-    data_set: COCO annotations of `coco`. rockfalls: number of rockfalls n in the series. The block labels in `data_set` code
-    both: kind k (from 0) of rockfall e has the label k n + e. In the returned copy, `block` is the rockfall's number e alone.
+    data_set: COCO annotations of `coco`, whose `block` says kind and rockfall in one label. Of n rockfalls, number e
+    (from 1) has the label e where its rock is missing, n + e where it has moved, and 2 n + e where it lies as a deposit.
+    rockfalls: n.
+
+    Returns a copy with `category_id` 1, 2 or 3 for the kind, and with the number e alone as `block`.
     """
     annotations = [
         {**each, "category_id": (each["block"] - 1) // rockfalls + 1, "block": (each["block"] - 1) % rockfalls + 1}
@@ -115,9 +118,9 @@ def by_kind(data_set: dict[str, Any], rockfalls: int) -> dict[str, Any]:
 
 
 def merge(data_sets: Iterable[dict[str, Any]], info: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Merge several results of `coco` into one, with ids that count from 1 throughout.
+    """Merge the annotations of several sets of images into one, with ids that count from 1 throughout.
 
-    data_sets: the results, of which the last gives the categories. info: further entries of COCO's `info`.
+    data_sets: results of `coco`; the last one's categories are kept. info: further entries of COCO's `info`.
     """
     result = coco([], AnnotationConfig(), info)
     for data_set in data_sets:
@@ -156,18 +159,18 @@ def block_annotations(block: IntArray, config: AnnotationConfig) -> Iterator[dic
 
 
 def run_length_encoding(crop: NDArray[np.bool_], row: int, column: int, shape: tuple[int, ...]) -> dict[str, Any]:
-    """Encode a mask, given by a crop of the frame, as COCO's compressed run lengths down the columns of the frame.
+    """Encode the mask of a block in an image as COCO's compressed run lengths, for an annotation.
 
-    The result equals that of encoding the whole frame but takes only the time for the crop.
+    Only the part of the mask around the block is needed, which saves time; the result is that of the whole image.
 
     Parameters
     ----------
     crop : (n, m) bool array
-        The mask in its bounding box.
+        The mask within the block's bounding box, true on the block.
     row, column : int
-        Position of the crop's top-left pixel in the frame.
+        Pixel of the image at the crop's top-left corner.
     shape : (int, int)
-        Height and width of the frame.
+        Height and width of the image, px.
     """
     from pycocotools import mask as coco_mask
 

@@ -93,16 +93,18 @@ class M3c2Map:
 
 
 def core_grid(grid: Grid, step: int) -> tuple[Grid, slice]:
-    """Return the coarser grid of M3C2's core points, one in the middle of every `step` x `step` pixels of `grid`.
+    """Return the coarser grid of M3C2's core points, one in the middle of every `step` x `step` pixels of a grid.
 
-    Also returns the slice that selects these middle rows and, likewise, columns from a raster on `grid`.
+    grid: the pixels of the difference map. step: distance of the core points, px.
+
+    Returns the coarser grid, and a slice that selects the rows (and, used again, the columns) of these middle pixels.
     """
     width, height = (max(size // step, 1) for size in (grid.width, grid.height))
     return replace(grid, gsd=grid.gsd * step, width=width, height=height), slice(step // 2, None, step)
 
 
 def m3c2(reference: FloatArray, epoch: FloatArray, raster: SurfaceRaster, block: IntArray, config: M3c2Config) -> M3c2Map:
-    """Compute M3C2 distances from the reference's points to the epoch's.
+    """Compute M3C2 distances, changes along the surface's normals, from the reference's points to an epoch's.
 
     The result does not depend on the number of threads.
 
@@ -111,7 +113,8 @@ def m3c2(reference: FloatArray, epoch: FloatArray, raster: SurfaceRaster, block:
     reference, epoch : (n, 3) and (m, 3) arrays
         Registered points, wall frame, m.
     raster : SurfaceRaster
-        Raster of the reference; every few of its pixels give a core point, at which a distance is computed.
+        Raster of the reference. One core point, at which a distance is computed, lies in the middle of every few of its
+        pixels.
     block : (h, w) array
         Label of the epoch's fallen block at each pixel of `raster`, 0 for none.
     config : M3c2Config
@@ -120,7 +123,7 @@ def m3c2(reference: FloatArray, epoch: FloatArray, raster: SurfaceRaster, block:
     Raises
     ------
     InputError
-        If py4dgeo is not installed or the map is smaller than a step.
+        If py4dgeo is not installed, or the map is smaller than the distance of the core points.
     """
     grid, every = core_grid(raster.grid, config.core_step_px)
     heights, labels = (full[every, every][: grid.height, : grid.width] for full in (raster.heights, block))

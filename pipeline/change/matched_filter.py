@@ -38,7 +38,7 @@ _LEAST_FREE = 0.5
 def signal_to_noise(
     difference: NDArray[np.float32], block: IntArray, change: NDArray[np.float32], count: int
 ) -> NDArray[np.float64]:
-    """Compute how well each niche stands out from the noise of a difference map.
+    """Compute how well each niche stands out from the noise of a difference map, to know which blocks a detector could find.
 
     The measure is the signal-to-noise ratio of a filter that is matched to the niche's true shape.
 
@@ -56,7 +56,7 @@ def signal_to_noise(
     Returns
     -------
     (count,) array
-        The ratio of each block: NaN if it cannot be determined, 0 for a block that is not in the map.
+        The ratio of each block, by its label: NaN if it cannot be determined, 0 for a block that is not in the map.
     """
     from scipy import ndimage
 
@@ -109,10 +109,10 @@ class _Spectra:
 
 
 def noise_spectrum(noise: NDArray[np.float32], side: int) -> FloatArray | None:
-    """Estimate the power spectrum of a map's noise, by Welch's method of overlapping windows.
+    """Estimate the power spectrum of a map's noise by Welch's method of overlapping windows, to judge what stands out from it.
 
-    noise: (h, w) values of the map outside of blocks, m; NaN elsewhere. side: side of a window, px. Returns the mean |N(k)|^2
-    of the windows' discrete Fourier transforms, (side, side), m2; None if no window has enough data.
+    noise: (h, w) values of the map outside of blocks, m; NaN elsewhere. side: side of a window, px. Returns the mean
+    |N(k)|^2 of the windows' discrete Fourier transforms N, (side, side), m2; None if no window has enough data.
     """
     from scipy import ndimage
 
@@ -133,7 +133,7 @@ def noise_spectrum(noise: NDArray[np.float32], side: int) -> FloatArray | None:
 def true_change(
     wall: RayCaster, carved: RayCaster, block: IntArray, grid: Grid, shift_m: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Return the true loss of the wall at the pixels of the niches, (h, w), m; 0 outside niches, NaN where there is no wall.
+    """Return how much rock the wall truly lost at the pixels of the niches, along z, to compare a difference map with it.
 
     Parameters
     ----------
@@ -145,6 +145,11 @@ def true_change(
         The map's pixels.
     shift_m : (h, w, 2) array
         By how much the map is displaced from the true wall in x and y at each pixel, m.
+
+    Returns
+    -------
+    (h, w) float32 array
+        The loss, m; 0 outside niches, NaN where there is no wall.
     """
     row, column = np.nonzero(block != WALL)
     result = np.zeros(grid.shape, dtype=np.float32)

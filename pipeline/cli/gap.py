@@ -18,6 +18,7 @@ SUMMARY = "find where a measurement and the model disagree, name the effects, ad
 EXAMPLE = """  scarpsim gap my_measurement --out diagnosis
   scarpsim gap scan.laz --reference wall.ply --scanner riegl_vz400i --out diagnosis
   scarpsim gap cloud.ply --reference wall.ply --photographs --out diagnosis
+  scarpsim gap monitored --scanner riegl_vz400i --out diagnosis
   scarpsim gap --identifiability my_site.yaml --sensor tls --out plans/gap"""
 
 
@@ -28,8 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=Path,
         metavar="MEASUREMENT",
-        help="folder with measurement.yaml, or raw scans with --reference and --scanner; with --identifiability also the config "
-        "of a simulation instead",
+        help="folder with measurement.yaml, folder that monitor wrote (its stable rock is diagnosed), or raw scans with "
+        "--reference and --scanner; with --identifiability also the config of a simulation instead",
     )
     add_source_arguments(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default: a new one under runs/)")
@@ -78,6 +79,8 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
 def _measurement_folder(arguments: argparse.Namespace, out: Path) -> Path:
     """Return the folder to read; if raw scans are given, build it first in the folder of the results."""
     given: list[Path] = arguments.measurement
+    if _of_monitor(given):
+        return _folder_of_monitoring(arguments, given[0], out / "measurement")
     if len(given) == 1 and (given[0].is_dir() or given[0].suffix in ("", ".yaml", ".yml")) and not arguments.reference:
         return given[0]
     if not arguments.reference:
@@ -88,6 +91,31 @@ def _measurement_folder(arguments: argparse.Namespace, out: Path) -> Path:
             "photographs without cameras; or give the folder of a measurement",
         )
     return build_measurement_folder(arguments, given, out / "measurement").folder
+
+
+def _of_monitor(given: list[Path]) -> bool:
+    """Return whether the argument is a folder of results of `scarpsim monitor`."""
+    from pipeline.monitoring.recorded import is_monitoring
+
+    return len(given) == 1 and is_monitoring(given[0])
+
+
+def _folder_of_monitoring(arguments: argparse.Namespace, given: Path, out: Path) -> Path:
+    """Build the measurement of the stable rock of a monitoring, and return its folder."""
+    from pipeline.formats.files.atomic import empty_folder
+    from pipeline.monitoring.stable_measurement import build_from_monitoring
+
+    for name in ("reference", "unit", "reference_unit", "columns", "cameras", "photographs", "pair", "scan"):
+        if getattr(arguments, name):
+            raise InputError(
+                "cannot be combined with a folder of scarpsim monitor, which knows its files",
+                where=f"--{name.replace('_', '-')}",
+                allowed="--scanner, --model and --position",
+                remedy="leave it out, or give the raw scans instead of the folder",
+            )
+    empty_folder(out)
+    found = build_from_monitoring(given, out, scanner=arguments.scanner, model=arguments.model, position=arguments.position)
+    return found.folder
 
 
 def _diagnosis(arguments: argparse.Namespace, out: Path) -> CommandOutput:
@@ -129,7 +157,10 @@ def _identifiability(arguments: argparse.Namespace, out: Path) -> CommandOutput:
             allowed="one",
             remedy="give one measurement or config",
         )
-    wanted = load_surveys(arguments.measurement[0], arguments.overrides, arguments.sensor)
+    given = arguments.measurement[0]
+    if _of_monitor([given]):
+        given = _folder_of_monitoring(arguments, given, out / "measurement")
+    wanted = load_surveys(given, arguments.overrides, arguments.sensor)
     found = [identifiability(survey, arguments.reference_error) for survey in wanted]
     report = write_identifiability(out, found)
     told = "\n\n".join(f"{summarise(each)}\n{format_table(each)}" for each in found)

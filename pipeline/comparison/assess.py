@@ -382,7 +382,7 @@ def class_edges(values: FloatArray, classes: int = _SIZE_CLASSES) -> FloatArray:
 
     Returns
     -------
-    (classes + 1,) edges, ascending, in the unit of the values; 0.01 and 1 if there are no values.
+    (classes + 1,) edges, ascending, in the unit of the values. Without values there is a single class from 0.01 to 1.
     """
     if len(values) == 0:
         return np.array([0.01, 1.0])
@@ -428,9 +428,9 @@ def _table(size: FloatArray, depth: FloatArray, hit: BoolArray) -> FloatArray:
 
 
 def shared_scale_m(noises: list[MapNoise]) -> float:
-    """Return the size of the noise from which the colour scale of all maps in a comparison is derived, m.
+    """Return the size of the noise by which all maps in a comparison of sensors are coloured, m, so that they can be compared.
 
-    It is the largest NMAD of the given sensors, so that the map of none saturates.
+    noises: the noise of each sensor. The result is the largest of their NMADs, so that the map of none saturates.
     """
     return max((each.stable.nmad for each in noises if each.stable.count), default=1e-3) or 1e-3
 

@@ -65,14 +65,15 @@ class DetectionCurve:
     ----------
     count, seen : Number of blocks, and of those detected.
     smallest_m, largest_m : Range of the block sizes, m.
-    middle_m, width, lapse : Parameters of the curve: the size at half of its height, m; the width of its rise, in natural
-        logarithms of size; and the share of blocks that is missed at any size.
+    middle_m : Size at half of the curve's height, m.
+    width : Width of the curve's rise, in natural logarithms of size.
+    lapse : Share of blocks that is missed at any size.
     smallest_95_m : Size from which 95 % are detected, m. None if it is known less well than to a factor of 1.5, or if the
         curve stays below 95 %.
-    between_m : If `smallest_95_m` is not known well enough, the neighbouring block sizes between which it lies, m. The lower
-        one is None below all sizes, the upper one above all sizes. None in all other cases.
-    interval_m : 95 % confidence interval of the size from which 95 % are detected, m; None for an end that the blocks do not
-        bound.
+    between_m : Only if `smallest_95_m` is not known well enough: the neighbouring block sizes between which it lies, m.
+        The lower one is None if it lies below all sizes, the upper one if it lies above all.
+    interval_m : 95 % confidence interval of the size from which 95 % are detected, m; None for an end that the blocks do
+        not bound.
     """
 
     count: int

@@ -144,7 +144,8 @@ def summary(comparison: ComparisonResult) -> str:
 def write_csv(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
     """Write a table as a CSV file; without rows, no file is written.
 
-    rows: one dictionary for each row. The keys of the first are the header, and None becomes an empty cell.
+    path: the file. rows: one dictionary for each row. The keys of the first are the header, and None becomes an empty
+    cell.
     """
     rows = list(rows)
     if not rows:

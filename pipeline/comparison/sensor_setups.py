@@ -57,17 +57,16 @@ def sensor_setups(
 ) -> list[SensorSetup]:
     """Read which sensors to compare, and put all of them in front of the first config's wall.
 
-    A config with two sensors gives two. A name is a config file, a run's folder or its run.json, the file of a sensor model,
-    or the name of a bundled file: a site, a scanner preset (such as riegl_vz400i) or a noise model (such as glendale_high).
-    Presets and models describe only a sensor. They are put into the first config, or into the demo's config if there is none.
-
     Parameters
     ----------
-    names : Names as above, or pairs of a name and a config to which overrides and seed are already applied.
+    names : What to compare, in any mix. A config file, a bundled site, a run's folder or its run.json gives its sensor,
+        or two if it has both kinds. A scanner preset (such as riegl_vz400i) or a noise model (such as glendale_high), by
+        name or file, describes only a sensor; it is put into the first config, or into the demo's if there is none. A
+        pair of a name and a config is used as it is, with overrides and seed already applied.
     overrides : Settings "key=value" that replace those of every config (the `--set` options).
     seed : Seed of the random numbers, which replaces those of the configs; None: theirs.
-    own_step : Whether scanner presets use their own angular step. By default they use the first config's, so that instruments
-        are compared and not scan times.
+    own_step : Whether scanner presets use their own angular step. By default they use the first config's, so that
+        instruments are compared and not scan times.
 
     Returns
     -------
@@ -106,7 +105,7 @@ def _check_given_once(names: Sequence[Given]) -> None:
             raise InputError(
                 f"the sensor is given twice{as_what}",
                 where=name,
-                remedy="name each sensor once; to vary its settings, copy the file",
+                remedy="name each sensor once; to compare two settings of one sensor, give a copy of its config file",
             )
         given[file] = name
 

@@ -59,12 +59,12 @@ def bundled_config(kind: str, name: str) -> Path:
 
 
 def config_path(kind: str, given: Path) -> Path:
-    """Return `given` itself or, if no such file exists, the bundled config that it names.
+    """Find the config file that a user names: a path or, if no such file exists, the name of a bundled config.
 
-    kind: a subfolder of the bundled configs, such as "sites", in which a name is looked up. given: a path, or the name of a
-    bundled config: a word (`glendale`), or its path in a checkout (`configs/sites/glendale.yaml`), which is elsewhere in an
-    installed wheel. Raises InputError, with the most similar name, if a bare word is neither a file nor a bundled config of
-    `kind`.
+    kind: a subfolder of the bundled configs, such as "sites", in which a name is looked up. given: what the user wrote: a
+    path; a word such as `glendale`; or a path in the source code, such as `configs/sites/glendale.yaml`, which also works
+    if the program is installed elsewhere. Raises InputError, with the most similar name, if a word is neither a file nor
+    a bundled config of `kind`.
     """
     if given.exists():
         return given

@@ -46,8 +46,8 @@ _BOUNDS = {"ge": "from {}", "gt": "above {}", "le": "up to {}", "lt": "below {}"
 def commented_yaml(config: BaseModel, own: Mapping[str, Any]) -> str:
     """Write a config as YAML that loads into the same config, each key with its meaning, unit and limits as a comment.
 
-    config: the checked config. own: the keys and values, as in a file, from which it was made. These are active; all other keys
-    are comments that remain valid when their `#` is removed.
+    config: the checked config. own: the keys and values of the config file from which it was made. Only these are
+    active. All other keys are comments with their defaults, which remain valid when their `#` is removed.
     """
     title = _first_line(type(config))
     return "\n".join([f"# {title}" if title else "", _HOW_TO, "", *_section(config, own, 0)]).strip("\n") + "\n"

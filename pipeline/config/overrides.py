@@ -53,10 +53,11 @@ def read_override(text: str) -> Override:
 
 
 def apply_overrides(values: dict[str, Any], overrides: Sequence[str | Override]) -> dict[str, Any]:
-    """Return a copy of the config `values` with each override (`key.path=value`) applied, in the given order.
+    """Return a copy of a config's values with changes (overrides) applied in order, as `--set key.path=value` asks for them.
 
-    Missing sections are created; whether a key exists is checked by the config model. Raises InputError if an override is
-    malformed, or leads through a plain value or beyond the end of a list.
+    values: content of the config file. overrides: the changes. Missing sections are created; whether a key exists is
+    checked later. Raises InputError if an override is malformed, names a key inside a value that is no section, or an
+    index beyond a list's end.
     """
     result = deepcopy(values)
     for given in overrides:

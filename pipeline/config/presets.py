@@ -51,10 +51,11 @@ def expand_shorthand(overrides: Sequence[str | Override]) -> list[Override]:
 
 
 def without_keys_of_preset(values: dict[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
-    """Remove from a config's values what a scanner preset sets, if the overrides name a preset.
+    """Remove from a config's values what a scanner preset sets, if the user's changes name a preset, so that the preset wins.
 
-    The preset so replaces the keys of `scanner` that it knows, and the model of a laser scanner, in its place. Everything else
-    in the file stays. Keys among the overrides are applied afterwards and win.
+    These are the instrument's keys in the section `scanner`, and the laser scanner's sensor model; everything else stays.
+    Without a preset in the changes, nothing is removed. Other changes are applied afterwards, so they win over the
+    preset.
 
     Parameters
     ----------
@@ -81,10 +82,11 @@ def without_keys_of_preset(values: dict[str, Any], overrides: Sequence[Override]
 
 
 def with_preset(values: dict[str, Any]) -> dict[str, Any]:
-    """Return a config's values in which the scanner preset that it names is replaced by the preset's own keys.
+    """Replace the scanner preset that a config names by the keys and the sensor model that it stands for.
 
-    `scanner` is a preset's name or file, or a section with the key `preset`, whose other keys replace the preset's. The
-    preset's sensor model is added if the config has no laser scanner's model of its own.
+    values: the config's values. Its `scanner` is a preset's name or file, or a section with the key `preset` and further
+    keys, which win over the preset's. The preset's sensor model is only added if the config has none of a laser scanner.
+    Returns the new values.
     """
     values = _with_section(values)
     own = values.get("scanner")

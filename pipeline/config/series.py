@@ -118,7 +118,7 @@ class SeriesConfig(Config):
         return np.array([self.hours_of(self.when(number)) for number in range(self.count)])
 
     def falls_h(self) -> Sequence[float]:
-        """Return when each rockfall given by hand (`events`) falls, h after the first epoch."""
+        """Return when each rockfall that the config lists under `events` falls, h after the first epoch, in their order."""
         return [self.hours_of(event.time) if event.time is not None else event.after_h or 0.0 for event in self.events]
 
 

@@ -114,7 +114,13 @@ class ProductsConfig(Config):
 
 
 class SimulationConfig(Config):
-    """A simulation of one wall, observed before and after rocks fall."""
+    """A simulation of one wall, observed before and after rocks fall.
+
+    Sections that have no description of their own: `rockfall` says which blocks fall, and `stations` how several
+    positions of the scanner are joined. `surface` and `fusion` say how points become a surface, and `difference` how
+    large the pixels of difference maps are. `annotation` says which blocks are labelled for training, and `products` what
+    is written. `planning` has the settings of `scarpsim inspect`, and `calibration` those of `scarpsim calibrate`.
+    """
 
     seed: int = Field(1, ge=0, lt=2**63, description="seed of all random numbers")
     epochs: int = Field(1, ge=1, le=9999, description="number of epochs after the reference, each with its own rockfalls")
@@ -276,19 +282,18 @@ class SimulationConfig(Config):
 
 
 def load_config(path: Path, overrides: Sequence[str | Override], sensor: SensorName | None, seed: int | None) -> SimulationConfig:
-    """Read a config file and apply `--set` overrides and the seed.
+    """Read a config file, apply the user's changes, and check it.
 
-    Paths in the file are relative to its folder, those of overrides to the working folder; both become absolute. The run.json
-    of a finished run is also a config, which repeats that run to the byte. So is a single sensor model (model.yaml,
-    model_after.yaml: its `sensor` is a word); everything else is then as in the demo. A preset among the overrides replaces
-    what the file says about the instrument (pipeline/config/presets.py).
+    Relative paths in the file start from its folder, those in overrides from the working folder; both become absolute.
 
     Parameters
     ----------
     path : Path
-        The file.
+        A YAML config; the run.json of a finished run, which repeats that run to the byte; or a sensor model alone
+        (model.yaml), with which everything else is as in the demo.
     overrides : sequence of str or Override
-        Values to change, `key.path=value`.
+        Values to change, `key.path=value`. A scanner preset among them replaces all that the file says about the
+        instrument.
     sensor : str or None
         The sensor that is used; None for any.
     seed : int or None

@@ -155,10 +155,18 @@ def _info(dataset: Record, split: Split, complete: bool) -> dict[str, Any]:
     }
 
 
+def has_kinds(dataset: Record) -> bool:
+    """Tell whether a data set annotates missing, moved and deposited rock in separate categories, not missing rock alone.
+
+    dataset: content of its dataset.json. It does so if the time series of a wall sets `kinds`.
+    """
+    walls = (wall for source in dataset["sources"].values() for wall in source["config"]["walls"].values())
+    return any((wall.get("series") or {}).get("kinds") for wall in walls)
+
+
 def _categories(dataset: Record) -> list[dict[str, Any]]:
     """Return COCO's categories: of missing, moved and deposited rock if a time series distinguishes them, else the only one."""
-    walls = (wall for source in dataset["sources"].values() for wall in source["config"]["walls"].values())
-    return KIND_CATEGORIES if any((wall.get("series") or {}).get("kinds") for wall in walls) else [BLOCK_CATEGORY]
+    return KIND_CATEGORIES if has_kinds(dataset) else [BLOCK_CATEGORY]
 
 
 def _write_coco(

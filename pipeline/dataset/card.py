@@ -70,7 +70,7 @@ def write_card(
     folder : Folder of the set.
     dataset : Content of dataset.json.
     statistics : Statistics of the set.
-    digests : SHA-256 checksums of the other files, by name.
+    digests : SHA-256 checksums of all files of the set that are not written here, by name.
     complete : Whether the set is complete.
     """
     from pipeline.dataset.figures import noise_figure, sizes_figure
@@ -106,7 +106,7 @@ def _readme(
     yield "In the samples, red is missing rock, blue a surface that stands further out; the colours end at six times the noise."
     yield "Black outlines are the annotated masks, grey is no data.\n"
     yield from (_split_rules(dataset), _TILES, _loading(statistics))
-    yield from _making(dataset, statistics, digests)
+    yield from _making(dataset, digests)
 
 
 def _table(statistics: SetStatistics) -> Iterator[str]:
@@ -182,7 +182,7 @@ def _split_rules(dataset: dict[str, Any]) -> str:
     return f"## Splits\n\n{apart if all(shares) else together} {rest}\n"
 
 
-def _making(dataset: dict[str, Any], statistics: SetStatistics, digests: dict[str, str]) -> Iterator[str]:
+def _making(dataset: dict[str, Any], digests: dict[str, str]) -> Iterator[str]:
     """Describe how the set was made, with versions and checksums."""
     yield "## How it was made\n"
     for name, source in dataset["sources"].items():

@@ -51,8 +51,8 @@ _RUNS_EACH = 2
 def runs(orders: Sequence[EpochOrder], workers: int) -> list[Run]:
     """Divide the epochs of a data set into groups, each of which one worker makes in one go.
 
-    The epochs of a group share wall, sensor and reference epoch, so that these are set up once; groups that share them are of
-    about equal length.
+    All epochs of a group share wall, sensor and reference epoch, so that these are set up once. Epochs that share them may be
+    more than one group, of about equal length, so that all workers have something to do.
 
     orders: the epochs, those that share a reference next to each other. workers: number of processes.
     """

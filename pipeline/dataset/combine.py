@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from pipeline.dataset.assemble import assemble, complete_shards
+from pipeline.dataset.assemble import assemble, complete_shards, has_kinds
 from pipeline.dataset.folder import tile_files
 from pipeline.dataset.records import SHARDS, Record, read_dataset_file, shard_name, write_dataset_file, write_shard
 from pipeline.dataset.run import DatasetSummary
@@ -36,7 +36,8 @@ def merge_datasets(folders: Sequence[Path], out: Path) -> DatasetSummary:
     Raises
     ------
     InputError
-        If a set is unfinished, two sets hold the same epochs, or the folder is in use.
+        If a set is unfinished, two sets hold the same epochs, only some have categories for the kind of change, or the folder
+        is in use.
     """
     if len(folders) < 2:
         raise InputError(
@@ -45,6 +46,7 @@ def merge_datasets(folders: Sequence[Path], out: Path) -> DatasetSummary:
             remedy="name the folders of the sets to merge",
         )
     sets = [(folder, _finished(folder)) for folder in folders]
+    _check_categories(sets)
     sources: dict[str, Any] = {}
     epochs: dict[str, list[int]] = defaultdict(list)
     for folder, dataset in sets:
@@ -59,6 +61,17 @@ def merge_datasets(folders: Sequence[Path], out: Path) -> DatasetSummary:
                 _copy(folder, out, record, dataset["sources"][record["source"]]["prefix"], f"{record['source']}_")
         name = "-".join(dict.fromkeys(dataset["name"] for _, dataset in sets))
         return _finish(out, name, sources, dict(epochs))
+
+
+def _check_categories(sets: Sequence[tuple[Path, Record]]) -> None:
+    """Raise InputError if only some of the sets annotate moved and deposited rock: one label would mean two things."""
+    with_kinds, without = ([folder for folder, dataset in sets if has_kinds(dataset) is wanted] for wanted in (True, False))
+    if with_kinds and without:
+        raise InputError(
+            f"{with_kinds[0]} has categories for missing, moved and deposited rock, and {without[0]} has one category, block",
+            where="scarpsim dataset merge",
+            remedy="merge sets that were made with the same `series.kinds`",
+        )
 
 
 def split_dataset(folder: Path, out: Path, keys: Sequence[str]) -> list[DatasetSummary]:

@@ -72,12 +72,15 @@ class NoiseLevel(Config):
     tls: ScaledModel | None = Field(None, description="model of the laser scanner")
 
     def of(self, sensor: SensorName) -> ScaledModel | None:
-        """Return the model of a sensor with the factor of its noise, at this level of noise; None if there is no such model."""
+        """Return the model of a sensor at this level, with the factor of its noise; None if the level has none."""
         return self.stereo if sensor == "stereo" else self.tls
 
 
 class SizeClass(Config):
-    """Size and density of the fallen blocks in one size class of a data set."""
+    """Size and density of the fallen blocks in one size class of a data set.
+
+    `rockfall` has the sizes and shapes of the blocks, and where they break out.
+    """
 
     blocks_per_m2: float = Field(gt=0, le=1e6, description="blocks per area of the wall; replaces rockfall.count")
     rockfall: RockfallConfig = RockfallConfig()
@@ -102,7 +105,10 @@ MOST_EPOCHS = 100_000
 
 
 class DatasetConfig(Config):
-    """Config of a data set of annotated difference map tiles, on which detectors of rockfall are trained and tested."""
+    """Config of a data set of annotated difference map tiles, on which detectors of rockfall are trained and tested.
+
+    `tiles` says how difference maps are cut into tiles, and `annotation` which fallen blocks are annotated in them.
+    """
 
     name: str = Field("rockfall", pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name of the data set")
     seed: int = Field(1, ge=0, lt=2**63, description="seed of all random numbers")
@@ -174,7 +180,7 @@ class DatasetConfig(Config):
         return self
 
     def steps(self, wall: str) -> Sequence[int]:
-        """Return the numbers of the epochs after the reference in the time series of a wall; only 0 on a wall without one.
+        """Return the numbers of the epochs of a wall's time series, without the reference; (0,) for a wall without a time series.
 
         wall: name of the wall.
         """
@@ -212,8 +218,8 @@ def load_dataset_config(path: Path, overrides: Sequence[str | Override] = (), se
     Parameters
     ----------
     path : Config file. Paths in it are relative to its folder.
-    overrides : `--set` options.
-    seed : Replaces the seed of the config.
+    overrides : Values to change, `key.path=value`, as the option `--set` gives them.
+    seed : Replaces the seed of the config; None: its own.
 
     Raises
     ------
@@ -231,7 +237,12 @@ def dataset_config(values: Any, overrides: Sequence[str | Override], seed: int |
     values : Content of a config file.
     overrides : Values to change, `key.path=value`.
     seed : Replaces the seed of the config; None: its own.
-    path : The file, or how errors should call it.
+    path : The config file, for errors; paths in the config are relative to its folder.
+
+    Raises
+    ------
+    InputError
+        If anything in the config is wrong.
     """
     if not isinstance(values, dict):
         raise InputError("the file is not a mapping of keys", where=str(path), remedy="start from configs/datasets/small.yaml")
@@ -262,7 +273,7 @@ def _only_source(values: dict[str, Any], path: Path) -> dict[str, Any]:
         raise InputError(
             "the record of the data set is damaged: it has no config",
             where=str(path),
-            remedy="give the YAML file that the set was made with in its place",
+            remedy="give the YAML file that the set was made with instead of this record",
         )
     return dict(configs[0])
 
@@ -277,7 +288,7 @@ def _wall(values: Any, where: str, folder: Path) -> Any:
     site, overrides = values["site"], values.get("set", [])
     if not isinstance(site, str) or not isinstance(overrides, list):
         raise InputError(
-            "expected `site: name` and `set: [key=value, ...]`",
+            "a wall needs `site` (a name or a YAML file) and may have `set` (a list of key=value)",
             where=where,
             remedy="see configs/datasets/small.yaml for an example",
         )

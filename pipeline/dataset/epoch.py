@@ -97,7 +97,7 @@ class StageCache:
     def of(self, epoch: PlannedEpoch, progress: Progress) -> EpochStage:
         """Return the stage (wall, scene, reference epoch) that an epoch of the data set needs.
 
-        It is set up unless the last call was for the same stage. progress: receives the progress of that.
+        A new stage is set up if the last call was for another one. progress: receives the progress of setting it up.
         """
         if self._kept is None or self._key != epoch.stage:
             self._kept = None  # free the memory before the new one is made

@@ -83,14 +83,18 @@ def epoch_damage(folder: Path, name: str) -> list[Damage]:
 
 
 def file_damage(folder: Path, file: str, digest: str, where: str) -> list[Damage]:
-    """Check one file of a data set.
+    """Check whether one file of a data set is missing or damaged.
 
     Parameters
     ----------
     folder : Folder of the set.
     file : The file, relative to `folder`.
-    digest : Its SHA-256.
+    digest : SHA-256 checksum that it should have.
     where : The file of the set that names it, for errors.
+
+    Returns
+    -------
+    A list with the damage; empty if the file is as it should be.
 
     Raises
     ------

@@ -48,9 +48,11 @@ class Sample:
 
 
 class Tiles(Sequence[Sample]):
-    """One split of a data set: a sequence of samples, each a tile of a difference map with its annotations, read on access.
+    """One split of a data set as a sequence of tiles, for loops that train or test a detector.
 
-        Tiles("sets/rockfall_9/train", sensor="stereo", noise="low")
+        tiles = Tiles("sets/rockfall_9/train", sensor="stereo", noise="low")
+
+    `tiles[k]` reads tile k from disk and returns its difference map with the blocks in it: boxes, masks and further keys.
 
     Parameters
     ----------

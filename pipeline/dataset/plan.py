@@ -25,10 +25,10 @@ class PlannedEpoch:
     ----------
     index : Index in the plan.
     split : "train", "val" or "test".
-    sensor, wall, noise, size : The combination of sensor, wall, noise level and size class that it belongs to, by their names.
-    number : Number among the epochs of its combination and split, from 1.
+    sensor, wall, noise, size : Names of the sensor, the wall, the noise level and the size class that are combined in it.
+    number : Number from 1 among the epochs of this combination and split; on a wall with a time series, the number of the series.
     reference : Number of the reference epoch that it is compared with, from 1.
-    step : On a wall with a time series, the number of the epoch in it, from 1; `number` then counts the series. Otherwise 0.
+    step : Number of the epoch in its time series, from 1; 0 on a wall without one.
     """
 
     index: int
@@ -60,7 +60,8 @@ class PlannedEpoch:
 def planned_epochs(config: DatasetConfig) -> list[PlannedEpoch]:
     """List all epochs that a data set's config asks for, those that share a reference epoch next to each other.
 
-    On a wall with a time series, each epoch of its config is a whole series, of which all epochs after the reference are listed.
+    On a wall with a time series, the config's numbers of epochs are numbers of series. All epochs of each series but its
+    reference are listed.
     """
     found = [
         PlannedEpoch(0, split, sensor, wall, noise, size, number, (number - 1) % config.references + 1, step)
@@ -132,14 +133,18 @@ def random_of_wall(config: DatasetConfig, wall: str) -> KeyedRandom:
 
 
 def random_of_reference(config: DatasetConfig, epoch: PlannedEpoch) -> KeyedRandom:
-    """Return the random source for simulating the reference epoch with which a data set's epoch is compared."""
+    """Return the random source for simulating the reference epoch with which a data set's epoch is compared.
+
+    config: of the data set. epoch: the epoch that is compared.
+    """
     return KeyedRandom(config.seed).child("dataset", "reference", *epoch.stage)
 
 
 def random_of_epoch(config: DatasetConfig, epoch: PlannedEpoch, draw: int) -> KeyedRandom:
     """Return the random source for the blocks, the noise and the registration of a data set's epoch.
 
-    draw: number of the attempt, from 1; blocks that find no room are drawn again from another source.
+    config: of the data set. epoch: which one. draw: number of the attempt, from 1; blocks that find no room are drawn again
+    from another source.
     """
     path = epoch.wall, epoch.sensor, epoch.noise, epoch.size, epoch.split
     return KeyedRandom(config.seed).child("dataset", "epoch", *path, "draw", draw)
@@ -148,7 +153,7 @@ def random_of_epoch(config: DatasetConfig, epoch: PlannedEpoch, draw: int) -> Ke
 def random_of_series(config: DatasetConfig, epoch: PlannedEpoch) -> KeyedRandom:
     """Return the random source for the rockfalls, the conditions and the measurements of a data set's time series.
 
-    epoch: an epoch of the series; the source is the same for all of them.
+    config: of the data set. epoch: any epoch of the series; the source is the same for all of them.
     """
     path = epoch.wall, epoch.sensor, epoch.noise, epoch.size, epoch.split
     return KeyedRandom(config.seed).child("dataset", "series", *path, epoch.number)
@@ -167,10 +172,10 @@ class TileRegion:
 
 
 def tile_region(split: Split, share: float, grid: Grid, config: TileConfig) -> TileRegion:
-    """Return the region of a split's tiles on a wall.
+    """Return the region of a split's tiles on a wall, so that training and validation see different parts of it.
 
-    Training uses the columns of tiles from the left; validation uses those at the right end. Strata run along the wall, so both
-    contain all of them. Tests use the whole wall.
+    Training uses the columns of tiles from the left, validation those at the right end. Rock strata run along the wall, so both
+    parts show all of them. Tests use the whole wall.
 
     Parameters
     ----------

@@ -150,13 +150,19 @@ def shard_name(source: str, index: int) -> str:
 
 
 def write_shard(folder: Path, name: str, record: Record) -> None:
-    """Write the record of a data set's epoch, with a checksum of its content. name: file name, as of `shard_name`."""
+    """Write the record of a data set's epoch, with a checksum of its content.
+
+    folder: the data set's. name: file name, as of `shard_name`. record: the record, JSON types.
+    """
     text = _text(record)
     write_text(folder / SHARDS / name, f"{_digest(text)}\n{text}\n")
 
 
 def read_shard(folder: Path, name: str) -> Record | None:
-    """Read the record of a data set's epoch; None if it is missing or damaged. name: file name, as of `shard_name`."""
+    """Read the record of a data set's epoch; None if it is missing or damaged.
+
+    folder: the data set's. name: file name, as of `shard_name`.
+    """
     try:
         digest, _, text = read_text(folder / SHARDS / name).partition("\n")
         text = text.removesuffix("\n")

@@ -65,9 +65,9 @@ class DatasetSummary:
     Attributes
     ----------
     folder : Folder of the set.
-    made : Times, memory and number of tiles of each epoch that was made (see `worker.make_and_store`).
-    images, annotations : Numbers in the whole set, by split.
-    damage : Files that were missing or damaged before.
+    made : Times, memory and number of tiles of each epoch that was made now (see `worker.make_and_store`).
+    images, annotations : Numbers in the whole set, by split (train, val, test).
+    damage : Files that were missing or damaged when the set was checked.
     warnings : Warnings about the set.
     """
 

@@ -92,18 +92,21 @@ def observe_step(
 
 
 def annotated(found: LaterEpoch, scene: SeriesScene, kinds: bool) -> tuple[IntArray, dict[int, dict[str, Any]]]:
-    """Say which changes of an epoch of a time series are annotated.
+    """Choose which changes of an epoch of a time series are annotated in the data set.
+
+    Missing rock always is. With `kinds`, blocks that moved and fragments that were deposited are too, in categories
+    of their own.
 
     Parameters
     ----------
     found : The simulated epoch.
     scene : Its true wall.
-    kinds : Whether moved blocks and fallen fragments are annotated too, with categories of their own.
+    kinds : Whether to annotate these other changes.
 
     Returns
     -------
-    The label of each pixel of the epoch, (h, w), 0 where nothing is annotated, and the record of the block of each label: with
-    kinds, also its `category_id`, and as `block` the number of its rockfall.
+    The label of each pixel of the difference map, (h, w) from 1, 0 where nothing is annotated; and for each label the record of
+    its block. With `kinds`, a record also has its `category_id`, and under `block` the number of the rockfall that it belongs to.
     """
     state, rules = scene.state, scene.rules
     if state is None or rules is None:

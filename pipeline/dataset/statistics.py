@@ -48,10 +48,10 @@ class ShownTile:
 
     Attributes
     ----------
-    cell : Combination of wall, noise level and so on to which the epoch of the tile belongs.
+    cell : Split, sensor, wall, noise level and size class of the epoch that the tile is cut from.
     file : Path of the tile's difference map, relative to the set's folder.
-    tile : What the epoch's record says of the tile, as in the JSON file.
-    noise_m : Noise of the epoch, m.
+    tile : Image and annotations of the tile, as stored in the JSON file of its epoch.
+    noise_m : Standard deviation of the noise of the difference map of that epoch, m.
     """
 
     cell: Cell

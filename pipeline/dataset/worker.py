@@ -81,9 +81,10 @@ def package_versions() -> dict[str, str]:
 
 
 def require_same_versions(entry: dict[str, Any], where: str) -> None:
-    """Raise InputError if package versions here differ from those that started a data set, which would change its bytes.
+    """Raise InputError if package versions here differ from those with which a data set was started.
 
-    entry: the source's entry in dataset.json. where: name of the file, for errors.
+    Other versions could change the bytes of its epochs. entry: what dataset.json stores of the config that makes them, with the
+    versions. where: name of the file or folder, for errors.
     """
     before, here = entry["versions"], package_versions()
     differ = sorted(key for key in before if key != "platform" and here.get(key) != before[key])

@@ -12,7 +12,7 @@ from scene.common.errors import InputError
 
 
 class ExportedRun(RunFiles):
-    """A run of `simulate` that is exported to other formats, read from its folder.
+    """A run of `simulate` that is exported to other formats, made of the run's folder; files are read when needed.
 
     Raises InputError if the folder contains no finished epoch.
     """
@@ -33,9 +33,9 @@ class ExportedRun(RunFiles):
         return len(self.record["epochs"]) - 1
 
     def limit_m(self, number: int) -> float:
-        """Return the difference at which the colour scale of an epoch's map ends, m, the same as in the run's report.
+        """Return the difference at which the colour scale of an epoch's map ends, m, as in the run's report.
 
-        number: of the epoch.
+        number: of the epoch, from 1.
         """
         statistics = self.record["epochs"][number].get("statistics")
         if not statistics:
@@ -47,5 +47,5 @@ class ExportedRun(RunFiles):
         return float(SCALE_SIGMAS * statistics["sigma_m"])
 
     def blocks(self, number: int) -> list[dict[str, Any]]:
-        """Return the records of the blocks that fell in an epoch of the run, the largest first. number: of the epoch."""
+        """Return the records of the blocks that fell in an epoch of the run, the largest first. number: of the epoch, from 1."""
         return sorted(self.record["epochs"][number]["blocks"], key=lambda block: -block["volume_m3"])

@@ -15,8 +15,9 @@ from scene.geometry.mesh import WALL, TriangleMesh, compact_vertices
 def save_gltf(run: ExportedRun, number: int, path: Path) -> None:
     """Write the measured surface of an epoch as a .glb file (glTF), for viewers of 3D models.
 
-    The wall and the niche of each block (`block_12`) are separate parts, coloured by the difference as in the report, grey
-    without data. number: of the epoch. Raises InputError if the run wrote no surface.
+    The wall and the niche of each block (`block_12`) are separate parts, coloured by the difference as in the report,
+    grey without data. run: the run. number: of the epoch, from 1. path: the .glb file. Raises InputError if the run wrote
+    no surface.
     """
     surface, (values, grid) = run.surface(number), run.difference(number)
     colours = colours_of(difference_at(surface.vertices, values, grid), run.limit_m(number))

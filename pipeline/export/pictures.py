@@ -40,9 +40,10 @@ _NIGHT, _BEAM = 26, np.array([255, 150, 30], dtype=np.uint8)
 
 
 def save_picture(run: ExportedRun, number: int, path: Path, width: int = 1280) -> None:
-    """Draw the wall of a run's epoch in perspective, coloured by the difference, with its largest blocks numbered; write a PNG.
+    """Write a PNG of the wall of a run's epoch in perspective, coloured by the difference, with its largest blocks numbered.
 
-    number: of the epoch. width: of the picture, px. The blocks have their numbers in the report.
+    run: the run. number: of the epoch; 0 is the reference, drawn as bare rock. path: the PNG file. width: of the picture,
+    px. The blocks have the numbers that they have in the report.
     """
     reference = run.surface(0)
     view = PerspectiveView.on(reference.vertices, width)
@@ -53,7 +54,7 @@ def save_picture(run: ExportedRun, number: int, path: Path, width: int = 1280) -
 def save_epochs(run: ExportedRun, path: Path, progress: Progress) -> None:
     """Write an animated GIF of a run's wall, epoch by epoch from the reference on, with one colour scale for the differences.
 
-    progress: receives the progress.
+    run: the run. path: the GIF file. progress: receives the progress.
     """
     numbers = range(1, run.last + 1)
     limit = max(run.limit_m(number) for number in numbers)
@@ -71,8 +72,8 @@ def save_epochs(run: ExportedRun, path: Path, progress: Progress) -> None:
 def save_scan(run: ExportedRun, number: int, path: Path) -> None:
     """Write an animated GIF that shows how a laser scanner records the points of an epoch, line by line.
 
-    number: of the epoch. Points are coloured by their distance from the wall plane. Raises InputError for a run of a stereo
-    pair, which records all its points at once.
+    run: the run. number: of the epoch. path: the GIF file. Points are coloured by their distance from the wall plane.
+    Raises InputError for a run of a stereo pair, which records all its points at once.
     """
     if run.record["sensor"] != "tls":
         raise InputError(

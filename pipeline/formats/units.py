@@ -72,7 +72,7 @@ def agreed_units(stated: AxisUnits | None, given: str | None, where: str, option
     Parameters
     ----------
     stated : The file's statement; None: it states nothing.
-    given : Name of the unit that the user gives, a key of METRES; None: the user gives nothing.
+    given : Name of the unit that the user gives, such as "mm"; None: the user gives nothing.
     where : Name of the file, for errors.
     option : Command-line option that gives the unit, for errors.
 
@@ -106,10 +106,10 @@ def understood_crs(text: str) -> Any:
 
 
 def not_understood(text: str, where: str) -> str:
-    """Return a note that a file's coordinate system is not understood, so that its coordinates are read as metres.
+    """Return a note for the user that a file's coordinate system is not understood, and that its coordinates are read as metres.
 
-    text: the system as the file states it. where: name of the file, for errors. Raises InputError if the text contains the name
-    of another unit.
+    text: the system as the file states it. where: name of the file, for errors. Raises InputError instead if the text names a
+    foot or yard.
     """
     problem = f"states a coordinate system that is not understood: '{text:.60}'"
     if word := re.search(r"foot|feet|yard|\bft\b|us-ft", text, re.IGNORECASE):

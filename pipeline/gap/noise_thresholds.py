@@ -11,9 +11,10 @@ class VarianceThresholds(ThresholdGroup):
     """Thresholds by which `gap` accepts noise terms: effects that change the variance of the residuals (variance model).
 
     A gain is a log-likelihood ratio of the models with and without a term; the score is the gain minus a penalty for the
-    parameters. Wall blocks are parts of the wall, which count as independent. Their agreement is the sum of their gains over
-    the root of the sum of the squares of these. An empirical term is a variance that is fitted freely in bins of a covariate,
-    such as the range.
+    parameters. Wall blocks are squares of the wall, which count as independent. Their agreement is measured like a number of
+    standard deviations: the sum of their gains over the root of the sum of squared gains. An empirical term is a variance that
+    is fitted freely in bins of a covariate, such as the range. The last text of each field states where its value comes from:
+    tuning on development cases, or judgement.
     """
 
     significance: PositiveFloat = threshold_field(
@@ -131,11 +132,19 @@ class VarianceThresholds(ThresholdGroup):
 class GridNoiseThresholds(ThresholdGroup):
     """Thresholds that separate white from grid-correlated noise of disparities, and noise from errors of the reference.
 
-    Grid-correlated noise is noise that a stereo matcher interpolates between widely spaced pixels (nodes of a grid).
+    White noise is independent from point to point. Grid-correlated noise is interpolated by a stereo matcher between widely
+    spaced pixels (nodes of a grid). The semivariogram of the residuals is fitted with each kind. The kind that fits better by
+    `margin` is named; otherwise both are reported as indistinguishable. An error of the reference also correlates residuals. A
+    component of the semivariogram is attributed to it if it is not larger than the `reference_error` limits allow. The last
+    text of each field states where its value comes from: tuning on development cases, or judgement.
     """
 
     margin: PositiveFloat = threshold_field(
-        6.0, "chi^2", "White or grid-correlated noise is named alone if its semivariogram fits better by this.", JUDGEMENT
+        6.0,
+        "chi^2",
+        "White noise is named alone if its chi^2 against the measured semivariogram is smaller by this than that of "
+        "grid-correlated noise, and the reverse. Otherwise both are named as a class.",
+        JUDGEMENT,
     )
     least_gain: PositiveFloat = threshold_field(
         12.0,
@@ -179,8 +188,9 @@ class GridNoiseThresholds(ThresholdGroup):
 class LockingThresholds(ThresholdGroup):
     """Thresholds of the test for pixel locking: measured disparities that crowd around whole pixels.
 
-    The resultant length measures how strongly fractions of a pixel crowd: 0 not at all, 1 all alike. The chi^2 of a trial
-    amplitude compares four resultant lengths (fractions of 1, 1/2, 1/3 and 1/4 pixel) with those that it predicts.
+    The resultant length measures how strongly fractions of a pixel crowd: 0 not at all, 1 all alike. It is computed for
+    fractions of 1, 1/2, 1/3 and 1/4 pixel; the chi^2 of a trial amplitude compares these four values with those that it
+    predicts.
     """
 
     fewest_cycles: PositiveFloat = threshold_field(
@@ -208,7 +218,8 @@ class LockingThresholds(ThresholdGroup):
     good_fit: PositiveFloat = threshold_field(
         20.0,
         "chi^2 of four values",
-        "If no amplitude fits better than this, the best small amplitude is taken: one that keeps the order of the disparities.",
+        "If even the best amplitude of pixel locking has a larger chi^2 than this, the best small amplitude is taken: one that "
+        "keeps the order of the disparities.",
         DEVELOPMENT,
     )
 
@@ -216,8 +227,8 @@ class LockingThresholds(ThresholdGroup):
 class QuantizationThresholds(ThresholdGroup):
     """Threshold of the test whether a scanner rounded its ranges to a step, such as 1 mm.
 
-    A phase is the remainder of a range after division by the step, as an angle. The mean resultant length is 1 if all are
-    alike.
+    A phase is the remainder of a range after division by the step, as an angle. The mean resultant length is 1 if all phases
+    are alike, as for rounded ranges, and near 0 if they are spread evenly.
     """
 
     least_resultant: PositiveFloat = threshold_field(
@@ -231,9 +242,10 @@ class QuantizationThresholds(ThresholdGroup):
 class EdgeThresholds(ThresholdGroup):
     """Thresholds of effects at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint.
 
-    A gain is a log-likelihood ratio of the models with and without an effect. Wall blocks are parts of the wall, which count as
-    independent. Their agreement is the sum of their gains over the root of the sum of the squares of these. A cell is a pixel
-    of the disparity raster. A selection pass is one search for all effects, with or without edge effects in the model.
+    A gain is a log-likelihood ratio of the models with and without an effect. Wall blocks are squares of the wall, which count
+    as independent. Their agreement is measured like a number of standard deviations: the sum of their gains over the root of
+    the sum of squared gains. A cell is a pixel of the disparity raster. A selection pass is one search for all effects, with or
+    without edge effects in the model.
     """
 
     least_gain: PositiveFloat = threshold_field(

@@ -73,8 +73,9 @@ class MeanThresholds(ThresholdGroup):
 
     A log-likelihood ratio compares models with and without an effect; the score is this ratio minus a penalty for the
     parameters. The equivalence class holds effects that explain the residuals as well as the best one. A signature is the
-    change of the observations by an effect. A typical size is the value of an effect's parameter in the catalogue that
-    instruments commonly have. A non-parametric term is a spline of a covariate, such as the range.
+    change of the observations by an effect. A typical size is the value that an effect's parameter commonly has in instruments.
+    A non-parametric term is a spline of a covariate, such as the range. The last text of each field states where its value
+    comes from: tuning on development cases, or judgement.
     """
 
     significance: PositiveFloat = threshold_field(
@@ -128,22 +129,23 @@ class MeanThresholds(ThresholdGroup):
     null_wave_ratio: PositiveFloat = threshold_field(
         2.0,
         "ratio of scores",
-        "A wave along a covariate must score this many times as much as the best oblique wave on the wall (spatial null "
-        "candidate).",
+        "A wave along a covariate must score this many times as much as the best wave that runs obliquely across the wall. No "
+        "sensor effect is oblique, so that wave shows what an error of the reference can score.",
         DEVELOPMENT,
     )
     most_effects: PositiveInt = threshold_field(3, "effects", "At most this many systematic effects are selected.", JUDGEMENT)
     absorbed_size: PositiveFloat = threshold_field(
         10.0,
         "typical sizes of the effect",
-        "An effect that the registration absorbs nearly, and that is larger than this, is accepted only if no misfit is left.",
+        "An effect that the registration nearly absorbs (`absorbed_share`), and that is larger than this, is accepted only if no "
+        "misfit is left.",
         JUDGEMENT,
     )
     absorbed_share: PositiveFloat = threshold_field(
         0.1,
         "share of the signature's sum of squares",
-        "An effect counts as nearly absorbed if the registration, or a curve of an angle's error, leaves less than this of its "
-        "signature.",
+        "If the registration leaves less than this of an effect's signature, it nearly absorbs the effect. The same share "
+        "decides whether a curve of an angle's error, stated in the model, makes the effect superfluous.",
         JUDGEMENT,
         lt=1,
     )
@@ -353,7 +355,12 @@ class VerdictThresholds(ThresholdGroup):
 
 
 class Thresholds(ThresholdGroup):
-    """All thresholds by which `gap` decides when it diagnoses a measurement, in groups: one attribute for each test."""
+    """All thresholds by which `gap` decides when it diagnoses a measurement, in groups.
+
+    Each attribute is a group for one test: which points are used; systematic effects (mean); noise (variance, grid_noise);
+    pixel locking; effects at depth steps (edges); missing returns; rounded ranges (quantization); changes of the rock;
+    validation; and the verdict.
+    """
 
     points: PointThresholds = PointThresholds()
     mean: MeanThresholds = MeanThresholds()
@@ -373,7 +380,7 @@ _IN_USE: ContextVar[Thresholds] = ContextVar("thresholds", default=_DEFAULTS)
 
 
 def read_thresholds(overrides: Sequence[str]) -> Thresholds:
-    """Return the default thresholds with the values replaced that the user gave on the command line.
+    """Return the thresholds for a diagnosis by `gap`: the defaults, with those replaced that the user set on the command line.
 
     Parameters
     ----------
@@ -387,7 +394,7 @@ def read_thresholds(overrides: Sequence[str]) -> Thresholds:
 
 
 def thresholds() -> Thresholds:
-    """Return the thresholds of the diagnosis by `gap` that is running; the defaults if none is running."""
+    """Return the thresholds of the diagnosis by `gap` that is running now (see `use_thresholds`), or the defaults if none is."""
     return _IN_USE.get()
 
 

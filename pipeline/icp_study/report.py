@@ -27,9 +27,10 @@ _LEAST_KEPT = 5e-4
 
 
 def write_icp_study(out: Path, study: IcpStudy) -> Path:
-    """Write the results of an ICP study, which registers epochs with many values of ICP's settings, and return the report's path.
+    """Write the results of an ICP study as a report with tables and pictures, and return the report's path.
 
-    The folder `out` gets report.html, tables (icp_study.json, icp_study.csv) and a picture for each setting. It appears only when
+    Such a study registers repeated measurements (epochs) with many values of ICP's settings, to find good ones. The folder
+    `out` gets report.html, tables (icp_study.json, icp_study.csv) and a picture for each setting. It appears only when
     everything has been written.
     """
     with filling(out) as folder:
@@ -67,7 +68,7 @@ def recommendation_sentence(found: Recommendation) -> str:
 def summary(study: IcpStudy) -> str:
     """State the main results of an ICP study as lines of text for the terminal.
 
-    They are the recommended settings, and the error of the registration that `simulate` itself applied to each epoch.
+    They are the recommended settings, and the error of the registration that the command `simulate` applied to each epoch.
     """
     lines = [recommendation_sentence(each) for each in study.recommended]
     for number, error in study.applied.items():
@@ -85,7 +86,7 @@ def study_figure(study: IcpStudy, parameter: Parameter) -> bytes:
     Three panels show the RMS residual, the error of the pose and the share of inliers. Lines are medians, dots single
     registrations.
 
-    study: the results. parameter: the setting, "subsample_ratio" or "outlier_distance_threshold".
+    study: the results of the study. parameter: the setting, "subsample_ratio" or "outlier_distance_threshold".
     """
     rows = [row for row in study.rows if row.parameter == parameter]
     figure = Figure(figsize=(13.0, 4.2), dpi=DPI, layout="constrained")

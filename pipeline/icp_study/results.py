@@ -14,7 +14,7 @@ Parameter = Literal["subsample_ratio", "outlier_distance_threshold"]
 
 @dataclass(frozen=True)
 class PoseError:
-    """Error of an estimated registration against the true one: how far it moves the reference's points from where they should be.
+    """Error of an estimated registration: how far it moves the reference's points from where the true registration puts them.
 
     Attributes
     ----------
@@ -40,24 +40,24 @@ class PoseError:
 class StudyRow:
     """Result of one ICP registration in a study, in which one setting of ICP is varied.
 
+    Results are None if ICP found too few pairs of points.
+
     Attributes
     ----------
     parameter, value
-        The setting that is varied ("subsample_ratio" or "outlier_distance_threshold"), and its value (a share, or m).
+        The setting that is varied ("subsample_ratio", the share of points left out, or "outlier_distance_threshold"), and its
+        value (a share, or m).
     gradual : bool
         Whether the outlier threshold decreased to its value over the first iterations, or was constant.
     epoch, repeat : int
         Number of the epoch, and of the repetition with another random subsample of its points.
     rms_m, inlier_share
-        RMS residual of all points (not only the subsample) within the outlier threshold, m, and the share of these points.
+        RMS residual of the points within the outlier threshold, m, and the share of points within it. They are computed from
+        points of the whole cloud, not only of the subsample that was registered.
     normal_error_m, displacement_m
-        RMS error of the registration over the reference's points: along the surface normals, and in all, m.
+        RMS displacement of the reference's points by the error of the registration: along the surface normals, and in all, m.
     iterations, seconds
         Iterations and duration of the registration.
-
-    Notes
-    -----
-    Results are None if ICP found too few pairs of points.
     """
 
     parameter: Parameter
@@ -88,9 +88,9 @@ class Recommendation:
     value : float
         The recommended value: a share, or m.
     good : (float, float)
-        Lowest and highest value whose error is as small (at most 10 % or 0.1 mm larger than that of the best).
+        Lowest and highest value whose error is nearly the smallest: at most 10 % or 0.1 mm above that of the best value.
     normal_error_m : float
-        RMS error along the surface normals that remains with the value, m.
+        RMS error along the surface normals that remains with the recommended value, m.
     """
 
     parameter: Parameter
@@ -116,13 +116,14 @@ class IcpStudy:
     offset_m : float
         Size of the known motion by which each epoch was moved before its registration, m.
     sigma_m : float
-        NMAD of the residuals along the normals at the true pose, m: the noise, which is the unit of the outlier thresholds tried.
+        Noise: robust standard deviation (NMAD) of the distances along the normals at the true pose, m. The outlier thresholds
+        that were tried are multiples of it.
     rows : list of StudyRow
         All registrations.
     recommended : list of Recommendation
         The recommended settings.
     applied : dict
-        Error of the registration that `simulate` itself applied, by number of the epoch; None for an epoch without ICP.
+        Error of the registration that the command `simulate` applied, by number of the epoch; None for an epoch without ICP.
     """
 
     sensor: str

@@ -63,9 +63,9 @@ class StudyEpoch:
     true : RigidTransform
         True motion that brings `points` to the reference.
     applied : RigidTransform or None
-        Registration that `simulate` estimated for the points as measured, without the known motion; None if it used no ICP.
+        Registration that the command `simulate` estimated for the points before the known motion; None if it used no ICP.
     true_applied : RigidTransform
-        True motion for these points as measured, with which `applied` is compared.
+        True motion that brings the points before the known motion to the reference, to compare `applied` with.
     """
 
     number: int
@@ -77,13 +77,14 @@ class StudyEpoch:
 
 @dataclass(frozen=True)
 class EpochSurfaces:
-    """Measured and true surface of an epoch, from which an ICP study knows the true registration.
+    """Measured and true surface of an epoch, from which an ICP study finds the true registration.
 
     Attributes
     ----------
     number : Number of the epoch, from 0; 0 is the reference.
-    measured, truth : Surface that the sensor measured, before registration, and true surface, wall frame, m.
-    applied : Registration that `simulate` estimated and applied to the epoch; None if it applied none.
+    measured : Surface that the sensor measured, before registration, wall frame, m.
+    truth : True surface, wall frame, m.
+    applied : Registration that the command `simulate` estimated and applied to the epoch; None if it applied none.
     """
 
     number: int
@@ -93,19 +94,19 @@ class EpochSurfaces:
 
 
 def surfaces_of_run(folder: Path, epochs: int) -> tuple[SimulationConfig, str, list[EpochSurfaces]]:
-    """Read config, measured and true surfaces from the folder of a run of `simulate`, for an ICP study.
+    """Read config, measured and true surfaces from the folder of a simulation run, for an ICP study.
 
     Parameters
     ----------
     folder : Path
-        Folder of the run.
+        Folder that the command `simulate` wrote.
     epochs : int
         Number of epochs to read after the reference.
 
     Returns
     -------
     (SimulationConfig, str, list of EpochSurfaces)
-        Config of the run, name of its sensor, and the surfaces of the reference and the epochs.
+        Config of the run, its sensor ("stereo" or "tls"), and the surfaces of the reference and the epochs.
 
     Raises
     ------
@@ -149,7 +150,7 @@ def _applied(record: dict[str, Any]) -> RigidTransform | None:
 
 
 def simulated_surfaces(config: SimulationConfig, sensor: SensorName, epochs: int, progress: Progress) -> list[EpochSurfaces]:
-    """Simulate the epochs of an ICP study as `simulate` does, without writing files.
+    """Simulate the epochs of an ICP study as the command `simulate` does, without writing files.
 
     Parameters
     ----------
@@ -200,11 +201,11 @@ def study(
     config : IcpConfig
         Settings of ICP; in each registration the subsample ratio or the outlier threshold is replaced.
     random : KeyedRandom
-        Source of subsamples and displacements.
+        Source of random numbers, for subsamples and for the motions of the epochs.
     offset_m : float
         Size of the random motion by which each epoch is moved before its registration, m; 0 for none.
     repeats : int
-        Number of random subsamples drawn for each subsample ratio.
+        Number of random subsamples drawn for each subsample ratio (share of points left out).
     progress : Progress, optional
         Receives the progress.
 
@@ -239,7 +240,7 @@ def study(
 
 
 def true_pose(surface: EpochSurfaces, random: KeyedRandom) -> RigidTransform:
-    """Find the rigid motion that brings a measured surface onto the true wall, as the truth for an ICP study.
+    """Find the rigid motion that brings a measured surface onto the true wall: the true registration for an ICP study.
 
     All measured vertices are fitted, point to plane, to the vertices and centroids of the true triangles.
 
@@ -259,10 +260,10 @@ def true_pose(surface: EpochSurfaces, random: KeyedRandom) -> RigidTransform:
 def recommend(rows: Iterable[StudyRow], parameter: Parameter) -> Recommendation | None:
     """Recommend a value of an ICP setting from registrations with several values.
 
-    Values are compared by their largest error over epochs and repetitions. An error counts as good if it exceeds the smallest one
-    (for ratios: the one with all points) by at most 10 % or 0.1 mm. The recommended subsample ratio, the share of points that
-    are left out, is the largest up to which all errors are good. The recommended outlier threshold is the geometric middle of
-    the range of good ones around the best.
+    A value is judged by its largest error over all epochs and repetitions. It is good if this error is at most 10 % or 0.1 mm
+    above that of the best value. For the subsample ratio (share of points left out) the best value is taken to be the smallest
+    ratio, and the largest value of the good range is recommended, to save time. For the outlier threshold the middle of the
+    good range around the best value is recommended.
 
     Parameters
     ----------

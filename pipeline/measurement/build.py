@@ -5,7 +5,8 @@ A record of how the files were interpreted is part of it.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from pipeline.config.presets import read_preset
 from pipeline.formats.measurements.model_file import read_model
 from pipeline.formats.point_cloud import PointCloud
-from pipeline.measurement.folder import Interpretation, MeasurementContent, write
+from pipeline.measurement.folder import STABLE_ROCK, Interpretation, MeasurementContent, write
 from pipeline.measurement.photogrammetry import describe_view, read_pair, viewing_rotation
 from pipeline.measurement.reference import HALF, Reference, reference_from_file, reference_from_half
 from pipeline.measurement.request import Request
@@ -34,6 +35,30 @@ _NAME_SCANNER = (
     "if the cameras are unknown"
 )
 _PLANES = "incidence angles refer to planes through 24 of its points, as noise and relief tilt its triangles"
+
+
+@dataclass(frozen=True)
+class ScanMaterial:
+    """Laser scans in memory, with all that a measurement folder says of them.
+
+    Attributes
+    ----------
+    scans : Points of each scan, m, in the frame of the reference.
+    stations : Place of the scanner in each scan, in the same frame.
+    reference : The surface with which the scans are compared.
+    model : Noise model of the scanner.
+    model_words : Where the model comes from, for the user.
+    stable_words : How much of each scan lies on stable rock, for the user; empty if all points are compared.
+    whole : Whether the first scan has all of its points, so that missing returns can be told.
+    """
+
+    scans: Sequence[RawScan]
+    stations: Sequence[Station]
+    reference: Reference
+    model: TlsModel
+    model_words: tuple[str, ...]
+    stable_words: tuple[str, ...] = ()
+    whole: bool = True
 
 
 def build(request: Request, out: Path) -> Interpretation:
@@ -56,7 +81,7 @@ def build(request: Request, out: Path) -> Interpretation:
     InputError
         If a file cannot be used, the scanner's place is unknown, or points and reference do not overlap.
     """
-    model, model_words = _model(request)
+    model, model_words = read_scanner_model(request)
     scans = _scans(request)
     stations = _stations(scans, request)
     station = stations[0]
@@ -67,21 +92,47 @@ def build(request: Request, out: Path) -> Interpretation:
     )
     if reference.rows is not None:
         scans = [scans[0].part(reference.rows), *scans[1:]]
-        stations = [_part(stations[0], reference.rows), *stations[1:]]
-    scans, stations, echo_words = _single_echoes(scans, stations)
-    model, noise_words = _with_rounding(model, scans[0], station)
+        stations = [stations[0].part(reference.rows), *stations[1:]]
+    whole = request.reference != HALF
+    return write_scans(ScanMaterial(scans, stations, reference, model, model_words, whole=whole), out)
+
+
+def write_scans(material: ScanMaterial, out: Path) -> Interpretation:
+    """Write the measurement folder, the input of `scarpsim gap`, of laser scans in memory, and check that `gap` can read it.
+
+    Parameters
+    ----------
+    material : Scans, places of the scanner, reference and model.
+    out : Folder to write.
+
+    Returns
+    -------
+    How the scans were interpreted.
+
+    Raises
+    ------
+    InputError
+        If points and reference do not overlap.
+    """
+    reference = material.reference
+    scans, stations, echo_words = _single_echoes(list(material.scans), list(material.stations))
+    station = stations[0]
+    model, noise_words = _with_rounding(material.model, scans[0], station)
     about = {
         "scan": tuple(f"{scan.name}: {len(scan.cloud.points):,} points{_notes_of(scan)}" for scan in scans) + echo_words,
         "scanner": station.words + _other_stations_in_words(scans, stations),
         "reference": (*reference.words, *((_PLANES,) if reference.of_points else ())),
+        **({STABLE_ROCK: material.stable_words} if material.stable_words else {}),
         "cannot show": reference.limits,
-        "model": (*model_words, *noise_words),
+        "model": (*material.model_words, *noise_words),
     }
     keys = _pose_keys(stations)
-    if "scanner" in keys and station.pattern is not None and request.reference != HALF and not echo_words:
+    if "scanner" in keys and station.pattern is not None and material.whole and not echo_words:
         keys["pattern"] = station.pattern
     if reference.of_points:
         keys |= {"incidence": "planes", "reference_error_m": float(f"{reference.error_m:.3g}")}
+    if reference.noise_is_known:
+        keys["reference_error_kind"] = "noise"
     clouds = [_for_file(scan, each) for scan, each in zip(scans, stations, strict=True)]
     content = MeasurementContent(
         "tls", clouds, reference.mesh, model, _eye(station), ", ".join(scan.name for scan in scans), keys=keys
@@ -225,8 +276,11 @@ def _reference_as_given(request: Request, scan: RawScan, position: FloatArray, r
     return reference
 
 
-def _model(request: Request) -> tuple[TlsModel, tuple[str, ...]]:
-    """Return the scanner's model, from a file or a preset, with a description."""
+def read_scanner_model(request: Request) -> tuple[TlsModel, tuple[str, ...]]:
+    """Return the scanner's noise model, from the request's file or preset, with a description for the user.
+
+    request: names the file or preset. Raises InputError if it names neither, or the model of a stereo pair.
+    """
     if request.model is not None:
         model = read_model(request.model)
         if not isinstance(model, TlsModel):
@@ -276,17 +330,8 @@ def _single_echoes(scans: list[RawScan], stations: list[Station]) -> tuple[list[
     if not lost:
         return scans, stations, ()
     words = (f"{lost:,} points of pulses with several echoes (edges, vegetation) are left out",)
-    parts = [(scan.part(rows), _part(station, rows)) for scan, station, rows in zip(scans, stations, kept, strict=True)]
+    parts = [(scan.part(rows), station.part(rows)) for scan, station, rows in zip(scans, stations, kept, strict=True)]
     return [part[0] for part in parts], [part[1] for part in parts], words
-
-
-def _part(station: Station, rows: Any) -> Station:
-    """Return the station with the geometry of some of the points."""
-    geometry = station.geometry
-    if geometry is None:
-        return station
-    columns = {name: getattr(geometry, name)[rows] for name in ("range_m", "azimuth", "zenith", "line", "pulse")}
-    return replace(station, geometry=replace(geometry, **columns))
 
 
 def _notes_of(scan: RawScan) -> str:

@@ -23,6 +23,8 @@ from sensors.cameras.camera import CameraPair
 from sensors.models.sensor_model import StereoModel, TlsModel
 
 INTERPRETATION_FILE = "understood.json"
+STABLE_ROCK = "stable rock"
+"""Subject of the lines that say how much of each epoch lies on stable rock; the report of `gap` repeats them."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,7 @@ def write(out: Path, content: MeasurementContent, found: Interpretation) -> None
         if content.cameras is not None:
             write_cameras_yaml(folder / "cameras.yaml", content.cameras)
             values["cameras"] = "cameras.yaml"
-        limits = [f"the reference: {words}" for words in found.about.get("cannot show", ())]
+        limits = [*found.about.get(STABLE_ROCK, ()), *(f"the reference: {words}" for words in found.about.get("cannot show", ()))]
         _write_yaml(folder / FILE, values | {"model": "model.yaml", "notes": limits})
         _write_yaml(folder / "model.yaml", content.model.model_dump(mode="json"), found.about["model"])
         write_text(folder / "understood.txt", found.summary() + "\n")

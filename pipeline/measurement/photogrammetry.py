@@ -47,9 +47,9 @@ def read_pair(path: Path, labels: tuple[str, str] | None) -> CameraPair:
 
 
 def viewing_rotation(camera: Camera) -> FloatArray:
-    """Return the rotation (3, 3) to the world from a frame at the camera with x forward, y left and z up in its picture.
+    """Return the rotation (3, 3) to the world from a frame like a laser scanner's at a camera, to draw and mesh from there.
 
-    Drawing and meshing as seen from the camera use this frame, which is like that of a laser scanner.
+    The frame has x along the viewing direction, y to the left and z up in the photograph.
     """
     right, down, forward = camera.rotation.T
     return np.stack([forward, -right, -down], axis=1)

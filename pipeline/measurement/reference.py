@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,7 @@ class Reference:
     rows : (k,) indices of the measured points that are compared with it, if it was made of the other ones; None: all.
     of_points : Whether it was meshed from points. Noise and relief then tilt its triangles, so that incidence angles must not
         refer to them.
+    noise_is_known : Whether `error_m` is noise of the vertices alone, without relief between them.
     """
 
     mesh: TriangleMesh
@@ -55,10 +57,28 @@ class Reference:
     limits: tuple[str, ...]
     rows: NDArray[Any] | None = None
     of_points: bool = False
+    noise_is_known: bool = False
+
+
+@dataclass(frozen=True)
+class MeasuredPointNoise:
+    """Noise of the measured points of which a reference is made, found by repeated measurements instead of from their neighbours.
+
+    Attributes
+    ----------
+    sigma_m : Standard deviation along the lines of sight, m.
+    words : Where it comes from, for the user.
+    """
+
+    sigma_m: float
+    words: str
 
 
 def is_cloud(path: Path) -> bool:
-    """Return whether a file contains points without triangles. A PLY file is opened for this; others tell by their suffix."""
+    """Return whether a file contains points without triangles.
+
+    A PLY file is opened for this; others are known by their suffix.
+    """
     if path.suffix.lower() != ".ply":
         return path.suffix.lower() in SUFFIXES
     faces = read_elements(path).get("face")
@@ -97,7 +117,34 @@ def reference_from_file(
         words = (f"mesh {path.name}: {len(mesh.faces):,} triangles, taken as exact", *notes)
         limit = "an error of the mesh (noise, chords across curved rock, cut edges) looks like an error of the sensor"
         return Reference(mesh, 0.0, words, (limit,))
-    scans = read_scans(path, unit, option="--reference-unit")
+    return reference_from_scans(read_scans(path, unit, option="--reference-unit"), path, position, rotation, seen_from)
+
+
+def reference_from_scans(
+    scans: Sequence[RawScan],
+    path: Path,
+    position: FloatArray,
+    rotation: FloatArray,
+    seen_from: str = "from the scanner",
+    noise: MeasuredPointNoise | None = None,
+) -> Reference:
+    """Mesh the points of scans as the reference surface with which later scans are compared.
+
+    Parameters
+    ----------
+    scans : The scans, all in one frame, m.
+    path : Their file or folder, for the description of the reference.
+    position : (3,) place as seen from which they are meshed, m, in the same frame.
+    rotation : (3, 3) rotation from a frame at that place to the frame of the scans.
+    seen_from : That place in words, for the description of the reference.
+    noise : Known noise of a point along the lines of sight, without the relief between points; None: it is estimated from the
+        scatter of neighbouring points, which includes the relief.
+
+    Raises
+    ------
+    InputError
+        If no triangle is left between the points.
+    """
     points = np.concatenate([scan.cloud.points for scan in scans])
     surface = triangulate_seen_points(points, position, rotation, str(path))
     said = f"cloud {path.name}: {len(points):,} points, meshed as seen {seen_from}, {len(surface.mesh.faces):,} triangles"
@@ -106,7 +153,10 @@ def reference_from_file(
         "the reference is a measurement itself: errors that both share (same scanner, same place) are invisible, and rock that "
         "moved between the two differs from an error only at its edges",
     )
-    return Reference(surface.mesh, surface.error_m, (said, *words, _noise_in_words(surface)), limits, of_points=True)
+    if noise is None or surface.smoothed:
+        return Reference(surface.mesh, surface.error_m, (said, *words, _noise_in_words(surface)), limits, of_points=True)
+    words = (said, *words, noise.words)
+    return Reference(surface.mesh, noise.sigma_m, words, limits, of_points=True, noise_is_known=True)
 
 
 def reference_from_dem(path: Path, unit: str | None = None, option: str = "--unit") -> Reference:
@@ -167,7 +217,8 @@ def reference_from_half(scan: RawScan, station: Station) -> Reference:
 
     One half is every second scan line, or every second pulse of each line if pulses are much denser than lines.
 
-    scan: the whole scan. station: position of the scanner, and the scan lines of the points.
+    scan: the whole scan. station: position of the scanner, and the scan lines of the points. In the result, `rows` has the
+    indices of the other half.
     """
     even, what = _halves(scan, station)
     surface = triangulate_seen_points(scan.cloud.points[even], station.position, station.rotation, scan.name)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.formats.measurements.scan_geometry import ScanGeometry
 from pipeline.measurement.origin import Origin, origin_from_point_order, origin_near, pattern_from
@@ -48,11 +50,20 @@ class Station:
 
     @property
     def pattern(self) -> dict[str, list[float]] | None:
-        """The scan's grid of azimuths and zenith angles, as the key `pattern` of measurement.yaml has it.
+        """The scan's nominal directions, to be written under the key `pattern` of measurement.yaml.
 
-        None without such a grid, and if lines are slanted or do not all begin at the same zenith angle.
+        The keys azimuth_rad and zenith_rad each have [start, stop, step], rad. None if the points lie on no regular grid of
+        angles, or if lines do not all begin at the same zenith angle.
         """
         return self.geometry.pattern if self.geometry is not None and self.geometry.synchronous else None
+
+    def part(self, rows: NDArray[Any]) -> Station:
+        """Return the station with the scan lines of only the points that `rows` selects: indices (k,), or a mask (n,)."""
+        geometry = self.geometry
+        if geometry is None:
+            return self
+        columns = {name: getattr(geometry, name)[rows] for name in ("range_m", "azimuth", "zenith", "line", "pulse")}
+        return replace(self, geometry=replace(geometry, **columns))
 
 
 def find_station(scan: RawScan, position: FloatArray | None = None) -> Station:

@@ -50,7 +50,8 @@ def check_same_unit(points: FloatArray, surface: FloatArray, where: str, unit: s
     Raises
     ------
     InputError
-        If the two would have the same size with another unit, if they lie far apart, or if all points of one coincide.
+        If the two would have the same size if one were in another unit, if they lie far apart, or if all points of one
+        coincide.
     """
     ends = [np.stack([np.min(each, axis=0), np.max(each, axis=0)]) for each in (points, surface)]
     sizes = [float(np.linalg.norm(each[1] - each[0])) for each in ends]

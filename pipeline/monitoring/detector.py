@@ -23,7 +23,8 @@ _WRONG_INPUT = 2
 def regions_of_detector(detector: str, difference: Path, change: Change) -> list[ChangedRegion]:
     """Find changed regions in a difference map with a trained detector, instead of with the level of detection.
 
-    The detector works in a process of its own, because TensorFlow and the ray tracer's compiler do not work in one.
+    The detector runs in a process of its own, because TensorFlow and the ray tracer's compiler disturb each other in the same
+    one.
 
     Parameters
     ----------
@@ -32,7 +33,7 @@ def regions_of_detector(detector: str, difference: Path, change: Change) -> list
     difference : Path
         GeoTIFF of the difference map.
     change : Change
-        The same map with its levels of detection, in which the detections are measured.
+        The same map with its levels of detection, in which depth, volume and significance of the detections are measured.
 
     Returns
     -------

@@ -41,15 +41,16 @@ def follow(
     folder : Path
         Folder into which new files are written, one for each epoch; they are compared in the order of their names.
     out : Path
-        Folder of the results; new or empty unless it is to be resumed.
+        Folder of the results: new, empty, or that of an earlier call, which is continued.
     options : MonitorOptions
         All other options of `scarpsim monitor`.
     times : sequence of str
-        Must be empty: the time of each epoch comes from its file.
+        Accepted because `monitor_paths` has it, but must be empty: the time of each epoch comes from its file.
     workers : int
         Number of processes; the results do not depend on it.
     resume : bool
-        Whether to keep the epochs that an earlier call finished in `out`. A complete result there is always continued.
+        Must be True to continue an earlier call that stopped before its results were complete. Complete results are continued
+        in any case.
     every_s : float
         Time between two looks at the folder, s.
     ended : callable

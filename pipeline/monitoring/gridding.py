@@ -122,7 +122,7 @@ class PointSums:
 
     @classmethod
     def over(cls, grid: Grid) -> PointSums:
-        """Return sums that are still zero for the pixels of a raster, so that points can be added to them."""
+        """Return sums that are still zero for the pixels of a raster, so that points can be added to them. grid: the raster."""
         return cls(grid, np.zeros((10, grid.height * grid.width)))
 
     def add(self, points: FloatArray) -> None:
@@ -131,7 +131,11 @@ class PointSums:
             _add_moments(self.sums, points[start : start + _CHUNK], self.grid)
 
     def heights(self) -> HeightRaster:
-        """Fit a plane to all added points in the 3 x 3 pixels about each pixel, and return the raster of heights."""
+        """Fit planes to all points added so far, and return the raster of heights.
+
+        The height of a pixel is that of a plane at its centre, frame of the raster, m. The plane is fitted to the points in
+        the 3 x 3 pixels about it. Heights are NaN where these are fewer than four or do not determine a plane well.
+        """
         return _fitted(self.sums.reshape(10, self.grid.height, self.grid.width), self.grid)
 
 

@@ -60,12 +60,13 @@ def predicted_level(model: TlsModel, reference: HeightRaster, epoch: HeightRaste
     return float(NORMAL_95 * np.nanmedian(point * np.sqrt(share)))
 
 
-def compared_in_words(measured_m: float, predicted_m: float) -> str:
-    """State the measured and the predicted level of detection, both m, and what to do if they differ by more than a third."""
+def compared_in_words(measured_m: float, predicted_m: float, next_step: str) -> str:
+    """State the measured and the predicted level of detection as text, and what to do if they differ by more than a third.
+
+    measured_m, predicted_m: the two levels, m. next_step: sentence that says how to find the reason; empty if there is no way.
+    """
     told = f"Level of detection: measured {1e3 * measured_m:.1f} mm, predicted by the model {1e3 * predicted_m:.1f} mm"
     if abs(measured_m / predicted_m - 1) <= DISAGREES:
         return f"{told}. They agree within a third."
-    return (
-        f"{told}. They disagree by more than a third: relief between the points, or an effect that the model lacks. "
-        "Find out with scarpsim gap on the scan and the reference, and fit the noise with scarpsim calibrate."
-    )
+    why = "They disagree by more than a third: relief between the points, or an effect that the model lacks."
+    return f"{told}. {why} {next_step}".strip()

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from pipeline.monitoring.stable_areas import StableArea
@@ -70,6 +72,19 @@ class MonitorOptions:
         values = {name: getattr(self, name) for name in self.__dataclass_fields__}
         plain = {name: value.tolist() if hasattr(value, "tolist") else value for name, value in values.items()}
         return {name: str(value) if isinstance(value, Path) else value for name, value in plain.items()}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> MonitorOptions:
+        """Return the options of `scarpsim monitor` as monitor.json stores them.
+
+        values: options by name. Names that are not known are ignored. Raises ValueError or TypeError for wrong values.
+        """
+        known: dict[str, Any] = {name: values[name] for name in cls.__dataclass_fields__ if values.get(name) is not None}
+        known |= {name: np.array(known[name], dtype=np.float64) for name in ("position", "direction") if name in known}
+        known |= {name: Path(known[name]) for name in ("reference", "targets", "model") if name in known}
+        known["stable"] = TypeAdapter(tuple[StableArea, ...]).validate_python(known.get("stable", ()))
+        known["columns"] = tuple(known.get("columns", ()))
+        return cls(**known)
 
 
 def read_areas(path: Path) -> tuple[StableArea, ...]:

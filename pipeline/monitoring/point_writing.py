@@ -26,7 +26,9 @@ _MOST_WAITING = 2
 def write_points_once(
     epoch: Followed, data: EpochData | None, site: ReferenceSite, out: Path, fingerprint: str, options: MonitorOptions
 ) -> None:
-    """Write an epoch's registered points, unless the folder of results has them with the same numbers of events already.
+    """Write an epoch's registered points with the event at each point, unless the folder of results has them already.
+
+    They are written again if the epoch's files, the reference, the options or the numbers of its events have changed.
 
     Parameters
     ----------
@@ -61,6 +63,8 @@ def _key(epoch: Followed, fingerprint: str) -> str:
 class PointsInOrder:
     """Writes the points of the epochs that one process compares, each once the results of all earlier epochs are stored.
 
+    Points are written with the numbers of their events, which depend on all earlier epochs.
+
     Attributes
     ----------
     site : ReferenceSite
@@ -71,6 +75,8 @@ class PointsInOrder:
         Checksum of the reference and the options.
     options : MonitorOptions
         Options of the call.
+    _catalogue, _next, _waiting
+        State: events so far, number of the next epoch, and epochs whose points wait for it.
     """
 
     site: ReferenceSite
@@ -82,10 +88,11 @@ class PointsInOrder:
     _waiting: dict[int, tuple[EpochSource, EpochRecord, EpochData]] = field(default_factory=dict)
 
     def add(self, source: EpochSource, record: EpochRecord, data: EpochData) -> None:
-        """Write the points of a compared epoch now, or after a later call of `add` if earlier results are still missing.
+        """Write the points of a compared epoch now, or in a later call of `add` if results of earlier epochs are still missing.
 
-        source: the epoch's files. record: its result, which is stored in the folder already. data: its points. Of epochs whose
-        turn does not come, at most two are remembered; the points of others have to be written elsewhere.
+        At most two epochs wait, and none with files too large for memory; the caller must write the points of the others later.
+
+        source: the epoch's files. record: its result, which is stored in the folder already. data: its points.
         """
         self._waiting[record.number] = (source, record, data)
         while (known := stored(self.out, self._next, self.fingerprint)) is not None:

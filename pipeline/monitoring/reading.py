@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from pipeline.formats.points.laz_chunks import CHUNK, count_points, read_chunks
 from pipeline.formats.points.points import SUFFIXES
 from pipeline.formats.records.result_records import RUN_FILE, read_run
 from pipeline.measurement.reference import DEMS, is_cloud, reference_from_dem
-from pipeline.measurement.scans import read_scans
+from pipeline.measurement.scans import RawScan, read_scans
 from pipeline.monitoring.gridding import SAMPLE, WallPoints
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.times import EpochTime, check_order, time_of
@@ -65,6 +65,11 @@ class EpochSource:
     def name(self) -> str:
         """Name of the epoch in reports and messages: that of its file or folder."""
         return self.path.name if self.run is None else f"{self.path.parent.name}/{self.path.name}"
+
+    @property
+    def is_surface(self) -> bool:
+        """Whether a file of the epoch is a mesh or an elevation model, not the points of a scan."""
+        return self.run is None and any(file.suffix.lower() in DEMS or not is_cloud(file) for file in self.files)
 
     def checksums(self) -> dict[str, str]:
         """Return the SHA-256 checksum of each file of the epoch, by its path: it tells whether a file was changed."""
@@ -152,7 +157,9 @@ class EpochData:
         return iter(np.array_split(self.points, -(-len(self.points) // CHUNK))) if self.large is None else self.large.chunks()
 
     def wall_points(self, frame: WallFrame, gsd_m: float, *, several: bool = False) -> WallPoints:
-        """Return the epoch's points in the wall frame, m; on a mesh, points are spread at about four a pixel.
+        """Return the epoch's points in the wall frame, m.
+
+        If the epoch is a mesh, points are made on its surface, about four for each pixel of the maps.
 
         Parameters
         ----------
@@ -161,7 +168,7 @@ class EpochData:
         gsd_m : float
             Side of a pixel of the maps, m.
         several : bool
-            Whether the wall has several views (separately mapped parts). On a mesh, points are then drawn at random on all
+            Whether the wall has several views (separately mapped parts). Points on a mesh are then drawn at random on all
             triangles, also on those that are steep in the wall frame.
         """
         if self.mesh is None:
@@ -257,6 +264,25 @@ def read_epoch(source: EpochSource, options: MonitorOptions) -> EpochData:
     return EpochData(np.concatenate([part.points for part in parts]), None, position, parts[0].crs, notes)
 
 
+def read_laser_scans(source: EpochSource, options: MonitorOptions) -> list[RawScan]:
+    """Read the laser scans of an epoch with intensity, times and the scanner's place, survey coordinates, m.
+
+    source: files of the epoch. options: they give the unit and the columns of text files. Raises InputError if a file cannot be
+    used, or holds a mesh or an elevation model instead of points.
+    """
+    if source.is_surface:
+        raise InputError(
+            "is a mesh or an elevation model, but the points of a laser scanner are needed",
+            where=source.name,
+            remedy="run scarpsim monitor on the scans that it was made from",
+        )
+    if source.run is None:
+        return [scan for file in source.files for scan in read_scans(file, options.unit, options.columns)]
+    frame = _frame_of_run(source.run)
+    scans = read_scans(source.files[0])
+    return [replace(scan, cloud=replace(scan.cloud, points=frame.to_world(scan.cloud.points))) for scan in scans]
+
+
 def _sampled(files: tuple[Path, ...], unit: str | None) -> EpochData:
     """Read large files once, to get a sample of their points and their number, extent and coordinate system."""
     stated = sum(map(count_points, files))
@@ -323,12 +349,17 @@ def _epochs_of_run(folder: Path) -> list[EpochSource]:
 
 def _of_run(source: EpochSource, run: dict[str, Any]) -> EpochData:
     """An epoch of a run, whose points are in the wall frame of its config."""
-    stated = run["wall_frame"]
-    frame = WallFrame(np.array(stated["rotation"]), np.array(stated["origin_m"]))
+    frame = _frame_of_run(run)
     (scan,) = read_scans(source.files[0])
     middle = scan.cloud.points.mean(axis=0) + np.array([0.0, 0.0, _BEFORE_M])
     notes = ("an epoch of a run of simulate: its points were put into survey coordinates",)
     return EpochData(frame.to_world(scan.cloud.points), None, frame.to_world(middle), "", notes)
+
+
+def _frame_of_run(run: dict[str, Any]) -> WallFrame:
+    """Return the wall frame of a run of `simulate`, in which its points are."""
+    stated = run["wall_frame"]
+    return WallFrame(np.array(stated["rotation"]), np.array(stated["origin_m"]))
 
 
 def _read_file(path: Path, options: MonitorOptions) -> EpochData:

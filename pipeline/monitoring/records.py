@@ -105,7 +105,9 @@ def kept(folder: Path, number: int, inputs: Mapping[str, str], fingerprint: str)
 
 
 def points_note(folder: Path, number: int) -> Path:
-    """Return the file with the checksum of all that the registered points of an epoch depend on, as they were last written.
+    """Return the path of a small file that tells whether the registered points of an epoch have to be written again.
+
+    It holds a checksum of all that they depended on when they were last written.
 
     folder: the folder of the results. number: number of the epoch.
     """
@@ -121,9 +123,10 @@ def discard(folder: Path, number: int) -> None:
 
 
 def stored(folder: Path, number: int, fingerprint: str) -> EpochRecord | None:
-    """Read the stored result of an epoch, whatever its files are now; None if there is none for this reference and options.
+    """Read the stored result of an epoch, without checking that the epoch's files are still the same.
 
     folder: the folder of the results. number: number of the epoch. fingerprint: checksum of the reference and the options.
+    Returns None if there is no result for these.
     """
     path = _file(folder, number)
     if not path.is_file():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,21 @@ def headline(result: Result) -> list[str]:
     return told
 
 
+def next_step(result: Result) -> str:
+    """Return a sentence with the commands that find out why the noise is not as the scanner's model predicts it.
+
+    It is empty for meshes and elevation models, whose points the scanner did not measure.
+    """
+    if any(source.is_surface for source in result.sources):
+        return ""
+    gap, calibration = (f"{result.folder}_{name}" for name in ("gap", "calibration"))
+    scanner = shlex.join(["scarpsim", "gap", str(result.folder), "--out", gap])
+    noise = shlex.join(["scarpsim", "calibrate", f"{gap}/measurement", "--out", calibration])
+    unknown = result.options.position is None and result.options.direction is not None
+    place = " (add --position with the place of the scanner, X,Y,Z in m, if no file states it)" if unknown else ""
+    return f"Find out with `{scanner}`{place}, which diagnoses the stable rock, and fit the noise there with `{noise}`."
+
+
 def law_in_words(law: PowerLaw) -> str:
     """State the magnitude-frequency law of the rockfalls, with the 95 % interval of its exponent, as a sentence."""
     return (
@@ -101,7 +117,8 @@ def _about(epoch: Followed, result: Result) -> dict[str, Any]:
         f"Their differences have an RMS of {1e3 * registration['rms_m']:.1f} mm. "
         f"The standard deviation of the shift is {shift:.2g} mm."
     )
-    predicted = None if np.isnan(record.predicted_level_m) else compared_in_words(record.level_m, record.predicted_level_m)
+    levels = record.level_m, record.predicted_level_m
+    predicted = None if np.isnan(record.predicted_level_m) else compared_in_words(*levels, next_step(result))
     return {"number": epoch.number, "registered": registered, "predicted": predicted, "notes": record.notes}
 
 

@@ -62,10 +62,12 @@ class Significance:
         return np.asarray(self.level / np.float32(NORMAL_95))
 
     def sigma_of_mean(self, pixels: float | NDArray[np.floating]) -> FloatArray:
-        """Return the standard deviation of a mean over so many neighbouring `pixels`, whose errors are correlated.
+        """Return the standard deviation of a mean over neighbouring pixels, whose errors are correlated.
 
-        The mean is of differences that are each divided by the standard deviation of their pixel, so it has no unit. The result
-        for more pixels than the largest square that was measured on stable rock is that of this square.
+        The mean is of differences that are each divided by the standard deviation of their pixel, so it has no unit.
+
+        pixels: numbers of pixels, in a roughly square area. For more than in the largest square that was measured on stable
+        rock, the result is that of this square.
         """
         side = np.sqrt(np.maximum(pixels, 1.0))
         return np.asarray(np.exp(np.interp(np.log(side), np.log(self.side_px), np.log(self.sigma))))

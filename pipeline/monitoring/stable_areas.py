@@ -59,8 +59,8 @@ class StableRock:
     def contains(self, points: FloatArray) -> NDArray[np.bool_]:
         """Return which of the points (n, 3), wall frame, m, lie in one of the areas, as a mask (n,).
 
-        Areas of the map reach through all depths of the wall. A polygon in survey coordinates contains points that lie in it when
-        seen along its normal, and no farther from its plane than half of its extent.
+        Areas in x and y of the wall frame reach through all depths of the wall. A polygon in survey coordinates contains points
+        that lie in it when seen along its normal, and no farther from its plane than half of its extent.
         """
         world = self.frame.to_world(points)
         found = np.zeros(len(points), dtype=bool)

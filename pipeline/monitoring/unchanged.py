@@ -66,7 +66,7 @@ def quieter_scatter(values: NDArray[np.floating]) -> float:
 
     It is computed from the positive or from the negative values, whichever scatter less, and allows for long tails.
 
-    values: (n,) differences, in any unit. Infinite if there are none.
+    values: (n,) differences, in any unit, which the result has too. Without values it is infinite.
     """
     sides = [side for side in (values[values > 0], -values[values < 0]) if len(side) >= _FEWEST]
     if not sides:

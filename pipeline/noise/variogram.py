@@ -98,7 +98,7 @@ def variogram(
     rasters = values[None] if values.ndim == 2 else values
     if np.isfinite(rasters).sum(axis=(1, 2)).max(initial=0) < 2:
         raise InputError(
-            "fewer than two pixels have data, which determines no variogram",
+            "fewer than two pixels have data, so there is no variogram",
             where="variogram",
             remedy="give difference maps in which more pixels have data",
         )
@@ -143,7 +143,7 @@ def _averaged(
         wanted &= across <= _SECTOR * along
     if not wanted.any():
         raise InputError(
-            f"no two pixels with data lie within {reach:g} m of each other, which determines no variogram",
+            f"no two pixels with data lie within {reach:g} m of each other, so there is no variogram",
             where="variogram",
             remedy="allow a larger distance (largest_lag_m), or give maps with more data",
         )
@@ -237,12 +237,14 @@ class VariogramModel:
 
 
 def fit_variogram(found: Variogram) -> VariogramModel:
-    """Fit a variogram model to an empirical variogram, to describe how far the noise of a map is correlated.
+    """Fit a variogram model to an empirical variogram, to describe over which distances the noise of a map is correlated.
 
     The model has a nugget (uncorrelated noise) and up to two correlated parts (structures). It has the smallest relative
-    misfit over all bins of distance. Each further structure must reduce the squared misfit by at least 20 %. All bins have
-    equal weight except those with few pairs of pixels: the model is assumed accurate to 3 %, and n pairs determine a
+    misfit over all bins of distance. Each further structure must reduce the squared misfit by at least 20 %. All bins
+    have equal weight except those with few pairs of pixels: the model is assumed accurate to 3 %, and n pairs determine a
     semivariance to sqrt(2 / n).
+
+    found: the empirical variogram.
     """
     if not found.semivariance_m2.max() > 0:
         return VariogramModel(0.0, ())

@@ -108,7 +108,8 @@ class Views:
         viewpoint : (3,) array
             Position of the sensor, wall frame, m.
         upright : (3,) array
-            Vertical axis of the sensor, wall frame. `seen_at` rotates a place about it that is seen exactly at normal incidence.
+            Vertical axis of the sensor, wall frame. It says which way `seen_at` tilts a place that the sensor sees exactly at
+            right angles: sideways, about this axis.
         """
         sight = places.points - viewpoint
         distance = np.linalg.norm(sight, axis=1)
@@ -122,7 +123,9 @@ class Views:
         return cls(viewpoint, places, aside, distance, np.arccos(cosine))
 
     def seen_at(self, ratio: float = 1.0, turn_rad: float = 0.0) -> Places:
-        """Return the places at another range and angle of incidence: moved along their lines of sight and rotated.
+        """Return what the places would be at another range or angle of incidence, to predict how the sensor would measure them.
+
+        They are moved along their lines of sight, and their normals are tilted.
 
         Parameters
         ----------

@@ -67,17 +67,16 @@ _CURVE_POINTS = 60
 
 @dataclass(frozen=True)
 class DetectionLaw:
-    """Give the probability that `monitor` lists a change of volume V, by a logistic regression on simulated trial blocks.
+    """Give the probability P that `monitor` lists a change of volume V, by a logistic regression on simulated trial blocks.
 
-    logit P = coefficients . (1, ln V, ln u), where u is the displacement of a block that has moved. For rock that has fallen
-    the term in u is absent.
+    For a block that has moved by u, ln(P / (1 - P)) = a + b ln V + c ln u. Rock that has fallen has no term in u.
 
     Attributes
     ----------
     coefficients : (2,) or (3,) array
-        Coefficients of the best fit, for V in m3 and u in m.
-    resampled : (b, 2) or (b, 3) array
-        Coefficients fitted to b bootstrap samples of the trial blocks, for confidence intervals.
+        Best fit of a, b and, for moved blocks, c; V is in m3 and u in m.
+    resampled : (n, 2) or (n, 3) array
+        Coefficients fitted to n bootstrap samples of the trial blocks, for confidence intervals.
     blocks : int
         Number of trial blocks that were used: those of which the sensor sees at least half.
     seen_share : float
@@ -189,19 +188,20 @@ class SeriesPlan:
         return sorted({*SCHEDULES_H, *own})
 
     def lead_h(self, volume_m3: float, every_h: float, promise: EpochPromise) -> tuple[float, float]:
-        """Return how long before its fall, h, a moving block is noticed: a cautious value and a median value.
-
-        The cautious value is reached in 95 % of cases, even if a whole interval between epochs passes after the block has moved
-        far enough. Both are 0 if the motion is not noticed before the fall.
+        """Return how long before its fall a moving block is noticed, h, to choose the interval between epochs.
 
         Parameters
         ----------
-        volume_m3 : float
-            Volume of the block, m3.
-        every_h : float
-            Interval between epochs, h.
+        volume_m3, every_h : float
+            Volume of the block, m3, and interval between epochs, h.
         promise : EpochPromise
-            What an epoch shows, by which the displacement is known from which the motion is noticed.
+            What an epoch is predicted to show. It gives the displacement from which a block of this volume is listed.
+
+        Returns
+        -------
+        (float, float)
+            Cautious: the block moves until it is listed in 95 % of cases, and a whole interval passes until the next epoch.
+            Typical: it moves until it is listed in 50 % of cases, and half an interval passes. 0 if the block falls before.
         """
         late = self.motion.time_left(promise.moved.displacement_m(volume_m3)[0]) - every_h
         usual = self.motion.time_left(promise.moved.displacement_m(volume_m3, 0.5)[0]) - every_h / 2
@@ -256,7 +256,7 @@ def plan_series(config: SimulationConfig, sensor: SensorName, progress: Progress
     Parameters
     ----------
     config : SimulationConfig
-        A config with a section `series` that simulates rockfalls, so without its key `surfaces` (given surfaces of epochs).
+        A config with a section `series` in which rockfalls are simulated, and not meshes of the user (key `surfaces`).
     sensor : str
         "stereo" or "tls".
     progress : Progress, optional
@@ -265,7 +265,7 @@ def plan_series(config: SimulationConfig, sensor: SensorName, progress: Progress
     Raises
     ------
     InputError
-        If the config has no such section, if the wall has no room for trial blocks, or if the sensor sees too few of them.
+        If the config simulates no rockfalls over time, the wall has no room for trial blocks, or the sensor sees too few.
     """
     if config.series is None or config.series.surfaces:
         raise InputError(
@@ -333,7 +333,7 @@ class _Sample:
         size = 3 if self._moved else 2
         if len(used) < _FEWEST:
             raise InputError(
-                f"of only {len(used)} of {len(rows)} simulated blocks does the sensor see at least half of the volume that fell",
+                f"the sensor sees only {len(used)} of {len(rows)} simulated blocks (at least half of the volume of each)",
                 where="inspect --series",
                 allowed=f"{_FEWEST} blocks or more",
                 remedy="move or turn the sensor so that it sees more of the wall; a map of `scarpsim inspect` shows what it sees",

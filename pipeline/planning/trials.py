@@ -64,9 +64,9 @@ def detection_trials(
 ) -> Trials:
     """Check predicted detection probabilities by simulation: carve cubes out of a flat wall and test for a change at each.
 
-    Half of each cube is in the rock, so that its fall leaves a niche (a hole) of half its side in depth. The sensor observes the
-    wall before and after. At the floor of each niche, the change is tested against the level of detection of M3C2. Only points
-    count whose noiseless counterpart lies on the part of the floor that is visible from the scanner or from both cameras.
+    Half of each cube is in the rock, so that its fall leaves a niche (a hole) of half its side in depth. The sensor
+    observes the wall before and after. On the floor of each niche, the change is tested against the level of detection of
+    M3C2. The points of a floor are those that would lie on it without noise, where the scanner or both cameras see it.
 
     Parameters
     ----------
@@ -84,6 +84,11 @@ def detection_trials(
         Number of cubes.
     apart_m : float
         Least distance between cubes, m.
+
+    Returns
+    -------
+    Trials
+        For each cube, the predicted probability and whether its change was detected.
     """
     blocks = place_blocks(_cubes(side_m, count, apart_m), wall, random.child("blocks"))
     centres = blocks.position_m * [1.0, 1.0, 0.0]

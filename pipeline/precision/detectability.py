@@ -56,9 +56,10 @@ _SMALLEST_M, _LARGEST_M, _HALVINGS = 1e-3, 30.0, 13
 
 
 class PlanningConfig(Config):
-    """Settings of `scarpsim inspect`: which maps it makes, and when a fallen block counts as detected.
+    """Settings of `scarpsim inspect`: the resolution of its maps, and when a fallen block counts as detected.
 
-    A block is a cube. Its fall leaves a niche (a hole) in the wall, whose floor is compared between the two epochs.
+    A block is a cube. Its fall leaves a niche (a hole) in the wall. The niche's floor is compared between two epochs, one
+    before and one after the fall.
     """
 
     gsd_m: float | None = Field(None, gt=0, description="side of a map's pixel; none: about 100,000 pixels for the wall [m]")
@@ -83,8 +84,8 @@ class PlanningConfig(Config):
 class Sampling:
     """Describe how densely and precisely a sensor samples a surface at n places, to predict which fallen blocks it detects.
 
-    The sensor's rays meet the surface in a lattice of points. Directions a and b are two perpendicular ones on the surface. A
-    niche is the hole that a fallen block leaves. All attributes are (n,) arrays or numbers.
+    The sensor's rays meet the surface in a lattice of points. a and b are two perpendicular directions on the surface, b along
+    the scan lines or image columns. A niche is the hole that a fallen block leaves. All attributes are (n,) arrays or numbers.
 
     Attributes
     ----------
@@ -93,14 +94,15 @@ class Sampling:
     shadow_a, shadow_b
         Width of the niche's floor that its rim hides along a and b, divided by the niche's depth.
     white
-        Standard deviation along the normal of the part of a point's error that is independent from point to point, m.
+        Standard deviation of a point along the normal, without the grid-correlated part, m. It is independent from point to
+        point.
     slope_a, slope_b
         Tangents along a and b of the angle between the rays and the normal.
     blur_a, blur_b
-        Standard deviation along a and b of where a ray truly hits the surface, about where it is recorded, m.
+        Standard deviation along a and b of the distance between where a ray hits the surface and where it is recorded, m.
     smooth
-        Standard deviation along the normal of the grid-correlated part of the error, averaged over positions, m. This part is
-        interpolated between random values at the nodes of a grid.
+        Standard deviation along the normal of the grid-correlated part of the error, m. Neighbouring points share this part: a
+        stereo matcher interpolates it between widely spaced pixels (nodes of a grid).
     grain_a, grain_b
         Distance between these nodes along a and b, m.
     """
@@ -120,15 +122,16 @@ class Sampling:
 
 
 def lattice(step_a: FloatArray, step_b: FloatArray, normals: FloatArray, sights: Sequence[FloatArray]) -> dict[str, FloatArray]:
-    """Describe the lattice in which a sensor's rays meet a surface at n places, for a `Sampling`.
+    """Describe the lattice in which a sensor's rays meet a surface at n places: values for the fields of a `Sampling`.
 
-    An oblique lattice is replaced by the rectangular one of equal area along step_b, the direction of the scan lines or of the
-    image's columns. On a steep wall these run upright, as the sides of a block do.
+    An oblique lattice is replaced by the rectangular one of equal area. Its direction b is along the scan lines or image
+    columns, which run upright on a steep wall; direction a is perpendicular to it.
 
     Parameters
     ----------
     step_a, step_b : (n, 3) arrays
-        Vectors from a point to the next one on the surface: from line to line (or column to column), and along it, m.
+        Vectors on the surface from a point to the next one: step_b to that on the same scan line (or image column), step_a to
+        that on the neighbouring one, m.
     normals : (n, 3) array
         Unit normals of the surface.
     sights : sequence of (n, 3) arrays
@@ -137,8 +140,9 @@ def lattice(step_a: FloatArray, step_b: FloatArray, normals: FloatArray, sights:
     Returns
     -------
     dict of (n,) arrays
-        step_a, step_b, m; shadow_a, shadow_b: width of the part of a hole's floor that some viewpoint does not see, divided by
-        the hole's depth; slope_a, slope_b: tangents of the angle between ray and normal.
+        step_a, step_b: distances between points along a and b, m; shadow_a, shadow_b: width of the part of a hole's floor that
+        some viewpoint does not see, divided by the hole's depth; slope_a, slope_b: tangents of the angle between ray and
+        normal.
     """
     length = np.linalg.norm(step_b, axis=1)
     width = np.linalg.norm(np.cross(step_a, step_b), axis=1) / length
@@ -158,8 +162,8 @@ def lattice(step_a: FloatArray, step_b: FloatArray, normals: FloatArray, sights:
 def detection_probability(sampling: Sampling, side_m: FloatArray | float, config: PlanningConfig) -> FloatArray:
     """Predict the probability that a sensor detects the fall of a cube at n places of a wall.
 
-    The fall counts as detected if the mean change on the floor of the hole that it leaves exceeds the level of detection, as in
-    M3C2 (Lague et al. 2013). The probability is the mean over all positions of the lattice of points relative to the hole.
+    The fall leaves a hole. It counts as detected if the mean change on the hole's floor exceeds the level of detection, as in
+    M3C2 (Lague et al. 2013). The probability is a mean over all positions of the measured points relative to the hole.
 
     Parameters
     ----------
@@ -212,8 +216,8 @@ def smallest_block(sampling: Sampling, config: PlanningConfig) -> FloatArray:
 def smallest_clear_block(sampling: Sampling, config: PlanningConfig) -> FloatArray:
     """Find the side of the smallest cube whose fall stands out from the noise of the whole wall, at n places.
 
-    It is the cube from which on the signal-to-noise ratio of the change is 4 (CLEAR_SNR). A detector that does not know place and
-    shape of the block needs at least this ratio. Below it, noise somewhere else on the wall looks as much like a block.
+    A detector that does not know place and shape of the block needs a signal-to-noise ratio of the change of at least 4
+    (CLEAR_SNR). Below it, noise somewhere else on the wall looks as much like a block.
 
     Parameters
     ----------
@@ -231,7 +235,7 @@ def smallest_clear_block(sampling: Sampling, config: PlanningConfig) -> FloatArr
 
 
 def signal_to_noise(sampling: Sampling, side_m: FloatArray | float, config: PlanningConfig) -> FloatArray:
-    """Return the signal-to-noise ratio of the fall of a cube: mean change on the floor of its hole over its standard deviation.
+    """Return how clearly the fall of a cube shows: mean change on the floor of its hole over the standard deviation.
 
     The mean change is the hole's depth times the share of the beams that hit its floor. The standard deviation is that of the
     difference of two epochs' means over the floor, including the error of their registration.

@@ -34,7 +34,7 @@ class StereoGeometry:
     gsd_m
         Ground sampling distance: side of the square that has the area of a pixel of the left image on the surface, m.
     cell_m
-        The same for a pixel of the depth map, which may be coarser than the image's, m.
+        Side of that square for a pixel of the depth map, which may be coarser than the image's, m.
     base_to_distance
         Distance between the cameras divided by `distance_m`.
     convergence_rad
@@ -44,8 +44,8 @@ class StereoGeometry:
     covariance : (n, 3, 3)
         Covariance of a point from matching and image noise, wall frame, m2.
     orientation_covariance : (n, 3, 3)
-        Covariance of a point from the noise of the cameras' orientation, wall frame, m2. It is common to the whole observation
-        and largely removed by the registration.
+        Covariance of a point from the noise of the cameras' orientation, wall frame, m2. All points of an observation share
+        this error, and the registration largely removes it.
     normal_sigma_m
         Standard deviation of a point along the surface's normal from matching and image noise, m.
     in_left, in_right
@@ -72,7 +72,8 @@ class StereoGeometry:
 class DisparityNoise:
     """Summarise the noise of the disparities of a stereo pair, to predict the precision of its points.
 
-    Grid-correlated noise is interpolated between random values at the nodes of a grid in the image.
+    A stereo matcher interpolates part of the noise between widely spaced pixels (nodes of a grid); neighbouring points share
+    this grid-correlated noise.
 
     Attributes
     ----------
@@ -90,9 +91,9 @@ class DisparityNoise:
 
     @classmethod
     def of(cls, model: StereoModel) -> DisparityNoise:
-        """Summarise the matching noise of a stereo sensor model, by adding the variances of independent and of correlated noise.
+        """Summarise the matching noise of a stereo sensor model: variances of independent and of correlated terms are added.
 
-        If several noise terms have grids of nodes, the largest distance between nodes is used.
+        If several correlated terms have grids of nodes, the largest distance between nodes is used.
         """
         noise = [effect for effect in model.matching_noise if not effect.is_null]
         white, smooth = (sum(each.total_variance for each in noise if each.shared == shared) for shared in (False, True))
@@ -102,6 +103,8 @@ class DisparityNoise:
 
 def stereo_geometry(pair: StereoPair, places: Places, image_sigma_px: float = 0.0) -> StereoGeometry:
     """Compute resolution and precision of a stereo pair at n places of a wall, by error propagation instead of simulation.
+
+    It predicts what a planned pair can measure.
 
     Parameters
     ----------
@@ -192,10 +195,11 @@ def _intersection(nominal: CameraPair, points: FloatArray) -> _Derivatives:
 
 
 def orientation_covariance(pair: StereoPair, points: FloatArray) -> FloatArray:
-    """Compute the covariance of points of a stereo pair that results from the noise of both cameras' orientation, to first order.
+    """Compute by error propagation the covariance of a stereo pair's points due to the noise of both cameras' orientation.
 
     Each orientation parameter in turn is changed by its standard deviation, in one camera, or in both if its error is common to
-    them. The point is projected with the change and intersected without it; the shift is one term of the covariance.
+    them. The point is projected with the changed cameras and intersected with the unchanged ones. The outer product of the
+    shift with itself is added to the covariance.
 
     Parameters
     ----------

@@ -25,14 +25,14 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Places:
-    """Hold n places on a wall, for which the precision of a sensor is predicted. Coordinates are in the wall frame.
+    """Hold n places on a wall, for which the precision of a sensor is predicted.
 
     Attributes
     ----------
     points : (n, 3) array
-        Positions, m.
+        Positions, wall frame, m.
     normals : (n, 3) array
-        Outward unit normals of the surface.
+        Outward unit normals of the surface, wall frame.
     albedo : (n,) array
         Share of light that the rock reflects, 0 to 1.
     """
@@ -42,13 +42,15 @@ class Places:
     albedo: FloatArray
 
     def at(self, chosen: BoolArray) -> Places:
-        """Return the places on the wall that a bool mask (n,) selects."""
+        """Return the chosen ones of the n places. chosen: mask (n,), true for places to keep."""
         return Places(self.points[chosen], self.normals[chosen], self.albedo[chosen])
 
 
 @dataclass(frozen=True)
 class WallRaster:
-    """Hold a wall sampled at the pixels of a grid, looking along -z of the wall frame, for maps of predicted quantities.
+    """Hold a wall sampled on a raster of pixels in its front view, for maps of predicted quantities.
+
+    The lines of sight run along -z of the wall frame.
 
     Attributes
     ----------
@@ -65,14 +67,19 @@ class WallRaster:
     places: Places
 
     def image(self, values: NDArray[np.generic]) -> FloatArray:
-        """Arrange n values, one for each pixel with a surface, as an image (height, width) of the wall with NaN elsewhere."""
+        """Arrange predicted values at the n places as an image of the wall.
+
+        values: (n,) one for each pixel with a surface, row by row. Returns (height, width) values, NaN elsewhere.
+        """
         result = np.full(self.grid.shape, np.nan)
         result[self.found] = values
         return result
 
 
 def wall_raster(caster: RayCaster, gsd_m: float | None = None) -> WallRaster:
-    """Sample a wall at the pixels of a grid, looking along -z of the wall frame, for maps of predicted quantities.
+    """Sample a wall on a raster of pixels in its front view, for maps of predicted quantities.
+
+    The lines of sight run along -z of the wall frame.
 
     Parameters
     ----------
@@ -138,15 +145,18 @@ def visible_from(caster: RayCaster, places: Places, viewpoint: FloatArray) -> Bo
 
 
 def rotate_vectors(matrix: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Multiply each of the vectors (n, 3) by a matrix (3, 3)."""
+    """Multiply each of n vectors by a matrix, for example to rotate them into another frame.
+
+    matrix: (3, 3). vectors: (n, 3). Returns (n, 3).
+    """
     return np.einsum("ij,nj->ni", matrix, vectors)
 
 
 def surface_shift(ray: FloatArray, turn: FloatArray, normals: FloatArray) -> FloatArray:
-    """Compute how far the point where a ray hits a plane moves when the ray's direction changes a little, for error propagation.
+    """Compute how far the point where a ray hits a plane moves if the ray's direction changes a little, for error propagation.
 
-    A point of the ray is c + t r, with origin c, direction r and length t. dr is the change of r, and n the plane's normal. The
-    point moves by dp = t (dr - r (n . dr) / (n . r)).
+    The ray hits at c + t r, with origin c, direction r and length t. n is the plane's normal. If r changes by dr, the point
+    moves by dp = t (dr - r (n . dr) / (n . r)).
 
     Parameters
     ----------

@@ -33,16 +33,17 @@ class TlsGeometry:
     spacing_line_m, spacing_pulse_m
         Point spacing on the surface, from scan line to scan line (azimuth) and from pulse to pulse (zenith), m.
     footprint_m, footprint_long_m
-        Diameter of the beam across its direction, and longest extent of its footprint on the surface, m; 0 if the scanner's
-        model gives no divergence.
+        Diameter of the beam across its direction, and longest extent of its footprint on the surface, m; 0 if the sensor model
+        gives no divergence.
     range_sigma_m, azimuth_sigma_m, zenith_sigma_m
-        Standard deviations of a point along the beam, and across it towards azimuth and zenith, m.
+        Standard deviations of a point along the beam, and across it in the directions of increasing azimuth and zenith angle,
+        m.
     covariance : (n, 3, 3)
         Covariance of a point, wall frame, m2.
     normal_sigma_m
         Standard deviation of a point along the surface's normal, m.
     power
-        Received power, relative to that of albedo 1 at 100 m and normal incidence.
+        Received power, relative to that of albedo 1 at 100 m and normal incidence in clear air.
     reached
         Whether the place is within the scan window and the range limits, and its echo is strong enough to be recorded.
     sampling : Sampling
@@ -68,11 +69,13 @@ class TlsGeometry:
 def tls_geometry(scanner: LaserScanner, places: Places) -> TlsGeometry:
     """Compute resolution and precision of a laser scanner at n places of a wall, by error propagation instead of simulation.
 
-    u is the beam's direction, R the range, z the zenith angle. e_az and e_ze are the unit vectors towards increasing azimuth and
-    zenith. s_R, s_az and s_ze are the standard deviations of range and angles, which are independent. The covariance of a point
-    is then s_R^2 u u' + (R sin z s_az)^2 e_az e_az' + (R s_ze)^2 e_ze e_ze'. On a plane, a beam that leaves in another direction
-    than recorded causes the same error along the normal as a point moved across the beam. If two faces are averaged, the mean
-    has half of these variances.
+    It predicts what a planned scan can measure. The covariance of a point is
+
+        s_R^2 u u' + (R sin z s_az)^2 e_az e_az' + (R s_ze)^2 e_ze e_ze'
+
+    u is the beam's direction, R the range and z the zenith angle. e_az and e_ze are the unit vectors
+    towards increasing azimuth and zenith angle. s_R, s_az and s_ze are the standard deviations of range and angles, which are
+    independent; ' means transposed. If two faces are averaged, the covariance is halved.
 
     Parameters
     ----------

@@ -86,11 +86,13 @@ class ReferenceSurface:
     ) -> FloatArray:
         """Pair points with their nearest reference points, and sum up what the normal equations of one ICP iteration need.
 
-        The sum runs over pairs of a moved point p and a reference point q, at most `gate` apart, in the reference's coordinates.
-        It is that of u u^T, where the column vector u of a pair is, with the translation g of the pose and q's normal n,
-        with normals n:  ((p - g) x n, n, n . (p - q), 1), so that the result is (8, 8);
-        without:         (p - g, q - p, 1), so that it is (7, 7).
-        The last element of the result is the number of pairs.
+        The result is the sum of u u^T over all pairs of a moved point p and a reference point q that are at most `gate`
+        apart. The column vector u of a pair is, with the translation g of the pose and q's normal n:
+
+        - with normals: ((p - g) x n, n, n . (p - q), 1), so that the result is (8, 8)
+        - without normals: (p - g, q - p, 1), so that it is (7, 7)
+
+        Its last element is the number of pairs. All coordinates are the reference's.
 
         Parameters
         ----------

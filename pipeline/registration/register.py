@@ -113,10 +113,10 @@ class IcpIteration:
     outlier_threshold_m : float
         Outlier threshold of this iteration, m.
     rms_m : float
-        RMS of the inliers' residuals after the step, with the pairs found before it, m (point_to_plane: to first order in the
-        rotation).
+        RMS of the inliers' residuals after the step, with the pairs found before it, m (point_to_plane: to first order in
+        the rotation).
     error_m : float
-        The same RMS over all points in use, with each outlier's residual set to the outlier threshold, m.
+        RMS of the residuals of all points in use, where an outlier counts with the outlier threshold as its residual, m.
     residual_change_m : float
         RMS over the inliers of the change of their residuals in the step, m.
     step_m : float
@@ -274,7 +274,7 @@ def register_to(
 ) -> Registration:
     """Find the rigid transform that brings a cloud to a reference whose search tree exists already, by ICP.
 
-    It saves time over `register` when many clouds are registered to one reference, and raises the same errors.
+    It saves time over `register` when many clouds are registered to one reference, and raises InputError as that does.
 
     Parameters
     ----------

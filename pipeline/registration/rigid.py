@@ -85,9 +85,9 @@ class RigidTransform:
 
 
 def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:
-    """Return the (3, 3) rotation matrix of a rotation vector w (3,): axis times angle, rad.
+    """Return the (3, 3) rotation matrix of a rotation vector, by Rodrigues' formula I + sin(a)/a W + (1 - cos(a))/a^2 W^2.
 
-    It is Rodrigues' formula I + sin(a)/a W + (1 - cos(a))/a^2 W^2, with a = |w| and W the cross-product matrix of w.
+    rotation_vector: (3,) vector w, the axis times the angle a = |w|, rad. W is its cross-product matrix.
     """
     x, y, z = rotation_vector
     skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

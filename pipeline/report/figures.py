@@ -396,9 +396,9 @@ def _no_data_legend(axes: Axes, values: NDArray[np.floating], colour: str, outli
 
 
 def pooling(grid: Grid) -> int:
-    """Return by which factor a raster is reduced for a picture of at most 2000 pixels a side.
+    """Return the factor by which a raster is reduced so that its picture has at most 2000 pixels a side.
 
-    Blocks of this many by this many pixels are then averaged to one pixel of the picture. 1 means no reduction.
+    With the factor f, the mean of f x f pixels becomes one pixel of the picture; 1 means no reduction. grid: the raster.
     """
     return max(1, int(np.ceil(max(grid.width, grid.height) / _WIDEST_PX)))
 

@@ -59,7 +59,8 @@ def acquire(config: SimulationConfig, site: SensorSite, scene: RayCaster, random
     Parameters
     ----------
     config : SimulationConfig
-        Method of reconstruction and products; the right depth map is only made if one of these needs it.
+        Says how surfaces are reconstructed and which products are written. A stereo pair's right depth map is only made
+        if one of them needs it.
     site : SensorSite
         The sensor and its position.
     scene : RayCaster
@@ -75,8 +76,8 @@ def acquire(config: SimulationConfig, site: SensorSite, scene: RayCaster, random
     Raises
     ------
     InputError
-        If the reconstruction does not fit the sensor: `colmap` for a laser scanner, or `vertices` for anything but a stereo
-        pair with simulated matching.
+        If the reconstruction does not fit the sensor: `colmap` for a laser scanner, or `vertices` for anything but a
+        stereo pair with simulated matching.
     """
     sensor, colmap = site.sensor, config.reconstruction == "colmap"
     vertices = None

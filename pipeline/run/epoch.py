@@ -69,7 +69,7 @@ class LaterEpoch:
     blocks : list of dict
         Record of each fallen block: its true shape, place and volume, and what the difference map shows of it.
     surface : TriangleMesh
-        The reconstructed surface before registration.
+        The reconstructed surface before registration, wall frame.
     registration : Registration, optional
         Registration of the surface to the reference; None without ICP.
     raster : SurfaceRaster
@@ -83,8 +83,8 @@ class LaterEpoch:
     since_last : SinceLast, optional
         Change since the epoch before, in a time series.
     rockfalls : int
-        Number of all rockfalls of a time series, by which its labels tell niches, moved blocks and deposits apart; 0 without a
-        series.
+        In a time series, the number n of all its rockfalls; else 0. Labels 1 to n are niches, n + 1 to 2 n moved blocks,
+        and 2 n + 1 to 3 n deposits.
     """
 
     number: int

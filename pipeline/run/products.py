@@ -64,7 +64,8 @@ def is_whole(out: Path, checksums: Checksums, where: Path) -> bool:
     Returns
     -------
     bool
-        True if all files exist with these checksums; False if there are none.
+        True if every listed file exists with its checksum; False if one is missing or changed, or if `checksums` is
+        empty.
 
     Raises
     ------

@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 
 def recorded_points(observations: Sequence[Observation]) -> PointCloud:
-    """Collect all points that the sensor recorded in an epoch as one point cloud, as points.laz stores it.
+    """Collect all points that the sensor recorded in an epoch as one point cloud, m, as points.laz stores it.
 
-    observations: one for each station (set-up). Its points follow in the order of the pulses and of the returns of a pulse, m.
-    Times count from the start of the station's scan.
+    observations: one for each station (set-up of the scanner). The points are in the order of the stations, of the
+    pulses, and of the returns of a pulse. Times count from the start of the station's scan.
 
     Extra channels are the true values (such as `true_range_m`, if asked for); `block`, the label of the fallen block;
-    `return_number` and `number_of_returns` if a pulse has several returns; `scan_angle_rad` of a scanner (nominal, from straight
-    down); and `station`, from 1, if there are several.
+    `return_number` and `number_of_returns` if a pulse has several returns; `scan_angle_rad` of a scanner (nominal, from
+    straight down); and `station`, from 1, if there are several.
     """
     clouds = [_of_station(observation) for observation in observations]
     if len(clouds) == 1:

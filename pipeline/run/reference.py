@@ -44,8 +44,8 @@ def reference_and_target(
 ) -> tuple[TriangleMesh, ReferenceSurface | None]:
     """Prepare the surface of the first epoch for the comparison, and the surface to which ICP registers later epochs.
 
-    With `icp_target: true_wall` the first epoch is itself registered to the true wall, like all others. Otherwise its own error
-    of orientation would appear in every difference map.
+    By default later epochs are registered to the first one. With `icp_target: true_wall` all epochs are registered to the
+    true wall, the first one too, as its own error of orientation would otherwise appear in every difference map.
 
     Parameters
     ----------

@@ -99,7 +99,8 @@ class Series:
     conditions : SeriesConditions
         Pose and effects of the sensor, snow and vegetation at each epoch.
     plants : KeyedRandom, optional
-        Source of the places where plants grow, to have them alike in several series; None: `random` decides.
+        Source of random numbers for the places where plants grow. Several series with the same one have the same plants.
+        None: `random`.
     """
 
     config: SimulationConfig
@@ -132,10 +133,10 @@ class Series:
         return self.site.frame.direction_to_wall(np.array([0.0, 0.0, 1.0]))
 
     def site_at(self, number: int) -> SensorSite:
-        """Return the wall and the sensor in the conditions of an epoch: with snow and plants, and with the pose of that time.
+        """Return the wall and the sensor in the conditions of an epoch, to simulate its measurement.
 
-        The wall is the untouched one; the parameters of the sensor's systematic effects are also those of that time.
-        number: of the epoch; 0 is the reference.
+        The wall is the untouched one, with snow and plants. The sensor has the pose, and the parameters of systematic
+        effects, of that time. number: of the epoch; 0 is the reference.
         """
         shift = self.conditions.poses[number]
         values = {
@@ -171,9 +172,10 @@ class Series:
         return self.conditions.covers[number].on(mesh, self.up, random.child("series", "cover"))
 
     def rules(self) -> Rules:
-        """Draw all rockfalls of the time series, and collect what else is the same at all its epochs.
+        """Draw all rockfalls of the time series, to follow the wall through time by `states`.
 
-        Raises InputError if the wall has no room for blocks, or if there would be too many rockfalls.
+        Returns the rockfalls with what holds at all epochs: where blocks may lie, their shapes, and the ground on which
+        fragments come to rest. Raises InputError if the wall has no room for blocks, or if there would be too many rockfalls.
         """
         keyed, given = self.random.child("series", "rockfalls"), self.series
         rockfalls = given_rockfalls(given.events, given.falls_h())
@@ -249,10 +251,10 @@ class SeriesScene:
     scene : EpochScene
         The wall as the sensor observes it, with the records of the fallen blocks.
     state : WallState, optional
-        The wall without snow and plants, with the rocks that have moved or fallen; None, as is `rules`, if the user gives the
-        meshes of the wall (`surfaces`).
+        The wall without snow and plants, with the rocks that have moved or fallen. None if the user's own meshes
+        (`surfaces`) are the wall.
     rules : Rules, optional
-        All rockfalls of the series and the placement of their blocks.
+        All rockfalls of the series and the placement of their blocks. None with the user's own meshes.
     new : (k,) int32 array
         Labels of what has fallen, moved or come to rest since the epoch before.
     """
@@ -321,11 +323,11 @@ class SeriesTruth:
     rules : Rules
         All rockfalls, and how their blocks are shaped and placed.
     rocks : dict
-        By the number of the rockfall, the rock cut out of the wall and the bounding box of its fragments at the foot of the wall
-        (wall frame, m); None in place of the box if there are no fragments.
+        By number of the rockfall, a pair: the rock cut out of the wall, and the bounding box of its fragments at the foot
+        of the wall (wall frame, m), or None if there are no fragments.
     volumes : list of dict
-        For each epoch its number, the volumes that have fallen and that have begun to move, the volume of the first wall, and
-        the balance of volumes (0 except for rounding), m3.
+        For each epoch its number and, in m3, the volumes that have fallen and that have begun to move, the volume of the
+        first wall, and the balance of volumes (0 except for rounding).
     """
 
     series: Series

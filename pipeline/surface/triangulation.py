@@ -59,8 +59,8 @@ class SeenSurface:
     def error_m(self) -> float:
         """Estimated standard deviation of the mesh's vertices along the lines of sight, m.
 
-        If vertices are means of neighbouring points, their errors are correlated. The value is then that of independent vertices
-        that would give equal noise of the surface between vertices.
+        If vertices are means of neighbouring points (`smoothed`), their errors are correlated. The value is then that of
+        independent errors which would make the surface between the vertices equally noisy.
         """
         return float(np.nan_to_num((_OF_SEVEN / _BETWEEN if self.smoothed else 1.0) * self.roughness_m))
 
@@ -68,7 +68,8 @@ class SeenSurface:
 def triangulate_seen_points(points: FloatArray, viewpoint: FloatArray, rotation: FloatArray, where: str) -> SeenSurface:
     """Make a triangle mesh from a point cloud as seen from one place, by Delaunay triangulation of the directions.
 
-    Edges across steps in depth and across holes are cut.
+    Triangles that would bridge a gap are removed: those with an edge across a step in depth, or much longer than the
+    typical point spacing.
 
     Parameters
     ----------
@@ -84,7 +85,7 @@ def triangulate_seen_points(points: FloatArray, viewpoint: FloatArray, rotation:
     Raises
     ------
     InputError
-        If no triangle is left.
+        If all points lie on one line of sight, or all triangles had to be removed.
     """
     from scipy.spatial import Delaunay, QhullError
 
@@ -104,7 +105,9 @@ def triangulate_seen_points(points: FloatArray, viewpoint: FloatArray, rotation:
     faces = faces[_uncut(local, distance, plane, faces)]
     if not len(faces):
         raise InputError(
-            "no triangle is left between the points", where=where, remedy="give a denser cloud, or a triangle mesh instead"
+            "no triangle between neighbouring points lies on the wall: all span gaps in depth",
+            where=where,
+            remedy="give a denser cloud, or a triangle mesh instead",
         )
     faces = _towards(faces, local)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])

@@ -57,7 +57,7 @@ def wall_figure(
     layer : Layer
         The quantity that gives the colours.
     shown : collection of str
-        What to draw: "surface", "points" and kinds of items.
+        What to draw: any of "surface", "points", "block", "detection", "event" and "scene change".
     selected : int, optional
         Index in `items` of the one to highlight.
     """
@@ -120,9 +120,9 @@ def map_figure(
     layer : Layer
         The quantity that gives the colours.
     shown : collection of str
-        Kinds of items to draw.
+        Which items to draw: any of "block", "detection", "event" and "scene change".
     window : ViewWindow or None
-        Left, right, lower and upper limit of the axes, wall frame, m; None for the whole patch.
+        Limits of the axes, wall frame, m; None for the whole patch.
     selected : int, optional
         Index in `items` of the one to highlight.
     """

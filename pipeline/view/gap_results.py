@@ -38,10 +38,11 @@ class GapResults:
     """Result of `scarpsim gap` (the diagnosis of a measurement), as `scarpsim view` shows it in the browser.
 
     It shows the residuals: how much deeper the measured surface is than the sensor model predicts, positive where rock is
-    missing. The user switches between the model before and after the diagnosis (a `step` of `Results`); the latter includes the
-    systematic effects that were found.
+    missing. The user switches between the model before the diagnosis and the one after it, which includes the systematic
+    effects that were found. Each is a `step`, as the class `Results` calls the states that the viewer can show.
 
-    The folder does not state the sensor's position, so the wall is shown from the side on which its normal points upwards.
+    The folder does not state the sensor's position, so the wall is shown from the side on which its normal points
+    upwards.
     """
 
     step_name = "model"

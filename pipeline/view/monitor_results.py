@@ -27,8 +27,9 @@ _REMEDY = "run scarpsim monitor again with another --out"
 class MonitorResults:
     """Result of `scarpsim monitor` (what changed on a wall from epoch to epoch), as `scarpsim view` shows it in the browser.
 
-    The user moves between the epochs (a `step` of `Results`; each view of the wall, if there are several, is a step of its own)
-    and selects events, the changes that monitor lists (an `item` of `Results`).
+    The user moves between the epochs and selects events, the changes that `monitor` lists. If the wall is mapped in
+    several parts (views), the user moves between the views of each epoch. For the class `Results`, the interface of the
+    viewer, each epoch or view is a `step`, and each event an `item`.
     """
 
     step_name = "epoch"

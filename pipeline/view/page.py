@@ -208,14 +208,14 @@ def pictures(
     layer : Layer
         The quantity that gives the colours.
     shown : list of str
-        What to draw: "surface", "points" and kinds of items.
+        What to draw: any of "surface", "points", "block", "detection", "event" and "scene change".
     number : int or None
-        Index of the selected item.
+        Index of the selected block, detection, event or change; None: no one.
     window : ViewWindow or None
         Part of the wall; None: all of it.
     second : (Pair, str, float), optional
-        For a picture with a border: what can be shown right of it, the key of the choice, and the share of the width, 0 to 1,
-        left of it.
+        To compare two states left and right of a vertical border: what the right side can show, the key of the state that
+        it shows, and the share of the picture's width, 0 to 1, that is left of the border.
 
     Returns
     -------

@@ -29,8 +29,9 @@ _ROCK, _HEIGHT = Layer("rock", "rock (shaded)", ""), Layer("height", "relief", "
 class RunResults:
     """Result of `scarpsim simulate` (a simulated run), as `scarpsim view` shows it in the browser.
 
-    The user moves between epochs (a `step` of `Results`) and selects fallen blocks (an `item` of `Results`). If a folder of
-    `scarpsim detect` is given, its detections can be selected too.
+    The user moves between epochs and selects fallen blocks, as well as the detections of a folder of `scarpsim detect` if
+    there is one. For the class `Results`, the interface of the viewer, each epoch is a `step`, and each block or
+    detection an `item`.
     """
 
     step_name = "epoch"

@@ -21,8 +21,8 @@ _SIGMA_M = 0.01
 class TileResults:
     """A split of a data set (train, val or test), as `scarpsim view` shows it in the browser.
 
-    The user moves from tile to tile, the images of difference maps (a `step` of `Results`), and selects annotated blocks (an
-    `item` of `Results`).
+    The user moves from tile to tile, the images of difference maps, and selects annotated blocks. For the class
+    `Results`, the interface of the viewer, each tile is a `step`, and each block an `item`.
     """
 
     step_name = "tile"
@@ -62,7 +62,7 @@ class TileResults:
         return Patch(*centres(grid, rows, columns, factor), -shown, shown * _MM, np.zeros(shown.shape, int), factor)
 
     def points(self, step: str, layer: Layer, window: ViewWindow | None, budget: int) -> PointLayer | None:
-        """Return None, as a data set contains difference maps but no measured points; the arguments have no effect."""
+        """Return None, as a data set contains difference maps but no measured points; all arguments have no effect."""
         return None
 
     def items(self, step: str) -> list[Item]:

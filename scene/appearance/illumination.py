@@ -76,7 +76,7 @@ def sun_position(time: datetime, latitude_rad: float, longitude_rad: float) -> S
     Notes
     -----
     Refraction is that of a standard atmosphere; below 15 deg of elevation it may differ by more than the stated accuracy
-        (Michalsky 1988, Solar Energy 40(3), with his errata of 1988).
+    (Michalsky 1988, Solar Energy 40(3), with his errata of 1988).
     """
     moment = time if time.tzinfo else time.replace(tzinfo=UTC)
     days = (moment - J2000).total_seconds() / 86400
@@ -184,9 +184,9 @@ class Illumination:
         scene : RayCaster
             The surface that casts shadows.
         point : 3 x (n,)
-            Positions of the surface elements in the scene's frame, m, as device vectors.
+            Positions of the surface elements in the scene's frame, m, on the ray-tracing device.
         normal : 3 x (n,)
-            Unit normals of the surface.
+            Unit normals of the surface, on the ray-tracing device.
         """
         sun, up = (mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in axis)) for axis in (self.sun, self.up))
         towards = mi.Array3f64(sun)

@@ -21,9 +21,10 @@ _SAMPLES = 1 << 18
 
 
 class WetnessConfig(Config):
-    """Wet rock: the albedo of the patches is multiplied by a factor, in the same places in every epoch.
+    """Wet patches of rock, which return weaker echoes to a laser scanner and are darker in photographs.
 
-    Wet patches return weaker echoes to a laser scanner and are darker in photographs. They are drawn at random from `seed`.
+    The albedo of the rock in a patch is multiplied by `albedo_factor`. The patches are drawn at random from `seed` and lie in the
+    same places in every epoch.
     """
 
     share: float = Field(0.3, ge=0, le=1, description="share of the rock that is wet, on a wall much larger than a patch")
@@ -39,7 +40,7 @@ class WetnessConfig(Config):
     def with_wet_patches(self, mesh: TriangleMesh) -> TriangleMesh:
         """Return the mesh (wall frame) with lower albedo at wet vertices, as a sensor meets the wet rock.
 
-        It is the given mesh itself if nothing is wet or darkened.
+        If nothing is wet or darkened, it is the argument `mesh` itself.
         """
         if self.share == 0 or self.albedo_factor == 1:
             return mesh

@@ -171,9 +171,11 @@ def place_blocks(config: RockfallConfig, mesh: TriangleMesh, random: KeyedRandom
 
     A block keeps its shape and is tried at positions drawn uniformly from the safe zone (the wall without a strip along its
     border and its holes), until its bounding box lies inside the zone and far enough from those of the other blocks. Large
-    blocks are placed first, so that small ones do not take their room. The middle of a block's z range then lies at the largest
-    z of the wall within its contour (`placement: relief`), at that of the wall's vertices (`highest_vertex`), or at the median
-    z (`mean_surface`). A block that does not reach into the rock there is placed again.
+    blocks are placed first, so that small ones do not take their room.
+
+    `config.placement` says at which height the middle of the block's z range then lies. It is the largest z of the wall's surface
+    within the block's contour (`relief`), the largest z of its vertices there (`highest_vertex`), or its median z there
+    (`mean_surface`). A block that does not reach into the rock at this height is placed again.
 
     Parameters
     ----------

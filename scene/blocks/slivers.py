@@ -31,9 +31,9 @@ IndexArray = NDArray[np.intp]
 
 
 def smallest_height(corners: FloatArray) -> FloatArray:
-    """Return the height (m,) of each of m triangles over its longest side, m, to find needle-shaped triangles (slivers).
+    """Return the height, m, of each of n triangles over its longest side, (n,), to find needle-shaped triangles (slivers).
 
-    corners: (m, 3, 3) array with the three corners of each triangle, m.
+    corners: (n, 3, 3) array with the three corners of each triangle, m.
     """
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     longest = np.sqrt(np.maximum(np.maximum(_square(b - a), _square(c - b)), _square(a - c)))

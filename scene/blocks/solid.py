@@ -29,8 +29,8 @@ neighbours included."""
 class Solid:
     """A closed mesh in the form of the library Manifold, which computes differences and intersections of solids (booleans).
 
-    Each triangle of a result still tells its row number in this mesh. `identity` is Manifold's number of this mesh, by which
-    the result tells from which mesh a triangle comes.
+    In the result of such a computation, each triangle keeps the row number of the triangle of this mesh that it is a part of.
+    `manifold` is the mesh itself, and `identity` is the number by which the result tells which triangles come from it.
     """
 
     manifold: Manifold
@@ -107,9 +107,9 @@ def split_wall(wall: Solid, blocks: Solid) -> tuple[Piece, Piece]:
 
 
 def read_piece(result: Manifold, first: Solid) -> Piece:
-    """Read the mesh that Manifold computed as the difference or intersection of the solid `first` with another one.
+    """Read the mesh that Manifold computed as the difference or intersection of two solids.
 
-    The result tells which faces come from `first`.
+    result: Manifold's mesh. first: the first of the two solids, whose faces are told from those of the second one.
     """
     mesh = result.to_mesh64()
     run_end = np.asarray(mesh.run_index).astype(np.int64) // 3

@@ -61,9 +61,10 @@ class Course(Config):
         return self
 
     def values(self, hours: FloatArray, random: KeyedRandom) -> FloatArray:
-        """Return by how much a quantity that changes over time departs from its configured value at n epochs, (n,), in its unit.
+        """Return by how much a quantity departs from its configured value at n epochs, (n,), in the unit of the quantity.
 
-        It is the sum of what the config states: a random walk, a drift, a cycle and a table of values.
+        A course describes how a condition of a series, such as the range scale, changes over time. The departure is the sum of
+        what the config states for it: a random walk, a drift, a cycle and a table of values.
 
         hours: (n,) times of the epochs, h, increasing; a random walk and a drift start at the first. random: source of the
         random walk.

@@ -107,15 +107,15 @@ class TriangleMesh:
     def edge_order(self) -> NDArray[np.int64]:
         """(3 m,) indices that sort the integers of the triangles' sides (`edges`), so that shared sides follow one another.
 
-        Equal ones keep their order.
+        Equal integers keep their order.
         """
         return np.argsort(self.edges, kind="stable")
 
     @cached_property
     def shared_edges(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Positions (k,) and (k,) in the array `edges` of the two sides of each edge that exactly two triangles share.
+        """The k edges that exactly two triangles share, to find neighbouring triangles: positions of their two sides in `edges`.
 
-        Position p is a side of triangle p modulo m, where m is the number of triangles.
+        Each array (k,) holds one side of every edge. Position p is a side of triangle p modulo m, the number of triangles.
         """
         order, ordered = self.edge_order, self.edges[self.edge_order]
         again = np.concatenate([[False], ordered[1:] == ordered[:-1], [False]])

@@ -66,7 +66,9 @@ class PointPlanes:
     def along(self, rays: FloatArray, point: NDArray[np.int32]) -> FloatArray:
         """Return the scatter (n, k), m, of points about their fitted planes, measured along rays, not normal to the planes.
 
-        rays: (n, 3) unit vectors. point: (n, k) numbers of the points whose planes are meant, k for each ray.
+        It tells how precisely rays hit the surface that the planes stand for.
+
+        rays: (n, 3) unit vectors. point: (n, k) for each ray, the numbers of the k points whose planes it may hit.
         """
         return _along(rays[:, None], self.normal[point], self.scatter_m[point])
 

@@ -289,7 +289,7 @@ def connected_groups(pairs: NDArray[np.integer], count: int) -> Index:
     pairs: (k, 2) numbers of linked elements. count: number of elements. Returns the number of each element's group (count,);
     groups are numbered by first appearance.
 
-    Every element points to the smallest member of its group known so far. A round links the groups that a pair joins to the
+    Every element points to the smallest element of its group known so far. A round links the groups that a pair joins to the
     smaller one, then follows the pointers to their ends (Shiloach and Vishkin 1982). SciPy's version takes as long, and its
     import takes longer.
     """

@@ -23,9 +23,7 @@ def orient_to_sensors(
 ) -> Repaired:
     """Order the corners of all triangles counter-clockwise as seen from the sensors, so that normals point to them.
 
-    This is done for each connected piece of the mesh.
-
-    A piece that mostly shows its back is flipped. Vertices do not change.
+    Each connected piece of the mesh that mostly shows its back is flipped. Vertices do not change.
 
     Parameters
     ----------

@@ -60,6 +60,8 @@ def highest_vertex_under(caster: RayCaster, outlines: Sequence[FloatArray]) -> F
 def median_under(caster: RayCaster, outlines: Sequence[FloatArray]) -> FloatArray:
     """Return the median z (k,) of the wall within the contour of each of k blocks, m; -inf where there is no wall.
 
+    A block whose middle lies at this height is about half in the rock.
+
     Parameters
     ----------
     caster : RayCaster

@@ -133,7 +133,7 @@ def join_meshes(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
 
 
 def read_reference(path: Path) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """Read a surface that measurements are compared with from a mesh file, m, and notes on it for the report.
+    """Read a mesh file with the surface that measurements are compared with; return the mesh, m, and notes on it for a report.
 
     Vertices stay as in the file, because repairs could move what is measured against. Raises InputError if the file cannot be
     used.
@@ -151,9 +151,10 @@ def read_reference(path: Path) -> tuple[TriangleMesh, tuple[str, ...]]:
 
 
 def read_mesh(path: Path, unit: str = "m") -> tuple[TriangleMesh, tuple[str, ...]]:
-    """Read a triangle mesh from a file, converted from `unit` to m, and notes on its coordinates for the report.
+    """Read a triangle mesh from a file; return it, converted to m, and notes on its coordinates for a report.
 
-    Raises InputError if the file cannot be read, or if coordinates are not finite, implausibly large or spoilt by rounding.
+    `unit` is the unit of the file's coordinates, such as "mm". Raises InputError if the file cannot be read, or if coordinates
+    are not finite, implausibly large or spoilt by rounding.
     """
     where, metres = str(path), METRES[unit]
     mesh = _read(path, unit)

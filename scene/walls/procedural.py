@@ -84,7 +84,8 @@ class Site:
     roughness, hurst : float
         Amplitude of the fractal relief at a scale of 1 m (m), and its Hurst exponent (1).
     albedo, bed_tone, block_tone, streaks : float
-        Mean albedo (0 to 1), and the contrast of beds, of blocks and of water streaks.
+        Mean albedo (0 to 1), and about the standard deviation by which it varies between beds, between blocks and by water
+        streaks.
     notches_per_m2, notch_m : float
         Number of erosional notches per m2, and their median size (m).
     band : Band, optional
@@ -290,13 +291,13 @@ class Rock:
     bend_u, bend_v : Fractal
         How far beds and joints depart from straight lines, m.
     fault, ledge, bed_tone : Table
-        Offset of the beds by faults (m), relief of hard and soft beds (m), and tone of the beds.
+        Offset of the beds by faults (m), relief of hard and soft beds (m), and how far the beds' albedo differs from the mean.
     blocks, band_blocks : tuple of JointedBlocks
         Blocks between beds and joints, of the wall and of its seam of another rock.
     notches : Notches, optional
         Erosional notches.
     patches, streaks, grain
-        Variation of the albedo: patches, water streaks and grain.
+        Patches of more and of less broken rock, and the variation of the albedo by water streaks and from point to point.
     """
 
     site: Site

@@ -195,12 +195,11 @@ class BlockRule:
 
 @dataclass(frozen=True)
 class JointedBlocks:
-    """Blocks into which beds and joints divide a generated wall, stored as tables.
+    """Blocks into which beds and joints divide a generated wall: how far each protrudes, and how bright it is.
 
-    The tables have a row for each bed and a column for each centimetre of the coordinate t along the beds.
-
-    The coordinates follow the rock: s = v - dip u crosses the beds, and t = u - lean v crosses the joints, m, with u along the
-    wall, v up its slope, and the slopes `dip` and `lean` of the rule.
+    They are stored as tables with a row for each bed and a column for each centimetre along the beds. The coordinates, m, follow
+    the rock: s = v - dip u crosses the beds, and t = u - lean v runs along them and crosses the joints. Here u is along the wall,
+    v is up its slope, and `dip` and `lean` are the slopes in the rule.
 
     Attributes
     ----------
@@ -210,7 +209,7 @@ class JointedBlocks:
         Table row as a function of s: a whole number within a bed, rising to the next over `ramp_m` of the rule, so that
         bilinear interpolation of the tables makes the steps between beds.
     across : Table
-        Distance of s from the middle of its bed, m.
+        Distance of s from the middle of its bed as a function of s, m.
     start : float
         t of the first column, m.
     height, slope, tone : float32 arrays (beds, columns)
@@ -246,8 +245,8 @@ class JointedBlocks:
     def at(self, u: Field, v: Field) -> tuple[Field, Field]:
         """Return the relief of the blocks' faces, m, and the tone of the blocks at positions in the wall plane.
 
-        u, v: (any shape) positions along the wall and up its slope, m, after the bends of beds and joints. The tone is a
-        standard normal number for each block, which makes its albedo higher or lower.
+        u, v: (any shape) positions along the wall and up its slope, m, already shifted by how far beds and joints depart from
+        straight lines there. The tone is a standard normal number for each block, which makes its albedo higher or lower.
         """
         s = v - np.float32(self.rule.dip) * u
         t = u - np.float32(self.rule.lean) * v
@@ -300,7 +299,8 @@ class Notches:
     def at(self, u: Field, v: Field) -> Field:
         """Return the depth of the notches, m, at positions in the wall plane.
 
-        u, v: (any shape) positions along the wall and up its slope, m, after the bends of beds and joints.
+        u, v: (any shape) positions along the wall and up its slope, m, already shifted by how far beds and joints depart from
+        straight lines there.
         """
         return _look_up(self.depth, u / np.float32(_NOTCH_STEP_M), v / np.float32(_NOTCH_STEP_M))
 
@@ -326,10 +326,10 @@ def draw_partings(draw: np.random.Generator, start: float, stop: float, mean: fl
 
 
 def ramp_knots(edges: FloatArray, ramp: float | FloatArray) -> FloatArray:
-    """Return the positions (2 n,), m, between which each of n steps of the relief rises, two for each step.
+    """Return where the steps of the relief at beds or joints begin and end to rise: (2 n,) positions, m, two for each of n steps.
 
-    edges: (n,) positions of the steps (beds or joints), m, ascending. ramp: width over which a step rises, m; it is less where
-    edges are close together.
+    edges: (n,) positions of the steps (beds or joints), m, ascending. ramp: width over which a step rises, m, one number or (n,);
+    it is less where edges are close together.
     """
     half = np.broadcast_to(np.asarray(ramp) / 2, edges.shape).copy()
     gap = np.diff(edges)

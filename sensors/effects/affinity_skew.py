@@ -26,8 +26,9 @@ class AffinitySkew(CameraEffect):
     b2_px: float = parameter("real minus calibrated skew", unit="px", source="Metashape user manual, appendix D", ge=-1e4, le=1e4)
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
-        """Add the errors of affinity and skew, px, to the parameters b1 and b2 of the real camera.
+        """Return the camera pair with the errors of affinity and skew, px, added to b1 and b2 of the real camera.
 
-        state: the cameras before this effect. `random` is not used.
+        state: the real cameras before this effect. The effect's `camera` says which of them changes, the left, the right or both.
+        `random` is not used.
         """
         return state.changed(self.camera, b1=self.b1_px, b2=self.b2_px)

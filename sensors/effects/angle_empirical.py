@@ -47,7 +47,7 @@ class AngleEmpirical(Effect):
         return not any(map(any, self.values_rad))
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Add the curve's value at each pulse's covariate, rad, to the recorded azimuth or zenith.
+        """Return the pulses with an error of azimuth or zenith, rad: the curve's value at each pulse's covariate.
 
         state: the pulses of a scan before this effect. `random` is not used.
         """

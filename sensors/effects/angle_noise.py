@@ -38,7 +38,7 @@ class AngleNoise(Effect):
     )
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Draw each pulse's errors of azimuth and zenith, rad, independently.
+        """Return the pulses with normal errors of azimuth and zenith, rad, drawn independently for each angle of each pulse.
 
         state: the pulses of a scan before this effect. random: source of random numbers.
         """

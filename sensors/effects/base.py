@@ -155,9 +155,9 @@ class Effect(Config, ABC):
 
     @classmethod
     def scored(cls) -> bool:
-        """Return whether the effect can be judged by a Gaussian log score of residuals.
+        """Return whether `scarpsim gap` can judge the effect by a Gaussian log score of residuals.
 
-        It can if it changes the mean or the scatter of ranges or disparities.
+        It can if the effect changes the mean or the scatter of ranges or disparities.
         """
         return cls.shows_in in (ShowsIn.MEAN, ShowsIn.SPREAD)
 

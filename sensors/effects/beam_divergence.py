@@ -17,11 +17,14 @@ class BeamDivergence(Effect):
     A pulse scanner merges echoes closer than c tau / 2 (c: speed of light) into one return at their centroid, weighted by power
     (mixed pixels). It records the first return, the strongest, the mean of all returns, or all of them. In the last case (mode
     `multiple`) the strongest fills the cell of the scan's grid, and the others are listed as further points. A phase scanner
-    adds all echoes as phasors, whatever the mode. On a tilted plane the footprint is D R / cos i long, and the mean range is
-    that of the axis to second order in D. A return belongs to the fallen block, if any, that gave its strongest echo. At edges
-    a return is biased towards the surface that is hit more squarely, whose echo is stronger. On a rough wall of 1 M pulses at
-    105 m this bias was 0.18 +- 0.03 mm on average. When all echoes were given the same power it was -0.01 +- 0.02 mm, so the
-    sub-rays themselves cause no bias.
+    adds all echoes as phasors, whatever the mode.
+
+    At the range R and the incidence angle i, the footprint on a plane is D R / cos i long, and the mean range is that of the axis
+    to second order in D. A return belongs to the fallen block, if any, that gave its strongest echo.
+
+    At edges a return is biased towards the surface that is hit more squarely, whose echo is stronger. On a rough wall of 1 M
+    pulses at 105 m this bias was 0.18 +- 0.03 mm on average. When all echoes were given the same power it was
+    -0.01 +- 0.02 mm, so the sub-rays themselves cause no bias.
     """
 
     name: Literal["beam_divergence"] = "beam_divergence"
@@ -51,7 +54,9 @@ class BeamDivergence(Effect):
     )
 
     def evaluate(self, state: Beam, random: KeyedRandom) -> Beam:
-        """Replace the beam of no width by one of this divergence, with its sub-rays and its way of ranging.
+        """Return a beam with this divergence, in place of one without width.
+
+        The new beam also says how many sub-rays represent it, and how the ranges of their echoes become one.
 
         state: the beam before this effect. `random` is not used.
         """

@@ -22,8 +22,9 @@ class CameraKappa(CameraEffect):
     angle_rad: float = parameter("real minus nominal rotation", unit="rad", source="photogrammetry", typical=1e-4, ge=-1, le=1)
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
-        """Rotate the real camera by the angle, rad, about its own z (viewing) axis.
+        """Return the camera pair with the real camera rotated by the angle, rad, right-handed, about its own z (viewing) axis.
 
-        state: the cameras before this effect. `random` is not used.
+        state: the real cameras before this effect. The effect's `camera` says which of them changes, the left, the right or both.
+        `random` is not used.
         """
         return state.rotated(self.camera, axis=2, angle_rad=self.angle_rad)

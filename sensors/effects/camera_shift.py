@@ -25,8 +25,9 @@ class CameraShift(CameraEffect):
     z_m: float = parameter("real minus nominal perspective centre, world z", unit="m", source="photogrammetry", ge=-10, le=10)
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
-        """Shift the real camera's perspective centre by (x, y, z), m, world frame.
+        """Return the camera pair with the real camera's perspective centre shifted by (x, y, z), m, world frame.
 
-        state: the cameras before this effect. `random` is not used.
+        state: the real cameras before this effect. The effect's `camera` says which of them changes, the left, the right or both.
+        `random` is not used.
         """
         return state.shifted(self.camera, np.array([self.x_m, self.y_m, self.z_m]))

@@ -38,14 +38,14 @@ class DetectionLimit(Effect):
     )
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Drop the returns whose received power is below the minimum.
+        """Return the pulses without the returns whose received power is below the minimum.
 
         state: the pulses of a scan before this effect. `random` is not used.
         """
         return replace(state, returned=state.returned & (state.power >= dr.opaque(mi.Float32, self.minimum_power)))
 
     def kept(self, at: PulseGeometry) -> FloatArray:
-        """Return 1 for a received power of at least the minimum and 0 below it, (n,).
+        """Return the probability (n,) that each return is detected: 1 for a power of at least the minimum, 0 below it.
 
         at: geometry of n pulses, as NumPy arrays.
         """

@@ -42,7 +42,7 @@ class DisparityEmpirical(Effect):
         return not any(map(any, self.values_px))
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        """Add c(x, y), px, the curve or surface `values_px` interpolated at each match, to the match's disparity.
+        """Return the matches with c(x, y), px, added to each disparity: the curve or surface `values_px`, interpolated.
 
         state: the matched cells of the depth map before this effect. `random` is not used.
         """

@@ -29,8 +29,9 @@ class FocalLength(CameraEffect):
     )
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
-        """Add the error, px, to the real camera's principal distance.
+        """Return the camera pair with the error, px, added to the real camera's principal distance.
 
-        state: the cameras before this effect. `random` is not used.
+        state: the real cameras before this effect. The effect's `camera` says which of them changes, the left, the right or both.
+        `random` is not used.
         """
         return state.changed(self.camera, f_px=self.delta_px)

@@ -15,10 +15,11 @@ from sensors.signal_chain.matches import Matches
 class FrontoParallelBias(Effect):
     """A matcher with windows of one disparity is biased in proportion to the gradient of the disparity.
 
-    dd = min(max(a |grad d| + b d_u, -L), L), with the slope a, the displacement b, the limit L and the change d_u of the
-    disparity d per column. It lies between -L and L. A window on a slanted surface contains a range of disparities and takes
-    one of them (Bleyer et al. 2011, 1). An asymmetric window takes that of a place beside its centre, b px along the row
-    (Kanade & Okutomi 1994). Registration absorbs most of b, because it displaces the whole surface.
+    dd = min(max(a |grad d| + b d_u, -L), L) is the bias of the disparity d, where a is `slope_px`, b is `row_px`, L is
+    `limit_px`, and d_u is the change of d per column. The first term is for windows that find one disparity in the range that a
+    slanted surface has within them (Bleyer et al. 2011, 1). The second is for asymmetric windows, which find the disparity of a
+    place b px along the row from their centre (Kanade & Okutomi 1994). That displaces the whole surface along the row, so that
+    registration removes most of it.
     """
 
     name: Literal["fronto_parallel_bias"] = "fronto_parallel_bias"
@@ -59,7 +60,7 @@ class FrontoParallelBias(Effect):
         return np.clip(linear, -self.limit_px, self.limit_px)
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        """Add the bias to the disparities, px; a cell whose neighbours have no match keeps its disparity.
+        """Return the matches with the bias, px, added to the disparities; a cell whose neighbours have no match keeps its own.
 
         state: the matched cells of the depth map before this effect. `random` is not used.
         """

@@ -46,7 +46,7 @@ class HeavyTailedNoise(NodeNoise):
     )
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        """Add smooth noise, px, to the disparities, with a local size that itself varies smoothly.
+        """Return the matches with smooth noise, px, added to the disparities; its local size itself varies smoothly.
 
         state: the matched cells of the depth map before this effect. random: source of random numbers.
         """

@@ -40,7 +40,7 @@ class AimEffect(Effect):
         """
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Add the angle errors to the pulses: recorded minus true azimuth and zenith, rad.
+        """Return the pulses with the errors of azimuth and zenith, recorded minus true, rad.
 
         state: the pulses of a scan before this effect. `random` is not used.
         """
@@ -72,7 +72,7 @@ class RangeEffect(Effect):
         """
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Add the systematic error, m, to each recorded range.
+        """Return the pulses with the systematic error, m, added to each recorded range.
 
         state: the pulses of a scan before this effect. `random` is not used.
         """
@@ -103,7 +103,7 @@ class RangeSpread(Effect):
         """
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Add normal noise, m, to each recorded range, independently for each pulse.
+        """Return the pulses with normal noise, m, added to each recorded range, independently for each pulse.
 
         state: the pulses of a scan before this effect. random: source of random numbers.
         """

@@ -25,7 +25,7 @@ class ParallaxNoise(MatchingNoise):
     sigma_px: float = parameter("standard deviation of the disparity", unit="px", source="empirical", typical=0.3, ge=0, le=1000)
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        """Add normal noise, px, to each disparity, independently for each cell.
+        """Return the matches with normal noise, px, added to each disparity, independently for each cell.
 
         state: the matched cells of the depth map before this effect. random: source of random numbers.
         """

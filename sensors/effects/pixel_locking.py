@@ -46,7 +46,7 @@ class PixelLocking(Effect):
     )
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        """Add the sine of the matched disparity, px, to the noisy disparity.
+        """Return the matches with the bias A sin(2 pi d / n + phase), px, added to each disparity d, which contains all noise.
 
         state: the matched cells of the depth map before this effect. `random` is not used.
         """
@@ -57,7 +57,7 @@ class PixelLocking(Effect):
         return replace(state, disparity=state.disparity + amplitude * _wave(matched / period, phase, DEVICE))
 
     def mean(self, at: Any) -> FloatArray:
-        """Return the change (n,) of the disparity, px, at the disparities that were found.
+        """Return the bias (n,) of the disparity towards whole pixels, px, at the disparities that the matcher found.
 
         at: geometry of n matched pixels of the stereo pair, as NumPy arrays.
         """

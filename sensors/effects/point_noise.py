@@ -14,12 +14,13 @@ from sensors.signal_chain.surface_places import RecordedPoints
 
 
 class PointNoise(Effect):
-    """Points lie above or below the surface, along its normal, by white and by grid-correlated noise.
+    """Points of a cloud without cameras lie above or below the surface, along its normal, by white and grid-correlated noise.
 
-    The white part is independent for each point. Its standard deviation is sqrt(sigma_m^2 + (steep_sigma_m b)^2), with the
-    slope b against the wall's plane in radians. The correlated part is interpolated bilinearly between the nodes of a grid on
-    the wall's plane, which are `shared_step_m` apart and have independent normal values of standard deviation `shared_sigma_m`.
-    Empirical: `scarpsim gap` and `scarpsim measurement` estimate it; no publication gives its values.
+    It stands for the matching noise of a stereo pair whose cameras, and so disparities, are unknown. The white part is
+    independent for each point. Its standard deviation is sqrt(sigma_m^2 + (steep_sigma_m b)^2), with the slope b against the
+    wall's plane in radians. The correlated part is interpolated bilinearly between the nodes of a grid on the wall's plane,
+    which are `shared_step_m` apart and have independent normal values of standard deviation `shared_sigma_m`. Empirical:
+    `scarpsim gap` and `scarpsim measurement` estimate it; no publication gives its values.
     """
 
     name: Literal["point_noise"] = "point_noise"
@@ -60,7 +61,7 @@ class PointNoise(Effect):
         return own + (self.steep_sigma_m * np.nan_to_num(at.covariates["slope"])) ** 2 if self.steep_sigma_m else own
 
     def evaluate(self, state: RecordedPoints, random: KeyedRandom) -> RecordedPoints:
-        """Move each point along the surface's normal by white and grid-correlated noise, m.
+        """Return the points moved along the surface's normal by white and by grid-correlated noise, m.
 
         state: the recorded points before this effect. random: source of random numbers.
         """

@@ -36,7 +36,7 @@ class Precipitation(Effect):
     )
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Lose returns at random by their range, and give back a share of them at the range of a drop, m.
+        """Return the pulses after rain: returns are lost at random, more at long range, and some come from a drop instead.
 
         state: the pulses of a scan before this effect. random: source of random numbers.
         """

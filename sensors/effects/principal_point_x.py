@@ -28,8 +28,9 @@ class PrincipalPointX(CameraEffect):
     )
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
-        """Shift the real camera's principal point along x by the error, px.
+        """Return the camera pair with the real camera's principal point shifted along x by the error, px.
 
-        state: the cameras before this effect. `random` is not used.
+        state: the real cameras before this effect. The effect's `camera` says which of them changes, the left, the right or both.
+        `random` is not used.
         """
         return state.changed(self.camera, cx_px=self.delta_px)

@@ -28,8 +28,9 @@ class PrincipalPointY(CameraEffect):
     )
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
-        """Shift the real camera's principal point along y by the error, px.
+        """Return the camera pair with the real camera's principal point shifted along y by the error, px.
 
-        state: the cameras before this effect. `random` is not used.
+        state: the real cameras before this effect. The effect's `camera` says which of them changes, the left, the right or both.
+        `random` is not used.
         """
         return state.changed(self.camera, cy_px=self.delta_px)

@@ -32,8 +32,9 @@ class RadialDistortion(CameraEffect):
     k4: float = parameter("real minus calibrated k4", unit="1", source="Metashape user manual, appendix D", ge=-100, le=100)
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
-        """Add the errors of k1 to k4 to the real camera's radial distortion.
+        """Return the camera pair with the errors of k1 to k4 added to the real camera's radial distortion.
 
-        state: the cameras before this effect. `random` is not used.
+        state: the real cameras before this effect. The effect's `camera` says which of them changes, the left, the right or both.
+        `random` is not used.
         """
         return state.changed(self.camera, k1=self.k1, k2=self.k2, k3=self.k3, k4=self.k4)

@@ -41,7 +41,7 @@ class RangeEmpirical(Effect):
         return not any(map(any, self.values_m))
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Add the value at each pulse's covariates, m, to its recorded range.
+        """Return the pulses with the error, m, at each pulse's covariates added to its recorded range.
 
         state: the pulses of a scan before this effect. `random` is not used.
         """

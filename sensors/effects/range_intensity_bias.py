@@ -18,8 +18,9 @@ class RangeIntensityBias(RangeEffect):
     """The range error depends on the received power (time walk).
 
     dR = k ln(I / I_0), with the coefficient k, the received power I, and I_0 a given power or the median of all pulses that
-    return. A weaker echo crosses a fixed threshold later, so k is negative there. The median belongs to one scan: give I_0 if
-    several scans, or parts of a scan, have to agree. Pulses that are lost only at the return stage count in the median.
+    return. A detector with a fixed threshold notices a weak echo later: its k is negative. If a correction overdoes it, k is
+    positive. The median belongs to one scan: give I_0 if several scans, or parts of a scan, have to agree. Pulses that other
+    effects remove afterwards count in the median.
     """
 
     name: Literal["range_intensity_bias"] = "range_intensity_bias"
@@ -48,9 +49,9 @@ class RangeIntensityBias(RangeEffect):
         return p.coefficient_m * m.log(at.power / p.reference_power)
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Add the range error, m. Without a given reference power, the median power of all pulses that return is taken.
+        """Return the pulses with the range error, m, added; the reference power is by default the median of all returns.
 
-        state: the pulses of a scan before this effect. random: source of random numbers.
+        state: the pulses of a scan before this effect. `random` is not used.
         """
         if self.reference_power:
             return super().evaluate(state, random)

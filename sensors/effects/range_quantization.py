@@ -31,7 +31,7 @@ class RangeQuantization(Effect):
     step_m: float = parameter("step of the recorded range", unit="m", source="datasheets", typical=0.001, ge=0, le=100)
 
     def evaluate(self, state: Pulses, random: KeyedRandom) -> Pulses:
-        """Round each recorded range to a multiple of the step, m.
+        """Return the pulses with each recorded range rounded to a multiple of the step, m.
 
         state: the pulses of a scan before this effect. `random` is not used.
         """

@@ -33,7 +33,9 @@ class RasterEffect(Effect):
         """
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        """Filter the raster of disparities, px; a step of more than one matched pixel counts as a depth step.
+        """Return the matches with filtered disparities, px.
+
+        Neighbouring cells whose disparities differ by more than the side of a cell (px of the frame) are a depth step.
 
         state: the matched cells of the depth map before this effect. `random` is not used.
         """

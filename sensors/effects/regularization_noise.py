@@ -35,7 +35,7 @@ class RegularizationNoise(NodeNoise):
     sigma_px: float = parameter("standard deviation at the nodes", unit="px", source="empirical", typical=0.2, ge=0, le=1000)
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        """Add grid-correlated noise, px, to the disparities.
+        """Return the matches with grid-correlated noise, px, added to the disparities.
 
         state: the matched cells of the depth map before this effect. random: source of random numbers.
         """

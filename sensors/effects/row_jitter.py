@@ -47,7 +47,7 @@ class RowJitter(Effect):
         return p.amplitude_px * m.sin(2 * math.pi * row / p.rows_per_cycle + p.phase_rad)
 
     def evaluate(self, state: ImageRows, random: KeyedRandom) -> ImageRows:
-        """Displace the columns of the camera's image by the wave at their row, px.
+        """Return the pixels with their columns displaced, px, by the wave at their row, if this effect is on their camera.
 
         state: pixels of one camera's image before this effect. `random` is not used.
         """

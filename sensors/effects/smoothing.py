@@ -31,7 +31,7 @@ class Smoothing(RasterEffect):
 
     @classmethod
     def scored(cls) -> bool:
-        """Return whether the effect can be judged by a log score of residuals: True.
+        """Return whether `scarpsim gap` can judge the effect by a log score of residuals: True.
 
         Smoothing changes disparities on every curved part of the surface, not only at edges.
         """

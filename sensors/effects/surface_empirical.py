@@ -49,7 +49,7 @@ class SurfaceEmpirical(Effect):
         )
 
     def evaluate(self, state: RecordedPoints, random: KeyedRandom) -> RecordedPoints:
-        """Move each point along the surface's normal by the value at its covariates, m.
+        """Return the points moved along the surface's normal by the error, m, at each point's covariates.
 
         state: the recorded points before this effect. `random` is not used.
         """

@@ -33,8 +33,9 @@ class TangentialDistortion(CameraEffect):
     )
 
     def evaluate(self, state: CameraPair, random: KeyedRandom) -> CameraPair:
-        """Add the errors of p1 and p2 to the real camera's tangential distortion.
+        """Return the camera pair with the errors of p1 and p2 added to the real camera's tangential distortion.
 
-        state: the cameras before this effect. `random` is not used.
+        state: the real cameras before this effect. The effect's `camera` says which of them changes, the left, the right or both.
+        `random` is not used.
         """
         return state.changed(self.camera, p1=self.p1, p2=self.p2)

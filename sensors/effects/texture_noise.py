@@ -46,7 +46,7 @@ class TextureNoise(Effect):
     coefficient: float = parameter("k", unit="1", source="Cramer-Rao bound", typical=2.0, ge=0, le=1e6)
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        """Add normal noise, px, to each disparity, larger where the albedo has little texture.
+        """Return the matches with normal noise, px, added to each disparity, larger where the albedo has little texture.
 
         Raises InputError if the wall has no albedo.
 

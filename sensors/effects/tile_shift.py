@@ -35,7 +35,7 @@ class TileShift(Effect):
     tile_px: float = parameter("side of a tile", unit="px", source="empirical", null=None, default=256.0, gt=0)
 
     def shift(self, u: Any, v: Any, m: Functions, p: Any) -> Any:
-        """Return the change of the disparity (n,), px, that the tile of each pixel has.
+        """Return the shift (n,), px, of the disparity in the tile in which each pixel lies.
 
         u, v: (n,) columns and rows in the left image, px. m: elementary functions for these arrays, `HOST` for NumPy or
         `DEVICE` for Dr.Jit. p: object with the effect's parameters as numbers.
@@ -44,14 +44,14 @@ class TileShift(Effect):
         return p.amplitude_px * (1 - 4 * (half - m.floor(half)))
 
     def evaluate(self, state: Matches, random: KeyedRandom) -> Matches:
-        """Shift the disparities, px, of each tile.
+        """Return the matches with the disparities, px, of each tile of the image shifted.
 
         state: the matched cells of the depth map before this effect. `random` is not used.
         """
         return replace(state, disparity=state.disparity + self.shift(state.u, state.v, DEVICE, DeviceParameters(self)))
 
     def mean(self, at: Any) -> FloatArray:
-        """Return the change of the disparity (n,), px, that the tile of each pixel has.
+        """Return the shift (n,), px, of the disparity in the tile in which each pixel lies.
 
         at: geometry of n matched pixels of the stereo pair, as NumPy arrays.
         """

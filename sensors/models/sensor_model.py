@@ -92,9 +92,10 @@ class TlsModel(Config):
 
 
 class DrawnParameter(Config):
-    """Mean and standard deviation of an orientation parameter, drawn at each observation; a single number is the sigma.
+    """Normal distribution from which an error of a camera's orientation is drawn at each observation.
 
-    The parameter is a difference of real from calibrated orientation of a camera.
+    The error is the real minus the calibrated value of one orientation parameter. A single number in a config is the standard
+    deviation, with mean 0.
     """
 
     mean: float = Field(0.0, description="mean, in the parameter's unit")
@@ -235,7 +236,7 @@ class StereoModel(Config):
 
     @property
     def matching_noise(self) -> tuple[MatchingNoise, ...]:
-        """The parts of the base noise and of the further errors by which disparities scatter, with a known semivariogram."""
+        """Noise of the disparity whose semivariogram is known: from the base noise and from the further errors of the model."""
         noise = self.noise
         base = (
             ParallaxNoise(sigma_px=noise.parallax_sigma_px),

@@ -82,9 +82,14 @@ def interpolate(x: Any, y: Any, along: Axis, across: Axis, rows_of_values: Rows)
     x, y : device arrays, (n,)
         Where to evaluate. y plays no role for a single row.
     along, across : Axis
-        Ranges of x and of y.
-    rows_of_values : Table
-        Rows along y, each with values along x.
+        Ranges of x and of y that the table covers.
+    rows_of_values : rows of numbers
+        The table: equally spaced rows along y, each with equally spaced values along x.
+
+    Returns
+    -------
+    mi.Float64, (n,)
+        Interpolated values.
     """
     values = np.asarray(rows_of_values, dtype=np.float64)
     rows, columns = values.shape
@@ -109,9 +114,9 @@ def interpolate_on_host(x: FloatArray, y: FloatArray, along: Axis, across: Axis,
     x, y : (n,) arrays
         Where to evaluate. y plays no role for a single row.
     along, across : Axis
-        Ranges of x and of y.
-    rows_of_values : Table
-        Rows along y, each with values along x.
+        Ranges of x and of y that the table covers.
+    rows_of_values : rows of numbers
+        The table: equally spaced rows along y, each with equally spaced values along x.
 
     Returns
     -------

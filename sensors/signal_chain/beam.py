@@ -36,7 +36,9 @@ _NOWHERE_M = 1e30
 
 @dataclass(frozen=True)
 class Echo:
-    """The echo of one ray of each of n pulses, or the return of each pulse, as arrays (n,) of the ray-tracing device.
+    """Echoes of n pulses, one for each pulse, as arrays (n,) of the ray-tracing device.
+
+    They are either what one ray of each pulse hits, or the returns that the receiver records of the pulses.
 
     Attributes
     ----------
@@ -85,8 +87,9 @@ class SubRays:
     def over(self, step: Callable[..., tuple[Any, ...]], *state: Any) -> tuple[Any, ...]:
         """Run a function once for each sub-ray, for all pulses together, to combine the echoes of each pulse.
 
-        step(echo, *state) gets the echo of one sub-ray of all pulses, and the state so far; it returns the new state. Returns
-        the final state. The sub-rays follow one another in a loop of the compiled kernel.
+        step: function step(echo, *state) that gets the echo of one sub-ray of all pulses, and the state so far; it returns the
+        new state, a tuple. state: the state before the first sub-ray, such as sums of 0. Returns the state after the last one.
+        The sub-rays follow one another in a loop of the compiled kernel.
         """
         many = dr.opaque(mi.UInt32, self.many)
         first = many * dr.arange(mi.UInt32, dr.width(self.echoes.range_m) // self.many)

@@ -65,7 +65,7 @@ class Matches:
     reduction : int
         Frame px per cell; one cell is one px of the image that is matched.
     tangent : mi.Float64
-        Tangent of the angle, up or down, between lines of sight in the cell's rectified row and the rectified axis.
+        Tangent of how far lines of sight in the cell's rectified row point below the rectified axis.
     infinity : float
         Disparity of a point at infinity.
     """

@@ -16,7 +16,7 @@ from scene.ray_casting.raycast import RayCaster
 
 @dataclass(frozen=True)
 class FurtherReturns:
-    """The returns of a scan that are not in its grid, which has one return a pulse, for pulses with several returns.
+    """Further returns of a scan's pulses: the scan's grid holds one return a pulse, and this the others of pulses with several.
 
     There are n of them, sorted by cell and then by range.
 
@@ -37,7 +37,7 @@ class FurtherReturns:
     truth : dict of (n,) arrays
         Error-free quantities by name, as for the returns in the grid.
     grid_number, grid_count : (h, w) uint8 arrays
-        Return number of the point in the grid, and the pulse's number of returns.
+        Return number of the point in each cell of the grid, and its pulse's number of returns.
     """
 
     cell: NDArray[np.int64]

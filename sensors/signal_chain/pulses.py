@@ -116,14 +116,14 @@ class Pulses:
     def normals(self, random: KeyedRandom) -> mi.Array4f:
         """Draw four independent standard normal numbers for each pulse, for noise.
 
-        random: source of random numbers; each of its children gives other ones.
+        random: source of random numbers. To draw more numbers for another purpose, pass one of its children.
         """
         return random.normals(self.pulse_key, self.line_key)
 
     def uniforms(self, random: KeyedRandom) -> mi.Array4f:
         """Draw four independent numbers in [0, 1) for each pulse, such as to decide which returns are lost.
 
-        random: source of random numbers; each of its children gives other ones.
+        random: source of random numbers. To draw more numbers for another purpose, pass one of its children.
         """
         return random.uniforms(self.pulse_key, self.line_key)
 

@@ -45,15 +45,20 @@ def further_returns(
 ) -> FurtherReturns:
     """Collect the returns that a scan's grid does not hold, for pulses with several returns, in order of cell and range.
 
-    Effects may have lost returns: numbers and counts refer to the remaining ones.
+    Effects may have lost returns; the return numbers and counts of the result refer to the remaining ones.
 
     Parameters
     ----------
     found : sequence of (cells, in_grid, returns)
-        For each return number, increasing: the cells of pulses with several returns, whether each return is the one in the grid
-        of `seen`, and what was recorded of it.
+        For each return number, increasing, the n pulses with several returns that have one of this number: the number (n,) of
+        their cell of the grid, row by row; a mask (n,), True where the grid holds this return; and what was recorded of it.
     seen : Observation
-        The scan's grid.
+        The scan's grid, h x w cells.
+
+    Returns
+    -------
+    FurtherReturns
+        The returns beside those in the grid.
     """
     shape = seen.depth.shape
     cell, in_grid, depth = (np.concatenate(part) for part in zip(*[(c, g, r.depth) for c, g, r in found], strict=True))

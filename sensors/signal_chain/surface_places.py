@@ -63,8 +63,9 @@ class SurfacePlaces:
     def covariates(self) -> dict[str, FloatArray]:
         """The quantities on which errors of points may depend, by name, (n,) each.
 
-        They are the position `along`, `up` and `out` (x, y, z in the wall frame, m), `slope` against the wall's plane (rad),
-        and `roughness`, `convexity` and `edge_distance` (m).
+        `along`, `up` and `out`: position x, y, z in the wall frame, m. `slope`: angle against the wall's plane, rad. `roughness`
+        and `convexity`: standard deviation of the vertices nearby from their plane, and height above their centre, m.
+        `edge_distance`: distance to the nearest edge of the mesh (its border or a crease), m.
         """
         along, up, out = self.point.T
         return {
@@ -126,7 +127,7 @@ class ShapedSurface:
 
     @property
     def rim(self) -> NDArray[np.int64]:
-        """Numbers (k,) of the vertices on the mesh's open borders."""
+        """Indices (k,) of the mesh's vertices on its open borders, which are edges of the measured surface."""
         edges, uses = np.unique(self.mesh.edges, return_counts=True)
         return np.unique(np.concatenate(np.divmod(edges[uses == 1], len(self.mesh.vertices))))
 

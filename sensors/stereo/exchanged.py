@@ -26,7 +26,11 @@ StereoSensor = StereoPair | MatchedStereoPair
 
 
 def pair_of(sensor: StereoSensor) -> StereoPair:
-    """Return the cameras of a stereo sensor with their settings, whether its matching is modelled or done on photographs."""
+    """Return the camera pair of a stereo sensor with its settings, for either kind of sensor.
+
+    A `StereoPair`, which models the errors of matching, is returned itself; of a `MatchedStereoPair`, which matches rendered
+    photographs, the pair that it contains is returned.
+    """
     return sensor.pair if isinstance(sensor, MatchedStereoPair) else sensor
 
 

@@ -107,8 +107,9 @@ class Studio:
             Frame pixels per pixel of the picture, along a row or a column.
         samples_per_side : int
             Rays per pixel along a row or a column.
-        displaced : Displacement
-            Function that gives the sideways displacement of image rows; by default there is none.
+        displaced : callable
+            Function that returns, for image rows v (n,), px of the frame, by how far they are displaced sideways, (n,), px:
+            recorded minus ideal column. By default 0.
         """
         rows, columns = camera.height // step, camera.width // step
         index = dr.arange(mi.UInt32, rows * columns)

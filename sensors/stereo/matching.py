@@ -30,9 +30,9 @@ SPECKLE_STEP_PX = 1.0
 
 
 class MatchingConfig(Config):
-    """The real matcher; its pixels are those of the pictures it matches, that is the depth map's cells.
+    """Settings of OpenCV's semi-global matching (a variant of Hirschmueller 2008), which really matches rendered photographs.
 
-    It is OpenCV's semi-global matching (a variant of Hirschmueller 2008), which runs on rendered photographs.
+    One pixel (px) is one of the pictures that are matched, which are as large as the depth map, not one of the full frame.
     """
 
     block_size_px: int = Field(5, ge=1, le=21, description="side of the window whose costs are summed, odd [px]")
@@ -73,9 +73,10 @@ class SearchRange:
 
     @classmethod
     def between(cls, smallest: float, largest: float) -> SearchRange:
-        """Return the range of disparities to search that contains `smallest` and `largest`, cells of the depth map.
+        """Return a range of disparities for the matcher to search that contains all from `smallest` to `largest`.
 
-        Raises InputError if it is too wide to be matched.
+        Both are in cells of the depth map, fractions allowed. The range has at least one cell more on either side, and its
+        count is rounded up to a multiple of 16. Raises InputError if it is too wide to be matched.
         """
         least = int(np.floor(smallest)) - 1
         count = 16 * int(np.ceil((largest + 2 - least) / 16))
@@ -122,9 +123,10 @@ def match(left: Picture, right: Picture, search: SearchRange, config: MatchingCo
 
 
 def without_speckles(disparity: Disparity, speckle_px: int) -> Disparity:
-    """Remove small isolated regions from a depth map: stray matches, such as those in the sky.
+    """Remove small isolated regions from the disparities of a depth map, such as stray matches in the sky; return the others.
 
-    disparity: (h, w), cells, NaN without a match. Connected smooth regions of at most `speckle_px` cells become NaN.
+    disparity: (h, w), in cells of the depth map, NaN without a match. speckle_px: a connected region of at most this many
+    cells, in which neighbours differ by at most one cell of disparity, becomes NaN.
     """
     known = ~np.isnan(disparity)
     least = np.float32(np.floor(disparity[known].min())) if known.any() else np.float32(0)

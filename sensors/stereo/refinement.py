@@ -40,9 +40,10 @@ LARGEST_SHIFT_PX = 1.5
 
 
 class RefinementConfig(Config):
-    """Least-squares matching after the semi-global one; pixels are the depth map's cells.
+    """Settings of least-squares matching, which improves the disparities that semi-global matching has found.
 
-    It improves each disparity by fitting a small window of the right picture to that of the left one.
+    Each disparity is fitted anew, with a small window of the right picture against that of the left one. One pixel (px) is one of
+    the pictures that are matched, that is a cell of the depth map.
     """
 
     steps: int = Field(3, ge=1, le=50, description="iterations")

@@ -100,8 +100,12 @@ class StereoPair:
 
         Returns
         -------
-        Matches, u, v, points
-            The matches, the rectified left pixels (u, v), px, and the true points 3 x (n,), wall frame, m.
+        Matches
+            The n cells of the left depth map with their disparities.
+        u, v : (n,)
+            Columns and rows of the cells in the left image as rectified with the nominal (calibrated) cameras, px.
+        points : 3 x (n,)
+            True points that the cells see, wall frame, m.
         """
         nominal = self.cameras.in_wall_frame(self.frame)
         real = self.real_pair(effects, random).in_wall_frame(self.frame)
@@ -273,9 +277,11 @@ def rectified_disparity(
 
 
 def row_tangent(geometry: Rectification, v: mi.Float64) -> mi.Float64:
-    """Return the tangent (n,) of the angle between lines of sight in rectified rows and the rectified axis, up or down.
+    """Return the tangent (n,) of how far lines of sight in rectified rows point below the rectified axis, such as for a tilt.
 
-    geometry: the rectification of the cameras. v: (n,) rows, px.
+    It is Y/Z in the frame of the rectified camera (y down, z forward).
+
+    geometry: the rectification of the cameras. v: (n,) rows of the rectified image, px.
     """
     scale, centre = opaque(geometry.f, geometry.v)
     return (v - centre) / scale

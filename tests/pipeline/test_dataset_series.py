@@ -11,6 +11,7 @@ import pytest
 from pycocotools.coco import COCO
 from tiny_dataset import TINY, digests, tiny
 
+from pipeline.dataset.combine import merge_datasets
 from pipeline.dataset.config import DatasetConfig
 from pipeline.dataset.epoch import StageCache, make_epoch
 from pipeline.dataset.loaders import Tiles
@@ -124,6 +125,11 @@ def test_kinds_are_categories_and_training_takes_the_missing_rock(tmp_path: Path
         "deposit",
     ]
     assert {each["category_id"] for each in CocoFolder(tmp_path / "set/test").annotations} == {1}
+    plain = tmp_path / "plain"
+    make_dataset(config({"test": 1}), plain)
+    with pytest.raises(InputError, match=r"one category, block.*same `series.kinds`"):
+        merge_datasets([tmp_path / "set", plain], tmp_path / "merged")
+    assert not (tmp_path / "merged").exists()
 
 
 @pytest.mark.parametrize(

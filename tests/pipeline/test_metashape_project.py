@@ -107,7 +107,7 @@ def test_an_only_chunk_needs_not_be_active(project: Path) -> None:
             lambda psx, files: _unknown_packing(files / "2" / "chunk.zip"),
             r"not an archive of a Metashape project \(.*not supported",
         ),
-        (lambda psx, files: _archive(files / "2" / "chunk.zip", "<frame/>"), "begins with <frame>"),
+        (lambda psx, files: _archive(files / "2" / "chunk.zip", "<frame/>"), "has <frame> as its outermost element"),
         (lambda psx, files: _archive(files / "2" / "chunk.zip", "<chunk>"), "not valid XML"),
         (lambda psx, files: _archive(files / "2" / "chunk.zip", "<!DOCTYPE x><chunk/>"), "entities"),
         (

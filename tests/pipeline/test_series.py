@@ -231,6 +231,28 @@ def test_truth_and_points_show_a_deposit(finished: Path) -> None:
     assert inside[0] > inside[1] + 60
 
 
+def test_py4dgeo_analyses_the_epochs_as_the_how_to_says(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the second block falls before the last epoch, distances are those of its creep first, and then of its niche."""
+    pytest.importorskip("py4dgeo")
+    page = (Path(__file__).parents[2] / "docs/howto/series.md").read_text()
+    (code,) = (each for each in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "py4dgeo" in each)
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs/series").symlink_to(finished)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(code, names)
+    analysis = names["analysis"]
+    assert [each.total_seconds() / 3600 for each in analysis.timedeltas] == [6, 12, 18]
+    second = json.loads((finished / "series.json").read_text())["events"][1]
+    places = analysis.corepoints.cloud
+    assert analysis.distances.shape == (len(places), 3)
+    near = np.linalg.norm(places[:, :2] - second["block"]["position_m"][:2], axis=1) < 0.2
+    first, before, after = np.nanmedian(np.abs(analysis.distances[near]), axis=0)
+    assert first == pytest.approx(second["displacement_m"][1], abs=0.003)
+    assert before == pytest.approx(second["displacement_m"][2], abs=0.003)
+    assert after > 0.05
+
+
 def test_the_how_to_s_config_is_short_and_loads(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs/howto/series.md").read_text()
     (text,) = re.findall(r"```yaml title=\"series.yaml\"\n(.*?)```", page, re.DOTALL)

@@ -125,7 +125,7 @@ def without_duplicates(found: Iterable[Detection]) -> list[Detection]:
 
 
 def not_covered_by(found: Iterable[Detection], others: Sequence[Detection]) -> list[Detection]:
-    """Return the detections of `found` of which no detection in `others` covers most of the pixels."""
+    """Return the detections in `found` that are missing in `others`: none of these covers most of their pixels."""
     bounds = np.array([item.bounds for item in others]).reshape(-1, 4)
 
     def covered(item: Detection) -> bool:
@@ -136,17 +136,17 @@ def not_covered_by(found: Iterable[Detection], others: Sequence[Detection]) -> l
 
 
 def bounds_overlap(bounds: NDArray[np.int64], other: tuple[int, int, int, int]) -> NDArray[np.bool_]:
-    """Find which rectangles overlap another one.
+    """Find which of n rectangles overlap another rectangle.
 
-    bounds: (n, 4) first row, end row, first column and end column of each, px, ends exclusive. other: the same of the other
-    one. Returns (n,) bool.
+    bounds: (n, 4) first row, end row, first column and end column of each, px; ends are exclusive. other: these four numbers of
+    the other rectangle. Returns (n,) bool.
     """
     top, bottom, left, right = bounds.T
     return np.asarray((top < other[1]) & (other[0] < bottom) & (left < other[3]) & (other[2] < right))
 
 
 def shared_pixels(one: Detection, other: Detection) -> int:
-    """Count the pixels of a map that are in the masks of both detections."""
+    """Count the pixels of a map that are in the masks of both detections, to tell whether they are of one block."""
     top, bottom = max(one.row, other.row), min(one.bounds[1], other.bounds[1])
     first, last = max(one.column, other.column), min(one.bounds[3], other.bounds[3])
     if top >= bottom or first >= last:

@@ -33,12 +33,13 @@ class Score:
 
     Attributes
     ----------
-    group : Name of the group.
-    confidence : Lowest score that counts.
+    group : Name of the group of images.
+    confidence : Lowest score of the detections that count.
     iou : Lowest overlap (intersection over union) that counts as a match.
-    true_positives, false_positives, false_negatives : Their numbers.
+    true_positives, false_positives, false_negatives : Numbers of detections that match a block, detections that match none, and
+        blocks that were not detected.
     area_ratio : Mean of predicted over true mask area of the matches; NaN without matches.
-    kind : Overlap of masks ("segm") or boxes ("bbox").
+    kind : Overlap by which detections are matched with blocks: of masks ("segm") or boxes ("bbox").
     stand_out : Share of the blocks whose niche stands out from the noise for a matched filter, which is about the largest
         recall that any detector could reach (pipeline/change/matched_filter.py). NaN if the annotations do not say.
     """
@@ -83,8 +84,8 @@ def match_detections(overlap: NDArray[np.float64], threshold: float, crowd: NDAr
     Parameters
     ----------
     overlap : (p, t) array
-        Intersection over union of detections by falling score with blocks. With crowd regions:
-        intersection over the detection's area.
+        Overlap of p detections, best score first, with t annotations: intersection over union with a block, and intersection
+        over the detection's area with a crowd region.
     threshold : float
         Smallest overlap of a match.
     crowd : (t,) bool array, optional
@@ -170,12 +171,12 @@ def matched_scores(
     ----------
     truth, predictions : COCO annotations and detections, as in `evaluate`.
     images : Ids of the images.
-    threshold : Smallest overlap of a match.
-    kind : Overlap of masks or boxes.
+    threshold : Smallest overlap of a match (intersection over union).
+    kind : Overlap of masks ("segm") or boxes ("bbox").
 
     Returns
     -------
-    (p,) scores and (p,) bool.
+    (p,) scores of the p detections, and (p,) bool: whether each is matched.
     """
     blocks, found = _by_image_and_category(truth["annotations"]), _by_image_and_category(predictions)
     scores: list[float] = []

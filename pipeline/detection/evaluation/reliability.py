@@ -39,14 +39,14 @@ class ScoreClass:
 
     @property
     def precision(self) -> float:
-        """Share of the detections with such scores that are blocks."""
+        """Share of the detections in this class of scores that are blocks."""
         return self.right / self.detections
 
     @property
     def error(self) -> float:
-        """Standard error of the share of these detections that are blocks.
+        """Standard error of the precision in this class of scores.
 
-        One block and one false alarm are added for it, so that it is never 0 (Agresti & Coull 1998).
+        It is computed with one more block and one more false alarm, so that it is never 0 (Agresti & Coull 1998).
         """
         count = self.detections + 2
         share = (self.right + 1) / count
@@ -59,10 +59,10 @@ class Reliability:
 
     Attributes
     ----------
-    group : Name of the group.
+    group : Name of the group of images.
     classes : Score classes with at least one detection.
-    kind : Overlap of masks or boxes.
-    iou : Smallest overlap of a match.
+    kind : Overlap by which detections are matched with blocks: of masks ("segm") or boxes ("bbox").
+    iou : Smallest overlap of a match (intersection over union).
     """
 
     group: str
@@ -93,7 +93,7 @@ def reliability(
     groups: Mapping[str, Iterable[int]],
     kind: Overlap = "segm",
 ) -> list[Reliability]:
-    """Compare the scores of detections with how many of them are blocks, for groups of images.
+    """Compare the scores of detections with how many of them are blocks, for groups of images; return the result of each group.
 
     A detection is a block if their intersection over union is at least OVERLAP (0.25).
 
@@ -101,7 +101,7 @@ def reliability(
     ----------
     truth, predictions : COCO annotations and detections, as in `evaluate`.
     groups : Image ids by the name of their group.
-    kind : Overlap of masks or boxes.
+    kind : Overlap of masks ("segm") or boxes ("bbox").
     """
     return [
         _group_reliability(group, *matched_scores(truth, predictions, images, OVERLAP, kind), kind)

@@ -32,8 +32,8 @@ class BaselineConfig(Config):
 def detect(difference: NDArray[np.float32], config: BaselineConfig | None = None) -> list[Detection]:
     """Detect missing rock in a difference map without a network, by a threshold; the best detections come first.
 
-    difference: (h, w), m, NaN without data. config: settings; by default the usual ones. The score of a connected component is
-    1 - 2^-r^2, where r is its mean difference over the threshold: 0.5 at the threshold, 0.94 at twice.
+    difference: (h, w), m, NaN without data. config: settings; None: the defaults. Each connected region above the threshold is
+    a detection. Its score is 1 - 2^-r^2, where r is its mean difference over the threshold: 0.5 for r = 1, 0.94 for r = 2.
     """
     config = config or BaselineConfig()
     valid = np.isfinite(difference)

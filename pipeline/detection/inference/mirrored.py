@@ -33,7 +33,8 @@ def build_network(config: DetectorConfig, image_px: int | None = None) -> MaskRC
 class MirroredMaskRCNN(MaskRCNN):
     """A MaskRCNN that also looks at mirror images of the map (views) and averages its outputs over them, for better detections.
 
-    The `levels` of its `FirstStage` hold the feature pyramid levels P2 to P5 of each view.
+    Its `first_stage` returns a FirstStage whose `levels` are a list for each view: the levels P2 to P5 of the view's own feature
+    pyramid.
     """
 
     @property
@@ -42,10 +43,10 @@ class MirroredMaskRCNN(MaskRCNN):
         return VIEWS[self.config.head.mirrored]
 
     def first_stage(self, image: Tensor, *, training: bool) -> FirstStage:
-        """Compute features, anchor scores and anchor boxes in all mirrored views of the images; average scores and boxes.
+        """Compute features of images and their mirror images (views), and which anchors (fixed boxes) may hold a block.
 
-        image: (b, h, w, c) the images, not mirrored; the averages belong to their anchors. training: whether layers are in
-        training mode.
+        image: (b, h, w, c) images, not mirrored. training: whether layers are in training mode. The result has the features of
+        each view. Scores and box codes are mirrored back and averaged over the views.
         """
         levels, logits, codes = [], [], []
         for axes in self.views:

@@ -31,9 +31,10 @@ _TRIED = tuple(float(score) for score in 1 / (1 + np.exp(-np.linspace(-3, 5, 33)
 
 
 def set_operating_point(folder: Path, validation: CocoFolder) -> float:
-    """Calibrate the scores of a trained detector so that the usual threshold gives the largest F1, and save it.
+    """Calibrate the scores of a trained detector, so that a threshold of 0.95 gives the largest F1, and save it.
 
-    If the detector has mirrored views (`head.mirrored`), scores are calibrated with and without them.
+    A shift is added to the log odds of the scores; it depends on the size of a detection. If the detector has mirrored views
+    (`head.mirrored`), shifts are found with and without them.
 
     Parameters
     ----------
@@ -42,7 +43,7 @@ def set_operating_point(folder: Path, validation: CocoFolder) -> float:
 
     Returns
     -------
-    Shift of the log odds of a block of 16 px, as the detector is configured; 0 if nothing is detected.
+    The shift that the detector now adds for a box of 16 px; 0 if nothing is detected.
     """
     config = weights.load_config(folder)
     set_to: dict[str, float] = {}
@@ -67,18 +68,18 @@ def _best_head_shifts(model: Any, validation: CocoFolder, prefix: str) -> dict[s
 
 
 def best_shifts(truth: dict[str, Any], found: list[dict[str, Any]]) -> tuple[float, float] | None:
-    """Find how to shift the log odds of the scores so that the usual threshold CONFIDENCE gives the largest F1.
+    """Find how to shift the log odds of a detector's scores so that a score threshold of 0.95 gives the largest F1.
 
-    A detection's size is that of its box.
+    The shift may depend on the size of a detection, which is that of its box.
 
     Parameters
     ----------
     truth : COCO images and annotations.
-    found : COCO detections.
+    found : COCO detections in these images.
 
     Returns
     -------
-    Shift for a size of 16 px, and for each doubling of the size; None if nothing is detected.
+    Shift for a size of 16 px, and its change for each doubling of the size; None if nothing is detected.
     """
     best, result = 0.0, None
     for slope in _TRIED_PER_DOUBLING:

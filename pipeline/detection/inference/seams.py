@@ -59,9 +59,9 @@ class Border:
 
     Attributes
     ----------
-    axis : 0 for a border along a row, 1 along a column.
-    place : Row or column beyond which the tile does not see.
-    step : Direction of the outside, -1 or 1.
+    axis : 0 for an upper or lower side, along a row; 1 for a left or right side, along a column.
+    place : Row or column of the map at which the side lies.
+    step : Direction from the side to the outside of the tile: -1 up or left, 1 down or right.
     """
 
     axis: int

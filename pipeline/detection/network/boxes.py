@@ -51,9 +51,9 @@ def anchors(
 
 
 def intersection_over_union(left: Tensor, right: Tensor) -> Tensor:
-    """Compute the overlap of each box with each other one, as intersection over union (..., n, m); 0 if both are empty.
+    """Compute the overlap of each of n boxes with each of m others: intersection over union (..., n, m), 0 if both are empty.
 
-    left, right: boxes (..., n, 4) and (..., m, 4) as top, left, bottom, right, px.
+    left, right: the n boxes (..., n, 4) and the m others (..., m, 4) as top, left, bottom, right, px.
     """
     left, right = ops.expand_dims(left, -2), ops.expand_dims(right, -3)
     common = _common(left, right)
@@ -61,10 +61,10 @@ def intersection_over_union(left: Tensor, right: Tensor) -> Tensor:
 
 
 def share_inside(left: Tensor, right: Tensor) -> Tensor:
-    """Return the share of each box that lies in each other one, (..., n, m); 0 for empty boxes.
+    """Return the share of the area of each of n boxes that lies in each of m others, (..., n, m); 0 for empty boxes.
 
-    left, right: boxes (..., n, 4) and (..., m, 4) as top, left, bottom, right, px; the share is of `left`. This is COCO's
-    overlap with a crowd region.
+    left, right: the n boxes (..., n, 4) and the m others (..., m, 4) as top, left, bottom, right, px. This is COCO's overlap
+    with a crowd region.
     """
     left, right = ops.expand_dims(left, -2), ops.expand_dims(right, -3)
     return _common(left, right) / ops.maximum(_area(left), 1e-6)
@@ -106,7 +106,10 @@ def decode(code: Tensor, reference: Tensor) -> Tensor:
 
 
 def widened(boxes: Tensor, margin: float) -> Tensor:
-    """Move all edges of boxes (..., 4), top, left, bottom, right, outwards by `margin`, px."""
+    """Return boxes with all edges moved outwards by `margin`, px, to predict masks with a margin.
+
+    boxes: (..., 4) top, left, bottom, right, px.
+    """
     return boxes + margin * np.array([-1, -1, 1, 1], np.float32)
 
 

@@ -20,8 +20,8 @@ Loss = Literal["proposal_class", "proposal_box", "class", "box", "mask"]
 class NormalisationConfig(Config):
     """How a difference map, m, becomes the network's input.
 
-    `minmax` maps the valid pixels of each image to 0...1, as the thesis does, and so loses the amplitude. `fixed` gives asinh(d /
-    scale_m), `level_of_detection` asinh(d / (1.96 NMAD of the image)); both keep the size of a difference, in metres or in
+    `minmax` maps the valid pixels of each image to 0...1, and so loses the size of a difference. `fixed` gives asinh(d /
+    scale_m), `level_of_detection` asinh(d / (1.96 NMAD of the image)); both keep the size of a difference d, in metres or in
     multiples of the level of detection. Pixels without data become 0 (`minmax`: the image's median).
     """
 
@@ -31,7 +31,7 @@ class NormalisationConfig(Config):
 
     @property
     def channels(self) -> int:
-        """Number of channels of the network's input: the difference, and where there is data if that is added."""
+        """Number of channels of the network's input: 1 for the differences, and 1 for where there is data, if that is added."""
         return 2 if self.validity_channel else 1
 
 
@@ -100,7 +100,7 @@ class HeadConfig(Config):
     def shifts(self) -> tuple[float, float]:
         """What detection adds to the log odds of a block of 16 px, and for each doubling of its side, to calibrate scores.
 
-        With mirrored views these are the values fitted with them.
+        If `mirrored` names views, these are the values that were fitted with them.
         """
         if self.mirrored == "none":
             return self.score_shift, self.score_per_doubling
@@ -109,7 +109,11 @@ class HeadConfig(Config):
 
 
 class DetectorConfig(Config):
-    """Settings of the network, a Mask R-CNN with a feature pyramid (He et al. 2017, Lin et al. 2017)."""
+    """Settings of the network, a Mask R-CNN with a feature pyramid (He et al. 2017, Lin et al. 2017).
+
+    `normalisation` has the settings of its input, `proposal` of the search for boxes that may hold a block, and `head` of the
+    parts that classify these boxes and draw masks.
+    """
 
     backbone: Literal["fine", "light", "resnet50", "resnet101"] = Field(
         "light", description="light and fine suit CPUs; fine suits blocks of a few pixels"
@@ -125,9 +129,9 @@ class DetectorConfig(Config):
 
     @property
     def strides(self) -> tuple[int, ...]:
-        """Pixels of the image per cell of each level of the feature pyramid, P2 to P6.
+        """Distance of neighbouring features in each level of the feature pyramid, P2 to P6, px of the image.
 
-        Larger blocks are detected in levels with larger cells.
+        Larger blocks are detected in levels with larger distances.
         """
         finest = 2 if self.backbone == "fine" else 4
         return tuple(finest << level for level in range(5))
@@ -148,7 +152,8 @@ class TrainingConfig(Config):
     weight_decay: float = Field(1e-4, ge=0, le=1000, description="decay of the weights towards zero")
     clip_norm: float = Field(5.0, gt=0, le=1e9, description="largest norm of the gradient")
     loss_weights: dict[Loss, Annotated[float, Field(gt=0, le=1e6)]] = Field(
-        {}, description="factors of the losses in their sum; 1 for those not listed, as in the thesis"
+        {},
+        description="factors of the losses (proposal_class, proposal_box, class, box, mask) in their sum; 1 for those not listed",
     )
     precision: Literal["float32", "bfloat16"] = Field(
         "float32",
@@ -177,7 +182,12 @@ class TrainingConfig(Config):
         ge=0,
         description="also keep the detector every so many epochs, in folders stage_0004, ... (0: only the best and the last)",
     )
-    seed: int = Field(1, ge=0, lt=2**63, description="seed of weights, order, flips and samples")
+    seed: int = Field(
+        1,
+        ge=0,
+        lt=2**63,
+        description="seed of the initial weights, of the order and mirroring of images, and of the random choice of proposals",
+    )
 
 
 class TrainConfig(Config):

@@ -126,7 +126,8 @@ def batches(
 ) -> Iterator[Batch]:
     """Yield all images of a folder once, as batches of network inputs for one epoch of training or validation.
 
-    What is drawn depends on seed, epoch and image only. An incomplete last batch is filled with its own first images.
+    Each batch is a dictionary of the arrays that `network_input` makes of an image, stacked along a first axis. Random choices
+    depend on seed, epoch and image only. An incomplete last batch is filled with its own first images.
 
     Parameters
     ----------
@@ -165,10 +166,22 @@ def batches(
 
 
 def network_input(labelled: LabelledMap, config: DetectorConfig) -> Batch:
-    """Return one image and its blocks as the network's input, without the batch axis.
+    """Convert one image and its annotated blocks to the network's input, without the batch axis.
 
-    labelled: the map and its blocks. config: says how values are scaled. Raises InputError if there are more blocks than its
-    `most_blocks`.
+    Parameters
+    ----------
+    labelled : The map and its blocks.
+    config : Says how values are scaled, and the largest number of blocks, `most_blocks`.
+
+    Returns
+    -------
+    A dictionary of `image` (h, w, c), scaled; `boxes` (most_blocks, 4) y0, x0, y1, x1, px; `valid` (most_blocks,) 1 for a block,
+    -1 for one to ignore, 0 for an unused box; and `labels` (h, w), 1 + the index of the block at a pixel.
+
+    Raises
+    ------
+    InputError
+        If there are more blocks than `most_blocks`.
     """
     count = len(labelled.boxes)
     if count > config.most_blocks:

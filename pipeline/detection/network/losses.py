@@ -10,7 +10,8 @@ from pipeline.detection.network.boxes import Tensor
 def binary_cross_entropy(logits: Tensor, targets: Tensor, weights: Tensor) -> Tensor:
     """Compute the loss of yes-or-no predictions: the weighted mean of -[t ln s(x) + (1 - t) ln(1 - s(x))].
 
-    s is the logistic function; the result cannot overflow. logits: x, before s. targets: t, 0 to 1. weights: of each element.
+    logits: x, the predicted log odds; s(x), their logistic function, is the probability. targets: t, 0 to 1, of the same shape.
+    weights: of each prediction; they may be broadcast. The result cannot overflow.
     """
     loss = ops.maximum(logits, 0.0) - logits * targets + ops.log1p(ops.exp(-ops.abs(logits)))
     return _mean(loss, weights)

@@ -36,13 +36,16 @@ def total_loss(losses: Mapping[str, Any], weights: Mapping[Loss, float]) -> Any:
 
 @dataclass(frozen=True)
 class FirstStage:
-    """What the network computes of b images before it looks at single boxes.
+    """Output of the network's first stage for b images: their features, and which anchors may hold a block.
+
+    Anchors are boxes of fixed size and place. The second stage looks at the best of them.
 
     Attributes
     ----------
-    levels : Feature pyramid levels P2 to P5, from which boxes take their features.
-    logits, codes : Log odds (b, a) that each of the a anchors (boxes of fixed size) holds a block, and codes (b, a, 4) of
-        better boxes.
+    levels : Features (b, h, w, c) at four resolutions: strides 4, 8, 16 and 32 px (levels P2 to P5 of the feature pyramid), or
+        half of these.
+    logits : (b, a) log odds that each of a anchors holds a block.
+    codes : (b, a, 4) shift and scaling from each anchor to a box that fits the block better, as `boxes.encode` defines them.
     """
 
     levels: list[Tensor]
@@ -54,16 +57,16 @@ class MaskRCNN(keras.Model):
     """The network that detects fallen blocks in difference maps, a Mask R-CNN (He et al. 2017).
 
     Called with images only, it detects; called with blocks too, it returns the losses. The input is a dictionary. image: (b, h,
-    w, c) float32 as `normalisation.normalised` makes it, with h = w = image_px. For the losses also boxes: (b, g, 4) float32,
-    px; valid: (b, g) 1 for a block, 0 for an empty place, -1 for a block to ignore; labels: (b, h, w) int32, 1 + the index of a
-    pixel's block.
+    w, c) float32 as `normalisation.normalised` makes it, with h = w = image_px. For the losses also boxes: (b, g, 4) float32 y0,
+    x0, y1, x1, px; valid: (b, g) 1 for a block, 0 for an unused box, -1 for a block to ignore; labels: (b, h, w) int32, 1 + the
+    index of the block at a pixel, 0 for none.
 
     Parameters
     ----------
     config : Settings of the network.
     image_px : Side of the images, px; None: as in the config. It differs in training on windows.
-    seed : Seed of the weights and of sampling.
-    loss_weights : Factors of the losses in their sum; default 1.
+    seed : Seed of the initial weights, and of the random choice of anchors and proposals for the losses.
+    loss_weights : Factors of the losses in their sum, by name; 1 for those not listed.
     """
 
     def __init__(
@@ -87,12 +90,12 @@ class MaskRCNN(keras.Model):
         self.built = True  # all layers are functional models with known shapes
 
     def call(self, inputs: dict[str, Tensor], training: bool = False) -> dict[str, Tensor]:
-        """Run the network on b images: the losses if the inputs have ground truth, else the detections.
+        """Run the network on b images: return the losses if the inputs have annotated blocks, else the detections.
 
         Parameters
         ----------
         inputs : `image` (b, h, w, c); for training also `boxes`, `labels` and `valid`, as `network_input` makes them, batched.
-        training : Whether the layers, such as batch normalisation, are in training mode; only with ground truth for the heads.
+        training : Whether the layers, such as batch normalisation, are in training mode; the heads only for the losses.
 
         Returns
         -------

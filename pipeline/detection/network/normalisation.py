@@ -20,17 +20,18 @@ def nmad(difference: Image) -> float:
 
 
 def normalised(difference: Image, config: NormalisationConfig, noise_m: float | None = None) -> Image:
-    """Convert a difference map to the network's input.
+    """Scale a difference map to the values that the detector's network takes, so that maps of any noise look alike.
 
     Parameters
     ----------
-    difference : (h, w) differences, m; NaN without data.
+    difference : (h, w) differences, m; NaN without data. It may be a tile of a larger map.
     config : How to scale them.
-    noise_m : Standard deviation of the noise for `level_of_detection`, m, of the map that the image was cut from; None: the NMAD.
+    noise_m : Standard deviation of the noise of the whole map, m. It is used by the method `level_of_detection` alone, which
+        divides by the level that noise of this size has. None: the NMAD of `difference`.
 
     Returns
     -------
-    (h, w, channels) float32.
+    (h, w, channels) float32: the scaled differences and, if the config asks for it, 1 where there are data and 0 elsewhere.
     """
     valid = np.isfinite(difference)
     if config.method == "minmax":

@@ -19,13 +19,16 @@ _IGNORED = 0.5
 
 @dataclass(frozen=True)
 class AnchorTargets:
-    """Anchors of b images, drawn for the loss of the region proposal network.
+    """Anchors (boxes of fixed size) of b images, drawn at random for the loss of the region proposal network.
+
+    The arrays have room for p positive and n negative anchors of each image, of which not all may be used.
 
     Attributes
     ----------
     positive, negative : (b, p) and (b, n) indices of anchors that hold a block, and of background.
-    positive_weight, negative_weight : 1 for a sample, 0 for an empty place.
-    code : (b, p, 4) target codes of the positives.
+    positive_weight, negative_weight : (b, p) and (b, n) 1 for a drawn anchor, 0 for an unused entry.
+    code : (b, p, 4) shift and scaling from each positive anchor to its block's box, which the network learns (see
+        `boxes.encode`).
     """
 
     positive: Tensor
@@ -37,13 +40,16 @@ class AnchorTargets:
 
 @dataclass(frozen=True)
 class BoxTargets:
-    """Proposed boxes of b images, drawn for the losses of the network's heads, positives (that hold a block) first.
+    """Proposed boxes of b images, drawn at random for the losses of the network's heads.
+
+    The arrays have room for p positives (boxes that hold a block), which come first, and n negatives of each image, of which not
+    all may be used.
 
     Attributes
     ----------
     boxes : (b, p + n, 4) boxes, top, left, bottom, right, px.
-    weight : (b, p + n) 1 for a sample, 0 for an empty place.
-    code : (b, p, 4) target codes of the positives.
+    weight : (b, p + n) 1 for a drawn box, 0 for an unused entry.
+    code : (b, p, 4) shift and scaling from each positive to its block's box (see `boxes.encode`), which the network learns.
     block : (b, p) index of each positive's block.
     """
 
@@ -54,7 +60,7 @@ class BoxTargets:
 
     @property
     def positives(self) -> int:
-        """Number of places for positive proposals (boxes that hold a block) in each image."""
+        """Number of entries for positive proposals (boxes that hold a block) in each image; not all may be used."""
         return int(self.code.shape[1])
 
 
@@ -69,7 +75,7 @@ def anchor_targets(
     ----------
     anchors : (a, 4) boxes, top, left, bottom, right, px.
     blocks : (b, g, 4) boxes of the annotated blocks in b images, px.
-    valid : (b, g) 1 for a block, 0 for an empty place, -1 for a block to ignore, in which no anchor is negative.
+    valid : (b, g) 1 for a block, 0 for an unused box, -1 for a block to ignore, in which no anchor is negative.
     config : Thresholds and numbers of samples.
     seed : Source of random numbers.
     """
@@ -97,8 +103,9 @@ def box_targets(proposals: Tensor, blocks: Tensor, valid: Tensor, config: HeadCo
 
     Parameters
     ----------
-    proposals : (b, n, 4) boxes, top, left, bottom, right, px; empty places have no area.
-    blocks, valid : As in `anchor_targets`.
+    proposals : (b, n, 4) boxes, top, left, bottom, right, px; those without area are unused.
+    blocks : (b, g, 4) boxes of the annotated blocks in b images, px.
+    valid : (b, g) 1 for a block, 0 for an unused box, -1 for a block to ignore, in which no proposal is negative.
     config : Threshold and number of samples.
     seed : Source of random numbers.
     """

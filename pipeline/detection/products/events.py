@@ -137,7 +137,7 @@ def read_events(path: Path) -> list[Event]:
 
 
 def label_raster(found: Sequence[Detection], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return a raster (h, w) with the number of the best detection at each pixel, from 1; NaN where there is none.
+    """Draw detections as a raster (h, w) for a GIS: the number of the best detection at a pixel, from 1; NaN where there is none.
 
     found: the detections, best first. shape: (h, w) of the map, px.
     """

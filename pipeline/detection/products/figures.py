@@ -65,7 +65,7 @@ def write_loss_figure(training: Sequence[Mapping[str, float]], validation: Seque
 
 
 def write_overlay(difference: NDArray[np.float32], grid: Grid, found: Sequence[Detection], path: Path, title: str = "") -> None:
-    """Draw a difference map with the outlines of detections; the colours end at six NMAD.
+    """Draw a difference map with the outlines of detections; the colour scale ends at six times the map's noise (NMAD).
 
     Parameters
     ----------

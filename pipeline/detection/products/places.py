@@ -22,10 +22,14 @@ are none.
 
 @dataclass(frozen=True)
 class EventPlaces:
-    """What converts an event's position on a difference map to world coordinates: a run's wall frame and its reference surface.
+    """Converts the position of a rockfall on a run's difference map to world coordinates.
 
-    The map gives x and y in the wall frame; the height comes from the vertices (n, 3) of the reference surface around them,
-    wall frame, m. They are sorted by x, so that those near an event are found by bisection, and empty if the run wrote none.
+    The map gives x and y in the wall frame. The height comes from the vertices of the reference surface around them.
+
+    Attributes
+    ----------
+    frame : The wall frame of the run.
+    vertices : (n, 3) vertices of the reference surface, wall frame, m, sorted by x; empty if the run wrote none.
     """
 
     frame: WallFrame

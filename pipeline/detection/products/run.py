@@ -51,10 +51,10 @@ def detector_folder(model: str) -> Path:
 
 
 def detector(model: str, *, mirrored: bool = False) -> Detector:
-    """Load a detector.
+    """Load a detector as a function from a difference map (h, w), m, NaN without data, to its detections, best first.
 
     model: `baseline` (a threshold), `default` (the weights that come with scarpsim), or a folder made by `scarpsim train`.
-    mirrored: whether it also searches mirror images of the map, as its config says.
+    mirrored: whether it also searches mirror images of the map, as its config says. Raises InputError if it cannot be loaded.
     """
     if model == BASELINE:
         if mirrored:
@@ -74,7 +74,7 @@ def detector(model: str, *, mirrored: bool = False) -> Detector:
 def sorted_confidences(values: Sequence[float]) -> tuple[float, ...]:
     """Return the confidences (smallest scores) at which detections are written, in rising order without repetition.
 
-    values: those that the user gives. Raises InputError unless they are between the lowest score that detections keep and 1.
+    values: those that the user gives. Raises InputError unless they are between 0.05, the lowest score of a detection, and 1.
     """
     for value in values:
         if not LOWEST_SCORE <= value <= 1:

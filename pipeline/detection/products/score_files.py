@@ -61,8 +61,8 @@ def assess(
     ----------
     truth : annotations.json, or its folder.
     predictions : File of detections.
-    keys : Keys of the truth's images, such as noise or wall; each of their values is a group.
-    kinds : Overlap of masks, of boxes (as in the thesis), or both.
+    keys : Keys of the truth's images, such as noise or wall; images with the same value of a key are also scored as a group.
+    kinds : Overlap by which detections are matched: of masks ("segm"), of boxes ("bbox"), or both.
     confidences : Lowest scores that count, each a column of the tables.
 
     Raises

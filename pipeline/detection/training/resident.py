@@ -105,6 +105,10 @@ def cut_on_device(data: ResidentSet, tile: Array, corner: Array, size: int) -> B
     tile : Index of the tile.
     corner : (2,) row and column of the window's first pixel.
     size : Side of the window, px.
+
+    Returns
+    -------
+    The network's input by name, as `data.network_input` has it: `image` of the window, and its blocks.
     """
     at = (tile, corner[0], corner[1])
     image = jax.lax.dynamic_slice(data.images, (*at, 0), (1, size, size, data.images.shape[3]))[0]
@@ -123,7 +127,10 @@ def cut_on_device(data: ResidentSet, tile: Array, corner: Array, size: int) -> B
 
 
 def mirrored_window(window: Batch, axis: int) -> Batch:
-    """Mirror a training window and its blocks up-down (axis 0) or left-right (axis 1), in the memory of a graphics card."""
+    """Mirror a training window and its blocks, in the memory of a graphics card, to vary training images.
+
+    window: network's input by name, as `cut_on_device` returns it. axis: 0 for up-down, 1 for left-right.
+    """
     size = window["labels"].shape[0]
     low, high = window["boxes"][:, axis], window["boxes"][:, axis + 2]
     boxes = window["boxes"].at[:, axis].set(size - high).at[:, axis + 2].set(size - low)

@@ -72,7 +72,7 @@ def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = Fals
 
     Parameters
     ----------
-    data_set : Folder of a data set with train and val.
+    data_set : Folder of a data set, with the folders train and val.
     config : Settings of detector and training.
     out : Folder to write.
     resume : Whether to continue after the last complete epoch in `out`, with the same losses as without the interruption.
@@ -85,7 +85,7 @@ def train(data_set: Path, config: TrainConfig, out: Path, *, resume: bool = Fals
     Raises
     ------
     InputError
-        If the data set lacks these folders, `out` holds another training, or resident data is used without JAX or with tiles
+        If the data set has no train or val, `out` holds another training, or resident data is used without JAX or with tiles
         that are not squares of one size.
     """
     progress = progress or Progress()

@@ -18,10 +18,10 @@ _COLMAP_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 
 
 def read_oriented(path: Path) -> MetashapeCameras | None:
-    """Read cameras with poses (world frame) by label, from a file or folder of Metashape or COLMAP.
+    """Read the cameras of a Metashape or COLMAP file, with calibrations and poses (world frame), by their labels.
 
-    path: Metashape's camera XML or project, or COLMAP's text model (its folder or a file of it). Returns None for other kinds
-    of file, such as the project's cameras.yaml. Raises InputError for a calibration without poses.
+    path: Metashape's camera XML or project, or COLMAP's text model (its folder or one of its files). Returns None for other kinds
+    of file, such as scarpsim's cameras.yaml. Raises InputError for a calibration without poses.
     """
     if path.is_dir() or path.name in _COLMAP_FILES:
         return MetashapeCameras(read_colmap(path if path.is_dir() else path.parent), ())
@@ -38,7 +38,10 @@ def read_oriented(path: Path) -> MetashapeCameras | None:
 
 
 def oriented_files(path: Path) -> list[Path]:
-    """Return the files that `read_oriented` reads cameras from: those of COLMAP's model or a Metashape project, or `path`."""
+    """Return all files that `read_oriented` reads for `path`, to tell by their checksums whether the cameras were changed.
+
+    They are those of COLMAP's model or of a Metashape project; else `path` alone.
+    """
     if path.is_dir() or path.name in _COLMAP_FILES:
         folder = path if path.is_dir() else path.parent
         return [folder / name for name in sorted(_COLMAP_FILES) if (folder / name).exists()]
@@ -46,9 +49,9 @@ def oriented_files(path: Path) -> list[Path]:
 
 
 def read_lens(path: Path) -> Camera:
-    """Read the calibration of a camera without a pose.
+    """Read the calibration of a single camera from a file that states no pose; the returned camera is at the origin.
 
-    path: Metashape's calibration XML, OpenCV's FileStorage, or plain numbers (.txt).
+    path: Metashape's calibration XML, a file of OpenCV's FileStorage, or a text file (.txt) of numbers as OpenCV has them.
     """
     root = _xml_root(path)
     if root == "document":

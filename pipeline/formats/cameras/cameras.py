@@ -35,7 +35,10 @@ def read_cameras_yaml(path: Path) -> CameraPair:
 
 
 def cameras_yaml_files(path: Path) -> list[Path]:
-    """Return the files that `read_cameras_yaml` reads: cameras.yaml and the calibrations that it names."""
+    """Return all files that `read_cameras_yaml` reads, to tell by their checksums whether the cameras were changed.
+
+    They are cameras.yaml itself, `path`, and the calibration files that it names.
+    """
     values = load_yaml(path)
     cameras = values.values() if isinstance(values, dict) else ()
     return [path, *(path.parent / camera["calibration"] for camera in cameras if _names_lens(camera))]

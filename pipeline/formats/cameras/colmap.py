@@ -97,9 +97,9 @@ def write_colmap(folder: Path, cameras: Mapping[str, Camera], points: FloatArray
 
 
 def write_map(path: Path, values: NDArray[np.floating]) -> None:
-    """Write a depth map (h, w) or a normal map (h, w, 3) in COLMAP's format.
+    """Write a depth map (h, w) or a normal map (h, w, 3), `values`, to a file in COLMAP's format.
 
-    That is a header `w&h&channels&`, then float32, channel by channel.
+    The file has a header `w&h&channels&`, then float32 values, channel by channel.
     """
     channels = values[..., None] if values.ndim == 2 else values
     height, width, depth = channels.shape

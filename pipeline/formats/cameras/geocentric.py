@@ -25,9 +25,9 @@ _REMEDY = "in Metashape convert the chunk's reference to a projected or local co
 
 
 def is_geocentric(position: FloatArray) -> bool:
-    """Return whether a camera's position (3,), m, is near the Earth's surface if it is relative to the Earth's centre.
+    """Return whether a camera's position is geocentric (relative to the Earth's centre), so that it has to be projected.
 
-    If so, its coordinates are geocentric and have to be projected.
+    position: (3,) coordinates, m. They are taken for geocentric if they would then be near the Earth's surface.
     """
     return bool(_EARTH_M[0] < np.linalg.norm(position) < _EARTH_M[1])
 
@@ -43,9 +43,10 @@ class Projection:
     where: str
 
     def pose(self, matrix: FloatArray) -> FloatArray:
-        """Convert the pose of a camera from geocentric coordinates to easting, northing and height in the projected system.
+        """Convert a camera's pose from geocentric coordinates to easting, northing and ellipsoidal height of the system.
 
-        matrix: (4, 4) from the camera's frame to geocentric coordinates, m. The height is ellipsoidal; a scale is kept.
+        matrix: (4, 4) from the camera's frame to geocentric coordinates, m. Returns (4, 4) from the camera's frame to the
+        projected coordinates, m. If the matrix has a scale, the result has it too.
         """
         position = matrix[:3, 3]
         shifted = position + _STEP_M * np.concatenate([np.eye(3), -np.eye(3)])

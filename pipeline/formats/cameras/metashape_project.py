@@ -34,10 +34,10 @@ def is_project(path: Path) -> bool:
 
 
 def active_chunk(path: Path) -> ElementTree.Element:
-    """Return the chunk (set of photographs with their cameras) of a Metashape project that was open when it was saved.
+    """Return the chunk (set of photographs with their cameras) of a Metashape project that was active when it was saved.
 
-    If none was, it is the project's only one. Raises InputError if files of the project are missing or damaged, or it has
-    several chunks of which none is active.
+    A project without an active chunk must have only one. Raises InputError if it has several, or if files of the project are
+    missing or damaged.
     """
     return _document(project_files(path)[-1], "chunk")
 
@@ -69,7 +69,7 @@ def _document(archive: Path, tag: str) -> ElementTree.Element:
     where = f"{archive}: {_DOCUMENT}"
     root = parsed(_unpacked(archive), where)
     if root.tag != tag:
-        raise InputError(f"begins with <{root.tag}>", where=where, allowed=f"<{tag}>", remedy=_EXPORT)
+        raise InputError(f"the XML has <{root.tag}> as its outermost element", where=where, allowed=f"<{tag}>", remedy=_EXPORT)
     return root
 
 

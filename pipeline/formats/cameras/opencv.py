@@ -67,7 +67,8 @@ class OpencvInterior:
     def of(cls, camera: Camera, where: str) -> OpencvInterior:
         """Convert the interior orientation of a camera to OpenCV's terms.
 
-        where: name of the file to be written, for errors. Raises InputError if OpenCV's model lacks one of its parameters.
+        where: name of the file to be written, for errors. Raises InputError if the camera has skew (b2) or k4, which OpenCV's
+        model lacks.
         """
         for name, meaning in (("b2", "skew"), ("k4", "radial distortion, r^8")):
             if getattr(camera, name) != 0:
@@ -96,9 +97,10 @@ class OpencvInterior:
 
 
 def shared_distortion(values: dict[str, float], where: str) -> dict[str, float]:
-    """Return the distortion coefficients that scarpsim's cameras have too.
+    """Select the distortion coefficients of OpenCV's camera model that scarpsim's has too: k1, k2, k3, p1 and p2.
 
-    values: coefficients by OpenCV's names. where: name of the file, for errors. Raises InputError if another one is not zero.
+    values: coefficients by OpenCV's names. where: name of the file, for errors. Returns the selected ones by name. Raises
+    InputError if another coefficient is not zero.
     """
     for name, value in values.items():
         if name not in _SHARED and value != 0:
@@ -159,7 +161,11 @@ def write_opencv(path: Path, camera: Camera) -> None:
 
 
 def read_opencv_text(path: Path) -> Camera:
-    """Read a calibration of plain numbers: width, height, the camera matrix by rows, and 4 to 14 distortion coefficients."""
+    """Read a camera's calibration from a text file of numbers in OpenCV's terms and order; its pose is the origin.
+
+    The numbers are width and height, px, the nine elements of the camera matrix row by row, px, and 4 to 14 distortion
+    coefficients.
+    """
     words = read_text(path, most_bytes=_MOST_BYTES).split()
     try:
         values = np.array([float(word) for word in words])

@@ -160,10 +160,10 @@ def new_folder(parent: Path, name: str) -> Path:
 
 
 def empty_folder(out: Path, remedy: str = "choose another --out") -> Path:
-    """Check that an output folder can be written to; return it if it is new or empty.
+    """Check that an output folder is new or empty and can be written to; return its path.
 
-    remedy: what the user can do otherwise, the end of an error. Raises InputError, naming --out, if it is in use or cannot be
-    created.
+    remedy: what the user can do otherwise, the end of an error. Raises InputError, naming --out, if the folder has content or
+    cannot be created.
     """
     check_place(out)
     if out.exists() and any(out.iterdir()):
@@ -215,9 +215,9 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write `text` as UTF-8 with its own line ends, completely or not at all.
+    """Write `text` as UTF-8, with the line ends that it has, completely or not at all.
 
-    What is not a character, such as bytes of a file name in another encoding, is written as an escape sequence.
+    Bytes that are no characters, as in a file name of another encoding, are written as escape sequences.
     """
     write_bytes(path, text.encode(errors="backslashreplace"))
 

@@ -13,7 +13,10 @@ _MOST_BYTES = 16_000_000_000
 
 
 def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file in hexadecimal; raise InputError if it cannot be read or is too large."""
+    """Return the SHA-256 checksum of a file in hexadecimal, which tells whether it was changed.
+
+    Raises InputError if it cannot be read or is too large.
+    """
     check_file(path, most_bytes=_MOST_BYTES, smaller="cut it to the scene")
     try:
         with path.open("rb") as file:

@@ -61,12 +61,14 @@ _LEAST_SIGMA = {
 class PointFit:
     """How well measured points fit the reference surface, along the sensor's rays, to find a wrong frame or unit.
 
+    A point is near the surface if it is at most 1 m, or the share `reach` of its range, before or behind it.
+
     Attributes
     ----------
-    hits : Share of the points whose rays meet the reference.
-    near : Share of these that are near it.
-    off_m : Median distance of the points behind it along the rays, m (negative: in front); NaN without hits.
-    reach : Share of the range within which a point is near.
+    hits : Share of the points whose rays meet the reference, 0 to 1.
+    near : Share of these points that are near the reference, 0 to 1.
+    off_m : Median distance of these points behind the reference along the rays, m (negative: in front); NaN without hits.
+    reach : Share of the range within which a point counts as near: 0.02 for a laser scanner, 0.06 for a stereo pair.
     """
 
     hits: float
@@ -78,7 +80,8 @@ class PointFit:
     def of(cls, points: FloatArray, origin: FloatArray, reference: RayCaster, sensor: Sensor) -> PointFit:
         """Compare measured points with the reference surface along their rays.
 
-        points: (n, 3), wall frame, m. origin: (3,) of the rays, m. reference: ready for ray casting. sensor: stereo or tls.
+        points: (n, 3), wall frame, m. origin: (3,) where the rays start, wall frame, m. reference: the surface, ready for ray
+        casting. sensor: stereo or tls (laser scanner), which decides how near points must be.
         """
         reach = _NEAR_SHARE[sensor]
         away = points[:: max(len(points) // _SAMPLE, 1)] - origin
@@ -96,14 +99,17 @@ class PointFit:
 
     @property
     def good(self) -> bool:
-        """Whether so many points are near the reference that they belong to this surface."""
+        """Whether the points belong to the reference surface.
+
+        They do if at least 1 % of the rays meet it, and at least 25 % of these points are near it.
+        """
         return self.hits >= _FEWEST_HITS and self.near >= _FEWEST_NEAR
 
 
 def finite(cloud: PointCloud, where: str) -> PointCloud:
-    """Return the points of a cloud whose coordinates and recorded values are finite.
+    """Return the points of a cloud without those that have NaN or infinity as a coordinate, intensity, time or pixel.
 
-    where: name of the file, for errors. Raises InputError if there are none, or all are at one place or on one line.
+    where: name of the file, for errors. Raises InputError if no points remain, or all are at one place or on one line.
     """
     channels = [cloud.intensity, cloud.gps_time, *(cloud.extra.get(name) for name in ("pixel_x", "pixel_y"))]
     points = cloud.points
@@ -149,10 +155,16 @@ def _on_a_line(points: FloatArray) -> bool:
 
 
 def check_frame(here: PointFit, other: PointFit | None, frame: str, where: str) -> None:
-    """Raise InputError if measured points do not fit the reference in the stated frame; it names the frame in which they would.
+    """Check that measured points are in the frame (scanner or world) that measurement.yaml states.
 
-    here: fit in the frame that measurement.yaml states; other: fit in the other frame, if there is one. frame: name of the
-    stated one. where: name of the file, for errors.
+    Raises InputError if they fit the reference only in the other frame, or if hardly any ray meets it.
+
+    Parameters
+    ----------
+    here : How points and reference fit in the stated frame.
+    other : How they fit in the other frame; None if there is none.
+    frame : Name of the stated frame, "scanner" or "world".
+    where : Name of the file, for errors.
     """
     if here.good:
         return
@@ -206,9 +218,11 @@ def check_seen(pair: CameraPair, points: FloatArray, where: str) -> float:
 
 
 def check_pixels(left: Camera, cloud: PointCloud, where: str) -> None:
-    """Raise InputError if the pixels stored with a cloud's points are not those in which the left camera sees them.
+    """Check the pixels (channels pixel_x and pixel_y) that a photogrammetric cloud states for its points.
 
-    where: name of the file, for errors. A cloud without pixels is accepted.
+    Raises InputError if the left camera sees the points elsewhere. A cloud without pixels is accepted.
+
+    left: the left camera. cloud: the points, in the frame of the camera's pose, m. where: name of the file, for errors.
     """
     if not {"pixel_x", "pixel_y"} <= set(cloud.extra):
         return
@@ -225,9 +239,9 @@ def check_pixels(left: Camera, cloud: PointCloud, where: str) -> None:
 
 
 def check_power(cloud: PointCloud, where: str) -> PointCloud:
-    """Return the cloud if its intensity can be a received power; raise InputError for negative or huge values.
+    """Check that a cloud's intensity, if it has one, can be a relative received power, on which errors of scanners depend.
 
-    where: name of the file, for errors.
+    where: name of the file, for errors. Returns the cloud. Raises InputError for negative values, or values above 1e12.
     """
     power = cloud.intensity
     if power is None or (power.min(initial=0.0) >= 0 and power.max(initial=0.0) <= _LARGEST_POWER):
@@ -252,9 +266,9 @@ def check_different(clouds: Mapping[str, PointCloud]) -> None:
 
 
 def check_near_rays(here: PointFit, where: str) -> None:
-    """Raise InputError if most measured points are far from the reference along their rays, so that it is not this wall.
+    """Raise InputError if most measured points are far from the reference along their rays: they then show another wall.
 
-    here: fit of points and reference. where: name of the file, for errors.
+    here: how points and reference fit. where: name of the file, for errors.
     """
     if here.good:
         return
@@ -267,10 +281,14 @@ def check_near_rays(here: PointFit, where: str) -> None:
 
 
 def check_pulses(azimuth: Sweep, zenith: Sweep, points: int, epochs: int, where: str) -> None:
-    """Raise InputError for a scan pattern that has far more pulses than there are points, or too few for them.
+    """Raise InputError if the scan pattern in measurement.yaml has far more or far fewer pulses than points were measured.
 
-    azimuth, zenith: start, stop and step of each angle, rad. points: their number in all epochs. epochs: number of scans with
-    this pattern. where: name of the file, for errors.
+    Parameters
+    ----------
+    azimuth, zenith : Start, stop and step of each angle of the pattern, rad.
+    points : Number of measured points in all epochs.
+    epochs : Number of scans with this pattern.
+    where : Name of the file, for errors.
     """
     pulses = float(np.prod([(stop - start) // step + 1 for start, stop, step in (azimuth, zenith)]))
     most = max(_PULSES_PER_POINT * points, _FEW_PULSES)
@@ -309,7 +327,8 @@ def check_inside(points: FloatArray, azimuth: Sweep, zenith: Sweep, where: str) 
 def check_noise(of: str, sigma: FloatArray) -> None:
     """Raise InputError if the sensor model predicts almost no noise, so that standardised residuals would be meaningless.
 
-    of: what the noise is of, for the message. sigma: (n,) predicted standard deviations.
+    of: kind of measurement: "tls" (ranges, m), "stereo" (disparities, px) or "surface" (points, m).
+    sigma: (n,) predicted standard deviations, in this unit.
     """
     least, unit, key = _LEAST_SIGMA[of]
     if sigma.min(initial=np.inf) < least:

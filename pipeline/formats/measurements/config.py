@@ -63,7 +63,11 @@ class ScanPattern(Config):
 
 
 class MeasurementConfig(Config):
-    """Content of measurement.yaml, which describes measured points, reference surface and sensor model for `scarpsim gap`."""
+    """Content of measurement.yaml, which describes measured points, reference surface and sensor model for `scarpsim gap`.
+
+    A laser scan also needs the pose of the scanner: `scanner`, or `scanners` for several. `pattern` has the nominal directions of
+    its pulses, if they are known.
+    """
 
     sensor: Literal["tls", "stereo"]
     reference: Path = Field(description="reference surface, world frame, m")
@@ -94,6 +98,11 @@ class MeasurementConfig(Config):
         description="standard deviation of the reference's vertices along the rays, with independent errors [m] (tls); "
         "none: 0, or as estimated from the vertices if `incidence` is not given either",
     )
+    reference_error_kind: Literal["noise", "relief"] | None = Field(
+        None,
+        description="whether `reference_error_m` is noise of the vertices, which rays to the same triangles share, or relief "
+        "between them (tls); none: as the scatter of the vertices about planes tells",
+    )
     notes: tuple[str, ...] = Field(
         (), description="notes on the measurement for the report, such as what a reference cannot show"
     )
@@ -111,7 +120,7 @@ class MeasurementConfig(Config):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         """Check that keys fit the sensor and each other."""
-        for name in ("incidence", "reference_error_m"):
+        for name in ("incidence", "reference_error_m", "reference_error_kind"):
             if self.sensor == "stereo" and getattr(self, name) is not None:
                 raise ValueError(f"'{name}' is for laser scans only; remove it")
         files = [self.points] if isinstance(self.points, Path) else self.points

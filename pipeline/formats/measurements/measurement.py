@@ -99,15 +99,15 @@ class MeasurementBase(ABC):
 
     @property
     def fit(self) -> PointFit:
-        """How well points fit the reference along the rays: shares that meet it and are near it, median offset, m."""
+        """How well the points fit the reference along the sensor's rays, to find a wrong frame, unit or pose."""
         return PointFit.of(self.cloud.points, self.viewpoint, self.scene, self.sensor)
 
     def check_near(self, where: str) -> None:
-        """Raise InputError, naming the file `where`, if most points are too far from the reference for any pose or effect."""
+        """Raise InputError, naming the file `where`, if most points are so far from the reference that they show another wall."""
         check_near_rays(self.fit, where)
 
     def changed(self, **values: Any) -> Self:
-        """Return a copy of the measurement with other values of its fields (points, cameras, pose); the ray caster is kept."""
+        """Return a copy with new `values` of some fields, by name, such as points or cameras; the prepared ray caster is kept."""
         other = replace(self, **values)
         other.__dict__["scene"] = self.scene  # where cached_property keeps it
         return other
@@ -117,7 +117,7 @@ class MeasurementBase(ABC):
         return self.changed(cloud=self.cloud.part(rows))
 
     def moved(self, pose: FloatArray) -> Self:
-        """Return the measurement shifted (m) and rotated (rad) about its viewpoint by a pose (6,), wall frame."""
+        """Return the measurement with points and sensor moved by pose (6,): shift, m, and rotation about the viewpoint, rad."""
         turn, centre = rotation_matrix(pose[3:]), self.viewpoint
         points = (self.cloud.points - centre) @ turn.T + centre + pose[:3]
         return self.changed(cloud=replace(self.cloud, points=points), **self._moved_sensor(turn, pose[:3]))
@@ -129,17 +129,18 @@ class MeasurementBase(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class TlsMeasurement(MeasurementBase):
-    """n points measured by one laser scan, or by several of other poses or faces (channel `scan`) or times (channel `epoch`).
+    """n points of one laser scan or several; the cloud's channels `scan` and `epoch` number each point's scan and time.
 
     Attributes
     ----------
     station, face : Pose of the first scan (scanner to wall frame), and the face of the instrument in which it was made.
-    scans : Pose and face of each of several scans; the points' channel `scan` has their numbers. Empty for one scan.
+    scans : Pose and face of each of several scans, in the order of their numbers; empty for one scan.
     pattern : Nominal directions of the pulses; None if unknown.
     pulses : (m,) mask of the m pulses of the pattern: true for those from which the points may come; None: all.
     order : (n,) scan line and (n,) elapsed share of the scan's duration of each point, if known.
     planes : Planes through the reference's vertices, to which incidence angles refer; None: its triangles.
     reference_error_m : Standard deviation of each vertex of the reference along the rays, m.
+    error_is_relief : Whether that error is mostly relief between the vertices, which is independent from ray to ray.
     """
 
     sensor = "tls"
@@ -152,6 +153,7 @@ class TlsMeasurement(MeasurementBase):
     order: tuple[FloatArray | None, FloatArray | None] | None = None
     planes: PointPlanes | None = None
     reference_error_m: float = 0.0
+    error_is_relief: bool = False
 
     @property
     def viewpoint(self) -> FloatArray:
@@ -164,20 +166,20 @@ class TlsMeasurement(MeasurementBase):
         return np.asarray(self.cloud.extra.get(SCAN, np.zeros(len(self.cloud.points))), dtype=np.int64)
 
     def each_scan(self) -> Iterator[tuple[Scanned, NDArray[np.int64], Self]]:
-        """Yield, for each scan of several, its pose, the indices of its points, and a measurement of these points alone."""
+        """Yield each of several scans (nothing for one): its pose, its points' indices, and a measurement of these alone."""
         for number, scan in enumerate(self.scans):
             rows = np.flatnonzero(self.scan_of == number)
             yield scan, rows, self.part(rows).changed(station=scan.pose, face=scan.face, scans=())
 
     @property
     def fit(self) -> PointFit:
-        """How well the points fit the reference along the rays, in the scan for which this is worst."""
+        """How well the points fit the reference along the sensor's rays; of several scans, the fit of the worst one."""
         several = self.each_scan()
         fits = [PointFit.of(one.cloud.points, one.viewpoint, self.scene, self.sensor) for _, rows, one in several if len(rows)]
         return min(fits, key=lambda each: (each.good, each.near)) if fits else super().fit
 
     def moved(self, pose: FloatArray) -> Self:
-        """Shift (m) and rotate (rad) the scans of each of k set-ups (scanner positions) by its six values in pose (6 k,)."""
+        """Return the measurement with each of k set-ups moved; pose (6 k,): shifts, m, and rotations about each scanner, rad."""
         if not self.scans:
             return super().moved(pose)
         points, scans = self.cloud.points.copy(), []
@@ -199,14 +201,14 @@ class TlsMeasurement(MeasurementBase):
 
 @dataclass(frozen=True, kw_only=True)
 class StereoMeasurement(MeasurementBase):
-    """Points that were measured by a stereo pair with known cameras.
+    """n points that were measured by a stereo pair with known cameras.
 
     Attributes
     ----------
     cameras : Nominal calibration and poses, world frame.
-    shaped_px : (n,) change of each point's disparity, px, by effects that depend on neighbouring pixels, such as smoothing. It
-        holds for poses close to the present one; None if it was not computed.
-    surroundings : What the cameras see around each point, for the same poses; None if it was not computed.
+    shaped_px : (n,) change of each point's disparity, px, by effects that depend on neighbouring pixels, such as smoothing.
+        Like `surroundings`, it holds for poses close to the present ones, and is None if it was not computed.
+    surroundings : What the cameras see around each point.
     """
 
     sensor = "stereo"
@@ -261,7 +263,7 @@ class SurfaceMeasurement(MeasurementBase):
 
     @cached_property
     def datum(self) -> FloatArray:
-        """(7, k) combinations of shift, rotation and scale of the points that a comparison with the reference can determine."""
+        """(7, k) combinations of 3 shifts, m, 3 rotations, rad, and scale that a comparison with the reference can determine."""
         vertices = np.arange(len(self.reference.vertices))
         return told_datum(self.reference.vertices - self.centre, self.shape.normals(vertices))
 
@@ -275,13 +277,13 @@ class SurfaceMeasurement(MeasurementBase):
         self.surface_fit.check(where)
 
     def changed(self, **values: Any) -> Self:
-        """Return a copy with other values of its fields, such as the points; what was computed from the reference is kept."""
+        """Return a copy with new `values` of some fields, by name, such as points; what the reference determines is kept."""
         other = super().changed(**values)
         other.__dict__["shape"], other.__dict__["datum"] = self.shape, self.datum
         return other
 
     def moved(self, pose: FloatArray) -> Self:
-        """Shift (m), rotate (rad) and scale the points about `centre`; pose (k,): amounts of the k columns of `datum`."""
+        """Shift (m), rotate (rad) and scale the points about `centre`; pose (k,): a factor for each column of `datum`."""
         whole = self.datum @ pose
         turn = (1 + whole[6]) * rotation_matrix(whole[3:6])
         points = (self.cloud.points - self.centre) @ turn.T + self.centre + whole[:3]
@@ -389,7 +391,7 @@ def _of_sensor(config: MeasurementConfig, material: Material, where: str, **shar
     station, vertices = _to_wall(pose, frame), shared["reference"].vertices
     points = ReferencePoints.of(config, vertices, station[0], material.model.noise.range_sigma_m)
     known: dict[str, Any] = {"planes": points.planes, "reference_error_m": points.error_m}
-    known["notes"] = (*shared.pop("notes"), *points.words)
+    known |= {"error_is_relief": points.error_is_relief, "notes": (*shared.pop("notes"), *points.words)}
     return TlsMeasurement(model=material.model, station=station, scans=scans, pattern=config.pattern, **known, **shared)
 
 
@@ -434,9 +436,7 @@ def _files(config: MeasurementConfig) -> list[Path]:
 
 
 def _cameras(config: MeasurementConfig, base: Path) -> CameraPair | None:
-    if config.sensor == "tls":
-        return None
-    if config.cameras is None:
+    if config.sensor == "tls" or config.cameras is None:
         return None
     return nominal_pair(base / config.cameras)
 

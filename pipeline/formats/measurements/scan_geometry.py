@@ -54,7 +54,7 @@ is one.
 
 @dataclass(frozen=True)
 class AngularGrid:
-    """Equally spaced angles of a scan pattern: first angle and step, rad, and their number."""
+    """Equally spaced angles of a scan pattern: the first (`start`) and the `step`, rad, and their number, `count`."""
 
     start: float
     step: float
@@ -76,15 +76,16 @@ class ScanGeometry:
 
     Attributes
     ----------
-    range_m, azimuth, zenith : (n,) m and rad, about the scan's own axis; azimuth has no jump within the scan.
+    range_m, azimuth, zenith : (n,) range, m, and angles, rad, about the scan's own axis; azimuth has no jump within the scan.
     line, pulse : (n,) int32 number of each point's scan line, and of its pulse in the line, from 0; echoes of one pulse share
         them.
     lines, pulses : Azimuths of the lines and zenith angles of the pulses.
     rotation : (3, 3) frame of the scan's axis to the scanner's frame (identity for a level scan).
-    line_shape : (3,) how a line departs from a meridian, rad: by the head's turn during it, collimation error and trunnion
-        tilt.
-    synchronous : Whether all lines begin on one zenith grid.
-    azimuth_rms, zenith_rms : RMS deviation of the far half's angles from the pattern, rad.
+    line_shape : (3,) d, c and t, rad, by which the azimuth along a line varies with the zenith angle z, as
+        d (z - pi/2) + c / sin z + t cot z: turn of the scanner's head, collimation error and trunnion tilt.
+    synchronous : Whether the pulses of all lines have the same zenith angles; otherwise each line begins at its own.
+    azimuth_rms, zenith_rms : RMS deviation of the measured angles from the pattern, rad, over the half of the points with the
+        longest ranges, whose angles are the most exact.
     """
 
     range_m: FloatArray
@@ -107,7 +108,10 @@ class ScanGeometry:
 
     @property
     def pattern(self) -> dict[str, list[float]]:
-        """The scan's nominal directions as the key `pattern` of a measurement.yaml."""
+        """The scan's nominal directions, to be written under the key `pattern` of measurement.yaml.
+
+        The keys azimuth_rad and zenith_rad each have [start, stop, step], rad.
+        """
         return {"azimuth_rad": self.lines.to_list(), "zenith_rad": self.pulses.to_list()}
 
     @cached_property
@@ -153,7 +157,7 @@ def _no_pattern(angle: str) -> InputError:
     return InputError(
         f"the points lie on no regular pattern in {angle}",
         where="scan",
-        remedy="use the raw points of one scan, not subsampled or merged, and the scanner's position and rotation",
+        remedy="give all raw points of one scan; if you did, correct the scanner's position and rotation",
     )
 
 

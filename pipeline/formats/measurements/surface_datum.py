@@ -30,8 +30,11 @@ def datum_columns(away: FloatArray, normal: FloatArray) -> FloatArray:
 def told_datum(away: FloatArray, normal: FloatArray) -> FloatArray:
     """Return which combinations of shift, rotation and scale can be determined by comparing points with a surface.
 
-    On a plane, for example, shifts along it cannot. away: (n, 3) places on the surface relative to the centre, m; normal: (n,
-    3) unit normals there. Returns the k combinations as columns (7, k): unit vectors if all seven values are determined.
+    On a plane, for example, shifts along it cannot.
+
+    away: (n, 3) places on the surface relative to its centre, m. normal: (n, 3) unit normals there. Returns the k combinations as
+    columns (7, k) of three shifts, m, three rotations, rad, and a change of scale. If all seven can be determined, this is the
+    identity.
     """
     some = slice(None, None, max(len(away) // _SAMPLE, 1))
     reach = np.sqrt(np.mean(np.sum(away[some] ** 2, axis=1)))

@@ -40,12 +40,12 @@ class SurfaceFit:
     def of(cls, points: FloatArray, reference: TriangleMesh) -> SurfaceFit:
         """Measure how well points fit a reference surface, by their distances from its nearest vertices.
 
-        Up to about 40,000 points are all used. Of more, a subsample is used, evenly spaced in their order, of 20,000 to 30,000.
+        Of more than 40,000 points, only some 20,000 to 30,000 are used, evenly spaced in their order.
 
         Parameters
         ----------
         points : (n, 3) measured points, in the frame of the reference, m.
-        reference : mesh of the reference surface.
+        reference : Mesh of the reference surface.
         """
         from scipy.spatial import cKDTree
 

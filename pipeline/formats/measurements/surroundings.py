@@ -20,8 +20,9 @@ class Surroundings:
     Attributes
     ----------
     point : (n, 3) place that each pixel sees, wall frame, m; NaN if unknown.
-    edge_px : (n,) how much the reference departs from a plane around each pixel. It is compared with its tangent plane at the
-        four pixels a few px to the left, right, above and below; the largest difference of the two disparities counts, px.
+    edge_px : (n,) step of the surface near each pixel, px of disparity; 0 on a plane, at most 10. It is the largest difference
+        between the disparity of the reference and that of its tangent plane, at the pixels 3 px to the left, right, above and
+        below.
     hidden : (n,) true where the right camera does not see the place.
     gradient : (n, 2) change of the reference's disparity along the row and along the column, px per px, as a stereo matcher sees
         it: between the two neighbouring cells of its raster.

@@ -16,7 +16,7 @@ from scene.geometry.mesh import TriangleMesh
 
 @dataclass(frozen=True)
 class GltfPart:
-    """A named part of a glTF model: a mesh with RGBA colours (n, 4) of its n vertices."""
+    """A named part of a glTF model, such as a wall or a block: a mesh with RGBA colours (n, 4), 0 to 255, of its n vertices."""
 
     name: str
     mesh: TriangleMesh

@@ -51,7 +51,7 @@ def write_ply_points(path: Path, cloud: PointCloud) -> None:
 
 
 def read_ply(path: Path) -> TriangleMesh:
-    """Read a mesh of triangles from a PLY file; properties other than `write_ply` writes are ignored.
+    """Read a mesh of triangles from a PLY file, with reflectances and block labels; other properties are ignored.
 
     Raises InputError for a missing or damaged file, faces that are not triangles, or indices of vertices that do not exist.
     """

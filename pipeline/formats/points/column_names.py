@@ -44,8 +44,7 @@ _NAME = re.compile(r"[^\s\[({]+(?:\s*[\[({][^\])}]*[\])}])?")
 """A name between white space, with its unit in brackets."""
 _PROJECT = "project the points to a coordinate system in metres, such as UTM, and export them again"
 _HOW = (
-    "name the columns x, y, z in the file, or with --columns where a command has it; "
-    "delete a line of text that does not name columns"
+    "name the columns x, y, z in this line, or with --columns where a command has it; if the line is a title or remark, delete it"
 )
 
 
@@ -69,9 +68,12 @@ class Column:
 
 @dataclass(frozen=True)
 class NamedColumns:
-    """The columns that a text file of points names, and notes on lines that were ignored.
+    """What the header of a text file of points says of its columns.
 
-    `columns` is empty if the file names none.
+    Attributes
+    ----------
+    columns : Name and unit of each column, in order; empty if the header names none.
+    notes : Notes for the user on header lines that were ignored, because they name no columns.
     """
 
     columns: tuple[Column, ...] = ()
@@ -81,8 +83,12 @@ class NamedColumns:
 def named_columns(layout: TextLayout, where: str) -> NamedColumns:
     """Interpret the column names of a text file of points.
 
-    They are in the last line above the points that names x, y and z, by these or other words. layout: what was found out about
-    the file. where: its name, for errors.
+    They are in the last line above the points that names x, y and z, by these or other words, such as easting and northing.
+
+    Parameters
+    ----------
+    layout : Header and form of the file, as `layout_of` found them.
+    where : Name of the file, for errors.
 
     Raises
     ------
@@ -110,9 +116,9 @@ def named_columns(layout: TextLayout, where: str) -> NamedColumns:
 
 
 def with_stated_units(columns: Sequence[Column], layout: TextLayout, where: str) -> tuple[Column, ...]:
-    """Add the units that a text file states for its columns to the columns that the user names.
+    """Return the columns that the user names, with the units that the header of the text file states for them.
 
-    columns: the user's. layout: what was found out about the file. where: its name, for errors.
+    columns: the user's. layout: header and form of the file, as `layout_of` found them. where: its name, for errors.
     """
     for line, words in reversed(_with_unit_line(layout)):
         if len(words) == len(columns):

@@ -47,12 +47,14 @@ _NODE = np.dtype([("key", "<i4", 4), ("offset", "<u8"), ("bytes", "<i4"), ("poin
 class Octree:
     """Points sorted into the cubes (nodes) of an octree, as COPC files store them.
 
+    A point is stored in one node only. Coordinates are integers, in the steps in which LAZ stores them.
+
     Attributes
     ----------
-    low, side : (3,) corner and side of the root cube, in the coordinates' steps.
-    keys : (m, 4) level, x, y, z of the nodes.
+    low, side : (3,) lowest corner of the root cube, and its side, steps.
+    keys : (m, 4) level of each of the m nodes, 0 for the root, and its position x, y, z among the cubes of this level.
     counts : (m,) number of points in each node.
-    order : (n,) indices of the points by node, in their given order within a node.
+    order : (n,) indices of the points, node by node; within a node in their original order.
     """
 
     low: NDArray[np.int64]
@@ -65,8 +67,8 @@ class Octree:
 def write_copc(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, header: LazHeader = _USUAL) -> None:
     """Write a point cloud as COPC, a LAZ file that viewers can load part by part; equal arguments give equal bytes.
 
-    The points are in the order of an octree. Level k has one point for each cell of side / (128 * 2^k), in addition to the
-    levels above. A node with at most 16,384 remaining points takes all of them.
+    The file is an octree, each level of which adds points. Level k adds one point for each cube whose side is that of the whole
+    cloud divided by 128 * 2^k. A node with at most 16,384 remaining points takes all of them.
 
     Parameters
     ----------

@@ -22,19 +22,19 @@ _GOLDEN = 0.6180339887498949
 def without_fillers(cloud: PointCloud, where: str, *, grid: bool = False) -> PointCloud:
     """Remove points that stand for a missing return of a laser pulse, and add a note on them to the cloud.
 
-    Programs write 0 0 0, or another fixed place, for pulses of a scan's grid without a return. A single record at 0 0 0 is
-    removed if it is outside of all other points, and in formats with grids always.
+    Programs write 0 0 0, or another fixed place, for pulses without a return. Several points at 0 0 0 are always removed. A
+    single one may be real: it is removed if the format stores missing returns, or if it lies outside the box of all others.
 
     Parameters
     ----------
     cloud : Points in the frame and the unit of the file.
     where : Name of the file, for errors.
-    grid : Whether the format has cells of a scan's grid, like E57 and PTX.
+    grid : Whether the format stores a grid of pulses with missing returns, like E57 and PTX.
 
     Raises
     ------
     InputError
-        If all records are 0 0 0.
+        If all points are 0 0 0.
     """
     points = cloud.points
     at_zero: NDArray[np.bool_] = np.logical_and.reduce([column == 0 for column in points.T])

@@ -72,7 +72,7 @@ def _by_keys(header: laspy.LasHeader, where: str) -> AxisUnits | None:
     if keys.get(_MODEL) in (_IN_DEGREES, _GEOCENTRIC) or (keys.get(_GEOGRAPHIC) and not codes[_PROJECTED] and _MODEL not in keys):
         what = "from the Earth's centre" if keys.get(_MODEL) == _GEOCENTRIC else "in degrees"
         raise InputError(
-            f"has coordinates {what}, by its GeoTIFF keys (geographic system {keys.get(_GEOGRAPHIC, 'not named')})",
+            f"its GeoTIFF keys say that coordinates are {what} (geographic system {keys.get(_GEOGRAPHIC, 'none')})",
             where=where,
             allowed="projected coordinates",
             remedy=_PROJECT,
@@ -111,10 +111,13 @@ def _agreed(by_system: float | None, unit_code: int | None, what: str, where: st
 
 
 def check_box(header: laspy.LasHeader, points: FloatArray, where: str) -> tuple[str, ...]:
-    """Compare the bounding box in a LAS file's header with its points; return a note if the box is much larger.
+    """Compare the bounding box in a LAS file's header with its points, to find files with a wrong scale or missing points.
 
-    points: (n, 3), in the file's unit. where: name of the file, for errors. Raises InputError if points are outside of the box.
-    A box of zeros, or turned inside out, states nothing.
+    Returns a note if the box is much larger than the points, else nothing. A box of zeros, or with minimum above maximum, is
+    ignored.
+
+    header: of the file. points: (n, 3), in the file's unit. where: name of the file, for errors. Raises InputError if points
+    are outside the box.
     """
     low, high = np.array(header.mins), np.array(header.maxs)
     if not len(points) or not np.isfinite([low, high]).all() or (low > high).any() or not (low.any() or high.any()):

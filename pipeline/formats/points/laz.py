@@ -131,9 +131,9 @@ class StoredCloud:
         return cls(las, cloud, present | dict(cloud.extra), full_scale)
 
     def with_points(self, cloud: PointCloud) -> StoredCloud:
-        """Return other points prepared for writing with the same header and extra dimensions, such as the next part of a file.
+        """Prepare further points of a file that is written part by part, with the header and extra dimensions of this cloud.
 
-        cloud: the other points; their intensity and time are left out.
+        cloud: the further points, without intensity. Their time is not written.
         """
         return replace(self, cloud=cloud, fields={"bit_fields": self.fields["bit_fields"], **cloud.extra})
 
@@ -184,10 +184,11 @@ def write_laz(path: Path, cloud: PointCloud, pulses: PulseChannels = _PLAIN, hea
 def read_laz(path: Path) -> PointCloud:
     """Read a point cloud from a LAS or LAZ file of any version.
 
-    Intensity is relative received power: in our files on their stored scale, in others counts / 65535. Intensity and GPS time
-    that are zero throughout count as not recorded. Extra channels `return_number` and `number_of_returns` exist if pulses have
-    several returns, `scan_angle_rad` (from straight down) if there are scan angles. Points that the file marks as withheld or
-    noise are left out, with a note; `stated_units` comes from its coordinate system.
+    The intensity is relative received power. In files that scarpsim wrote, it has the scale that they state; in others it is
+    the count divided by 65535. Intensity and GPS time that are zero throughout count as not recorded. Extra channels
+    `return_number` and `number_of_returns` exist if pulses have several returns, and `scan_angle_rad` (from straight down) if
+    there are scan angles. Points that the file marks as withheld or noise are left out, with a note. `stated_units` of the
+    cloud comes from the file's coordinate system.
 
     Raises InputError for a missing, truncated or other file, or a header that contradicts the points.
     """

@@ -35,7 +35,10 @@ _FIELDS = (
 
 
 def count_points(path: Path) -> int:
-    """Return the number of points that the header of a LAS or LAZ file states, 0 for a file that is not readable as such."""
+    """Return the number of points that the header of a LAS or LAZ file states, to know whether they fit into memory.
+
+    It is 0 for a file that is not readable as LAS or LAZ.
+    """
     try:
         with laspy.open(path) as reader:
             return int(reader.header.point_count)
@@ -51,7 +54,7 @@ def read_chunks(path: Path, unit: str | None = None) -> Iterator[FloatArray]:
     Parameters
     ----------
     path : LAS or LAZ file.
-    unit : Name of the coordinates' unit, a key of METRES; None: as the file states, or metres.
+    unit : Name of the coordinates' unit, such as "mm"; None: as the file states, or metres.
 
     Raises
     ------

@@ -75,8 +75,8 @@ def read_placed_scans(
 
     Parameters
     ----------
-    path : File of a format in SUFFIXES, or of one that another package reads.
-    unit : Name of the coordinates' unit, a key of METRES; None: as the file states, or metres.
+    path : File in LAS, LAZ, PLY, E57, PTX or text format, or in one that a plug-in reads.
+    unit : Name of the coordinates' unit, such as "mm"; None: as the file states, or metres.
     columns : Names of a text file's columns, instead of the file's own.
     option : Command-line option that gives the unit, for errors.
 

@@ -77,8 +77,8 @@ _BINARY_KINDS = {b"LASF": ("a LAS or LAZ file", ".laz"), b"ASTM-E57": ("an E57 f
 def encoding_of(path: Path) -> str:
     """Detect the character encoding of a text file of points; return its name in Python.
 
-    It is told by a byte-order mark, UTF-16 by its null bytes, else UTF-8 or Western European. Raises InputError for a file with
-    other null bytes, which is not text.
+    UTF-16 is known by its byte-order mark or its null bytes. Other files are UTF-8, or Western European if they are not valid
+    UTF-8. Raises InputError for a file with null bytes that is not text.
     """
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)

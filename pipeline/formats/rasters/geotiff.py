@@ -301,7 +301,7 @@ def _check_values(raster: NDArray[np.float32], path: Path) -> None:
 def most_pixels() -> int:
     """Return the largest number of pixels that an image may have, so that a wrong file cannot fill the memory.
 
-    It is MOST_PIXELS, or more if the limit in the environment variable READ_LIMIT names allows it, at four bytes a pixel.
+    It is MOST_PIXELS, or more if the environment variable SCARPSIM_READ_GB allows more GB, at four bytes a pixel.
     """
     return max(MOST_PIXELS, int(read_limit_gb() * 1e9 / 4))
 

@@ -76,9 +76,9 @@ EntryT = TypeVar("EntryT", bound=_Entry)
 
 @dataclass(frozen=True)
 class Coco:
-    """Annotations of blocks in images in COCO's format, checked, in the order of the file.
+    """Annotations of fallen rock (blocks) in images, read from a file in COCO's format and checked.
 
-    images, annotations and categories are COCO's entries.
+    images, annotations and categories are the file's lists of these names, in its order.
     """
 
     images: list[Entry]
@@ -127,14 +127,15 @@ def read_coco(path: Path, *, masks: bool = True) -> Coco:
 
 
 def read_detections(path: Path, truth: Coco, *, masks: bool = True) -> list[Entry]:
-    """Read COCO detections in the images of `truth`, whose image ids they get.
+    """Read detections in COCO's format, to score them against the true annotations of the same images.
 
-    Detections with a list of images are joined by file name, others (pycocotools' plain list) by image id.
+    A file with a list of images (`scarpsim detect`) is matched with the truth by file name; a list of detections alone
+    (pycocotools) by image id. The returned detections have the image ids of the truth.
 
     Parameters
     ----------
     path : The JSON file.
-    truth : The annotations.
+    truth : The true annotations.
     masks : Whether each detection must have a mask.
 
     Raises

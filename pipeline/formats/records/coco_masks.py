@@ -22,7 +22,7 @@ _LONGEST_NUMBER = 7
 
 
 def run_lengths(segmentation: Any, height: int, width: int, where: str) -> dict[str, Any]:
-    """Return the mask of a COCO annotation as compressed run lengths, {size, counts}, with `counts` as of pycocotools.
+    """Return the mask of a COCO annotation as compressed run lengths, the dictionary {size, counts} that pycocotools takes.
 
     Parameters
     ----------

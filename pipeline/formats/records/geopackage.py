@@ -54,7 +54,7 @@ def write_geopackage(
     rows : sequence of mappings
         For each polygon, a value or None for each column.
     outlines : sequence of Rings
-        The polygon of each row.
+        The polygon of each row: a closed ring (n, 3), x, y and z, m, for each of its separate parts.
     wkt : str
         The coordinate system of the polygons; empty where there is none.
     """

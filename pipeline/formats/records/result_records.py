@@ -168,8 +168,8 @@ class _Gap(_Record):
 def read_run(path: Path, remedy: str) -> dict[str, Any]:
     """Read and check run.json, the record of a simulation, finished or not.
 
-    Missing lists of blocks become empty, and null values are left out. remedy: what the user can do, the end of an error.
-    Raises InputError if the file is not such a record.
+    Each epoch in the result has a list of blocks, perhaps empty; null values are left out. remedy: what the user can do, the end
+    of an error. Raises InputError if the file is not such a record.
     """
     values = read_json(path, remedy=remedy)
     parse(_RunRecord, values, str(path))
@@ -178,9 +178,10 @@ def read_run(path: Path, remedy: str) -> dict[str, Any]:
 
 
 def read_annotations(path: Path) -> dict[str, Any]:
-    """Read annotations.json of a run: the fallen blocks in its difference maps, in COCO's format.
+    """Read annotations.json of a run, which has the fallen blocks in its difference maps, in COCO's format.
 
-    Its images have an epoch and its annotations a block; InputError is raised for other files.
+    Each image also has the number of its epoch (`epoch`), and each annotation that of its block (`block`). Raises InputError for
+    any other file.
     """
     values = read_json(path, remedy="make the run again")
     parse(_RunAnnotations, values, str(path))

@@ -53,9 +53,10 @@ class RunFiles:
         return read_own_points(self._written(number, "points.laz"))
 
     def survey_points(self, number: int) -> tuple[PointCloud, str]:
-        """Read the points of one of the run's epochs, and the WKT of their coordinate system, "" if the config names none.
+        """Read the points of one of the run's epochs in survey coordinates, m, and the WKT of their coordinate system.
 
-        number: of the epoch. The points are in the wall's own coordinates if the run wrote those, else in the wall frame; m.
+        number: of the epoch. The WKT is "" if the config of the run names no system. A run that wrote no points_world.laz has no
+        survey coordinates; the points are then in the wall frame.
         """
         world = epoch_folder(self.folder, number) / "points_world.laz"
         if not world.is_file():

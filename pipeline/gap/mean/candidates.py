@@ -93,9 +93,9 @@ class Wave:
         return np.stack([sine, cosine, derivative], axis=1)
 
     def part(self, rows: Rows) -> Wave:
-        """Return the sinusoidal error at a subset of its n points.
+        """Return the sinusoidal error at a subset of its n points, such as the points that a fit uses.
 
-        rows: numbers of the points to keep, from 0, as an int64 array.
+        rows: numbers of the points to keep, from 0, as an int64 array; they may be in another order.
         """
         return Wave(self.key, self.factor[rows], self.x[rows], self.least)
 
@@ -118,7 +118,8 @@ class Candidate:
         effect apart.
     empirical : True for a non-parametric term, false for an effect of the catalogue.
     form : Form of a non-parametric term, such as "line" or "wave"; "" for an effect.
-    wave, period : For a sine, the quantity along which it runs with its scale, and its period; overtones have a period too.
+    wave : For a sine, the quantity along which it runs, and the change of the observable for a sine of value 1; else None.
+    period : Period of a sine, of its overtones, or of a pattern of scan lines; 0 for other terms.
     prior_precision : (k,) prior inverse variances of the coefficients, from typical sizes of the effect; None without a prior.
     angle : For a non-parametric term that is an error of a recorded angle, the name of that angle; else "".
     """
@@ -147,29 +148,29 @@ class Candidate:
 
     @property
     def sine(self) -> Wave:
-        """Return the sine of a candidate that is a sinusoidal error, such as a wobble along the azimuth.
+        """Return the `Wave` of a candidate that is a sinusoidal error, such as a wobble along the azimuth.
 
-        It holds the quantity along which the sine runs, at each of n points, and by how much a sine of value 1 changes the
-        observable of each point. Raises TypeError if the candidate is not sinusoidal.
+        From it the design columns for another period can be computed, when the best period is searched. Raises TypeError if the
+        candidate is not sinusoidal.
         """
         if self.wave is None:
             raise TypeError(f"candidate {self.name} is not a sine")
         return self.wave
 
     def part(self, rows: Rows) -> Candidate:
-        """Return the candidate at a subset of its n points.
+        """Return the candidate at a subset of its n points, such as the points that a fit uses.
 
-        rows: numbers of the points to keep, from 0, as an int64 array.
+        rows: numbers of the points to keep, from 0, as an int64 array; they may be in another order.
         """
         matrix = None if self.matrix is None else self.matrix[rows]
         return replace(self, matrix=matrix, wave=None if self.wave is None else self.wave.part(rows))
 
     @property
     def family(self) -> str:
-        """Name that all variants of one explanation share, by which the search groups them.
+        """Name under which the search groups all variants of one explanation; it represents the group by its best variant.
 
-        Variants of one effect differ only in values that are tried, such as the period or the camera. The search represents
-        each family by its best variant. For a non-parametric term the name is made of covariate, form and angle.
+        The variants of an effect differ in values that are tried, such as the period or the camera; the name is that of the
+        effect. For a non-parametric term it is made of covariate, form and angle.
         """
         return f"free {self.name} {self.form} {self.angle}" if self.empirical else self.name
 
@@ -209,9 +210,8 @@ class SineGrid:
     def at_period(self, period: float) -> Candidate:
         """Return the sinusoidal error with a given period, which need not be one of the trial periods, as a candidate.
 
-        Two coefficients are fitted, of a sine and a cosine column. The candidate's function `parameters` converts them to
-        amplitude and phase; if a third value is given, it is a correction of the frequency 1 / period, which changes the
-        period.
+        The candidate has two coefficients, of a sine and a cosine column. Its function `parameters` converts them to amplitude,
+        phase and period. It also takes a third value, the fitted correction of the frequency 1 / period.
 
         period: period in the unit of the quantity along which the sine runs.
         """
@@ -233,18 +233,18 @@ class SineGrid:
         return [replace(self, frequencies=self.frequencies[start : start + _CHUNK]) for start in starts]
 
     def columns(self, rows: FloatArray) -> FloatArray:
-        """Compute the sine and cosine design columns of all f trial frequencies at once, each row multiplied by a weight.
+        """Compute the sine and cosine design columns of all f trial frequencies at once, to score them all in one search.
 
         This is quicker than one frequency at a time: the frequencies are evenly spaced, so each pair of columns is the
         preceding pair rotated by the same phase angle at each point.
 
         Parameters
         ----------
-        rows : (n,) weight of each point, such as the inverse of its standard deviation.
+        rows : (n,) weight of each point, such as the inverse of its standard deviation; it multiplies the point's row.
 
         Returns
         -------
-        (n, 2 f) columns: sine and cosine of the first frequency, then of the second one, and so on.
+        (n, 2 f) weighted columns: sine and cosine of the first frequency, then of the second one, and so on.
         """
         count = len(self.frequencies)
         spacing = float(self.frequencies[1] - self.frequencies[0]) if count > 1 else 0.0
@@ -257,15 +257,17 @@ class SineGrid:
         return columns.T
 
     def part(self, rows: Rows) -> SineGrid:
-        """Return the grid of sines at a subset of its n points.
+        """Return the grid of sines at a subset of its n points, such as the points that a fit uses.
 
-        rows: numbers of the points to keep, from 0, as an int64 array.
+        rows: numbers of the points to keep, from 0, as an int64 array; they may be in another order.
         """
         return replace(self, wave=self.wave.part(rows))
 
 
 def expand_grids(families: list[Candidate | SineGrid]) -> list[Candidate]:
     """Return a flat list of candidate errors, in which a sine of unknown period becomes one candidate per trial frequency.
+
+    It serves callers that compare all candidates alike, whether their period is searched or not.
 
     families: candidates with known design columns, and sines with their grids of trial frequencies.
     """
@@ -338,15 +340,16 @@ def with_period(candidate: Candidate, period: float) -> Candidate:
 
 
 def prior_precision(candidate: Candidate, width: int) -> FloatArray:
-    """Return the prior inverse variances of a candidate's coefficients for a regression; 0 (no prior) where none are stated.
+    """Return the prior inverse variances of a candidate's coefficients, as a regression with priors needs them.
 
     Parameters
     ----------
     candidate : The candidate error.
-    width : Number of columns that are fitted; for a sine one more than its own two if its frequency is fitted too.
+    width : Number of coefficients that are fitted: 2 for a sine, 3 if its frequency is corrected too, else the number of the
+        candidate's design columns.
 
     Returns
     -------
-    (width,) prior inverse variances; all 0 for a candidate without a prior. Sines have no prior.
+    (width,) prior inverse variances; all 0 for a candidate without a prior, as every sine is.
     """
     return np.zeros(width) if candidate.prior_precision is None else candidate.prior_precision

@@ -39,7 +39,7 @@ class CandidateFamilies:
 
     Attributes
     ----------
-    plain : Candidates with known columns; effects of the catalogue come before non-parametric terms.
+    plain : Candidates with known design columns; effects of the catalogue come before terms that name no cause.
     grids : Sines of unknown period, each with its grid of trial frequencies.
     """
 
@@ -57,10 +57,12 @@ class CandidateFamilies:
 
     @cached_property
     def by_name(self) -> dict[str, tuple[list[int], list[int]]]:
-        """For the name of each family (all variants of one explanation), which candidates belong to it: two lists of indices.
+        """Variants of each family, by the family's name, so that the search can find the best variant of each.
 
-        The first list has indices into `plain`. The second one has the numbers of its sines, counted through the trial
-        frequencies of all `grids` one after the other, from 0, as the method `sine` takes them.
+        A family is one explanation of the residuals with all its variants, such as an effect with each camera or period.
+
+        The value is two lists of indices. The first one holds indices into the list `plain` of candidates with known design
+        columns. The second one holds numbers of trial sines, as the method `sine` takes them.
         """
         families: dict[str, tuple[list[int], list[int]]] = {}
         for row, candidate in enumerate(self.plain):
@@ -73,10 +75,10 @@ class CandidateFamilies:
         return families
 
     def sine(self, number: int) -> Candidate:
-        """Return the sine at one trial frequency as a candidate.
+        """Return a sinusoidal error at one of its trial frequencies as a candidate.
 
-        number: counts through the trial frequencies of the first element of `grids`, then through those of the next, from 0.
-        Raises IndexError if there are fewer.
+        number: running number of the trial sine, from 0. It counts the trial frequencies of the first sine in the list `grids`,
+        then those of the second one, and so on. Raises IndexError if there are fewer.
         """
         for grid in self.grids:
             if number < len(grid.frequencies):
@@ -90,8 +92,8 @@ class Design:
     """The regression problem of one search for systematic errors: n residuals, and the columns of pose and all candidates.
 
     A candidate is a possible sensor error, or a term that names no cause. Residuals and columns are divided by the predicted
-    standard deviation sigma of each point. They are then split into the means of square cells of the wall, and deviations
-    within these cells (see `ProjectedColumns`). Designs are immutable.
+    standard deviation sigma of each point ("over sigma"). Each is then split into its means over square cells of the wall and
+    its deviations within these cells: a `ProjectedColumns`. Designs are immutable.
 
     Attributes
     ----------
@@ -99,17 +101,17 @@ class Design:
     families : The candidates.
     cells : The square cells of the wall, with the points in each.
     model : Generalised least squares with the covariances of the reference surface's error and of the noise.
-    pose_basis : (n, p) orthonormal basis of the p pose columns over sigma; rows as in `model.rows`.
+    pose_basis : (n, p) orthonormal basis of the p pose columns over sigma; points in the order of `model.rows`.
     pose_transform : (p, p) matrix R with pose columns over sigma = pose_basis R.
     pose_precision : (p,) prior inverse variances of the pose parameters; 0: no prior.
-    grids : Sines of unknown period with their trial frequencies; rows as in `model.rows`.
+    grids : Sines of unknown period with their trial frequencies; points in the order of `model.rows`.
     value : The residuals over sigma, split.
     fixed : The columns of the pose, then of the candidates with known columns, split.
     sine_columns : Split columns of sines that stay in the model at one period, numbered after those of `fixed`; None without
         any.
     column_numbers : For each candidate the numbers of its columns.
     sine_products : Inner products of the columns of all trial sines with the other columns.
-    noise_products : (k, d) inner products of the k columns in `fixed` with d = NULL_DRAWS draws of simulated noise within cells.
+    noise_products : (k, d) inner products of the k columns in `fixed` with d = 499 draws of simulated noise within cells.
     equations : Normal equations of all columns, under each covariance of the reference error that the residuals allow.
     """
 
@@ -166,7 +168,7 @@ class Design:
         )  # few non-parametric ones are held
         waves = SineProducts.of(model, grids, fixed.within_weighted[:, :held_count], value, noise)
         known = [np.zeros(count), *(prior_precision(each, each.columns.shape[1]) for each in chosen.plain)]
-        equations = assemble(model, covariances, fixed, value, waves).with_precision(np.concatenate(known))
+        equations = assemble(covariances, fixed, value, waves).with_precision(np.concatenate(known))
         drawn = noise.products(fixed.within[noise.rows], model.within_noise.to_nodes(fixed.within))
         found = cls(
             residuals, chosen, cells, model, pose, turn, precision, grids, value, fixed, None, place, waves, drawn, equations
@@ -175,14 +177,18 @@ class Design:
 
     @cached_property
     def pose_columns(self) -> list[int]:
-        """Numbers of the design columns of the sensor's pose, which come before those of the candidates."""
+        """Numbers of the design columns of the sensor's pose: 0 to p - 1 for p pose parameters.
+
+        Every model that is fitted contains them; the columns of candidate errors come after them.
+        """
         return list(range(self.pose_basis.shape[1]))
 
     @cached_property
     def ranked_covariances(self) -> list[int]:
-        """Trial covariances of the reference surface's error, as indices into `equations.covariances`, the most likely first.
+        """Trial covariances of the reference surface's error, ranked from the most to the least likely.
 
-        They are ranked by the likelihood of a fit of the sensor's pose alone, without any candidate error.
+        They are indices into `equations.covariances`. The likelihood is that of a fit of the sensor's pose alone, without any
+        candidate error. Simulations without an effect save time by using only the first ones.
         """
         return [int(row) for row in np.argsort(-self.equations.log_likelihood(self.pose_columns)[:, 0], kind="stable")]
 
@@ -197,9 +203,9 @@ class Design:
 
     @property
     def plain_columns(self) -> list[list[int]]:
-        """The numbers of the design columns of each candidate that has known columns, in the order of `families.plain`.
+        """For each candidate with known design columns, the numbers of its columns, by which it is scored.
 
-        Sines of unknown period are not included.
+        One list for each candidate of `families.plain`, in that order. Sines of unknown period are not among them.
         """
         return [self.column_numbers[candidate] for candidate in self.families.plain]
 
@@ -246,20 +252,22 @@ class Design:
         )
 
     def columns(self, candidates: Sequence[Candidate]) -> list[int]:
-        """Return the numbers of the design columns of a model: those of the sensor's pose, then those of some candidate errors.
+        """Return the numbers of all design columns of a model, with which its normal equations are solved.
 
-        candidates: members of the model. A sine must have been put into this design by `conditioned_on`.
+        The columns of the sensor's pose come first, then those of the candidate errors.
+
+        candidates: candidate errors in the model. A sine must have been put into this design by `conditioned_on`.
         """
         return [*self.pose_columns, *(column for each in candidates for column in self.column_numbers[each])]
 
     def log_likelihood(self, value: FloatArray, candidate: Candidate) -> float:
-        """Return the log-likelihood of a fit of the pose and one candidate error to other residuals of the same points.
+        """Return the log-likelihood of other residuals of the same points, with the pose and one candidate error fitted.
 
-        With it the residuals before and after a refit of an effect without linearisation are compared.
+        It tells whether residuals become more likely when an effect is refitted without linearisation.
 
         Parameters
         ----------
-        value : (n,) residuals, in the unit of the observable (m, or px of disparity).
+        value : (n,) the other residuals, in the unit of the observable (m, or px of disparity).
         candidate : The candidate error.
         """
         columns = self._projected_pose.append(self.model.project(_projected(self.pose_basis, self._matrix([candidate], None))))
@@ -274,13 +282,14 @@ class Design:
         Parameters
         ----------
         candidates : Candidate errors to fit; none: the pose alone.
-        wave_coefficients : For each candidate, the present (2,) sine and cosine coefficients of a sine whose frequency shall
-            be corrected too, else None. None instead of a list: no frequency is corrected.
+        wave_coefficients : One entry for each candidate. For a sine whose frequency is to be corrected as well: its present (2,)
+            sine and cosine coefficients. For any other candidate: None. If None is given instead of a list, no frequency is
+            corrected.
 
         Returns
         -------
-        The fit. Its coefficients are those of `residuals.pose_jacobian`, then those of each candidate in order; a corrected
-        frequency is a third coefficient of its sine.
+        The fit. Its coefficients are those of the pose parameters, as in `residuals.pose_jacobian`, then those of each candidate
+        in order. A sine whose frequency is corrected has the correction as its third coefficient.
         """
         turned = np.linalg.inv(self.pose_transform)
         if not candidates:
@@ -337,12 +346,16 @@ class Design:
         return found, self.fit(found, wave_coefficients)
 
     def split_coefficients(self, values: NDArray[Any], candidates: list[Candidate]) -> list[NDArray[Any]]:
-        """Divide the coefficients that `fit_refined` returns into one array per candidate error, without those of the pose.
+        """Divide the coefficients of a joint fit into one array for each candidate error, without those of the pose.
 
         Parameters
         ----------
-        values : (k,) coefficients of the joint fit, or any other array with one value for each coefficient.
-        candidates : The fitted candidates, in the order of the fit. A sine has three coefficients.
+        values : (k,) coefficients, as `fit_refined` returns them; or any other array with one value for each coefficient.
+        candidates : The fitted candidates, in the order of the fit.
+
+        Returns
+        -------
+        One array for each candidate; a sine has three values: sine, cosine and correction of the frequency.
         """
         widths = [candidate.columns.shape[1] + (candidate.wave is not None) for candidate in candidates]
         return np.split(values[len(self.pose_columns) :], np.cumsum(widths)[:-1]) if candidates else []
@@ -358,7 +371,7 @@ class Design:
         return float(np.sqrt(self.fit(candidates).cell_covariance.variance_ratio)) * self.model.typical_sigma
 
     def residuals_after(self, chosen: list[Candidate]) -> FloatArray:
-        """Return the (n,) residuals minus the fitted pose and some fitted errors.
+        """Return the (n,) residuals minus the fitted pose and some fitted errors, to see what these leave unexplained.
 
         They are in the unit of the observable (m, or px of disparity).
 
@@ -371,16 +384,17 @@ class Design:
         return np.asarray(value)
 
     def identifiability(self) -> tuple[list[str], FloatArray, FloatArray]:
-        """Compare the signatures of all effects (the residuals that each one makes) with each other and with those of the pose.
+        """Compare the signatures of all effects, to show which sensor errors this measurement cannot tell apart.
 
-        It shows which sensor errors this measurement cannot tell apart. Two effects with a cosine near 1 in magnitude cannot
-        be distinguished. An effect of whose signature little is left beside the pose cannot be told from a wrong pose.
+        An effect's signature is the pattern of residuals that it makes. Two effects whose signatures have a cosine near 1 in
+        magnitude cannot be distinguished. If a change of the sensor's pose makes nearly the same residuals, the effect cannot be
+        told from a wrong pose.
 
         Returns
         -------
-        The names of the f effects, each represented by its first variant and first coefficient; (f, f) cosines between their
-        signatures after the pose is fitted to each; and (f,) the share of each signature's norm that is left then, from 0 to
-        1.
+        names : The names of f effects, each represented by one variant and its first coefficient.
+        cosines : (f, f) cosines between the signatures, after the part that the pose can imitate is taken out of each.
+        shares : (f,) share of each signature's norm that is left then, from 0 to 1.
         """
         row = self.ranked_covariances[0]
         names, matrices = [], []

@@ -49,7 +49,7 @@ class DetectableSize:
     parameter : Name of the effect's parameter that states the size; "" if the size is in the unit of the observable.
     size : Value of that parameter, in its unit; infinite if no size shows, NaN if it was not computed.
     at : Values that are not fitted and for which the size holds, by name, such as the period of a wave or the camera.
-    note : Condition or reason, in words.
+    note : Condition under which the size holds, or reason why there is none, in words; "" without any.
     """
 
     name: str
@@ -69,7 +69,7 @@ class DetectableSize:
 
 @dataclass(frozen=True, eq=False)
 class Signature:
-    """The pattern of residuals of one candidate error, of which the smallest detectable size is to be computed.
+    """One error whose smallest detectable size is to be computed, with the place of its design columns.
 
     It belongs to one parameter of the error, or to a wave whose phase is free.
 
@@ -77,10 +77,10 @@ class Signature:
     ----------
     candidate : The candidate error.
     parameter : Name of the parameter whose detectable size is wanted.
-    columns : Numbers of the candidate's design columns among those of all candidates that are examined.
+    columns : Numbers of the candidate's design columns among the examined columns that a `DetectionPower` holds.
     sine : Whether the candidate has a phase; the phase that is hardest to detect is then taken.
-    needed : Function that returns the log-likelihood ratio from which the error shows. Its argument is the indices of the
-        trial covariances of the reference surface's error, the most likely first.
+    needed : Function that returns the log-likelihood ratio that the error must reach to count as detected. Its argument is the
+        indices of the trial covariances of the reference surface's error, the most likely first.
     """
 
     candidate: Candidate
@@ -90,11 +90,11 @@ class Signature:
     needed: Callable[[Sequence[int]], float]
 
     def direction(self, information: FloatArray) -> FloatArray:
-        """Return the unit vector of coefficients along which the detectable size is computed.
+        """Return the direction in the space of an error's k coefficients along which its detectable size is computed.
 
-        It is the coefficient of the parameter alone; for a wave it is the phase that is hardest to detect.
+        It is the coefficient of the examined parameter alone; for a wave it is the phase that is hardest to detect.
 
-        information: (k, k) Fisher information of the candidate's k coefficients.
+        information: (k, k) Fisher information of the k coefficients: how precisely the measurement determines them.
 
         Returns
         -------
@@ -113,14 +113,18 @@ class Signature:
 def noncentrality(needed: float, columns: int, power: float = POWER) -> float:
     """Return how far an effect must stand out of the noise for a likelihood-ratio test to detect it with a given probability.
 
-    The measure is the noncentrality of a chi-square variable that exceeds twice the needed log-likelihood ratio with that
-    probability. It grows with the square of the effect's size, so that the detectable size follows from it.
+    Twice the log-likelihood ratio follows a noncentral chi-square distribution. Its noncentrality grows with the square of the
+    effect's size, so that the detectable size follows from it.
 
     Parameters
     ----------
     needed : Log-likelihood ratio from which the test is passed.
     columns : Number of design columns of the effect, the degrees of freedom.
     power : The probability, from 0 to 1.
+
+    Returns
+    -------
+    The noncentrality at which the needed ratio is exceeded with that probability.
     """
     at, rare = 2 * needed, 1e-9
     return float(brentq(lambda x: ncx2.sf(at, columns, x) - power, rare, 4 * (at + 10 * columns + 10)))
@@ -128,18 +132,19 @@ def noncentrality(needed: float, columns: int, power: float = POWER) -> float:
 
 @dataclass(frozen=True, eq=False)
 class DetectionPower:
-    """Simulated measurements without further effects, from which the detectable size of any examined sensor error follows.
+    """Simulated measurements from which the detectable size of any examined sensor error follows.
 
-    They are kept as inner products of d simulations with the k design columns of the examined errors, under each of C trial
-    covariances of the reference surface's error. Columns that every model has, of the pose and of the effects found, are
-    projected out; they are called nuisance columns.
+    The simulations contain no errors but those already found. They are kept as inner products of d simulations with the k
+    design columns of the examined errors, under each of C trial covariances of the reference surface's error. The columns of
+    the pose and of the found errors are in every model; they are called nuisance columns.
 
     Attributes
     ----------
     likely : Index of the most likely covariance, under which the simulations were drawn.
     plain : (C, d) log-likelihood of each simulation with the nuisance columns alone fitted.
-    right : (C, k, d) products of the examined columns with the simulations, nuisance columns projected out.
-    matrix : (C, k, k) products of the examined columns with each other, nuisance columns projected out, plus priors.
+    right : (C, k, d) inner products of the examined columns with the simulations, nuisance columns projected out.
+    matrix : (C, k, k) inner products of the examined columns with each other, nuisance columns projected out, plus the prior
+        inverse variances on the diagonal.
     whole : (C, k) squared norms of the examined columns before the nuisance columns are projected out.
     """
 
@@ -153,15 +158,16 @@ class DetectionPower:
     def of(
         cls, design: Design, members: Sequence[Candidate], plain: list[int], sines: list[int], random: KeyedRandom
     ) -> DetectionPower:
-        """Simulate measurements without further effects, and compute what the detectable sizes of the examined errors need.
+        """Simulate measurements that contain no errors but those found, to compute from them the detectable sizes of others.
 
         Parameters
         ----------
-        design : The regression problem with the found effects in the model (`Design.conditioned_on`).
-        members : The found effects, fitted beside each examined error. Sines among them only determine the most likely
+        design : The regression problem with the found errors in the model (`Design.conditioned_on`).
+        members : The found errors, fitted beside each examined error. Sines among them only determine the most likely
             covariance.
         plain : Numbers of the design columns to examine, of candidates that have known columns.
-        sines : Numbers of the trial sines to examine; their two columns each follow the columns `plain`.
+        sines : Numbers of the trial sines to examine, as `CandidateFamilies.sine` takes them. In the result the examined columns
+            are those of `plain`, then the sine and the cosine column of each trial sine.
         random : Source of the random numbers.
         """
         equations, known = design.equations, design.columns(members)
@@ -191,14 +197,14 @@ class DetectionPower:
     def size(self, signature: Signature) -> float:
         """Return the size of an error that the measurement would have shown with a probability of 95 %.
 
-        An error of that size also raises the estimate of the reference surface's error, and with it the log-likelihood ratio
-        that is needed. The size is therefore computed a second time, with that larger reference error.
+        An error of that size also raises the estimate of the reference surface's error, and with it the log-likelihood ratio that
+        counts as detected. The size is therefore computed a second time, with that larger estimate.
 
-        signature: the pattern of the error, and the parameter whose size is wanted.
+        signature: the error, and the parameter whose size is wanted.
 
         Returns
         -------
-        The size in the unit of the parameter; infinite if no size shows.
+        The size in the unit of the parameter; infinite if the error would not show at any size.
         """
         rows = signature.columns
         precision = signature.candidate.prior_precision
@@ -267,10 +273,11 @@ def detectable_sizes(
 
     Parameters
     ----------
-    design : The regression problem with the found effects in the model (`Design.conditioned_on`).
-    members : The found effects; they are fitted beside each other error, and no size is computed for them.
-    needed : Function that returns the log-likelihood ratio from which a candidate error shows. Its arguments are the
-        candidate, and the indices of the trial covariances of the reference surface's error, the most likely first.
+    design : The regression problem with the found errors in the model (`Design.conditioned_on`).
+    members : The found errors; they are fitted beside each other error, and no size is computed for them.
+    needed : Function that returns the log-likelihood ratio that a candidate error must reach to count as detected. Its
+        arguments are the candidate, and the indices of the trial covariances of the reference surface's error, the most likely
+        first.
     random : Source of the random numbers of the simulations.
 
     Returns

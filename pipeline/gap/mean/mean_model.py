@@ -59,16 +59,17 @@ _NOTHING = 1e-14
 
 @dataclass(frozen=True, eq=False)
 class CellCovariance:
-    """A trial covariance of the mean residuals in m square cells of the wall, given by its eigenvectors and eigenvalues.
+    """A trial covariance of the mean residuals in m square cells of the wall, under which candidate errors are fitted.
 
     It is the sum of two parts: the error of the reference surface, which is correlated between cells, and the sensor's noise.
-    Cell means are divided by the standard deviations of their noise, so that the noise is the unit matrix.
+    Cell means are divided by the standard deviations of their noise, so that the noise has the unit matrix as covariance. The
+    true covariance is not known, so several are tried.
 
     Attributes
     ----------
-    basis : Index of the correlation function of the reference's error among those tried, and so of the eigenvectors.
+    basis : Index of the correlation function of the reference's error among those tried. It tells which eigenvectors apply.
     variance_ratio : Variance of the reference's error divided by the median noise variance of a cell mean.
-    weight : (m,) inverse eigenvalues.
+    weight : (m,) inverse eigenvalues of the covariance.
     """
 
     basis: int
@@ -98,9 +99,9 @@ class MeanFit:
 class MeanModel:
     """Generalised least squares for residuals with independent noise and a reference error that is correlated over metres.
 
-    Points are gathered in m square cells of the wall. The class divides any design column over the points into cell means,
-    which follow the correlated error, and deviations within cells, which are nearly independent. Columns are given "over
-    sigma": each row is divided by the standard deviation of its point.
+    Points are gathered in m square cells of the wall. The class splits design columns over the points into cell means, which
+    follow the correlated error, and deviations within cells, which are nearly independent. All columns are divided by the
+    predicted standard deviation of each point first.
 
     Attributes
     ----------
@@ -168,8 +169,8 @@ class MeanModel:
     ) -> tuple[MeanModel, list[CellCovariance], list[int]]:
         """Drop trial covariances of the reference surface's error under which the residuals are unlikely, to save time later.
 
-        A correlation function is kept if the residuals are likely under it with at least one of the given sets of columns
-        fitted. Of each, only amplitudes near the most likely ones are returned.
+        A trial covariance has a correlation function and an amplitude. A function is kept if the residuals are likely under it
+        with at least one of the given sets of columns fitted. Of its amplitudes, only those near the most likely ones are kept.
 
         Parameters
         ----------
@@ -180,8 +181,9 @@ class MeanModel:
 
         Returns
         -------
-        The model with the remaining correlation functions; the remaining covariances; and the indices of the remaining
-        correlation functions among the present ones, with which `ProjectedColumns.in_bases` reduces columns.
+        model : The model with the kept correlation functions.
+        covariances : The kept trial covariances.
+        kept : Indices of the kept correlation functions among all; `ProjectedColumns.in_bases` reduces columns to them.
         """
         ratios = [ratio for ratio in self._ratios if ratio <= (most_sigma / self.typical_sigma) ** 2]
         normals = [_NormalEquations.of(design, value) for design in designs]
@@ -205,9 +207,10 @@ class MeanModel:
 
     @property
     def covariances(self) -> list[CellCovariance]:
-        """The trial covariances of the reference surface's error plus noise, for the mean residuals in the cells of the wall.
+        """The trial covariances of the mean residuals in the cells of the wall, for fits that pick the most likely one.
 
-        There is one for each remaining correlation function of the reference's error and each trial amplitude of it.
+        Each is the sum of the reference surface's error and noise. There is one for each pair of a correlation function and an
+        amplitude of the reference's error that the model tries; `restrict` returns a model that tries fewer.
         """
         return [self._covariance(basis, float(ratio)) for basis in range(len(self._bases)) for ratio in self._ratios]
 
@@ -243,13 +246,16 @@ class MeanModel:
 
         Returns
         -------
-        (3 m, k) the m means, then two slopes of each of the m cells, divided by their standard deviations; only (m, k) means
-        if neighbouring points share noise.
+        (3 m, k) coefficients: first the means of the m cells, then their m slopes along x, then those along y, each divided
+        by its standard deviation. Only the (m, k) means if neighbouring points share noise.
         """
         return np.asarray((self._planes if rows == slice(None) else self._planes[:, rows]) @ weighted)
 
     def deviations(self, weighted: FloatArray, planes: FloatArray, rows: slice = slice(None)) -> FloatArray:
         """Return the deviations of design columns from their fitted plane (or mean) in each cell of the wall.
+
+        The error of the reference surface, which is correlated over metres, hardly affects them; their noise is nearly
+        independent.
 
         Parameters
         ----------
@@ -264,9 +270,10 @@ class MeanModel:
         return np.asarray(weighted[rows] - self._across[rows] @ planes)
 
     def in_bases(self, means: FloatArray) -> list[FloatArray]:
-        """Transform cell means of design columns to the eigenvectors of each trial covariance, in which they are uncorrelated.
+        """Transform cell means of design columns so that they are uncorrelated under each trial covariance.
 
-        A fit then only needs the eigenvalues, whatever the amplitude of the reference surface's error.
+        They become coordinates in the eigenvectors of the covariance's correlation function. A fit then only needs the
+        eigenvalues, whatever the amplitude of the reference surface's error.
 
         Parameters
         ----------
@@ -317,13 +324,14 @@ class MeanModel:
 
         Parameters
         ----------
-        at : Covariance of the cell means from which the draws come.
+        at : Covariance of the cell means under which all draws are made.
         count : Number of draws.
         random : Source of the random numbers.
 
         Returns
         -------
-        For each trial correlation function, the (m, count) draws in coordinates of its eigenvectors.
+        One (m, count) array for each trial correlation function of the reference's error, because fits are made under each. All
+        hold the same draws, as coordinates in the eigenvectors of that function (see `in_bases`).
         """
         draws = random.generator().standard_normal((len(self._total), count)) / np.sqrt(at.weight)[:, None]
         vectors = self._bases[at.basis][1]
@@ -412,8 +420,7 @@ def fit_reml(
     """Fit design columns to residuals by generalised least squares, under the most likely trial covariance.
 
     The covariances of the reference surface's error plus noise are compared by their restricted likelihood (REML, Patterson &
-    Thompson 1971). The returned covariance of the coefficients is an average over all of them, weighted by that likelihood. It
-    includes the differences between their estimates, because the true covariance is not known.
+    Thompson 1971).
 
     Parameters
     ----------
@@ -421,6 +428,12 @@ def fit_reml(
     columns : The k design columns to fit.
     value : The residuals, as one column.
     precision : (k, k) prior inverse covariance of the coefficients; None: no prior.
+
+    Returns
+    -------
+    The fit under the most likely covariance. Only its covariance of the coefficients is an average over all trial covariances,
+    weighted by their likelihood. It includes how much the estimates differ between them, because the true covariance is not
+    known.
     """
     normal = _NormalEquations.of(columns, value)
     fits = [normal.at(each, precision) for each in covariances]

@@ -34,18 +34,19 @@ _AT_ONCE = 8
 class SineProducts:
     """Inner products of the design columns of w trial sines with other columns, from which normal equations are built.
 
-    A trial sine is a sinusoidal error at one trial frequency; it has two columns, sine and cosine. Columns are divided into
-    deviations within m cells of the wall, weighted by the inverse covariance of the noise, and cell means. The products of the
-    means depend on the covariance of the reference surface's error, and are added by the method `at`.
+    A trial sine is a sinusoidal error at one trial frequency; it has two columns, sine and cosine. Each column is split into
+    its means over m cells of the wall and its deviations within the cells. Products "within cells" are those of the deviations,
+    weighted by the inverse covariance of their noise. Products of the means depend on the covariance of the reference surface's
+    error; the method `at` adds them.
 
     Attributes
     ----------
-    fixed : (2 w, k) products with the first k columns of pose and candidates that have known columns, within cells.
-    own : (w, 2, 2) products of each sine's two columns with each other, within cells.
-    right : (2 w, v) products with v columns of residuals, within cells.
-    noise : (2 w, d) products with d draws of simulated noise, within cells.
-    between : For each trial correlation function of the reference's error, the (m, 2 w) cell means of the sines in coordinates
-        of its eigenvectors.
+    fixed : (2 w, k) products within cells with the first k columns of the pose and of candidates that have known columns.
+    own : (w, 2, 2) products within cells of each sine's two columns with each other.
+    right : (2 w, v) products within cells with v columns of residuals.
+    noise : (2 w, d) products within cells with d draws of simulated noise.
+    between : For each trial correlation function of the reference's error, the (m, 2 w) cell means of the sines, as coordinates
+        in its eigenvectors.
     """
 
     fixed: FloatArray
@@ -60,13 +61,19 @@ class SineProducts:
     ) -> SineProducts:
         """Compute the inner products of the columns of all trial sines with other design columns, residuals and noise.
 
+        From them a search scores a sinusoidal error at every trial frequency without returning to the points.
+
         Parameters
         ----------
-        model : The mean model: division into cells of the wall, and covariances.
-        grids : Sines of unknown period, each with its trial frequencies; w sines in all.
-        fixed : (n, k) other columns at n points: deviations within cells, times the inverse covariance of the noise.
-        value : v columns of residuals.
+        model : Generalised least squares with the cells of the wall, the points in them, and the covariances to try.
+        grids : Sines of unknown period, each with its trial frequencies; together w trial sines.
+        fixed : (n, k) deviations of the other columns within cells at n points, times the inverse covariance of the noise.
+        value : v columns of residuals, split into cell means and deviations within cells.
         noise : d draws of simulated noise within cells.
+
+        Returns
+        -------
+        The products of all trial sines, in the order of `grids`.
         """
         beside = np.concatenate([fixed, value.within_weighted], axis=1)
 
@@ -90,19 +97,21 @@ class SineProducts:
         return cls(products[:, :count], own, products[:, count:], drawn, model.in_bases(means.T))
 
     def at(self, covariances: list[CellCovariance], within: FloatArray, between: list[FloatArray]) -> FloatArray:
-        """Return the inner products of the sines with other columns under each of C trial covariances of the reference's error.
+        """Return the inner products of w trial sines with other columns under each of C trial covariances, for normal equations.
 
-        They are the sum of the products of deviations within the cells of the wall and of those of the cell means.
+        Each is the sum of a product of deviations within the cells of the wall, which is given, and one of cell means, which
+        depends on the covariance.
 
         Parameters
         ----------
-        covariances : The C covariances of the cell means.
-        within : (2 w, a) products of the w sines with the `a` other columns, within cells.
-        between : For each correlation function, the (m, a) cell means of the other columns in coordinates of its eigenvectors.
+        covariances : The C trial covariances of the cell means: error of the reference surface plus noise.
+        within : (2 w, a) products of the sines' deviations within cells with those of `a` other columns.
+        between : For each trial correlation function of the reference's error, the (m, a) means of the other columns in m cells,
+            as coordinates in its eigenvectors.
 
         Returns
         -------
-        (C, 2 w, a) products.
+        (C, 2 w, a) products; each sine has two columns, sine and cosine.
         """
         found = np.empty((len(covariances), *within.shape))
         for basis, rows in _by_basis(covariances).items():
@@ -112,9 +121,11 @@ class SineProducts:
         return found
 
     def own_at(self, covariances: list[CellCovariance]) -> FloatArray:
-        """Return the inner products of each sine's two columns with each other under each of C trial covariances.
+        """Return the inner products of each trial sine's two columns with each other under each of C trial covariances.
 
-        covariances: the C covariances of the mean residuals in the cells of the wall.
+        They are the diagonal part of the normal equations of the sines.
+
+        covariances: the C trial covariances of the mean residuals in the cells of the wall.
 
         Returns
         -------
@@ -141,14 +152,14 @@ def _by_basis(covariances: list[CellCovariance]) -> dict[int, list[int]]:
 class NoiseDraws:
     """Simulated noise of n points, from which the random error of the coefficient of any design column is computed.
 
-    The noise consists of white noise and of noise that neighbouring points share: random values at q nodes of a pixel grid,
-    interpolated between them.
+    It shows how well candidate errors explain noise by chance. The noise consists of white noise, and of noise that
+    neighbouring points share: random values at q nodes of a pixel grid, interpolated between them.
 
     Attributes
     ----------
     rows : Slice that selects the n' points on which white noise is drawn, a subsample that saves time.
-    white : (n', d) white noise of d draws (realisations), in single precision, which is enough here.
-    on_nodes : (q, d) contribution of the noise at the nodes (see `WithinCellNoise.draw`).
+    white : (n', d) white noise of d draws (realisations), scaled as `products` needs it; in single precision, which is enough.
+    on_nodes : (q, d) what the shared noise adds to the random error of a coefficient, per grid node (`WithinCellNoise.draw`).
     """
 
     rows: slice
@@ -178,7 +189,7 @@ class NoiseDraws:
         return cls(rows, (white / np.sqrt(model.within_noise.white)).astype(np.float32), on_nodes)
 
     def products(self, within: FloatArray, on_nodes: FloatArray) -> FloatArray:
-        """Return the inner products of k design columns with the d draws of noise.
+        """Return the inner products of k design columns with d draws of simulated noise.
 
         They are weighted by the inverse covariance of the noise, and are what noise alone adds to the right-hand side of the
         normal equations.
@@ -187,7 +198,8 @@ class NoiseDraws:
         ----------
         within : (n', k) columns minus their mean (or plane) in each cell of the wall, at the n' points on which white noise is
             drawn.
-        on_nodes : (q, k) columns projected on the q nodes of the grid-correlated noise (`WithinCellNoise.to_nodes`).
+        on_nodes : (q, k) columns projected on the q nodes of the pixel grid whose noise neighbouring points share, as
+            `WithinCellNoise.to_nodes` returns them.
 
         Returns
         -------
@@ -203,12 +215,14 @@ def _squares(columns: FloatArray) -> FloatArray:
 
 
 def sine_products(grids: list[SineGrid], weighed: FloatArray, root: FloatArray) -> FloatArray:
-    """Compute the inner products of the columns of w trial sines with other columns, for the part within cells of the wall.
+    """Compute the inner products of the columns of w trial sines with other columns, such as those of a selected effect.
+
+    With them, sinusoidal errors are scored beside that effect. Only the part within the cells of the wall is computed.
 
     Parameters
     ----------
-    grids : Sines of unknown period, each with its trial frequencies; w sines in all.
-    weighed : (n, k) other columns at n points: deviations within cells, times the inverse covariance of the noise.
+    grids : Sines of unknown period, each with its trial frequencies; together w trial sines.
+    weighed : (n, k) deviations of the other columns within cells at n points, times the inverse covariance of the noise.
     root : (n,) inverse standard deviations of the points.
 
     Returns
@@ -223,10 +237,10 @@ def sine_products(grids: list[SineGrid], weighed: FloatArray, root: FloatArray) 
 class NormalEquations:
     """Normal equations X' V^-1 X b = X' V^-1 y of pose and all candidate errors, under each of C trial covariances V.
 
-    X are design columns and y residuals. From the equations, any set of candidates is scored without returning to the points.
-    There are k columns of the pose and of candidates with known columns, called fixed, and w sines at trial frequencies. Sines
-    only have products with themselves and with the h held columns: those of the pose and of effects that stay in the model
-    while others are scored.
+    X are design columns, b their coefficients and y residuals. From the equations, any set of candidates is scored without
+    returning to the points. There are k fixed columns, of the pose and of candidates with known columns, and w sines at trial
+    frequencies. A sine is only scored beside held columns: the h fixed columns of the pose and of effects that stay in the
+    model.
 
     Attributes
     ----------
@@ -234,7 +248,7 @@ class NormalEquations:
     fixed : (C, k, k) inner products of the k fixed columns.
     right : (C, k, v) inner products of the fixed columns with v columns of residuals, measured or simulated.
     constant : (C, v) log-likelihood of the residuals without any column.
-    wave_fixed : (C, 2 w, h) inner products of w sines with the held columns.
+    wave_fixed : (C, 2 w, h) inner products of the sine and cosine columns of w sines with the held columns.
     wave_own : (C, w, 2, 2) inner products of each sine's two columns with each other.
     wave_right : (C, 2 w, v) inner products of the sines with the residuals.
     held_columns : Numbers of the h held columns among the fixed ones.
@@ -257,7 +271,7 @@ class NormalEquations:
         return replace(self, fixed=self.fixed + np.diag(precision))
 
     def with_values(self, right: FloatArray, constant: FloatArray, wave_right: FloatArray) -> NormalEquations:
-        """Return the normal equations for v other columns of residuals, such as simulated ones, with the same design columns.
+        """Return the normal equations of the same design columns for other residuals, such as those of v simulations.
 
         Parameters
         ----------
@@ -268,13 +282,13 @@ class NormalEquations:
         return replace(self, right=right, constant=constant, wave_right=wave_right)
 
     def with_sine_products(self, columns: list[int], products: FloatArray) -> NormalEquations:
-        """Return the normal equations in which more design columns can stay in the model while sines are scored beside them.
+        """Return normal equations with which sines can also be scored beside further columns, such as those of a selected effect.
 
         Parameters
         ----------
-        columns : Numbers of these `a` columns, such as those of a selected effect.
-        products : (C, 2 w, a) inner products of the columns with the sine and cosine columns of w trial sines, under C
-            covariances.
+        columns : Numbers of the `a` further design columns.
+        products : (C, 2 w, a) inner products of these columns with the sine and cosine columns of w trial sines, under each of C
+            trial covariances.
         """
         return replace(
             self, wave_fixed=np.concatenate([self.wave_fixed, products], axis=2), held_columns=(*self.held_columns, *columns)
@@ -316,12 +330,12 @@ class NormalEquations:
         Parameters
         ----------
         base : Numbers of the b columns to fit.
-        right : (C, b, a) right-hand sides: inner products of these columns with `a` columns of residuals, or with other
-            columns.
+        right : (C, b, a) right-hand sides: inner products of these columns with the `a` vectors that are to be fitted, such as
+            residuals, under each covariance.
 
         Returns
         -------
-        (C, b, a) fitted coefficients.
+        (C, b, a) fitted coefficients, a column for each fitted vector.
         """
         matrix = self.fixed[:, base][:, :, base]
         scale = 1 / np.sqrt(np.maximum(np.einsum("ckk->ck", matrix), 1e-300))
@@ -340,8 +354,9 @@ class NormalEquations:
 
         Returns
         -------
-        (v,) values of the base model alone for v columns of residuals; (f, v) with each candidate added; and (w, v) with each
-        of the w trial sines added.
+        plain : (v,) log-likelihoods of the base model alone, for v columns of residuals.
+        added : (f, v) log-likelihoods with each candidate added.
+        waves : (w, v) log-likelihoods with each of the w trial sines added.
         """
         parts = [self._part(slice(start, start + _AT_ONCE)) for start in range(0, len(self.covariances), _AT_ONCE)]
         found = map_in_threads(lambda part: part._profile_chunk(base, fixed), parts)
@@ -393,18 +408,17 @@ def _explained(rest: FloatArray, own: FloatArray, left: FloatArray) -> FloatArra
     return np.asarray(0.5 * np.einsum("cfk,cfkv->cfv", share, turned**2))
 
 
-def assemble(
-    model: MeanModel, at: list[CellCovariance], fixed: ProjectedColumns, value: ProjectedColumns, waves: SineProducts
-) -> NormalEquations:
+def assemble(at: list[CellCovariance], fixed: ProjectedColumns, value: ProjectedColumns, waves: SineProducts) -> NormalEquations:
     """Build the normal equations of pose and candidate errors under each of C trial covariances.
+
+    From them, any set of candidates is scored without returning to the points.
 
     Parameters
     ----------
-    model : The mean model.
     at : The C trial covariances of the mean residuals in the cells of the wall.
     fixed : The k design columns of the pose and of all candidates but the sines of unknown period.
     value : v columns of residuals: one of measured residuals, or several of simulated ones.
-    waves : Inner products of the sines at w trial frequencies.
+    waves : Inner products of the columns of w trial sines with the other columns and the residuals.
 
     Returns
     -------
@@ -432,9 +446,9 @@ def extend(
     Parameters
     ----------
     equations : The present equations.
-    had : Their columns of pose and candidates, as one or more sets, in order.
-    value : The columns of residuals of the equations.
-    added : Columns to append. The products of trial sines with them are not computed.
+    had : Their columns of pose and candidates, as one or more sets, in the order of the equations.
+    value : The residuals of the equations, as columns.
+    added : Columns to append. Their products with trial sines are not computed; `with_sine_products` adds them.
     """
     cross, own = np.concatenate([each.within.T @ added.within_weighted for each in had]), added.within.T @ added.within_weighted
     right = added.within.T @ value.within_weighted

@@ -26,8 +26,7 @@ class NullDistribution:
 
     Attributes
     ----------
-    log_likelihood_ratios : For each family by name, the (NULL_DRAWS,) ratio of its best variant in each of the 499
-        simulations.
+    log_likelihood_ratios : For each family by name, the (499,) ratios of its best variant, one for each simulation.
     """
 
     log_likelihood_ratios: Mapping[str, FloatArray]
@@ -80,24 +79,28 @@ class NullDistribution:
         """Return the p-value of a candidate's score: the probability that chance alone gives a score as large.
 
         The test statistic is the largest score over all families of candidates, which corrects for multiple testing. If it
-        reaches the given score in b of N simulations without effects, the p-value is (1 + b) / (1 + N).
+        reaches the given score in b of N simulations without effects, the p-value is (1 + b) / (1 + N). A family is one candidate
+        with all its variants, such as an effect with all trial periods.
 
         Parameters
         ----------
         score : Penalised log-likelihood ratio of the candidate.
-        larger : Names of the families over which the maximum is taken, each with a factor by which its simulated ratios are
-            multiplied. None: all families, with factor 1. Factors above 1 make the test stricter.
+        larger : For the name of each family that takes part in the test, a factor by which its simulated log-likelihood
+            ratios are multiplied; above 1 the test is stricter. None: all families, with factor 1.
         """
         return float((1 + np.sum(self._largest_scores(larger) >= score)) / (1 + NULL_DRAWS))
 
     def critical_score(self, significance: float, larger: Mapping[str, float] | None = None) -> float:
         """Return the score that a candidate must exceed for its p-value to be at most `significance`.
 
+        It is a quantile of the largest score over all families of candidates in simulations without effects. A family is one
+        candidate with all its variants, such as an effect with all trial periods.
+
         Parameters
         ----------
         significance : Largest p-value, such as 0.01.
-        larger : Names of the families of candidates over which the largest simulated score is taken, each with a factor by
-            which its simulated log-likelihood ratios are multiplied. None: all families, with factor 1.
+        larger : For the name of each family that takes part in the test, a factor by which its simulated log-likelihood
+            ratios are multiplied; above 1 the test is stricter. None: all families, with factor 1.
         """
         allowed = max(int(significance * (1 + NULL_DRAWS) + 1e-9) - 1, 0)
         return float(np.sort(self._largest_scores(larger))[-1 - allowed])

@@ -26,17 +26,17 @@ _ALIKE = 100.0
 
 
 class MeanSearch:
-    """Scores every candidate error as an explanation of some residuals, alone or beside errors that are already selected.
+    """Scores every candidate error as an explanation of the residuals, alone or beside errors that are already selected.
 
     Candidates are the sensor errors of the catalogue (effects) and terms that name no cause. A score is a penalised
-    log-likelihood ratio; its p-value comes from simulations without any effect. `select` runs the forward selection with these
-    scores.
+    log-likelihood ratio; its p-value comes from simulations without any effect. The method `select` chooses the errors that
+    explain the residuals by these scores.
 
     Attributes
     ----------
     design : The regression problem, with the residuals and the design columns of all candidates.
-    single_effect_ratios : Log-likelihood ratio of each explanation alone. The key is its name, and whether it is a term that
-        names no cause.
+    single_effect_ratios : Log-likelihood ratio of each explanation fitted alone. The key is a pair: the name of the effect or
+        covariate, and True for terms that name no cause, else False.
     """
 
     def __init__(
@@ -136,15 +136,18 @@ class MeanSearch:
         return self._null.p_value(score)
 
     def goodness_of_fit_p_value(self, family_scores: Sequence[FamilyScore]) -> float | None:
-        """Test whether the selected errors leave anything to explain, by the p-value of the best score of a further candidate.
+        """Test whether the selected systematic errors leave anything to explain.
 
-        The simulations behind the p-value draw the reference surface's error from a Gaussian process. A real reference may
-        have larger single waves. How much larger is estimated along oblique directions on the wall, where no sensor has an
-        axis, and all sines are discounted by that factor. This is genomic control (Devlin & Roeder 1999).
+        The p-value is that of the best score that any further candidate reaches, from simulations without further errors. In
+        these the error of the reference surface is drawn from a Gaussian process. A real reference may have larger single
+        waves, which would pass for sinusoidal sensor errors. How much larger is estimated along oblique directions on the
+        wall, where no sensor has an axis. The null distribution of all sinusoidal candidates is stretched by that factor
+        (genomic control, Devlin & Roeder 1999).
 
         Parameters
         ----------
-        family_scores : Scores of all families of candidates beside the selected errors, as `select` returns them.
+        family_scores : Scores of all further candidates beside the selected errors, as `select` returns them. A family is a
+            candidate with its variants, such as a sine with all its periods.
 
         Returns
         -------
@@ -164,15 +167,15 @@ class MeanSearch:
     def detectable_sizes(
         self, members: Sequence[Candidate], family_scores: tuple[FamilyScore, ...], random: KeyedRandom
     ) -> list[DetectableSize]:
-        """Compute how large each sensor error that was not found must be to show in this measurement.
+        """Compute how large each sensor error that was not found would have to be to show in this measurement.
 
-        Sizes of smooth errors that are not in the catalogue are computed too. An error shows if the goodness-of-fit test
-        rejects the model without it. The size at which it does so with a probability of 95 % is computed.
+        An error shows if the goodness-of-fit test rejects the model without it; the size is the one at which it does so with a
+        probability of 95 %. Sizes of smooth errors that are not in the catalogue are computed too.
 
         Parameters
         ----------
         members : Errors that were found in this search; they stay in the model.
-        family_scores : Scores of all families of candidates beside them, as `select` returns them.
+        family_scores : Scores of all other candidates beside the found errors, as `select` returns them.
         random : Source of the random numbers of the simulations.
         """
         discounts = self._discounts(family_scores)
@@ -195,11 +198,12 @@ class MeanSearch:
 
         Parameters
         ----------
-        family_scores : Scores of all families of candidates beside the selected errors, as `select` returns them.
+        family_scores : Scores of all candidates beside the selected errors, spatial null candidates included, as `select` returns
+            them.
 
         Returns
         -------
-        The p-value of their best score; None if there are no such candidates.
+        The p-value of the best score of a spatial null candidate; None if there are no such candidates.
         """
         scores = [item.score for item in family_scores if item.name.startswith(SPATIAL_NULL)]
         places = [name for name in self.design.families.by_name if name.startswith(f"free {SPATIAL_NULL}")]
@@ -208,9 +212,9 @@ class MeanSearch:
     def joint_score(self, members: EffectSet) -> float:
         """Return the score of several errors together: their joint log-likelihood ratio minus the penalty of each.
 
-        The periods of their sines are refined first, because a strong sine loses likelihood on the grid of trial periods.
+        The periods of sines are refined first, because a strong sine loses likelihood on the grid of trial periods.
 
-        members: the errors, each with its own score and ratio, from which its penalty follows.
+        members: the errors, each as the search scored it; its penalty is its log-likelihood ratio minus its score.
         """
         candidates = tuple(member.candidate for member in members)
         design = self._conditioned_on(candidates)
@@ -219,15 +223,15 @@ class MeanSearch:
         return float(with_them - without - sum(member.log_likelihood_ratio - member.score for member in members))
 
     def correlated_covariates(self, form: FamilyScore) -> set[str]:
-        """Return the covariates that could replace that of a non-parametric term because they are so highly correlated with it.
+        """Return the covariates with which a non-parametric term would explain nearly the same residuals.
 
-        The limit is the threshold `mean.same_covariate`, an absolute correlation.
+        Their absolute correlation with the term's own covariate exceeds the threshold `mean.same_covariate`.
 
         form: the term (a line, spline or wave along a covariate, or a polynomial of two) with its score.
 
         Returns
         -------
-        Names of the covariates, among them the term's own.
+        Names of the covariates, the term's own among them.
         """
         found = self.design.residuals.covariates
         covariates = {name: values for name, values in found.items() if np.ptp(values) > 0}
@@ -236,7 +240,7 @@ class MeanSearch:
         return {name for name, row in zip(covariates, correlation, strict=False) if row.max() > thresholds().mean.same_covariate}
 
     def with_harmonics(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
-        """Return the form of a periodic non-parametric term that fits best, with some other errors in the model.
+        """Replace a non-parametric term that describes a periodic error by its best periodic form, to name the error's shape.
 
         A wave gets overtones if they fit clearly better, because a periodic error need not be a sine. A spline becomes a wave
         if that fits as well. Among patterns that repeat every few scan lines, columns or rows, the one with the fewest lines
@@ -244,8 +248,12 @@ class MeanSearch:
 
         Parameters
         ----------
-        members : The other errors in the model.
+        members : The other errors in the model, fitted jointly.
         form : The term, such as a wave along a covariate, with its score.
+
+        Returns
+        -------
+        The term in its best form, with its score.
         """
         if form.candidate.form.startswith(LINE_PATTERN):
             return self._of_fewest_lines(members, form)
@@ -295,13 +303,13 @@ class MeanSearch:
     def may_be_reference_error(self, members: EffectSet, form: FamilyScore) -> bool:
         """Tell whether a wave in the residuals is so small that it may be part of the reference surface's error.
 
-        The wave's standard deviation is compared with that of the reference's error, which is estimated in the same fit and
-        limited by the threshold `grid_noise.reference_error`.
+        The wave's standard deviation is compared with that of the reference's error. The latter is estimated in the same fit; at
+        most the threshold `grid_noise.reference_error` is taken for it.
 
         Parameters
         ----------
         members : Other errors in the model, fitted jointly.
-        form : The non-parametric term with its score; the answer is false for one that is no wave.
+        form : The wave: a non-parametric term with its score. For a term that is no wave the answer is false.
         """
         if form.candidate.form != "wave":
             return False
@@ -313,7 +321,7 @@ class MeanSearch:
     def fitted_std(self, item: FamilyScore) -> float:
         """Return how large a candidate error is: the standard deviation of its fitted values over the points.
 
-        The candidate and the sensor's pose are fitted together, without any other candidate. The result is in the unit of the
+        The fit has the candidate and the pose of the sensor, and no other candidate. The result is in the unit of the
         observable (m, or px of disparity).
 
         item: the candidate with its score.
@@ -330,8 +338,8 @@ class MeanSearch:
     def leading_effects(self) -> list[Candidate]:
         """List the sensor errors that explain the most on their own, which are worth refitting without linearisation.
 
-        These are effects of the catalogue. They reach a share (`mean.refit_share`) of the largest log-likelihood ratio and a
-        least ratio (`mean.refit_gain`). Sines of unknown period are not included.
+        They are effects of the catalogue; sines of unknown period are not included. Each reaches at least the log-likelihood
+        ratio `mean.refit_gain`, and at least the share `mean.refit_share` of the largest ratio (thresholds).
 
         Returns
         -------
@@ -348,9 +356,9 @@ class MeanSearch:
         return [each for ratio, each in ranked if ratio >= least][:_MOST_LEADING]
 
     def selected_alone(self, candidate: Candidate) -> SelectedEffect:
-        """Describe a candidate effect as if it were the only selected one, with its p-value.
+        """Describe a candidate effect as if it were the only selected one, to refit it alone without linearisation.
 
-        The result also names the effects that cannot be distinguished from it.
+        The result has its p-value, and names the effects that cannot be distinguished from it.
 
         candidate: the effect, with the parameter values that are kept, such as its camera.
         """

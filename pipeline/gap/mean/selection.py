@@ -25,10 +25,10 @@ _NOT_SPATIAL = ("intensity", "disparity_fraction")
 
 @dataclass(frozen=True)
 class FamilyScore:
-    """How well one family of candidate errors explains residuals in addition to the errors that are already in a model.
+    """How well one candidate error explains residuals in addition to the errors that are already in a model.
 
-    A family is the set of all variants of one candidate, such as an effect with all trial periods. Its best variant represents
-    it.
+    A candidate may have variants, such as an effect with each trial period; together they are called a family. The best variant
+    represents them.
 
     Attributes
     ----------
@@ -37,8 +37,8 @@ class FamilyScore:
     score : Log-likelihood ratio minus a penalty for what is fitted: an estimate of the ratio on new data.
     log_likelihood_ratio : Log-likelihood with the candidate minus that without it.
     candidate : The best variant.
-    negligible : Whether the ratio is tiny relative to that of the candidate alone. The candidate may then only absorb what the
-        linearised columns of the errors in the model miss.
+    negligible : Whether the ratio is tiny compared with the one that the candidate reaches in a model without other errors. The
+        candidate may then only correct the linearisation of those errors.
     """
 
     name: str
@@ -67,8 +67,8 @@ class SelectedEffect:
     log_likelihood_ratio : Log-likelihood with the error minus that without it; the other selected effects are in the model
         both times.
     score : Log-likelihood ratio minus a penalty for what is fitted.
-    family_scores : Scores of all candidates with the other selected effects in the model; for a non-parametric term, with
-        none.
+    family_scores : Scores of all candidates in place of this error, with the other selected effects in the model. If the error
+        is a non-parametric term, no other effect is in the model.
     """
 
     candidate: Candidate
@@ -192,35 +192,37 @@ class CandidateScorer(Protocol):
         """
 
     def correlated_covariates(self, form: FamilyScore) -> set[str]:
-        """Return the covariates that could replace that of a non-parametric term because they are so highly correlated with it.
+        """Return the covariates with which a non-parametric term would explain nearly the same residuals.
+
+        They are highly correlated with the term's own covariate.
 
         form: the term (a line, spline or wave along a covariate, or a polynomial of two) with its score.
 
         Returns
         -------
-        Names of the covariates, among them the term's own.
+        Names of the covariates, the term's own among them.
         """
 
     def with_harmonics(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
-        """Return the form of a periodic non-parametric term that fits best.
+        """Replace a non-parametric term that describes a periodic error by its best periodic form, to name the error's shape.
 
         For example, a spline along a covariate becomes a wave with overtones.
 
         Parameters
         ----------
-        members : Other errors in the model.
+        members : Other errors in the model, fitted jointly.
         form : The term with its score; one that is not periodic is returned unchanged.
         """
 
     def may_be_reference_error(self, members: EffectSet, form: FamilyScore) -> bool:
-        """Tell whether a wave in the residuals is so small that it may be part of the reference surface's error.
+        """Tell whether a wave in the residuals is so small that the reference surface's own error may cause it.
+
+        It is if the standard deviation of the fitted wave is below a threshold's multiple of that of the reference's error.
 
         Parameters
         ----------
-        members : Other errors in the model, fitted jointly.
-        form : The non-parametric term with its score; the answer is false for one that is no wave.
-
-        The wave is so small if its standard deviation is below a threshold's multiple of that of the reference's error.
+        members : The systematic errors already in the model, which are fitted together with the wave.
+        form : The wave: a non-parametric term with its score. For a term that is no wave the answer is false.
         """
 
 
@@ -355,10 +357,10 @@ class ForwardSelection:
 
         Parameters
         ----------
-        among : The selected set.
-        item : The effect, a member of the set.
-        scores : Joint scores of other sets of effects, by the names of their effects. A set that scores nearly as well tells
-            which effect could replace `item`.
+        among : The selected set of effects.
+        item : The effect to describe, a member of the set.
+        scores : Joint score of each set of effects that was tried; the key is the names of its effects. A set that scores nearly
+            as well as the selected one tells which effect could replace `item`.
         """
         others = tuple(member for member in among if member is not item)
         beside = [

@@ -151,7 +151,7 @@ def _of_cameras(
         for side in _SIDES
         for key in sorted({key for keys in sets[effect] for key in keys})
     ]
-    changed = (real_pair(nominal, (effect(camera=side, **{key: step}),), measurement) for effect, side, key, step in varied)
+    changed = (real_pair((effect(camera=side, **{key: step}),), measurement) for effect, side, key, step in varied)
     base, *seen = predict_disparities(nominal, [nominal.pair, *changed], geometry)
     changes = np.stack([(each - base) / step for (*_, step), each in zip(varied, seen, strict=True)], axis=1)
     passed = apply_smoothing(measurement.model.effects, geometry, changes)

@@ -47,13 +47,15 @@ class WithinCellNoise:
 
     @classmethod
     def of(cls, field: NodeField, inverse_sigma: FloatArray, gathered: sparse.csr_array) -> WithinCellNoise:
-        """Compute the covariance of the noise within cells from the noise that neighbouring points share.
+        """Compute the covariance of the noise within wall cells from the noise that neighbouring points share.
 
         Parameters
         ----------
-        field : The shared noise at n points: values at the nodes of a grid with their covariance, and bilinear weights.
+        field : The shared noise: the covariance of the values at the nodes of a pixel grid, and their bilinear weights at n
+            points.
         inverse_sigma : (n,) inverse standard deviations of the points.
-        gathered : (m, n) matrix that maps a column of n values over sigma to its means in m cells of the wall.
+        gathered : (m, n) matrix that maps a column of n values, each divided by its standard deviation, to its means in m
+            cells of the wall, divided by theirs.
         """
         nodes = sparse.csr_array(field.weights.multiply(inverse_sigma[:, None]))
         means = (gathered @ nodes).toarray()
@@ -78,10 +80,10 @@ class WithinCellNoise:
         return self.nodes.shape[1] == 0
 
     def to_nodes(self, columns: FloatArray, means: FloatArray | None = None) -> FloatArray:
-        """Multiply design columns by Z', which maps them to the q grid nodes whose noise neighbouring points share.
+        """Project k design columns on the q nodes of the pixel grid whose noise neighbouring points share.
 
-        Z holds the bilinear weights with which the noise at the nodes acts on the n points, minus their means in each wall
-        cell.
+        It is the first step of weighting the columns by the inverse covariance of the noise. They are multiplied by Z': Z
+        holds the bilinear weights with which the noise at the nodes acts on the n points, minus their means in each wall cell.
 
         Parameters
         ----------
@@ -96,40 +98,53 @@ class WithinCellNoise:
         return found if means is None else found - self.means.T @ means
 
     def solve(self, on_nodes: FloatArray) -> FloatArray:
-        """Return K^-1 times k columns over the q nodes of the grid-correlated noise.
+        """Solve K a = b for k columns over the q nodes of the pixel grid: a step of weighting columns by the inverse of R.
 
-        It is a step of weighting design columns by the inverse covariance of the noise. K = w C^-1 + Z'Z, with the share w of
-        white noise, the covariance C of the node values, and their weights Z at the points.
+        R = w I + Z C Z' is the covariance of the noise within wall cells. The share of white noise is w. The noise at the
+        nodes has the covariance C and acts on the n points by the weights Z (n, q). The inverse of R is (I - Z K^-1 Z') / w with
+        K = w C^-1 + Z'Z.
 
-        on_nodes: (q, k) columns, as `to_nodes` returns them.
+        on_nodes: (q, k) columns b: design columns projected on the nodes by `to_nodes`.
+
+        Returns
+        -------
+        (q, k) columns a.
         """
         return np.asarray(cho_solve((self.root, True), on_nodes)) if len(self.root) else on_nodes
 
     def whiten(self, on_nodes: FloatArray) -> FloatArray:
-        """Transform k columns over the q nodes of the grid-correlated noise so that their inner products are weighted by K^-1.
+        """Transform k columns b over the q nodes of the pixel grid to a = L^-1 b, so that a' a = b' K^-1 b.
 
-        It is a step of computing products of design columns under the inverse covariance of the noise.
+        It serves inner products of design columns that are weighted by the inverse of R, where R = w I + Z C Z' is the covariance
+        of the noise within wall cells. The share of white noise is w. The noise at the nodes has the covariance C and acts on the
+        n points by the weights Z (n, q). The inverse of R is (I - Z K^-1 Z') / w with K = w C^-1 + Z'Z = L L'.
 
-        The result is L^-1 times the columns, with L L' = K = w C^-1 + Z'Z: the share w of white noise, the covariance C of the
-        node values, and their weights Z at the points.
+        on_nodes: (q, k) columns b: design columns projected on the nodes by `to_nodes`.
 
-        on_nodes: (q, k) columns, as `to_nodes` returns them.
+        Returns
+        -------
+        (q, k) columns a.
         """
         return np.asarray(solve_triangular(self.root, on_nodes, lower=True)) if len(self.root) else on_nodes
 
     def draw(self, white: FloatArray, rows: slice, cell_sums: FloatArray, random: KeyedRandom) -> FloatArray:
-        """Simulate the part of the noise that acts through the grid nodes, once for any number of design columns.
+        """Simulate noise that neighbouring points share, in a form that quickly gives its effect on any fitted coefficient.
 
-        The noise r = sqrt(w) e + Z v has white noise e, and node values v with covariance C that neighbouring points share by
-        the weights Z. Its inner product with a column c, weighted by the inverse of its covariance R = w I + Z C Z', is c'
-        R^-1 r = c' e / sqrt(w) + (Z' c)' f. Returned is f = K^-1 (C^-1 v - Z' e / sqrt(w)) with K = w C^-1 + Z'Z.
+        The noise r = sqrt(w) e + Z v of n points consists of white noise e, whose share of the variance is w, and of values v
+        at the q nodes of a pixel grid, interpolated by the weights Z (n, q). With the covariance C of v, the covariance of r is
+        R = w I + Z C Z'. Its effect on the coefficient of a design column c (n,) follows from the inner product
+
+            c' R^-1 r = c' e / sqrt(w) + (Z' c)' f,  with  f = K^-1 (C^-1 v - Z' e / sqrt(w))  and  K = w C^-1 + Z'Z.
+
+        The vector f (q,) does not depend on the column, so it is drawn once, here. `NoiseDraws.products` then adds both terms.
 
         Parameters
         ----------
-        white : (n', d) d draws of the white noise e at n' points.
+        white : (n', d) d draws of the white noise e at a subsample of n' points, scaled to stand for all n.
         rows : Slice that selects these n' points from all n.
-        cell_sums : (m, d) means of the draws in the m cells of the wall, divided by their standard deviations.
-        random : Source of the random numbers for the node values.
+        cell_sums : (m, d) means of these draws in the m cells of the wall, divided by their standard deviations. They are needed
+            because cell means are subtracted from the weights Z.
+        random : Source of the random numbers for v.
 
         Returns
         -------
@@ -143,6 +158,9 @@ class WithinCellNoise:
 
 
 def inverse_from_cholesky(root: FloatArray) -> FloatArray:
-    """Return the inverse of a symmetric positive definite (q, q) matrix; root: (q, q) its lower Cholesky factor."""
+    """Return the inverse of a symmetric positive definite (q, q) matrix, such as a covariance, from its Cholesky factor.
+
+    root: (q, q) lower Cholesky factor L; the matrix is L L'.
+    """
     half = np.tril(dpotri(root, lower=True)[0])
     return np.asarray(half + np.tril(half, -1).T)

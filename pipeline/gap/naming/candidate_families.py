@@ -48,7 +48,7 @@ def model_has(measurement: Measurement, name: str) -> bool:
 
 
 def catalogue_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
-    """List the systematic sensor errors to try as explanations of residuals: all of the catalogue that can be tried.
+    """List the systematic sensor errors of the catalogue to try as explanations of residuals, as regression terms.
 
     Left out are errors that the sensor model already contains, and those that need data which were not recorded (intensity,
     time). Each error gets a Gaussian prior of its size with mean 0, so that two similar errors cannot grow large and cancel.
@@ -60,8 +60,8 @@ def catalogue_families(measurement: Measurement, part: Residuals) -> list[Candid
 
     Returns
     -------
-    list : design columns (change of the observable per unit of a parameter, n rows) of each error; a grid of trial frequencies
-        for an error that is a sine.
+    list : each error with its n design columns (change of the observable per unit of a parameter); for an error that is a sine,
+        a grid of trial frequencies.
     """
     return [_with_prior(each) for each in systematic_families(part, measurement)]
 
@@ -69,9 +69,9 @@ def catalogue_families(measurement: Measurement, part: Residuals) -> list[Candid
 def candidate_families(measurement: Measurement, part: Residuals) -> list[Candidate | SineGrid]:
     """List all regression terms that a forward selection tries as explanations of the systematic part of residuals.
 
-    They are the sensor errors of the catalogue that the sensor model lacks; non-parametric terms of each covariate (line,
-    spline, steps, waves), for errors that the catalogue lacks; and non-parametric terms along oblique directions on the wall.
-    No sensor causes the latter, so they show what an error of the reference surface can imitate.
+    They are of three kinds: sensor errors of the catalogue that the sensor model lacks; terms along each covariate that name no
+    cause (line, spline, steps, waves), for errors that the catalogue lacks; and such terms along oblique directions on the wall.
+    No sensor causes the last ones, so they show what an error of the reference surface can imitate.
 
     Parameters
     ----------
@@ -80,8 +80,8 @@ def candidate_families(measurement: Measurement, part: Residuals) -> list[Candid
 
     Returns
     -------
-    list : design columns (change of the observable per unit of a coefficient, n rows) of each term; a grid of trial frequencies
-        for a wave.
+    list : each term with its design columns, n rows (change of the observable per unit of a coefficient); for a wave, a grid of
+        trial frequencies.
     """
     named = catalogue_families(measurement, part)
     lowest = {PERIODIC[each.name]: each.frequencies[0] for each in named if isinstance(each, SineGrid) and each.name in PERIODIC}

@@ -63,11 +63,12 @@ NONPARAMETRIC_TERMS = ("", True)
 
 @dataclass(frozen=True)
 class SelectionResult:
-    """What a selection of sensor errors (effects) leaves beside the effects themselves: scores, tests and notes.
+    """What a selection of sensor errors (effects) yields beside the effects themselves: scores, tests and notes.
 
     Attributes
     ----------
-    tried, variance_tried : scores of all systematic effects and of all noise terms that were tried.
+    tried : scores of all systematic effects that were tried.
+    variance_tried : scores of all noise terms that were tried.
     systematic : names of the selected systematic effects, such as "tls.range_offset", empirical ones included.
     p_value : p-value of the misfit that remains with all selected systematic effects in the model; None if nothing was left to
         try.
@@ -75,11 +76,11 @@ class SelectionResult:
     unexplained_noise : observed over predicted standard deviation within small squares of the wall; 1 if a noise term explains
         it.
     notes : notes for the report.
-    identifiability : `names` of the effects, `cosines` between their signatures (the patterns of residuals that they make), and
-        `survival`, the share of each signature that is left after the sensor's pose is fitted.
+    identifiability : table with three keys: `names` of the effects; `cosines` between their signatures, the patterns of
+        residuals that they make; and `survival`, the share of each signature that is left after the sensor's pose is fitted.
     reference_sigma : standard deviation of the error of the reference surface, in the unit of the observable (m or px).
     noise_ratio : observed over predicted standard deviation of the residuals after the systematic effects.
-    detectable : for each effect that was not found, the size from which it would have been found.
+    detectable : for each effect that was not found, the size at which it would have been found with a probability of 95 %.
     """
 
     tried: tuple[FamilyScore, ...]
@@ -97,7 +98,8 @@ class SelectionResult:
     def p_value_given(self, named: Sequence[NamedEffect]) -> float | None:
         """Look up the p-value of the misfit that remains if only some of the selected effects are kept in the sensor model.
 
-        It is known if all selected systematic effects are kept, or none of them.
+        It serves the verdict after validation has dropped effects. Only the p-values with all selected systematic effects and
+        with none of them are known.
 
         Parameters
         ----------
@@ -105,7 +107,7 @@ class SelectionResult:
 
         Returns
         -------
-        float or None : the p-value; None if it was not computed for this set of effects.
+        float or None : the p-value; None if only a part of the selected systematic effects is kept.
         """
         kept = self.systematic & {item.name for item in named}
         if kept == self.systematic:
@@ -125,7 +127,8 @@ def select_effects(
 
     A linearised search finds systematic effects. They are put into the sensor model, residuals are computed again, and further
     effects are searched. Strong effects are refitted without linearising. Noise terms are fitted to the remaining residuals and
-    weight the next search.
+    weight the next search. If the fitted value of an effect is implausible, the effect is excluded, and the selection is
+    repeated.
 
     Parameters
     ----------
@@ -134,11 +137,9 @@ def select_effects(
     noise_ratio : observed over predicted standard deviation of these residuals.
     random : source of random numbers for the null distributions.
     excluded : effects that are not tried, as pairs (name, whether it is an empirical term); `NONPARAMETRIC_TERMS` stands for
-        all empirical terms. If the fitted value of an effect is out of bounds, the effect is excluded too, and the selection is
-        repeated.
-    grid_noise : noise that neighbouring points share, as a preceding selection found it in its residuals. It is then part of
-        the model from the start, because it imitates non-parametric terms and errors of the reference. None in a first
-        selection.
+        all empirical terms.
+    grid_noise : noise that neighbouring points share, if a preceding selection found it in its residuals. It is then part of
+        the model from the start, because it imitates empirical terms and errors of the reference. None in a first selection.
 
     Returns
     -------
@@ -273,13 +274,13 @@ def keep_implausible_in_class(
     """Report implausibly large effects as alternatives to the effects that a selection named in their place.
 
     A first selection chose effects of implausible size, and was repeated without them. An implausible effect may still be the
-    true one. It is therefore added to the list `indistinguishable` of each effect that the first selection could not tell from
-    it, or that was named only because it had been excluded.
+    true one. It is therefore added to the list `indistinguishable` of two kinds of effects: those that the first selection could
+    not tell from it, and those that only the repeated selection named.
 
     Parameters
     ----------
     named : effects that the repeated selection named.
-    chosen : effects that the first selection chose, with those that it could not tell from each.
+    chosen : effects that the first selection chose; each lists the effects that it could not be told from.
     before : names of the systematic effects of the first selection, without the sensor's prefix.
     excluded : the implausible effects, as pairs (name, whether it is an empirical term).
 

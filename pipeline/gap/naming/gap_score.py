@@ -110,8 +110,8 @@ class Gap:
     def uncertain(self) -> bool:
         """Whether the gap is too small to be measured, so that no closed share is stated.
 
-        That is so if the score without the named effects exceeds neither the score that noise alone leaves (`floor`) nor the
-        score with the effects by more than the uncertainty of the difference.
+        That is so if two differences are both within their uncertainty: the score without the named effects (`before`) minus the
+        score that noise alone leaves (`floor`), and `before` minus the score with the effects (`after`).
         """
         return not self.above_floor and self.before - self.after <= thresholds().verdict.gap_sigmas * self.error
 
@@ -140,8 +140,8 @@ class RegisteredModel:
     ----------
     model : the sensor model.
     pose : (6 k,) shift (m) and small rotation (rad) of each of k set-ups from the pose in the measurement, wall frame. For a
-        surface without cameras: amounts of the combinations of shift, rotation and scale that can be determined (columns of
-        `datum`).
+        surface without cameras: (q,) amounts of those combinations of shift, rotation and scale that its points determine, as
+        the attribute `datum` of its residuals defines them.
     """
 
     model: TlsModel | StereoModel
@@ -191,9 +191,9 @@ def measure_gap(
 ) -> Gap | None:
     """Compare how well two sensor models, without and with the named sensor errors, predict validation points.
 
-    The measurement is simulated with each model. The score is the continuous ranked probability score (CRPS) of the mean and
-    the standard deviation of the residuals in patches of the wall. Both models use the same random numbers, so that their
-    difference is less noisy.
+    The measurement is simulated with each model. The wall is divided into patches of about 30 points, and the mean and the
+    standard deviation of the residuals in each are predicted. The score is their continuous ranked probability score (CRPS).
+    Both models use the same random numbers, so that their difference is less noisy.
 
     Parameters
     ----------
@@ -249,9 +249,9 @@ def measure_gap(
 def measure_losses(missing: ExpectedPulses, chance: FloatArray, held_out: BoolArray) -> Gap | None:
     """Score how well an explanation of missing laser returns predicts which validation pulses are lost (Brier score).
 
-    The score `before` is that of one probability for all pulses: the share that is lost of the pulses not kept for validation.
-    The score `after` is that of the explanation. The floor is the score to expect if pulses are lost with exactly its
-    probability.
+    Three scores are computed. `before` is that of one probability for all pulses: the share that is lost of the pulses to which
+    the explanation was fitted. `after` is that of the explanation. `floor` is the score to expect if pulses are lost with exactly
+    the probability that the explanation predicts.
 
     Parameters
     ----------

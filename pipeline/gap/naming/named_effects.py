@@ -139,8 +139,9 @@ def aligned_with(
 
 
 def within_bounds(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
-    """Tell whether the config of a sensor model accepts a sensor error (effect) with certain parameter values.
+    """Tell whether the config of a sensor model accepts a fitted sensor error (effect) with its parameter values.
 
+    model: the sensor model that would contain the effect.
     entry: the effect as in the config's list `effects`: name and parameter values.
     """
     try:
@@ -153,6 +154,7 @@ def within_bounds(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
 def only_within_bounds(model: TlsModel | StereoModel, named: list[NamedEffect]) -> tuple[list[NamedEffect], list[str]]:
     """Keep the sensor errors (effects) whose fitted parameter values a config of the sensor model accepts.
 
+    model: the sensor model that would contain the effects.
     named: effects with their fitted values. Returns those that are kept, and a note for the report on each of the others.
     """
     kept = [item for item in named if within_bounds(model, item.entry)]
@@ -162,10 +164,13 @@ def only_within_bounds(model: TlsModel | StereoModel, named: list[NamedEffect]) 
 
 
 def is_plausible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
-    """Tell whether a fitted sensor error (effect) is plausible: a config accepts its values, and it is not absurdly large.
+    """Tell whether a fitted sensor error (effect) is plausible, so that absurd explanations are not reported.
 
-    Too large is more than 100 times the effect's typical size in the catalogue, by default. model: the sensor model that would
-    contain it; entry: the effect as in the model's config: name and parameter values.
+    It is if a config accepts its values and its size is at most `mean.largest_size` (a threshold, by default 100) times its
+    typical size in the catalogue.
+
+    model: the sensor model that would contain the effect.
+    entry: the effect as in the model's config: name and parameter values.
     """
     if not within_bounds(model, entry):
         return False
@@ -186,11 +191,10 @@ def relative_size(entry: dict[str, Any]) -> float:
 def effect_from_range_step(comb: RangeStep, part: Residuals) -> NamedEffect:
     """Convert the rounding of a scanner's ranges to the named effect "range quantisation", as an entry of gap.json.
 
-    Its log-likelihood ratio is set to the number of ranges times the strength of the rounding, because rounded ranges leave no
-    doubt.
+    Its log-likelihood ratio is the number of ranges times the strength of the rounding, as rounded ranges leave no doubt.
 
-    comb: the step, such as 1 mm, to which ranges are rounded, and its strength from 0 to 1; part: residuals, one for each
-    range.
+    comb: the step, such as 1 mm, to which ranges are rounded, and its strength from 0 to 1.
+    part: residuals of the rounded ranges; only their number is used.
     """
     entry = {"name": RangeQuantization.tag(), "step_m": comb.step_m}
     name, gain = f"tls.{RangeQuantization.tag()}", float(len(part)) * comb.strength
@@ -227,8 +231,8 @@ def effect_from_seams(found: TileSeams) -> NamedEffect:
 def effect_from_variance(found: VarianceTerm, sensor: str) -> NamedEffect:
     """Convert a fitted noise term to a named effect (sensor error), as an entry of gap.json.
 
-    found: the noise term, which explains variance of the residuals that the sensor model does not predict; sensor: "tls" or
-    "stereo", the prefix of the name.
+    found: the noise term, which explains variance of the residuals that the sensor model does not predict.
+    sensor: "tls" or "stereo", the prefix of the name.
     """
     alike = tuple(f"{sensor}.{name}" for name in found.indistinguishable)
     empirical = found.empirical or effect_of(found.effect).empirical
@@ -299,11 +303,12 @@ class Estimate:
 
 
 def effect_from_estimate(found: Estimate, part: Residuals) -> NamedEffect:
-    """Convert a fitted systematic error to a named effect, as an entry of gap.json, with standard deviations.
+    """Describe a fitted systematic error as an entry of gap.json: name, parameters and their standard deviations.
 
     A non-parametric term is described by its values at evenly spaced places along its covariate.
 
-    found: the error as a regression term with fitted coefficients; part: residuals of the points that are its rows.
+    found: the error as a regression term with fitted coefficients.
+    part: residuals of the points to which it was fitted.
     """
     if found.candidate.empirical:
         return _empirical_effect(found.candidate, found.values, found.chosen, part)
@@ -342,7 +347,7 @@ def _empirical_effect(candidate: Candidate, values: FloatArray, item: SelectedEf
     if candidate.angle and isinstance(part, TlsResiduals):
         return _angle_term(candidate, error, item, part)
     term, key = part.empirical_term
-    found = _surface_nodes(candidate, error, part) if candidate.form == POLYNOMIAL else _curve_nodes(candidate, error, part)
+    found = _surface_nodes(error, part) if candidate.form == POLYNOMIAL else _curve_nodes(candidate, error, part)
     rows = _rounded_rows(found.pop("values"))
     entry = {"name": term.tag(), **found, key: rows}
     return NamedEffect(f"{part.sensor}.{term.tag()}", "empirical", entry, {}, (), item.p_value, item.log_likelihood_ratio)
@@ -369,14 +374,14 @@ def merge_angle_curves(
 ) -> tuple[list[NamedEffect], list[NamedEffect]]:
     """Add up error curves of a scanner's angle that two successive selections found, so that each is reported once.
 
-    A curve gives the error (rad) of an angle along a covariate. The first curves are in the model of the second selection, so
-    what that finds for the same angle and covariate is a correction of them.
+    A curve gives the error (rad) of an angle along a covariate. The second selection has the curves of the first one in its
+    model. What it finds for the same angle and covariate is therefore a correction of them.
 
     Parameters
     ----------
     angles : curves of the first selection.
     later : curves that the second selection found in addition.
-    part : residuals, which give the range of each covariate.
+    part : residuals, with the covariates of their points, over whose range the curves are added.
 
     Returns
     -------
@@ -417,7 +422,7 @@ def _curve_nodes(candidate: Candidate, error: FloatArray, part: Residuals, rows:
     return {"covariate": candidate.name, "along": {"low": low, "high": high, "period": cycle}, "values": [curve]}
 
 
-def _surface_nodes(candidate: Candidate, error: FloatArray, part: Residuals) -> dict[str, Any]:
+def _surface_nodes(error: FloatArray, part: Residuals) -> dict[str, Any]:
     """Fit the polynomial of two covariates to its values at the points and evaluate it on a grid of nodes."""
     first, second = part.position_covariates
     x, y = part.covariates[first], part.covariates[second]
@@ -452,7 +457,9 @@ def _plain_numbers(entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def out_of_bounds(measurement: Measurement, estimates: list[Estimate], part: Residuals) -> frozenset[tuple[str, bool]]:
-    """Find the fitted effects (sensor errors) to exclude: a config does not accept their values, or they are far too large.
+    """Find fitted sensor errors (effects) of implausible size, to exclude them from the next selection.
+
+    They are those whose values a config does not accept, and those that are far larger than typical.
 
     Parameters
     ----------
@@ -471,17 +478,17 @@ def out_of_bounds(measurement: Measurement, estimates: list[Estimate], part: Res
 def absorbed_by_registration(
     estimates: list[Estimate], part: Residuals, survival: Mapping[str, float]
 ) -> frozenset[tuple[str, bool]]:
-    """Find the fitted effects (sensor errors) that are implausibly large because the measurement hardly determines their size.
+    """Find fitted sensor errors (effects) that are large only because the measurement hardly determines their size.
 
-    A shift and rotation of the sensor imitates such an effect almost completely, so the pose fit absorbs it. By default, less
-    than 10 % of its signature is left, and its size is more than 10 times the typical one.
+    A shift and rotation of the sensor imitates such an effect almost completely, so the pose fit absorbs it. Two thresholds
+    tell it: a share of less than `mean.absorbed_share` of its signature (the pattern of residuals that it makes) is left beside
+    the pose, and its size is more than `mean.absorbed_size` times the typical one.
 
     Parameters
     ----------
     estimates : effects with fitted coefficients.
     part : residuals of the points to which the rows of their design columns belong.
-    survival : by effect name, the share of the effect's signature (the pattern of residuals that it makes) that is left after
-        the pose is fitted.
+    survival : by effect name, the share of the effect's signature that is left after the pose is fitted, from 0 to 1.
 
     Returns
     -------

@@ -38,9 +38,10 @@ class SearchInput:
     ----------
     measurement : the training points (those that are not kept for validation), with their sensor model.
     part : residuals of these points, measured minus predicted.
-    families : effects to search, as regression terms; one grid of trial frequencies for each kind of wave.
-    variance_at : function that fits noise terms to residuals. It is called with residuals that were computed with some of the
-        effects in the model.
+    families : effects to search, as regression terms. A sinusoidal effect comes with all its trial frequencies as one
+        `SineGrid`.
+    variance_at : function that fits noise terms to residuals and returns them. The noise is fitted anew whenever effects are put
+        into the model, because residuals change then.
     added : variance to add to the predicted one, squared unit of the observable; it covers errors found before, such as
         rounding.
     random : source of random numbers for the null distributions.
@@ -56,18 +57,18 @@ class SearchInput:
 
 @dataclass(frozen=True)
 class SearchOutcome:
-    """One explanation of the residuals: systematic sensor errors (effects) of a search, and those that a second one adds.
+    """One explanation of the residuals by systematic sensor errors (effects), found by one or two searches.
 
-    In the second search the effects of the first are in the sensor model without linearisation.
+    The second search finds further effects, with those of the first in the sensor model without linearisation.
 
     Attributes
     ----------
     chosen : effects that the first search selected.
     estimates : effects of both searches with their coefficients.
-    search : the second search; the first one if there was no second.
-    residuals : residuals that this search explains.
-    further : effects that this search selected.
-    tried : scores of all candidate effects beside the selected ones.
+    search : the last search: the second one, or the first if there was no second.
+    residuals : residuals that the last search explains.
+    further : effects that the last search selected.
+    tried : scores of all candidate effects beside those that the last search selected.
     """
 
     chosen: list[SelectedEffect]
@@ -79,7 +80,10 @@ class SearchOutcome:
 
     @property
     def complexity(self) -> tuple[int, int]:
-        """Numbers of empirical terms and of all effects in this explanation of residuals; the smaller pair is preferred."""
+        """Number of empirical terms in this explanation of residuals, then number of all effects, to prefer the simplest one.
+
+        Pairs are compared in this order; empirical terms name no cause.
+        """
         return sum(each.candidate.empirical for each in self.estimates), len(self.estimates)
 
 
@@ -158,15 +162,18 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
     """Select the systematic sensor errors (effects) that explain residuals, and refit the strong ones without linearising.
 
     The linearised model is inexact for a large effect, and forward selection then adds spurious effects that absorb the
-    linearisation error. The strongest effects are therefore refitted alone without linearising, and the selection is repeated
-    with the best one in the model. If that leaves several effects, it is also repeated with the model linearised where all
-    effects of the catalogue, fitted together, put it. Of the explanations, the one with the fewest empirical terms is returned,
-    then the one with the fewest effects.
+    linearisation error. Several explanations are therefore compared. One is the linearised selection. For another, the strongest
+    effects are refitted alone without linearising, and the selection is repeated with the best one in the model. If that still
+    needs several effects, a third one is tried (`search_at_joint_fit`).
 
     Parameters
     ----------
     given : points, residuals and candidate effects.
-    first : the search with the model linearised at the given residuals.
+    first : the linearised search, in which residuals change in proportion to the size of each effect.
+
+    Returns
+    -------
+    SearchOutcome : the explanation with the fewest empirical terms, and of these the one with the fewest effects.
     """
     together, tried = first.select()
     linear = SearchOutcome(together, _estimates_of(first, together), first, given.part, together, tried)
@@ -192,11 +199,11 @@ def select_and_refit(given: SearchInput, first: MeanSearch) -> SearchOutcome:
 
 
 def search_at_joint_fit(given: SearchInput) -> SearchOutcome | None:
-    """Search for systematic sensor errors (effects) with the model linearised at the joint fit of all effects of the catalogue.
+    """Search for systematic sensor errors (effects) after fitting all effects of the catalogue together.
 
-    It serves measurements with several large errors. With all effects in the model, rays meet the reference where the real rays
-    did, so the Jacobian is right even if an error is large. What the fitted effects explain is added back to the residuals
-    before the search.
+    It serves measurements with several large errors, for which a model that is linearised without effects is inexact. The joint
+    fit moves each ray to about where the real one was, so that the derivatives taken there are right. What the fitted effects
+    explain is then added back to the residuals, and effects are selected anew.
 
     Parameters
     ----------
@@ -230,9 +237,11 @@ def fit_jointly(given: SearchInput, candidates: list[Candidate]) -> tuple[Measur
 
     Returns
     -------
-    tuple or None : the measurement with the effects in its model, its residuals of n points, and the (n,) part of the
-        observations that the effects explain to first order, in the unit of the observable. None if an effect is out of bounds
-        or too few points remain.
+    measurement : the measurement with the effects in its model.
+    residuals : its residuals of n points.
+    explained : (n,) part of the observations that the effects explain to first order, in the unit of the observable (m or px).
+
+    None instead if an effect is out of bounds or too few points remain.
     """
     measurement, at, before = given.measurement, given.part, np.inf
     widths = [each.columns.shape[1] for each in candidates]

@@ -26,14 +26,15 @@ def with_added_variance(part: Residuals, variance: float) -> Residuals:
 def with_fitted_variance(part: Residuals, noise_terms: list[VarianceTerm], noise_ratio: float) -> Residuals:
     """Return a copy of residuals with fitted noise in place of the predicted one, to weight a search for sensor errors.
 
-    Its standard deviations hold for means over many neighbours: they are larger than those of single points if neighbours share
-    noise.
+    The search compares means over many neighbouring points, so the returned standard deviations hold for such means. Where
+    neighbours share noise they are larger than those of single points.
 
     Parameters
     ----------
     part : residuals with their predicted standard deviations.
-    noise_terms : noise terms that were fitted, each with the variance that it adds; if empty, `noise_ratio` is used instead.
-    noise_ratio : observed over predicted standard deviation, by which the predicted ones are then multiplied.
+    noise_terms : noise terms that were fitted, each with the variance that it adds.
+    noise_ratio : observed over predicted standard deviation. If there are no noise terms, the predicted standard deviations are
+        multiplied by it.
     """
     part = part.with_sigma_of_means
     if not noise_terms:

@@ -45,11 +45,11 @@ class PassInput:
     edge_effects : edge effects that are in the model.
     measurement : the measurement with these effects in its model.
     residuals : residuals of n points against that model, measured minus predicted.
-    touched : (n,) true for points that edge effects move by an amount that cannot be predicted as well as the noise allows.
+    touched : (n,) true for points that edge effects move by an uncertain amount, so that a search leaves them out.
     changes : regions where the rock itself changed since the reference.
     changed : (n,) true for points in these regions.
     registered_residuals : (n,) residuals after a robust pose fit, in the unit of the observable (m or px).
-    noise_ratio : observed over predicted standard deviation of these, at least 1.
+    noise_ratio : observed over predicted standard deviation of the registered residuals, at least 1.
     cells : small squares of the wall; the search for systematic errors averages the residuals in each.
     held_out : (n,) true for points that are kept for validation.
     training_rows : (k,) rows of the residuals that the search may use.
@@ -76,19 +76,18 @@ class PassInput:
         edge_effects: list[EdgeEffect],
         realigned: bool = True,
     ) -> PassInput:
-        """Build the input of one run of the search for sensor errors, with edge effects in the sensor model.
+        """Build the input of one run of the search for sensor errors, with certain edge effects in the sensor model.
 
-        The sensor's pose is estimated, and regions where the rock changed are found and set aside.
-
-        Edge effects are errors at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint.
+        Edge effects are errors at depth steps: edge fattening, smoothing, filled occlusions and the beam footprint. Regions
+        where the rock changed are found and set aside.
 
         Parameters
         ----------
-        aligned : measurement of N points, with the sensor at its aligned pose.
+        aligned : measurement of N points; the pose of its sensor was estimated without edge effects.
         plain : its residuals without edge effects.
         held_out_points : (N,) true for points that are kept for validation.
-        edge_effects : edge effects to put into the model; the `touched` of each is (N,).
-        realigned : whether the pose is estimated again with the edge effects in the model.
+        edge_effects : edge effects to put into the model. Their attribute `touched` must have a value for each of the N points.
+        realigned : true: the pose is estimated again with the edge effects in the model; false: the pose of `aligned` is kept.
         """
         touched = np.any([np.zeros(len(plain), dtype=bool), *(each.touched[plain.index] for each in edge_effects)], axis=0)
         registration_rows = plain.index[~(touched | held_out_points[plain.index])] if realigned else None
@@ -141,8 +140,8 @@ class PassInput:
         """The measurement and the residuals of the training points alone, from which sensor errors are selected.
 
         Training points are a subsample of the points on smooth, unchanged surface that are no outliers and not kept for
-        validation. What edge effects do at these points is kept fixed while the pose is fitted: a move by millimetres hardly
-        changes it.
+        validation. The shift of these points by edge effects (errors at depth steps) is not computed again while the pose is
+        fitted: a move by millimetres hardly changes it.
         """
         measurement, residuals = self.measurement, self.residuals
         if isinstance(measurement, StereoMeasurement) and isinstance(residuals, StereoResiduals):
@@ -181,15 +180,19 @@ class SelectionPass:
 
     @property
     def edge_effect_names(self) -> set[str]:
-        """Names of the effects at depth steps (such as edge fattening) in the model when the search for errors began."""
+        """Names of the edge effects in the sensor model of this run of the search, by which runs are told apart.
+
+        Edge effects are errors at depth steps, such as edge fattening. They were found before the run, which selects other
+        errors.
+        """
         return {each.name for each in self.pass_input.edge_effects}
 
     @property
     def complexity(self) -> tuple[int, int]:
         """How complex the result of a search for sensor errors is: two numbers, to prefer the simplest of several results.
 
-        The first is the number of empirical terms (which name no cause), and the second that of all sensor errors and scene
-        changes. The smaller pair, compared in this order, is the simpler result.
+        The first is the number of empirical terms (which name no cause). The second is the number of all errors, those at
+        depth steps included, plus that of the scene changes. Pairs are compared in this order; the smaller is the simpler result.
         """
         given = self.pass_input
         return sum(item.kind == "empirical" for item in self.named), len(self.named) + len(given.edge_effects) + len(
@@ -206,7 +209,7 @@ class PassInputs:
 
     Attributes
     ----------
-    measurement : measurement of N points, with the sensor at its aligned pose.
+    measurement : measurement of N points; the pose of its sensor was estimated without edge effects.
     plain : its residuals without edge effects.
     held_out_points : (N,) true for points that are kept for validation.
     """
@@ -245,8 +248,11 @@ class PassInputs:
     def edge_effects_given(self, named: list[NamedEffect]) -> list[EdgeEffect]:
         """Search effects at depth steps (edge effects) again, with other errors in the model that can hide or imitate them.
 
-        named: sensor errors that a search found, to put into the model first. Returns the edge effects that the residuals then
-        show.
+        named: sensor errors that a search found, to put into the model first.
+
+        Returns
+        -------
+        list : the edge effects that the residuals then show.
         """
         seen = aligned_with(self.measurement, named, self.plain.index[~self.held_out_points[self.plain.index]])
         return _find_edge_effects(seen.measurement, seen.residuals, self.held_out_points)
@@ -262,10 +268,10 @@ class PassInputs:
 def best_pass(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple[str, bool]]) -> SelectionPass:
     """Run the search for sensor errors with several inputs and return the simplest run that explains the residuals.
 
-    The inputs differ in the edge effects (errors at depth steps) in the sensor model. An error that moves all rays can hide or
-    imitate an edge effect. Edge effects are therefore searched again with the named errors in the model. If there are some, a
-    run without them is tried too, and they are searched again with what that run names. Smoothing can shift the estimated pose,
-    so a run at the initial pose is tried too if the first run needs an empirical term and no single error explains everything.
+    The inputs differ in the edge effects (errors at depth steps) in the sensor model, because other errors can hide or imitate
+    them. Up to three runs are made: with the edge effects that the residuals show; without any; and, if smoothing is among them
+    and may have shifted the estimated pose, at the initial pose. After each run, edge effects are searched again with the named
+    errors in the model; if others show, the run is repeated with them.
 
     Among the runs whose noise is close to the lowest, the one with the fewest empirical terms wins, then the one with the
     fewest errors. The noise is compared because enough noise can take the place of any error.

@@ -18,19 +18,19 @@ _IN_GENERAL = {
 
 
 def with_separating_measurements(measurement: Measurement, named: list[NamedEffect]) -> list[NamedEffect]:
-    """Fill in, for each named effect (sensor error) that has alternatives, which further measurement would tell it from these.
+    """Say for each named effect (sensor error) that has alternatives which further measurement would tell it from them.
 
-    Several additional measurements, such as a second station, are tried by computation. One tells two effects apart if their
-    signatures (the patterns of residuals that they make) are no longer alike with it.
+    Several additional measurements, such as a second station, are tried by computation. One tells two effects apart if it makes
+    their signatures (the patterns of residuals that they make) clearly different.
 
     Parameters
     ----------
     measurement : measurement as it was taken.
-    named : named effects; each knows the effects from which this measurement cannot tell it.
+    named : named effects; each lists the effects from which this measurement cannot tell it.
 
     Returns
     -------
-    list : the effects; `split_by` says which measurement separates each from its alternatives.
+    list : the effects, with the further measurement in the attribute `split_by` of each that has alternatives.
     """
     if not any(item.indistinguishable for item in named):
         return named

@@ -26,8 +26,8 @@ _NO_SIZE = "no plausible size of it would have shown"
 def unseen_effects(residuals: Residuals, computed: Iterable[DetectableSize], named: Sequence[str]) -> tuple[DetectableSize, ...]:
     """List the sensor errors that a diagnosis did not name but that may be there, each with the size that would have shown.
 
-    These are all effects of the catalogue that were not named, and smooth errors outside the catalogue. If there is no such
-    size, a note says why.
+    The list has every effect of the catalogue that was not named, and smooth errors outside the catalogue. An effect without such
+    a size has a note that says why: it needs data that were not recorded, or no plausible size would have shown, for example.
 
     Parameters
     ----------

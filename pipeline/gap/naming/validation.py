@@ -36,8 +36,8 @@ class ValidationResult:
     value : (n,) residuals against it after registration, in the unit of the observable (m or px); NaN where a ray misses the
         reference.
     pose : (6 k,) pose of that registration: shift (m) and small rotation (rad) of each of k set-ups from the pose in the
-        measurement, wall frame. For a surface without cameras: amounts of the combinations of shift, rotation and scale that
-        can be determined (columns of `datum`).
+        measurement, wall frame. For a surface without cameras: (q,) amounts of those combinations of shift, rotation and
+        scale that its points determine, as the attribute `datum` of its residuals defines them.
     gap : scores of the model without and with the effects; None if too few points can be scored.
     """
 
@@ -82,7 +82,8 @@ class Validation:
     registration_rows : rows of the residuals from which the pose is estimated.
     tested : (n,) true for validation points, which no earlier step has used.
     training : (n,) true for points that the selection of effects may use.
-    losses : explanation of the missing laser returns, with a mask of the pulses that it was not fitted to; or None.
+    losses : explanation of the missing laser returns, and a mask of the expected pulses that is true where the explanation was
+        not fitted; None if missing returns were not explained.
     reference_sigma : standard deviation of the error of the reference surface, in the unit of the observable (m or px).
     most_sigmas : points farther than this many predicted standard deviations from the models are not scored.
     random : source of random numbers.
@@ -104,18 +105,19 @@ class Validation:
     def pose(self) -> FloatArray:
         """Pose that registers the measurement to the model without named effects, relative to the pose in the measurement.
 
-        (6 k,) shift (m) and small rotation (rad) of each of k set-ups, wall frame. For a surface without cameras: amounts of
-        the combinations of shift, rotation and scale that can be determined (columns of `datum`).
+        (6 k,) shift (m) and small rotation (rad) of each of k set-ups, wall frame. For a surface without cameras: (q,)
+        amounts of those combinations of shift, rotation and scale that its points determine, as the attribute `datum` of its
+        residuals defines them.
         """
         return fit_pose(self.residuals, self.registration_rows)
 
     def validate(self, named: list[NamedEffect]) -> tuple[ValidationResult, list[str]]:
         """Score the sensor model without and with the named effects on validation points, and drop effects that do harm.
 
-        While the score is worse with the effects than without, the effect that does most harm on training points is dropped, if
-        that harm exceeds its uncertainty. Some effects are dropped only if the validation score is worse by more than its
-        uncertainty: those that were found in the distribution of the values, and empirical terms that are no noise. Lower noise
-        values are proposed only if they predict better.
+        While the score is worse with the effects than without, effects are dropped one by one: each time the one that most
+        worsens the predictions of training points, if by more than the uncertainty. Two kinds of effects are dropped only if
+        the validation score is worse by more than its uncertainty: effects found in the distribution of the values (such as
+        rounding), and empirical terms that are no noise. Lower noise values are proposed only if they predict better.
 
         Parameters
         ----------

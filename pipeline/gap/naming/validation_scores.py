@@ -32,7 +32,7 @@ class ValidatedEffects:
 
     Attributes
     ----------
-    named : effects that improve them, with the log-likelihood ratio on these validation blocks.
+    named : effects that improve the predictions; the gain of each is its log-likelihood ratio on these parts.
     failed : effects that do not improve them.
     weak : effects that improve them, but by less than an effect must to be reported by name.
     """
@@ -47,9 +47,9 @@ def validate_effects(
 ) -> ValidatedEffects:
     """Test whether each named effect (sensor error) improves the likelihood of parts of the wall that no fit used.
 
-    All other effects are in the model. Two systematic effects may only compensate each other, and then each seems to be needed.
-    The log-likelihood ratio of all of them together is therefore tested first. If it fails, the effect with the smallest ratio
-    of its own is removed, an empirical term before any other, and the remaining effects are tested again in the same way.
+    The model with all effects is compared with the model without the tested one. Two systematic effects may only compensate each
+    other, and then each seems to be needed. Therefore all systematic effects are first tested together. If they fail, the one
+    with the smallest log-likelihood ratio is removed, an empirical term before any other, and the test is repeated with the rest.
 
     Parameters
     ----------

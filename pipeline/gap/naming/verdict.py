@@ -103,9 +103,9 @@ class Evidence:
     def gap_stays_open(self) -> bool:
         """Whether the named effects leave most of the gap open: the model still fits much worse than noise explains.
 
-        The score with the effects must exceed the score that noise alone leaves, and most of the gap must be left, both by more
-        than their uncertainty. The gap also stays open if the score is worse with the effects than without and the misfit is
-        significant.
+        The gap is the score on validation points minus the score that noise alone leaves. It stays open in two cases. First, the
+        score with the effects exceeds that of noise, and the effects close less of the gap than a diagnosis must, both beyond
+        uncertainty. Second, the score is worse with the effects than without, and the remaining misfit is significant.
         """
         gap = self.gap
         if gap is not None and gap.after > gap.before and self.misfit_is_significant:
@@ -114,9 +114,10 @@ class Evidence:
 
     @property
     def misfit_stays(self) -> bool:
-        """Whether nothing shows that the named effects help: the misfit stays significant, and the gap is too uncertain.
+        """Whether nothing shows that the named effects help: the remaining misfit is significant, and the gap is too uncertain.
 
-        The gap is how much worse than noise explains the model predicts validation points.
+        The gap is how much worse the model predicts validation points than noise explains; too uncertain, it does not tell
+        whether the effects close it.
         """
         return self.misfit_is_significant and self.gap is not None and self.gap.closed is None
 
@@ -129,7 +130,7 @@ class Evidence:
     def closes_little(self) -> bool:
         """Whether the named effects close clearly less of the gap between model and measurement than a diagnosis must.
 
-        The required share is the threshold `least_closed`, one half by default. Also true if the gap is too small to be
+        The required share is the threshold `verdict.least_closed`, by default one half. Also true if the gap is too small to be
         measured.
         """
         gap = self.gap
@@ -207,7 +208,10 @@ def verdict_sentence(verdict: str, named: Sequence[NamedEffect], evidence: Evide
 def describe_misfit(named: Sequence[NamedEffect], evidence: Evidence) -> str:
     """Return a sentence for the report on the misfit that the named effects (sensor errors) leave; "" if it may be chance.
 
-    named: the effects; without any, the sentence is "". evidence: numbers that decide the verdict, with the misfit's p-value.
+    Parameters
+    ----------
+    named : the effects; without any, the sentence is "".
+    evidence : numbers that decide the verdict, with the misfit's p-value.
     """
     if not named or not evidence.misfit_is_significant:
         return ""

@@ -85,14 +85,17 @@ class GapDiagnosis:
     before, after : (n,) residuals after registration, without and with the named effects in the model, in the unit of the
         observable: m for ranges and distances, px for disparities.
     pose : (6 k,) shift (m) and rotation (rad) of each of k set-ups from its surveyed pose, wall frame. For a surface without
-        cameras: amounts of the combinations of shift, rotation and scale that can be determined (columns of `datum`).
+        cameras: (q,) amounts of those combinations of shift, rotation and scale that its points determine, as the attribute
+        `datum` of its residuals defines them.
     model_after : sensor model with the named effects.
-    gap : scores of the model without and with these; None if too few points could be scored.
-    tried, variance_tried : scores of all systematic effects and of all noise terms that were tried.
-    remaining : what the effects leave unexplained, as in the entry `remaining` of gap.json.
-    identifiability : `names` of systematic effects, `cosines` between their signatures (the patterns of residuals that they
-        make), and `survival`, the share of each signature that is left after the pose is fitted.
-    seconds, timings : duration of the whole diagnosis and of each step, s.
+    gap : scores of the model without and with the named effects; None if too few points could be scored.
+    tried : scores of all systematic effects that were tried.
+    variance_tried : scores of all noise terms that were tried.
+    remaining : what the effects leave unexplained: p-value, noise and outliers, as the entry `remaining` of gap.json.
+    identifiability : table with three keys: `names` of systematic effects; `cosines` between their signatures, the patterns of
+        residuals that they make; and `survival`, the share of each signature that is left after the pose is fitted.
+    seconds : duration of the whole diagnosis, s.
+    timings : duration of each step by its name, s.
     unseen : effects that were not named, each with the size that would have shown with a probability of 95 %.
     reference_sigma : estimated standard deviation of the reference's correlated error, in the unit of the observable.
     thresholds : thresholds of the tests.
@@ -326,7 +329,8 @@ def _select_and_validate(
     words += [f"{item.name} dropped: it only describes the misfit of the empirical term" for item in left]
     rows_of_tails = subsample_rows(np.flatnonzero(given.stable & ~given.held_out))
     kept = [item for item in scored.named if item not in left]
-    found, tails = _with_heavy_tails(*subsample(aligned, given.residuals, rows_of_tails), kept, given.cells.side_m)
+    fewer, _ = subsample(aligned, given.residuals, rows_of_tails)
+    found, tails = _with_heavy_tails(fewer, kept, given.cells.side_m)
     words += [tails.note] if tails else []
     return _ValidatedSelection(given, selection, losses, with_separating_measurements(aligned, found), tails, words)
 
@@ -340,7 +344,7 @@ def _validate(aligned: Measurement, given: PassInput, named: list[NamedEffect], 
 
 
 def _with_heavy_tails(
-    measurement: Measurement, residuals: Residuals, named: list[NamedEffect], side_m: float
+    measurement: Measurement, named: list[NamedEffect], side_m: float
 ) -> tuple[list[NamedEffect], HeavyTails | None]:
     """Add heavy tails to the named effects if outliers lie all over the wall.
 

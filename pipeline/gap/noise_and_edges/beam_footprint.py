@@ -49,12 +49,12 @@ def find_footprint(
     measurement : laser scan with the pose that was estimated by fitting it to the reference surface.
     residuals : its n range residuals (measured minus predicted from the reference), m.
     registered_residuals : (n,) these residuals after a small correction of the pose, fitted robustly, m.
-    noise_ratio : observed standard deviation of the registered residuals, divided by the predicted one.
+    noise_ratio : observed standard deviation of `registered_residuals`, divided by the predicted one.
     held_out : (n,) true for validation points, which are not used.
 
     Returns
     -------
-    list : one edge effect with the divergence, or none.
+    list : one edge effect with the divergence; empty if none is significant.
     """
     sigma, footprint = noise_ratio * residuals.sigma, _FootprintSimulation(measurement, residuals)
     every = slice(None, None, max(len(residuals) // _MOST_POINTS, 1))

@@ -30,7 +30,8 @@ class EdgeEffect:
     effect : the effect (of the known sensor effects) with its estimated parameters.
     std : standard deviations of its parameters, by parameter name.
     gain : log-likelihood ratio of the models with and without it.
-    touched : (n,) true for points that it moves by an amount that is uncertain by more than the noise.
+    touched : (n,) true for points whose shift by the effect cannot be predicted as precisely as the noise. Other fits leave
+        them out.
     """
 
     effect: Effect
@@ -46,24 +47,28 @@ class EdgeEffect:
 
 @dataclass(frozen=True)
 class WallBlocks:
-    """Blocks of the wall with about a hundred points each. An edge effect is accepted only if they agree on it.
+    """Division of the wall into squares of about a hundred points, to test whether an edge effect shows all over the wall.
 
-    Residuals are correlated within a block, so blocks and not points count as independent.
+    Residuals are correlated within such a wall block, so wall blocks and not points count as independent. An effect is accepted
+    only if they agree on it.
 
     Attributes
     ----------
-    number : (n,) number of the block in which each point lies.
+    number : (n,) number of the wall block in which each point lies.
     """
 
     number: NDArray[np.int64]
 
     @classmethod
     def over(cls, at: FloatArray) -> WallBlocks:
-        """Divide the wall into blocks of about a hundred points. at: (n, 2) positions of the points, wall frame, m."""
+        """Divide the wall into squares of about a hundred points, which count as independent in tests of edge effects.
+
+        at: (n, 2) positions of the points, x along the wall and y up, wall frame, m.
+        """
         return cls(wall_blocks_by_points(at, _POINTS_PER_BLOCK))
 
     def sums(self, gains: FloatArray) -> FloatArray:
-        """Sum log-likelihood ratios of points over each wall block, to see whether the blocks agree on an effect.
+        """Sum log-likelihood ratios of points over each wall block, to see whether all parts of the wall agree on an effect.
 
         Parameters
         ----------
@@ -71,21 +76,22 @@ class WallBlocks:
 
         Returns
         -------
-        FloatArray : (b,) sums, one for each of b blocks.
+        FloatArray : (b,) sums, one for each of b wall blocks.
         """
         return np.asarray(np.bincount(self.number, gains))
 
     def total_if_agreed(self, gains: FloatArray, least_sigmas: float | None = None, *, by_signs: bool = False) -> float | None:
-        """Return the total log-likelihood ratio of an effect if it is large enough and the wall blocks agree on it, else None.
+        """Test an edge effect: return its log-likelihood ratio if it is large enough and the wall blocks agree, else None.
 
-        Agreement is the sum of the blocks' ratios over the root of the sum of their squares, like a number of standard
-        deviations.
+        Agreement is measured like a number of standard deviations: the sum of the wall blocks' ratios over the root of the sum
+        of their squares.
 
         Parameters
         ----------
         gains : (n,) log-likelihood ratio of each point: model with the effect against model without it.
         least_sigmas : smallest agreement that is accepted; None: the threshold `edges.block_sigmas`.
-        by_signs : whether agreement of the signs alone is enough, for effects of which a few blocks hold most of the points.
+        by_signs : whether agreement of the signs alone is enough, for effects of which a few wall blocks hold most of the
+            points.
         """
         by = thresholds().edges
         total, sums = float(gains.sum()), self.sums(np.clip(gains, -by.most_gain_of_a_point, by.most_gain_of_a_point))
@@ -100,8 +106,8 @@ class WallBlocks:
     def std(self, gains: Callable[[float], FloatArray], value: float, width: float | None = None) -> float:
         """Return the standard deviation of an edge effect's parameter at its maximum-likelihood value.
 
-        It is computed from the scatter of the derivatives of the log-likelihood between wall blocks (sandwich estimator), which
-        is valid if points in a block are correlated.
+        It comes from the scatter between wall blocks of the derivative of the log-likelihood (sandwich estimator). It is valid
+        although points in a wall block are correlated.
 
         Parameters
         ----------
@@ -121,7 +127,7 @@ def log_density(registered_residuals: FloatArray, shift: FloatArray, sigma: Floa
     Parameters
     ----------
     registered_residuals : (n,) residuals after a robust pose fit, m (ranges) or px (disparities).
-    shift : (n,) shift of each residual by the effect, same unit; its uncertainty of 15 % is added to the noise.
+    shift : (n,) predicted shift of each residual by the effect, same unit; its uncertainty of 15 % is added to the noise.
     sigma : (n,) standard deviations of the noise, same unit.
 
     Returns
@@ -137,13 +143,13 @@ def log_density(registered_residuals: FloatArray, shift: FloatArray, sigma: Floa
 def maximise_gain(gains: Callable[[float], FloatArray], values: list[float], factors: tuple[float, ...]) -> float:
     """Find the maximum-likelihood value of an edge effect's positive parameter, such as a width.
 
-    The search tries a grid, then finer geometric grids around the best value, and ends with a parabola.
+    The search tries given values, then finer geometric grids around the best one, and ends with a parabola.
 
     Parameters
     ----------
     gains : function from the parameter's value to the (n,) log-likelihood ratios of the points.
-    values : values of the first grid.
-    factors : ratio of neighbouring values in each finer grid, coarsest first; empty: only the first grid is tried.
+    values : values to try first.
+    factors : ratio of neighbouring values in each finer grid, coarsest first; empty: only `values` are tried.
 
     Returns
     -------

@@ -173,13 +173,12 @@ class _VariogramFit:
 def separate_white_and_grid_noise(
     found: list[VarianceTerm], part: StereoResiduals, value: FloatArray, model: StereoModel
 ) -> list[VarianceTerm]:
-    """Decide whether noise that was taken for white is independent from point to point or correlated between grid nodes.
+    """Decide whether noise that was taken for white is independent from point to point, or grid-correlated.
 
-    Grid nodes are the widely spaced pixels between which a stereo matcher interpolates disparities and their noise. The
-    semivariogram of the residuals decides; where it supports neither kind over the other, both are reported as
-    indistinguishable. A noise term may also be empirical, that is, a variance fitted freely to a covariate such as the depth.
-    Where the points with one value of the covariate belong to few grid nodes, grid-correlated noise looks as if it depended
-    on the covariate, and therefore replaces such a term.
+    Grid-correlated noise comes from a stereo matcher that interpolates between widely spaced pixels (grid nodes). The
+    semivariogram of the residuals decides. If it supports neither kind over the other, both are reported as indistinguishable.
+    Grid-correlated noise may also look like a variance that depends on a covariate such as the depth: points of similar depth
+    may belong to few nodes. It therefore replaces such an empirical term.
 
     Parameters
     ----------
@@ -199,10 +198,10 @@ def separate_white_and_grid_noise(
 def find_grid_noise(
     part: StereoResiduals, value: FloatArray, model: StereoModel, random: KeyedRandom
 ) -> tuple[VarianceTerm | None, str]:
-    """Find noise that neighbouring points share because the matcher interpolates it between widely spaced grid nodes.
+    """Find noise that neighbouring points share because the matcher interpolates it between widely spaced pixels (grid nodes).
 
-    Points around one node hardly differ by such noise, so it does not show in the deviations from a plane within small cells of
-    the wall, to which other noise terms are fitted.
+    Other noise terms are fitted to deviations from a plane within small squares of the wall. This noise hardly shows there,
+    because points near one node hardly differ by it. It needs a search of its own.
 
     Parameters
     ----------

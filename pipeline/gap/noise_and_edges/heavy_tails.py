@@ -23,7 +23,8 @@ class HeavyTails:
     ----------
     share : share of all residuals beyond `limit_sigmas`.
     limit_sigmas : number of predicted standard deviations beyond which a residual is an outlier.
-    sigma : standard deviation that the residuals have in addition to the predicted one, relative to it.
+    sigma : standard deviation of the noise to be added to the predicted noise to explain the scatter of all residuals, in
+        predicted standard deviations.
     gain : log-likelihood ratio of a mixture, in which this share of the residuals has larger noise, against normal noise.
     uniform : whether outliers lie all over the wall, as an instrument's own do. Edges, plants and moved rock leave them in
         parts of it.
@@ -48,7 +49,8 @@ def find_heavy_tails(z: FloatArray, block: NDArray[np.int64]) -> HeavyTails | No
     Parameters
     ----------
     z : (n,) residuals over the standard deviation that the model with all named effects predicts.
-    block : (n,) number of each point's wall block, to see whether outliers lie all over the wall.
+    block : (n,) number of the wall block (a square part of the wall) of each point, to see whether outliers lie all over the
+        wall.
     """
     by = thresholds().variance
     outlying = np.abs(z) > by.tail_sigmas

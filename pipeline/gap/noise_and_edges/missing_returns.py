@@ -37,17 +37,17 @@ _LARGEST_LOG_POWER = 500.0
 
 @dataclass(frozen=True)
 class LossExplanation:
-    """An explanation of why m laser pulses did or did not return.
+    """An explanation of why m laser pulses did or did not return, such as rain or a detection limit.
 
     Attributes
     ----------
-    name : name of the effect; if losses were fitted freely to a covariate (non-parametric), the effect that stands for it.
-    gain : log-likelihood ratio against the same probability of loss for all pulses.
+    name : name of the effect; for losses that were fitted freely to a covariate, the effect that stands for them in a model.
+    gain : log-likelihood ratio against one probability of loss for all pulses.
     score : gain minus the number of parameters.
     parameters, std : values of the effect's parameters and their standard deviations, by parameter name.
     probability : (m,) probability of losing each pulse.
     tried : names and scores of the explanations that were compared.
-    covariate : name of the covariate of a non-parametric explanation, such as a direction; else "".
+    covariate : name of the covariate, such as a direction, to which losses were fitted freely; else "".
     """
 
     name: str
@@ -62,13 +62,13 @@ class LossExplanation:
 
 @dataclass(frozen=True)
 class LossData:
-    """Observed losses of m laser pulses, to which models of the probability of loss are fitted.
+    """Which of m laser pulses were lost: the data to which models of the probability of loss are fitted.
 
     Attributes
     ----------
     lost : (m,) whether each pulse was lost.
     fit : (m,) true for pulses that are used for fitting.
-    log_likelihood : log-likelihood of these pulses with one probability of loss for all; the reference for other models.
+    log_likelihood : log-likelihood of the pulses in `fit` with one probability of loss for all, with which models are compared.
     """
 
     lost: BoolArray
@@ -77,7 +77,7 @@ class LossData:
 
     @classmethod
     def of(cls, lost: BoolArray, fit: BoolArray) -> LossData:
-        """Collect which laser pulses were lost, and compute the log-likelihood with one probability of loss for all.
+        """Prepare losses of laser pulses for fits: compute their log-likelihood with one probability of loss for all.
 
         Parameters
         ----------
@@ -94,13 +94,14 @@ class LossData:
 
         Parameters
         ----------
-        probability : function from the model's parameters and the covariate x to the probability of loss of each pulse.
+        probability : function of the model's parameters (an array) and of covariate values, which returns the probability of
+            loss for each value.
         x : (m,) covariate of each pulse, such as its range.
         starts : parameter vectors; the search begins at the most likely one.
 
         Returns
         -------
-        _LossFit : parameters, log-likelihood ratio against one probability for all, and probabilities (m,).
+        _LossFit : best parameters, log-likelihood ratio against one probability for all pulses, and probabilities (m,).
         """
         seen, lost = x[self.fit], self.lost[self.fit]
         every = slice(None, None, max(len(lost) // _MOST_PULSES, 1))
@@ -133,8 +134,8 @@ def explain_missing_returns(
     """Find the effect that explains which laser pulses did not return; None if no explanation improves the likelihood enough.
 
     Losses come in clusters (shrubs, wet rock), so a likelihood of independent pulses is overconfident. Log-likelihood ratios
-    are therefore divided by the overdispersion: the variance of the losses in patches of the wall relative to that of
-    independent losses.
+    are therefore divided by the overdispersion: how much more losses vary between parts of the wall than independent ones
+    would.
 
     Parameters
     ----------
@@ -169,14 +170,14 @@ def explain_missing_returns(
 
 
 def count_isolated_returns(at: FloatArray, early: BoolArray) -> int:
-    """Return the number of early returns if they are scattered as from drops or flakes, and 0 if they come from objects.
+    """Count returns from rain drops or snow flakes in front of the wall; 0 if they come from objects.
 
-    An object in front of the wall returns many pulses side by side.
+    Drops return single pulses scattered over the wall; an object returns many pulses side by side.
 
     Parameters
     ----------
-    at : (n, 2) positions of all returns on the wall, wall frame, m.
-    early : (n,) true for early returns: those from far in front of the wall.
+    at : (n, 2) positions of all returns, x along the wall and y up, wall frame, m.
+    early : (n,) true for returns from far in front of the wall.
     """
     patch, count = wall_blocks_by_points(at, _PULSES_PER_PATCH), int(early.sum())
     number = int(patch.max()) + 1

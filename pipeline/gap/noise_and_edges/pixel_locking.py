@@ -46,14 +46,15 @@ _MOST_POINTS = 60_000
 
 @dataclass(frozen=True)
 class Locking:
-    """Pixel locking that was found: a matcher's systematic error that repeats with each pixel of the disparity.
+    """Pixel locking that was found: a matcher's systematic error of the disparity, a sine that repeats with each pixel.
 
     Attributes
     ----------
     amplitude_px, std_px : amplitude of the sine and its standard deviation, px.
-    period_px : size of a pixel of the image that was matched, px of the full image: above 1 if the image was reduced.
+    period_px : period of the sine: size of a pixel of the image that was matched, px of the full image; above 1 if the image
+        was reduced.
     phase_rad : phase of the sine at disparity 0, rad.
-    tilt_rad : rotation of the matcher's rectification about the base, rad.
+    tilt_rad : rotation about the base by which the matcher's rectification differs from ours, rad.
     gain : log-likelihood ratio against no locking.
     """
 
@@ -67,9 +68,9 @@ class Locking:
 
 @dataclass(frozen=True)
 class NoiseBounds:
-    """Bounds of the matching noise, px, for estimating pixel locking in its presence.
+    """Bounds of the standard deviation of matching noise, to estimate the amplitude of pixel locking beside it.
 
-    The noise must be bounded, because a small amplitude cannot be told from another amplitude with other noise.
+    Without bounds, a small amplitude with much noise could not be told from a large one with little noise.
 
     Attributes
     ----------
@@ -81,13 +82,16 @@ class NoiseBounds:
     measured: float
 
     def in_matched_pixels(self, frequency: float) -> NoiseBounds:
-        """Convert the bounds of the noise to pixels of the (reduced) matched image. frequency: matched pixels per px."""
+        """Convert the bounds of the noise to pixels of the image that was matched, which may be reduced.
+
+        frequency: number of matched pixels per px of the full image, at most about 1.
+        """
         return NoiseBounds(self.predicted * frequency, self.measured * frequency)
 
     def noise_range(self, amplitude: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the lowest and highest plausible standard deviation of the matching noise beside given pixel locking.
+        """Return the lowest and highest plausible standard deviation of matching noise for trial amplitudes of pixel locking.
 
-        The measured variance contains both, so a larger amplitude of the locking leaves less for the noise.
+        The measured variance contains noise and locking, so a larger amplitude leaves less for the noise.
 
         Parameters
         ----------
@@ -112,14 +116,14 @@ def find_locking(
 ) -> Locking | None:
     """Find pixel locking: measured disparities crowd around certain fractions of a pixel. None if not significant.
 
-    Test statistic is R, the mean of exp(i phase) over n points, where a whole pixel is a phase of 2 pi. Without locking, n
-    |R|^2 is exponentially distributed (Rayleigh test).
+    A disparity is converted to a phase, in which a whole pixel is 2 pi. The test statistic is R, the mean of exp(i phase) over
+    n points. Without locking, n |R|^2 is exponentially distributed (Rayleigh test).
 
     Parameters
     ----------
     disparity : (n,) measured disparities, px.
     reference : (n,) disparities of the reference, px. Crowding in these is due to the shape of the wall.
-    tangent : (n,) tangent of the angle between each point's rectified image row and the optical axis.
+    tangent : (n,) vertical slope of each point's line of sight: (rectified row - principal row) / focal length in px.
     infinity : disparity of a point at infinity, px, from which disparities are counted.
     noise : bounds of the matching noise, px; None if it is unknown.
     """

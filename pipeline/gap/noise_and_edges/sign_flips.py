@@ -14,10 +14,11 @@ DRAWS = 1999
 
 
 def null_p_value(squares: FloatArray, shapes: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
-    """Test whether any candidate noise effect explains that residuals vary more than predicted.
+    """Test whether any candidate noise effect explains that residuals vary more than predicted, and return the p-value.
 
-    The test statistic is the largest standardised score over the candidates, which corrects for their number. Its null
-    distribution comes from N random sign flips of the scores of whole wall blocks.
+    A candidate's score is large if deviations are larger where it adds more variance. The test statistic is the largest
+    standardised score over the candidates, which corrects for their number. Its null distribution comes from random sign flips
+    of the scores of whole wall blocks (squares of the wall).
 
     Parameters
     ----------
@@ -28,17 +29,18 @@ def null_p_value(squares: FloatArray, shapes: list[FloatArray], block: NDArray[n
 
     Returns
     -------
-    float : the p-value (1 + b) / (1 + N), if b of the N flips reach the observed statistic.
+    float : the p-value (1 + b) / (1 + N), if b of N sign flips reach the observed statistic.
     """
     observed, largest = _scores_with_flipped_signs(squares, shapes, block, random)
     return float((1 + np.sum(largest >= observed)) / (1 + DRAWS))
 
 
 def null_critical_score(squares: FloatArray, shapes: list[FloatArray], block: NDArray[np.int64], random: KeyedRandom) -> float:
-    """Return the critical value for the test whether any candidate noise effect explains the squared deviations.
+    """Return the critical value of the test of `null_p_value`, to compute how large a noise effect must be to be found.
 
-    The test statistic is the largest standardised score over the candidates. Its null distribution comes from random sign flips
-    of the scores of whole wall blocks; the critical value is its quantile at the threshold `variance.significance`.
+    The test asks whether any candidate noise effect explains that residuals vary more than predicted. Its statistic is the
+    largest standardised score over the candidates. The null distribution comes from random sign flips of the scores of whole
+    wall blocks (squares of the wall). The critical value is its quantile at the significance level `variance.significance`.
 
     Parameters
     ----------

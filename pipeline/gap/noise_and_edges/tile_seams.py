@@ -31,11 +31,13 @@ _AT_ONCE, _REFINED = 512, 201
 
 @dataclass(frozen=True)
 class TileSeams:
-    """Square image tiles, shifted against each other by a stereo matcher, that were found in disparities.
+    """Square image tiles that were found in disparities: a stereo matcher processed them separately and shifted them.
+
+    Neighbouring tiles are shifted in opposite directions, so their disparities differ by twice the amplitude.
 
     Attributes
     ----------
-    tile_px, amplitude_px : side and shift of a tile, px; the disparities of neighbouring tiles differ by twice the shift.
+    tile_px, amplitude_px : side of a tile, and size of its shift (the amplitude), px.
     tile_std_px, amplitude_std_px : standard deviations of the side and of the shift, px.
     gain : log-likelihood ratio of the disparity differences across seams: tiles against no tiles.
     p_value : Gaussian p-value of the mean difference, times the number of sides that were tried (Bonferroni).

@@ -36,13 +36,15 @@ _FISHER_ROUNDS = 25
 
 @dataclass(frozen=True)
 class VarianceCandidate:
-    """A noise effect to fit: the variance that it adds at each of n points, by k fitted factors theta (one a parameter).
+    """A noise effect to fit: the variance that it adds at each of n points, as a sum of k fitted terms, one for each parameter.
+
+    A fitted factor theta multiplies the variance that a parameter adds at its typical size (1: typical size).
 
     Attributes
     ----------
     name : name of the effect.
-    variance : (n, k) variance that each of k parameters adds at its typical size, squared unit of the observable.
-    scale : (k,) typical sizes; a parameter is scale * sqrt(theta).
+    variance : (n, k) variance that each parameter adds at its typical size, squared unit of the observable (m² or px²).
+    scale : (k,) typical sizes; the value of a parameter is scale * sqrt(theta).
     names : (k,) names of the parameters.
     cost : penalty subtracted from the log-likelihood ratio: 1 for each fitted parameter, less for those in `fixed`.
     fixed : values, by name, of parameters that are not fitted; each of a few trial values makes a candidate of its own.
@@ -56,18 +58,21 @@ class VarianceCandidate:
     fixed: Mapping[str, float] = field(default_factory=dict)
 
     def parameters(self, theta: FloatArray) -> dict[str, float]:
-        """Return a noise effect's parameters by name.
+        """Convert fitted factors of the variance to values of the noise effect's parameters, by name.
 
-        theta: (k,) fitted factors of the variance, one for each fitted parameter; 1 is the variance at its typical size.
+        theta: (k,) factors; 1 is the variance at a parameter's typical size.
         """
         return dict(zip(self.names, map(float, np.sqrt(theta) * np.array(self.scale)), strict=True)) | dict(self.fixed)
 
     def standard_deviations(self, theta: FloatArray, error: FloatArray) -> dict[str, float]:
-        """Return the standard deviations of a noise effect's parameters by name; near 0, the size that it may have.
+        """Return the standard deviations of a noise effect's parameters by name.
+
+        They follow from those of the fitted factors of the variance. If a factor is below its standard deviation, the parameter
+        may be 0; the returned value is then the size at which the factor equals its standard deviation.
 
         Parameters
         ----------
-        theta : (k,) fitted factors; 1 stands for the variance at a parameter's typical size.
+        theta : (k,) fitted factors of the variance; 1 is the variance at a parameter's typical size.
         error : (k,) standard deviations of theta.
         """
         root = np.sqrt(theta)
@@ -87,8 +92,8 @@ class VarianceTerm:
     p_value : p-value from the simulated null distribution.
     gain : log-likelihood ratio of the models with and without it.
     parameters, std : values of the effect's parameters and their standard deviations, by parameter name.
-    empirical : whether no effect of the catalogue fits well, so that a variance fitted freely to a covariate is reported.
-    variance : (n,) variance that it adds at each point, squared unit of the observable.
+    empirical : true if no effect of the catalogue fits well, so that a variance fitted freely to a covariate is reported.
+    variance : (n,) variance that it adds at each point, squared unit of the observable (m² or px²).
     """
 
     name: str
@@ -102,7 +107,10 @@ class VarianceTerm:
     variance: FloatArray
 
     def with_constant_variance(self, count: int) -> VarianceTerm:
-        """Return this noise term for `count` other points, each with the mean of its variances: noise alike everywhere."""
+        """Return this noise term for other points, as noise that is the same everywhere: each gets the mean of its variances.
+
+        count: number of the other points.
+        """
         return replace(self, variance=np.full(count, float(self.variance.mean())))
 
 
@@ -112,8 +120,8 @@ class VarianceScore:
 
     Attributes
     ----------
-    name : name of the effect, or of the covariate of an empirical term.
-    gain : log-likelihood ratio against the predicted variance.
+    name : name of the effect; for a variance fitted freely to a covariate (empirical term), that covariate.
+    gain : log-likelihood ratio of the models with and without the term.
     score : gain minus the number of parameters.
     empirical : whether the term is not in the catalogue.
     """
@@ -125,20 +133,20 @@ class VarianceScore:
 
 
 def standardised_deviations(residuals: Residuals, cells: WallCells, value: FloatArray) -> FloatArray:
-    """Return residuals minus a plane fitted in each small cell of the wall, over the predicted standard deviation.
+    """Return residuals minus a plane fitted in each small square (cell) of the wall, over the predicted standard deviation.
 
-    Fits of the noise use them: they have variance 1 if the noise model is right. The planes remove the reference error, which
-    is correlated over metres.
+    Noise is fitted to them: they have variance 1 if the noise model is right. The planes remove the error of the reference,
+    which is correlated over metres.
 
     Parameters
     ----------
-    residuals : residuals with their predicted standard deviations.
+    residuals : residuals of n points with their predicted standard deviations.
     cells : the cells into which the wall is divided.
     value : (n,) residuals after the systematic effects are removed, m (ranges) or px (disparities).
 
     Returns
     -------
-    FloatArray : (n,) standardised deviations, NaN outside of cells.
+    FloatArray : (n,) standardised deviations; NaN for points in no cell or in cells with too few points for a plane.
     """
     inside = cells.cell >= 0
     cell = cells.cell[inside]
@@ -163,10 +171,10 @@ def standardised_deviations(residuals: Residuals, cells: WallCells, value: Float
 
 
 def variance_candidates(residuals: Residuals) -> list[VarianceCandidate]:
-    """List the noise effects of the catalogue that can be fitted to residuals, given the fields that were recorded.
+    """List the noise effects of the catalogue that can be fitted to residuals.
 
-    An effect may need a field such as the intensity. Noise that neighbouring points share is left out, because it hardly shows
-    in deviations within small cells of the wall, to which the effects are fitted.
+    An effect is left out if it needs a field that was not recorded, such as the intensity. Noise that neighbouring points share
+    is also left out: effects are fitted to deviations within small squares of the wall, where it hardly shows.
     """
     found = []
     for effect in residuals.candidates:
@@ -193,12 +201,12 @@ def _candidate(effect: type[Effect], geometry: Geometry, fixed: dict[str, float]
 def fit_variance_model(
     residuals: Residuals, cells: WallCells, value: FloatArray, random: KeyedRandom, excluded: frozenset[str] = frozenset()
 ) -> tuple[list[VarianceTerm], list[VarianceScore], str]:
-    """Find at most two noise terms that explain why the residuals scatter more than the model predicts.
+    """Find at most two noise terms that explain why the residuals scatter more than the sensor model predicts.
 
     Parameters
     ----------
-    residuals : residuals with their predicted standard deviations.
-    cells : small cells of the wall; deviations from a plane within each are used.
+    residuals : residuals of n points with their predicted standard deviations.
+    cells : small squares of the wall; deviations from a plane within each are used.
     value : (n,) residuals after the systematic effects are removed, m (ranges) or px (disparities).
     random : source of random numbers for the null distribution.
     excluded : names of effects that are not tried.
@@ -311,12 +319,14 @@ def _unshared_share(residuals: Residuals, value: FloatArray, used: BoolArray, ad
 
 @dataclass(frozen=True)
 class NoiseRatio:
-    """Observed over predicted standard deviation of residuals, as deviations from planes in small cells of the wall.
+    """Observed over predicted standard deviation of residuals, to tell whether the sensor model's noise is right.
+
+    It is computed from deviations from planes in small squares of the wall, without errors that vary slowly over the wall.
 
     Attributes
     ----------
     value : the ratio.
-    clearly_below : whether the ratio is significantly below 1, as judged by wall blocks.
+    clearly_below : whether the ratio is significantly below 1: most parts of the wall agree.
     """
 
     value: float
@@ -328,8 +338,8 @@ class NoiseRatio:
 
         Parameters
         ----------
-        residuals : residuals with their predicted standard deviations.
-        cells : small cells of the wall; deviations from a plane within each are used.
+        residuals : residuals of n points with their predicted standard deviations.
+        cells : small squares of the wall; deviations from a plane within each are used.
         value : (n,) residuals after the systematic effects are removed, m (ranges) or px (disparities).
         random : source of random numbers, with which correlated noise is simulated.
         """
@@ -346,9 +356,9 @@ class NoiseRatio:
 
     @property
     def at_most_one(self) -> float:
-        """Factor that corrects a predicted noise that is too large: observed over predicted if clearly below 1, else 1.
+        """Factor that corrects predicted noise that is too large: observed over predicted if clearly below 1, else 1.
 
-        A ratio below 1 means that the sensor model's own noise is too large, because no effect removes noise.
+        Such noise must be corrected in the sensor model itself, because effects only add noise.
         """
         return self.value if self.clearly_below and self.value < thresholds().variance.excess_noise_ratio else 1.0
 

@@ -42,8 +42,8 @@ _ABOUT_POINT_NOISE = Advice(
 def advice_on(named: NamedEffect) -> Advice:
     """Return the sentences of the report on what a named effect (sensor error) means and what to do about it.
 
-    The texts are those of the effect's class. An effect without such a text is explained by the first paragraph of its
-    docstring. Empirical terms, which name no cause, have a general text.
+    The texts are those of the effect's class, or else the first paragraph of its docstring. Empirical terms, which are curves
+    without a physical cause, have a general text.
     """
     if named.effect.stage == Stage.POINT:
         return _ABOUT_POINT_NOISE if named.adds_variance else _ABOUT_A_SURFACE_TERM
@@ -61,12 +61,15 @@ def advice_on(named: NamedEffect) -> Advice:
 
 
 def page_of(name: str) -> str:
-    """Return the address (file URI) of a documentation page on this machine, to link it in the report; "" without one.
+    """Return the address (file URI) of a documentation page on this machine, to link it in the report.
 
     Parameters
     ----------
-    name : path of the page without ending, such as `reference/effects/tls.wobble`. The built site (`make docs`) is preferred to
-        the source.
+    name : path of the page without ending, such as `reference/effects/tls.wobble`.
+
+    Returns
+    -------
+    str : address of the page in the built site (`make docs`); else of its source; "" if neither exists.
     """
     pages = _ROOT / "site" / f"{name}.html", _ROOT / "docs" / f"{name}.md"
     return next((page.as_uri() for page in pages if page.is_file()), "")

@@ -14,11 +14,11 @@ from scene.geometry.mesh import FloatArray
 
 
 def contributions(found: GapDiagnosis, measurement: Measurement) -> FloatArray:
-    """Return which part of the residuals each named effect (sensor error) explains, for viewers that switch effects on and off.
+    """Compute what part of the residuals each named effect (sensor error) explains, for viewers that switch effects on and off.
 
-    It is the residual without any effect minus that with this effect alone in the model, each after a pose fit of its own. The
-    sum over the effects is nearly `before - after` of the diagnosis. What the pose fit absorbs of several effects together
-    differs.
+    The part is the residual without any effect minus that with this effect alone in the model, each after its own pose fit. The
+    parts of all effects add up to nearly `before - after` of the diagnosis, the change of the residuals by all of them. They
+    differ a little, because a pose fit may absorb several effects together.
 
     Parameters
     ----------

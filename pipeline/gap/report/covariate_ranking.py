@@ -35,10 +35,10 @@ def rank_disagreements(found: GapDiagnosis) -> list[dict[str, Any]]:
 
     Returns
     -------
-    list : at most ten entries of `where` in gap.json, the most significant first. Each has `covariate`; `statistic` ("mean",
+    list : at most ten entries of `where` in gap.json, the most significant first. Keys: `covariate`; `statistic` ("mean",
         "spread" for standard deviation, "shape" for outliers, "missing" for lost returns); `p_value`; `region`, the bin's
-        limits; and `size_m`, the difference in m, which for a mean is positive if the measured surface lies deeper than
-        predicted. Lost returns have the share of lost pulses, `share_lost`, instead.
+        limits; and `size_m`, the difference in m (0 for lost returns). That of a mean is positive if the measured surface lies
+        deeper than predicted. Entries on lost returns also have `share_lost` of the bin and `share_lost_overall`, 0 to 1.
     """
     residuals = found.residuals
     rows = [row for name, x, z in standardised_by_covariate(found) for row in _rank_statistics(name, x, z, residuals)]
@@ -55,7 +55,7 @@ def rank_disagreements(found: GapDiagnosis) -> list[dict[str, Any]]:
 def standardised_by_covariate(found: GapDiagnosis) -> list[tuple[str, FloatArray, FloatArray]]:
     """Return the standardised residuals of a diagnosis against each covariate, such as range, to plot or rank them.
 
-    They are the residuals without named effects over their predicted standard deviation.
+    The residuals are those of the model without the named effects, divided by their predicted standard deviations.
 
     Returns
     -------
@@ -69,10 +69,10 @@ def standardised_by_covariate(found: GapDiagnosis) -> list[tuple[str, FloatArray
 
 
 def inliers(found: GapDiagnosis) -> Any:
-    """Return which of the n points of a diagnosis count in profiles and rankings, as an (n,) mask.
+    """Tell which of the n points of a diagnosis are used in profiles and rankings, as an (n,) mask.
 
-    They lie on smooth surface, not within 0.3 m of the box around a scene change, and their residual without named effects is
-    below 6 predicted standard deviations.
+    They lie on smooth, stable rock and not within 0.3 m of a region where the rock changed. Their residual without the named
+    effects is below 6 predicted standard deviations.
     """
     residuals = found.residuals
     used = residuals.usable & (np.abs(found.before) < _OUTLIER_SIGMAS * residuals.sigma)

@@ -46,7 +46,7 @@ class DatumScale:
 
 
 def estimate_scale(found: GapDiagnosis) -> DatumScale | None:
-    """Estimate how much larger a cloud from unknown cameras is than the reference, from the datum that was fitted to it.
+    """Estimate how much larger a cloud from unknown cameras is than the reference, from shift, rotation and scale fitted to it.
 
     found: diagnosis of the cloud. Returns None for measurements with known cameras or of a laser scanner, if the wall has too
     little relief to show a scale, and for fewer than 100 points.

@@ -42,9 +42,10 @@ _MANY_DECADES = 300.0
 
 
 def maps_figure(found: GapDiagnosis) -> bytes:
-    """Draw maps of the wall for the report: the mean residual without and with the named effects, as PNG.
+    """Draw four maps of the wall for the report, as PNG, that show where the named effects improve the sensor model.
 
-    Below them are maps of the standard deviation over the predicted one. A pixel of a map has about eight points.
+    The upper two show the mean residual, the lower two the standard deviation over the predicted one. The left ones are without
+    the named effects, the right ones with them. A pixel of a map has about eight points.
     """
     unit, pixels = 1e3 * found.residuals.depth_m, _PixelGrid(found)
     left, right, low, high = pixels.extent
@@ -170,7 +171,8 @@ def _log_axis(panel: Axes) -> None:
 def gap_figure(gap: Gap) -> bytes:
     """Draw how much of the gap between model and measurement the named effects close, as one bar, as PNG.
 
-    The bar runs from the score that noise alone leaves (floor) over the score with the effects to that without them.
+    The gap is measured by a score on validation points. Three of its values are marked: floor (what noise alone leaves), after
+    (with the named effects) and before (without them).
     """
     factor, unit = gap.display_unit
     floor, after, before = (factor * value for value in (gap.floor, gap.after, gap.before))
@@ -197,7 +199,7 @@ def gap_figure(gap: Gap) -> bytes:
 
 
 def matrix_figure(names: list[str], cosines: FloatArray, survival: FloatArray) -> bytes:
-    """Draw which sensor errors a measurement can tell apart, as PNG: a matrix of similarities, and bars.
+    """Draw which sensor errors a measurement can tell apart, as PNG: a matrix of their similarities, and a bar for each error.
 
     A signature is the pattern of residuals that an error makes. A bar shows how much of it is left after the sensor's pose is
     fitted.

@@ -71,7 +71,7 @@ def write_identifiability(out: Path, found: Sequence[Identifiability]) -> Path:
 
 
 def summarise(found: Identifiability) -> str:
-    """Return a paragraph on which sensor errors a planned survey can tell apart, for the terminal.
+    """Return a paragraph for the terminal on which sensor errors a planned survey can tell apart.
 
     It names the errors that a shift or rotation of the sensor imitates, the pairs that look alike, and the further measurement
     that separates most pairs. found: the analysis of the survey for one sensor.

@@ -46,7 +46,7 @@ _MOST_TRIED = 25
 def to_dict(found: GapDiagnosis, measurement: Measurement) -> dict[str, Any]:
     """Return the content of gap.json, the machine-readable result of a diagnosis.
 
-    found: the diagnosis; measurement: the measurement that was diagnosed, with its world frame.
+    found: the diagnosis. measurement: the measurement that was diagnosed; it is needed to give positions in the world frame.
     """
     with use_thresholds(found.thresholds):
         return _to_dict(found, measurement)
@@ -91,10 +91,10 @@ def _registration(pose: FloatArray, measurement: Measurement) -> dict[str, Any]:
 def write_report(out: Path, found: GapDiagnosis, measurement: Measurement) -> Path:
     """Write the files of a diagnosis: gap.json, model_after.yaml, before.laz and after.laz, report.html and its figures.
 
-    before.laz and after.laz hold the points (world frame) with their residual without and with the named effects, `residual_m`.
-    It is positive where the measured surface lies deeper than the predicted one. With several effects, before.laz also holds
-    what each explains alone, `effect_1_m`, `effect_2_m` and so on, in the order of gap.json. Nothing is written if a figure
-    fails.
+    model_after.yaml is the sensor model with the named effects. before.laz and after.laz hold the points (world frame) with
+    their residual `residual_m` without and with the named effects; it is positive where the measured surface lies deeper than
+    predicted. With several effects, before.laz also holds what each explains alone: `effect_1_m`, `effect_2_m` and so on, in
+    the order of gap.json. Nothing is written if a figure fails.
 
     Parameters
     ----------

@@ -28,8 +28,10 @@ def unseen_entry(found: GapDiagnosis) -> list[dict[str, Any]]:
 def unseen_rows(found: GapDiagnosis) -> list[dict[str, str]]:
     """Return the rows of the report's table of sensor errors that may be there although the diagnosis did not name them.
 
-    Columns: `name`; `size`, from which the error would have shown with a probability of 95 %; and `note`: the choice (period,
-    camera) for which the size holds, or why there is no size.
+    Returns
+    -------
+    list : for each error the table's columns: `name`; `size`, from which it would have shown with a probability of 95 %; and
+        `note`: the period or camera for which the size holds, or why there is no size.
     """
     return [
         {
@@ -42,9 +44,9 @@ def unseen_rows(found: GapDiagnosis) -> list[dict[str, str]]:
 
 
 def unseen_line(found: GapDiagnosis) -> str:
-    """Return a line for the terminal on sensor errors that may be there unseen, with the size that would have shown.
+    """Return a line for the terminal on sensor errors that may be there unseen, with the size from which they would have shown.
 
-    It names the four whose size is largest relative to the typical one; "" if no such size is known.
+    It names four errors: those whose size is largest relative to what instruments commonly have. It is "" if no size is known.
     """
     sensor = found.residuals.sensor
     known = [each for each in found.unseen if np.isfinite(each.size) and each.parameter]
@@ -57,9 +59,10 @@ def unseen_line(found: GapDiagnosis) -> str:
 
 
 def reference_line(found: GapDiagnosis) -> str:
-    """Return a sentence that warns of a reference surface whose estimated error is over three times the usual; else "".
+    """Return a warning if the reference surface is unusually inaccurate, because this hides sensor errors that look alike.
 
-    Sensor errors that look like an error of the reference stay hidden then.
+    The warning is given if the standard deviation of its error, as estimated, is over 3 mm (laser scanner) or 15 mm (stereo);
+    otherwise the text is "".
     """
     if not len(found.residuals) or not found.reference_sigma:
         return ""

@@ -75,7 +75,7 @@ def paragraph(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
     Parameters
     ----------
     found : diagnosis.
-    rows : where measurement and model differ most, from `rank_disagreements`.
+    rows : values of covariates, such as the range, where measurement and model differ most, from `rank_disagreements`.
     """
     return " ".join(each for each in (*_findings(found, rows), describe_gap(found), *_side_notes(found)) if each)
 
@@ -83,12 +83,13 @@ def paragraph(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
 def answer(found: GapDiagnosis, rows: list[dict[str, Any]]) -> str:
     """Return the outcome of a diagnosis as a paragraph for the top of the report, with the share of the gap that closes.
 
-    It leaves out the scores, which the report shows further below.
+    The gap is the distance between sensor model and measurement. Its scores are left out, as the report shows them further
+    below.
 
     Parameters
     ----------
     found : diagnosis.
-    rows : where measurement and model differ most, from `rank_disagreements`.
+    rows : values of covariates, such as the range, where measurement and model differ most, from `rank_disagreements`.
     """
     return " ".join(each for each in (*_findings(found, rows), _describe_closed_gap(found), *_side_notes(found)) if each)
 
@@ -155,12 +156,13 @@ def _largest_disagreement(found: GapDiagnosis, rows: list[dict[str, Any]]) -> st
 
 
 def outcome(found: GapDiagnosis, tried: Sequence[FamilyScore], item: FamilyScore) -> str:
-    """Say what became of one explanation of the residuals' mean that the diagnosis tried, for the report's table.
+    """Say what became of one explanation of systematic residuals that the diagnosis tried, for the report's table.
 
     Parameters
     ----------
     found : diagnosis.
-    tried : all explanations of the mean (systematic sensor errors and empirical terms) that were tried, best first.
+    tried : all explanations that were tried, best first: systematic sensor errors, and empirical terms (curves without a
+        cause).
     item : one of these.
 
     Returns
@@ -175,7 +177,7 @@ def outcome(found: GapDiagnosis, tried: Sequence[FamilyScore], item: FamilyScore
 
 
 def variance_outcome(found: GapDiagnosis, item: VarianceScore) -> str:
-    """Say what became of one explanation of the residuals' variance that the diagnosis tried, for the report's table.
+    """Say what became of one explanation of the residuals' scatter that the diagnosis tried, for the report's table.
 
     found: diagnosis; item: one of the noise terms that were tried. Returns "named", "cannot be told from the named one", "added
     as empirical" or "rejected".
@@ -300,7 +302,7 @@ def _describe_range(effect: NamedEffect) -> str:
 def describe_gap(found: GapDiagnosis) -> str:
     """Return a sentence for the report with the scores of the sensor model without and with the named effects.
 
-    It also states the score that noise alone leaves; "" if nothing was scored.
+    It also states the score that noise alone gives. It is "" if nothing was scored.
     """
     if found.gap is None:
         return ""

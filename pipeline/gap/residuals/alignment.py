@@ -42,7 +42,7 @@ change as it moves.
 def fit_pose_robustly(residuals: Residuals) -> tuple[FloatArray, FloatArray, float]:
     """Fit the pose of the sensor to the residuals by least squares, rejecting outliers in several rounds.
 
-    The surveyed pose is never exact, so it is corrected before errors of the sensor are searched for in the residuals.
+    The surveyed pose is never exact. Its error must be removed before errors of the sensor are searched for in the residuals.
 
     Parameters
     ----------
@@ -50,11 +50,11 @@ def fit_pose_robustly(residuals: Residuals) -> tuple[FloatArray, FloatArray, flo
 
     Returns
     -------
-    value : (n,) residuals minus the effect of the pose, m or px, as the residuals.
-    pose : (6 k,) shift (m) and small rotation (rad) of each set-up in the wall frame. For a cloud without cameras it has one
-        value for each column of its pose Jacobian (with a scale, up to seven).
-    noise_ratio : NMAD of the residuals divided by their predicted standard deviations, at least 1. It is above 1 if the
-        residuals scatter more than predicted.
+    value : (n,) residuals minus what the fitted change of the pose explains, in the unit of the residuals (m or px).
+    pose : (6 k,) correction of each set-up's pose: shift (m) and small rotation (rad), wall frame. For a cloud without cameras:
+        one value for each column of `residuals.pose_jacobian`, at most seven (shift, rotation and scale).
+    noise_ratio : Robust standard deviation (NMAD) of `value` divided by its predicted standard deviation; at least 1. It is
+        above 1 if the residuals scatter more than predicted.
     """
     kept, scale = residuals.usable.copy(), 1.0
     value, pose, design = residuals.value, np.zeros(residuals.pose_jacobian.shape[1]), _weighted_design(residuals)
@@ -72,7 +72,9 @@ def fit_pose_robustly(residuals: Residuals) -> tuple[FloatArray, FloatArray, flo
 
 
 def fit_pose(residuals: Residuals, rows: BoolArray | NDArray[np.int64]) -> FloatArray:
-    """Fit the pose of the sensor to the residuals of some points by weighted least squares, without rejecting outliers.
+    """Fit the pose of the sensor to the residuals of chosen points by weighted least squares.
+
+    Outliers are not rejected; use it where the points are known to be good.
 
     Parameters
     ----------
@@ -81,8 +83,8 @@ def fit_pose(residuals: Residuals, rows: BoolArray | NDArray[np.int64]) -> Float
 
     Returns
     -------
-    (6 k,) shift (m) and small rotation (rad) of each of k set-ups (positions of the sensor), wall frame. For a cloud without
-    cameras: one value for each column of the pose Jacobian.
+    (6 k,) correction of the pose of each of k set-ups (positions of the sensor): shift (m) and small rotation (rad), wall
+    frame. For a cloud without cameras: one value for each column of `residuals.pose_jacobian`.
     """
     return _least_squares(_weighted_design(residuals, rows))
 
@@ -119,16 +121,16 @@ def _qr_factors(blocks: FloatArray) -> FloatArray:
 def compute_raw_residuals(measurement: Measurement) -> Residuals:
     """Compute residuals (measured minus predicted observable) with the sensor at the pose that the measurement states.
 
-    All epochs share this pose.
+    Unlike `compute_residuals`, it fits no pose to single epochs (repetitions of the measurement).
 
     Parameters
     ----------
-    measurement : A laser scan or several, a stereo pair, or a point cloud from photographs without its cameras, with the
-        reference surface and the sensor model that predict it.
+    measurement : One laser scan or several, a stereo pair, or a point cloud from photographs without its cameras. It contains
+        the reference surface and the sensor model, by which the observables are predicted.
 
     Returns
     -------
-    Residuals of the class for this kind of measurement: ranges, disparities, or distances from the reference surface.
+    Residuals of ranges (m), of disparities (px), or of distances from the reference surface (m), by the kind of measurement.
     """
     if isinstance(measurement, SurfaceMeasurement):
         return surface_residuals(measurement)
@@ -140,10 +142,13 @@ def compute_raw_residuals(measurement: Measurement) -> Residuals:
 def compute_residuals(measurement: Measurement) -> Residuals:
     """Compute the residuals (measured minus predicted observable) of a measurement, with the sensor at its surveyed pose.
 
+    If there are several epochs (repetitions), the sensor may stand a little differently in each. A pose is therefore fitted to
+    each epoch, and the effect of its difference from the mean pose is subtracted.
+
     Parameters
     ----------
-    measurement : A laser scan or several, a stereo pair or a cloud without cameras, with reference surface and sensor model. If
-        it has several epochs, a pose is fitted to each, and the effect of its difference from the mean pose is subtracted.
+    measurement : One laser scan or several, a stereo pair or a cloud without cameras. It contains the reference surface and the
+        sensor model.
 
     Returns
     -------
@@ -167,8 +172,8 @@ class AlignedMeasurement(NamedTuple):
     ----------
     measurement : The measurement with the sensor at this pose.
     residuals : Its residuals (measured minus predicted observable) at this pose.
-    pose : (6 k,) total shift (m) and small rotation (rad) of each of k set-ups (positions of the sensor) from the surveyed
-        pose, wall frame. For a cloud without cameras: one value for each column of its pose Jacobian (with a scale).
+    pose : (6 k,) by how much each of k set-ups (positions of the sensor) was moved from its surveyed pose: shift (m) and small
+        rotation (rad), wall frame. For a cloud without cameras: one value for each column of `residuals.pose_jacobian`.
     """
 
     measurement: Measurement
@@ -181,9 +186,9 @@ def align(
 ) -> AlignedMeasurement:
     """Move the sensor to the pose that fits the residuals best, and compute the residuals there.
 
-    The pose is fitted to linearised residuals. If it moves the rays by more than 2 mm on the wall, the rays are traced again
-    and the fit is repeated, up to three times. For a point cloud without cameras the limit is a tenth of the predicted standard
-    deviation, on average, and the fit is repeated up to twelve times.
+    The fit is linear in the pose. After a larger move the residuals are therefore computed again and the fit is repeated: if
+    rays move by more than 2 mm on the wall, up to three times. For a cloud without cameras: if the points move by more than a
+    tenth of their predicted standard deviations on average, up to twelve times.
 
     Parameters
     ----------
@@ -231,11 +236,11 @@ def _moves_rays_far(pose: FloatArray, residuals: Residuals) -> bool:
 def at_points_of(found: Residuals, part: Residuals) -> Residuals:
     """Restrict residuals to the points of other residuals, to compare two sensor models on the same points.
 
-    Points that are unusable for fitting in `found` (for example at edges), or outliers there, are left out.
+    Points that `found` marks as unusable for fitting (for example at edges) are left out, and so are its outliers.
 
     Parameters
     ----------
-    found : Residuals to restrict, for example with one more effect in the sensor model.
+    found : Residuals to restrict, for example those under a sensor model with one more effect.
     part : Residuals of the points to keep, of the same measurement.
 
     Returns

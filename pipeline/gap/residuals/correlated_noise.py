@@ -27,9 +27,10 @@ _REACH = 2.5
 
 @dataclass(frozen=True, eq=False)
 class NodeField:
-    """Grid-correlated noise in matrix form: random values at q grid nodes, interpolated bilinearly to n points.
+    """Grid-correlated noise in matrix form, for the covariance of n points in a least-squares fit.
 
-    The noise of the points has the covariance weights · covariance · weightsᵀ.
+    Random values at the q nodes of a grid are interpolated bilinearly to the points. The noise of the points then has the
+    covariance weights · covariance · weightsᵀ.
 
     Attributes
     ----------
@@ -42,7 +43,10 @@ class NodeField:
 
     @property
     def variance(self) -> float:
-        """Mean variance of the interpolated noise over a sample of the points, px²; 0 without nodes."""
+        """Variance of the grid-correlated noise at a point, averaged over a sample of the points, px².
+
+        It is 0 if the noise model has no grid nodes.
+        """
         some = self.weights[:: max(self.weights.shape[0] // _SAMPLE, 1)]
         return float(np.mean((some @ self.covariance * some.toarray()).sum(axis=1))) if some.shape[1] else 0.0
 
@@ -51,12 +55,12 @@ class NodeField:
 class GridCorrelatedNoise:
     """The part of a stereo pair's predicted noise that neighbouring points share.
 
-    It is modelled by random values at the nodes of a grid in the image, interpolated bilinearly to the points, as a stereo
-    matcher with regularisation makes it. The fits need it because the points are not independent.
+    A stereo matcher that smooths its disparities makes such noise. The model is a grid in the image with random values at its
+    nodes, interpolated bilinearly to the points. Fits need it, because points with shared noise are not independent.
 
     Attributes
     ----------
-    effects : The noise terms of the sensor model that are of this kind, each with its standard deviation and node spacing.
+    effects : The terms of the sensor model for such noise, each with its standard deviation and node spacing.
     pixels : (n, 2) columns and rows of the points in the left image, px; None if there is no such noise.
     """
 
@@ -65,11 +69,11 @@ class GridCorrelatedNoise:
 
     @classmethod
     def of(cls, model: StereoModel, pixels: FloatArray) -> GridCorrelatedNoise:
-        """Collect the noise terms of a sensor model that are correlated between the nodes of a grid.
+        """Collect those noise terms of a sensor model that neighbouring points share (grid-correlated noise).
 
         Parameters
         ----------
-        model : The sensor model of the stereo pair.
+        model : The sensor model of the stereo pair; its other noise terms are ignored.
         pixels : (n, 2) column and row of each point in the left image, px.
         """
         return cls(_grid_correlated(model.matching_noise), pixels)
@@ -88,11 +92,9 @@ class GridCorrelatedNoise:
     def node_field(self, count: int) -> NodeField:
         """Return the grid-correlated noise of all points in matrix form, for the covariance in a least-squares fit.
 
-        Noise on a grid finer than the mean spacing of the points acts like white noise and is left out.
+        Noise whose grid is finer than the mean spacing of the points acts like white noise and is left out.
 
-        Parameters
-        ----------
-        count : Number n of points, which is the number of rows of the weights even if there is no such noise.
+        count: number n of points. Without grid-correlated noise the matrix of weights is (n, 0).
         """
         if self.pixels is None or not count:
             return _empty_field(count)

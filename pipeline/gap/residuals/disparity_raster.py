@@ -37,10 +37,10 @@ _STEEP = 0.3
 
 @dataclass(frozen=True)
 class DisparityRaster:
-    """Disparities of the reference surface on the stereo matcher's pixel raster.
+    """Disparities of the reference surface on the raster of pixels at which a stereo matcher measured.
 
     It is used to predict errors in which a pixel is affected by its neighbours: edge fattening, smoothing and filled
-    occlusions.
+    occlusions. Such errors cannot be predicted from scattered points.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class DisparityRaster:
         Parameters
         ----------
         measurement : The stereo pair with its reference surface and sensor model.
-        geometry : The pixels of its n points.
+        geometry : The matched pixels of its n points; they determine the spacing of the raster.
 
         Returns
         -------
@@ -74,7 +74,7 @@ class DisparityRaster:
         if step is None or raster_cell_count(geometry.u, geometry.v, step) > MOST_CELLS:
             return None
         nominal = NominalPair.of(measurement)
-        real = real_pair(nominal, measurement.model.effects, measurement)
+        real = real_pair(measurement.model.effects, measurement)
         left, right = real.left, real.right
         (columns, column), (rows, row) = (
             _raster_axis(x, step, size) for x, size in ((geometry.u, left.width), (geometry.v, left.height))
@@ -97,17 +97,20 @@ class DisparityRaster:
 
     @property
     def depth_step_px(self) -> float:
-        """Difference in disparity of neighbouring raster cells, px, above which a depth step of the rock lies between them."""
+        """Threshold by which depth steps of the rock are found in the raster, px.
+
+        There is a step between two neighbouring cells if their disparities differ by more.
+        """
         return max(_STEEP * self.step, 1.0)
 
     def search_part(self) -> tuple[DisparityRaster, NDArray[np.int64]]:
-        """Return the part of the raster in which edge effects (such as edge fattening) are searched for, to save time.
+        """Return a part of the raster, to save time when edge effects (such as edge fattening) are searched for.
 
         Returns
         -------
-        raster : The whole raster, or four bands of rows if it has more than a million cells. The bands are separated by empty
-            rows so that they do not affect each other; `hidden` is only valid in rows with points.
-        points : (k,) row numbers, among the n measured points, of those that lie in it.
+        raster : The whole raster if it has at most a million cells, else four bands of its rows. Empty rows between the bands
+            keep them from affecting each other. In rows without points `hidden` is not valid.
+        points : (k,) row numbers of those of the n measured points that lie in it.
         """
         from scipy.ndimage import maximum_filter1d
 
@@ -126,14 +129,17 @@ class DisparityRaster:
         return replace(self, disparity=disparity, hidden=hidden, row=place[self.row[points]], column=self.column[points]), points
 
     def at_points(self, raster: NDArray[Any]) -> NDArray[Any]:
-        """Look up the values of a raster (rows, columns) in the cells of the n measured points; return (n,) values."""
+        """Look up the values of an array with the shape of this raster in the cells of the n measured points.
+
+        raster: (rows, columns) values. Returns (n,) values.
+        """
         return np.asarray(raster[self.row, self.column])
 
     def near_border(self, sigma_px: float) -> BoolArray:
         """Tell which points are so near the border of the common field of view that smoothing cannot be predicted there.
 
-        These are the points for which more than 1 % of the weight of a Gaussian low-pass filter lies outside that field of view
-        (occlusions count as inside).
+        A Gaussian low-pass filter would use disparities beyond the border, which are unknown. A point is near if more than 1 %
+        of the filter's weight lies there. Occlusions do not count as beyond the border.
 
         Parameters
         ----------
@@ -151,7 +157,7 @@ class DisparityRaster:
     def in_filled_occlusions(self, effects: Iterable[Effect]) -> BoolArray:
         """Tell which measured points lie in occlusions, where a matcher can only have filled in a disparity.
 
-        Only the left camera sees the reference there, and the given effects predict no disparity.
+        In an occlusion only the left camera sees the reference. Cells to which an edge effect carries a disparity do not count.
 
         Parameters
         ----------
@@ -159,12 +165,12 @@ class DisparityRaster:
 
         Returns
         -------
-        (n,) true for such points.
+        (n,) true for points in occlusions.
         """
         return np.asarray(np.isnan(self.at_points(self.apply(effects))) & self.at_points(self.hidden))
 
     def copied_from_neighbour(self, found: FloatArray, tolerance: float) -> BoolArray:
-        """Tell which measured disparities equal that of a neighbouring cell in the same row.
+        """Tell which measured disparities equal that of a neighbouring cell in the same row of the raster.
 
         A stereo matcher that fills occlusions copies disparities from a neighbouring pixel, so equal values reveal it.
 
@@ -183,14 +189,11 @@ class DisparityRaster:
         return self.at_points(np.pad(same, ((0, 0), (1, 0))) | np.pad(same, ((0, 0), (0, 1))))
 
     def apply(self, effects: Iterable[Effect]) -> FloatArray:
-        """Predict the disparities that a matcher with effects of neighbouring pixels measures on the reference surface.
-
-        Such effects are edge fattening, smoothing and filled occlusions. They are applied to the raster of the reference's
-        disparities.
+        """Predict the disparities that a matcher with edge fattening, smoothing or filled occlusions gives on the reference.
 
         Parameters
         ----------
-        effects : Effects of the sensor model; those that do not involve neighbouring pixels are ignored.
+        effects : Effects of the sensor model; those in which neighbouring pixels play no part are ignored.
 
         Returns
         -------
@@ -203,26 +206,27 @@ class DisparityRaster:
         return found
 
     def added_by(self, effects: Iterable[Effect], disparity: FloatArray) -> FloatArray:
-        """Return what effects of neighbouring pixels (such as edge fattening and smoothing) add to the points' disparities.
+        """Return by how much edge fattening, smoothing and filled occlusions change the disparity at each measured point.
 
         Parameters
         ----------
         effects : Effects of the sensor model; those of other kinds are ignored.
-        disparity : (n,) disparity of the reference at the points, px, used where the raster has none.
+        disparity : (n,) disparity of the reference at the points, px. It stands in for the raster's value in cells that are
+            NaN.
 
         Returns
         -------
-        (n,) added disparity, px; 0 where the effects predict no disparity.
+        (n,) disparity with these effects minus disparity of the reference, px; 0 where the effects give no match.
         """
         plain = self.at_points(self.disparity)
         return np.nan_to_num(self.at_points(self.apply(effects)) - np.where(np.isnan(plain), disparity, plain))
 
 
 def apply_smoothing(effects: Iterable[Effect], geometry: PixelGeometry, columns: FloatArray) -> FloatArray:
-    """Apply the smoothing of a stereo matcher to small changes of the disparities, such as the columns of a pose Jacobian.
+    """Smooth small changes of the disparities, such as a pose Jacobian, as the stereo matcher smooths its disparities.
 
-    A move of the cameras changes the disparities in a pattern that follows the rock's relief; the matcher smooths this pattern
-    too. If the points are a subsample, only the pixels that are present are averaged.
+    A move of the cameras changes the disparities in a pattern that follows the rock's relief, and the matcher smooths it. If
+    the points are a subsample, only the pixels that are present are averaged.
 
     Parameters
     ----------
@@ -232,7 +236,7 @@ def apply_smoothing(effects: Iterable[Effect], geometry: PixelGeometry, columns:
 
     Returns
     -------
-    (n, k) smoothed changes; unchanged without smoothing or if the pixels lie on no raster.
+    (n, k) smoothed changes; unchanged without smoothing, if the pixels lie on no raster, or if it has over 40 million cells.
     """
     filters, step = [effect for effect in effects if isinstance(effect, Smoothing)], raster_cell_px(geometry.u, geometry.v)
     if not filters or step is None or raster_cell_count(geometry.u, geometry.v, step) > MOST_CELLS:
@@ -287,7 +291,7 @@ def _cell(x: FloatArray, step: float) -> NDArray[np.int64]:
 
 
 def raster_cell_px(u: FloatArray, v: FloatArray) -> float | None:
-    """Return the spacing of the pixel raster on which a stereo matcher measured, such as every second or fourth pixel.
+    """Find the spacing of the pixel raster on which a stereo matcher measured, such as every second or fourth pixel.
 
     Parameters
     ----------
@@ -295,16 +299,16 @@ def raster_cell_px(u: FloatArray, v: FloatArray) -> float | None:
 
     Returns
     -------
-    The smaller one of the spacings of columns and of rows, px; None if the pixels lie on no raster.
+    The spacing of the columns or of the rows, whichever is smaller, px; None if the pixels lie on no raster.
     """
     steps = [step for step in (raster_spacing_px(u), raster_spacing_px(v)) if step is not None]
     return min(steps, default=None)
 
 
 def raster_spacing_px(u: FloatArray) -> float | None:
-    """Return the spacing of neighbouring columns (or rows) in a raster of pixels, px.
+    """Find the spacing of the columns, or of the rows, of a raster on which measured pixels lie.
 
-    It is found even if a registration has shifted the pixels a little.
+    Pixels that a registration has shifted a little still count.
 
     Parameters
     ----------
@@ -312,7 +316,7 @@ def raster_spacing_px(u: FloatArray) -> float | None:
 
     Returns
     -------
-    The spacing; None if the pixels lie on no raster.
+    The spacing, px; None if the pixels lie on no raster.
     """
     gaps = np.diff(np.unique(np.round(u, 3)))
     step = float(np.median(gaps)) if len(gaps) > 10 else 0.0

@@ -27,12 +27,11 @@ _SAME_STEP = 0.5
 def simulate_disparities(
     measurement: StereoMeasurement, model: StereoModel, residuals: StereoResiduals, randoms: Sequence[KeyedRandom]
 ) -> FloatArray:
-    """Simulate the disparity that a sensor model gives at each measured pixel of a stereo pair.
+    """Simulate the disparities that a sensor model gives at the measured pixels of a stereo pair, with its random errors.
 
-    The full simulation produces depth maps of three qualities, with cells of 2, 4 or 8 px. The one is used whose cell centres
-    are nearest to the pixels on average, and only the cells in which measured pixels lie are traced. As a pixel is not at the
-    centre of its cell, the difference of the reference's nominal disparity between pixel and centre is added. Effects that depend
-    on neighbouring cells are applied on the measurement's own raster if its spacing differs from that of the depth map.
+    The simulated depth maps have cells of 2, 4 or 8 px. The size is chosen whose cell centres lie nearest to the pixels. The
+    disparity of the reference is corrected for the distance of each pixel from the centre of its cell. If the measurement's own
+    raster has another spacing, effects that depend on neighbouring cells are applied on that raster.
 
     Parameters
     ----------

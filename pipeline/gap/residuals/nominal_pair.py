@@ -43,7 +43,7 @@ class PixelGeometry:
     radius, radius_right : (n,) distance from the centre of the left and of the right image, px.
     tangent : (n,) vertical slope of the line of sight in the rectified left image: (row - principal row) / focal length in px.
     infinity : (n,) disparity of a point at infinity, px.
-    shaped : (n,) what effects of neighbouring pixels (edge fattening, smoothing) add to the reference's disparity, px.
+    shaped : (n,) change of the disparity by edge fattening, smoothing and filled occlusions of the sensor model, px; 0 without.
     along_row, along_column : (n,) change of the reference's disparity along the row and along the column of the left image,
         between neighbouring cells of the matcher's raster, px per px; None if not computed.
     """
@@ -83,7 +83,7 @@ class PixelGeometry:
 
     @property
     def departure(self) -> FloatArray:
-        """(n,) measured minus reference disparity, px, without subtracting any effect of the sensor model."""
+        """(n,) measured minus reference disparity, px. Predicted systematic errors of the sensor are still in it."""
         return np.asarray(self.found - self.disparity)
 
 
@@ -91,8 +91,8 @@ class PixelGeometry:
 class NominalPair:
     """A stereo pair with the calibration and pose that the measurement states, in the wall frame.
 
-    Disparities are differences of columns in the images that this pair rectifies. The real cameras may differ from it by errors
-    of calibration and pose.
+    Disparities are defined by it: they are differences of columns in the images that it rectifies. The real cameras may differ
+    from it by errors of calibration and pose.
 
     Attributes
     ----------
@@ -124,12 +124,12 @@ class NominalPair:
         return _on_host(self.left_column(*first) - self.right_column(*second))[0]
 
     def surface_disparity(self, scene: RayCaster, u: FloatArray, v: FloatArray) -> FloatArray:
-        """Return the disparity of the surface point that each pixel of the left image sees.
+        """Predict the disparity of the surface point that each pixel of the left image sees.
 
         Parameters
         ----------
-        scene : The surface, for casting rays on it, wall frame.
-        u, v : (n,) columns and rows of the pixels in the left image, px.
+        scene : The surface, in the wall frame, prepared for ray tracing.
+        u, v : (n,) columns and rows of the pixels in the original (not rectified) left image, px.
 
         Returns
         -------
@@ -141,21 +141,21 @@ class NominalPair:
         return self.disparity((u, v), project(self.pair.right, point))
 
     def left_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
-        """Rectify pixels of the left image and return their columns, px. Arrays (n,) lie on the ray-tracing device.
+        """Transform pixels of the left image to the rectified image, and return their columns, px: one half of a disparity.
 
-        u, v: columns and rows in the original image, px.
+        u, v: (n,) columns and rows in the original image, px. These and the result are arrays on the ray-tracing device.
         """
         rect = self.geometry
         return rectified_pixel(self.pair.left, rect.left, u, v, rect.f, rect.u_left, rect.v)[0]
 
     def tangent(self, u: FloatArray, v: FloatArray) -> FloatArray:
-        """Return the vertical slope of each pixel's line of sight in the rectified left image.
+        """Return the vertical slope of each pixel's line of sight in the rectified left image, to model pixel locking.
 
         It is (row - principal row) / focal length.
 
         Parameters
         ----------
-        u, v : (n,) columns and rows in the left image, px.
+        u, v : (n,) columns and rows in the original left image, px.
 
         Returns
         -------
@@ -167,27 +167,27 @@ class NominalPair:
         return _on_host(row_tangent(rect, row))[0]
 
     def right_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
-        """Rectify pixels of the right image and return their columns, px. Arrays (n,) lie on the ray-tracing device.
+        """Transform pixels of the right image to the rectified image, and return their columns, px: one half of a disparity.
 
-        u, v: columns and rows in the original image, px.
+        u, v: (n,) columns and rows in the original image, px. These and the result are arrays on the ray-tracing device.
         """
         rect = self.geometry
         return rectified_pixel(self.pair.right, rect.right, u, v, rect.f, rect.u_right, rect.v)[0]
 
     def right_column_of(self, real: Camera, point: mi.Array3f64) -> mi.Float64:
-        """Predict in which rectified column points appear if the real right camera differs from the nominal one.
+        """Predict in which rectified column points appear if the real right camera differs from the calibrated one.
 
-        The real camera takes the image; the image is then rectified with the nominal calibration, because the difference is
-        unknown to the user. Arrays lie on the ray-tracing device.
+        The real camera takes the image. The image is rectified with the nominal calibration, because the user does not know the
+        difference.
 
         Parameters
         ----------
         real : The right camera as it really is.
-        point : n points, wall frame, m.
+        point : n points, wall frame, m, on the ray-tracing device.
 
         Returns
         -------
-        (n,) columns in the rectified right image, px.
+        (n,) columns in the rectified right image, px, on the ray-tracing device.
         """
         x, y = _seen_tangents(real, point)
         if _interior(real) != _interior(self.pair.right):  # else both cameras have the same tangents
@@ -202,7 +202,7 @@ def project(camera: Camera, points: FloatArray) -> tuple[FloatArray, FloatArray]
     Parameters
     ----------
     camera : The camera with its pose.
-    points : (n, 3) points in the frame in which the pose is given, m.
+    points : (n, 3) points in the frame of the camera's pose, such as the wall frame, m.
 
     Returns
     -------
@@ -222,8 +222,8 @@ def pixel_rays(camera: Camera, u: FloatArray, v: FloatArray) -> FloatArray:
 
     Returns
     -------
-    (n, 3) directions in the frame in which the camera's pose is given. They are not of unit length: the component along the
-    camera's axis is 1.
+    (n, 3) directions in the frame of the camera's pose, such as the wall frame. They are not of unit length: the component
+    along the camera's axis is 1.
     """
     return np.stack(_on_host(*_ray(camera, on_device(mi.Float64, u), on_device(mi.Float64, v))), axis=1)
 
@@ -257,11 +257,11 @@ def _on_host(*columns: mi.Float64) -> list[FloatArray]:
 
 
 def is_hidden(scene: RayCaster, position: FloatArray, points: FloatArray) -> BoolArray:
-    """Tell which points are hidden from a camera behind another surface.
+    """Tell which points a camera does not see, because the surface itself lies in front of them (occlusions).
 
     Parameters
     ----------
-    scene : The surface.
+    scene : The surface, prepared for ray tracing.
     position : (3,) position of the camera, wall frame, m.
     points : (n, 3) points on the surface, wall frame, m; NaN counts as not hidden.
 
@@ -275,20 +275,21 @@ def is_hidden(scene: RayCaster, position: FloatArray, points: FloatArray) -> Boo
 
 
 def predict_disparities(nominal: NominalPair, real: Iterable[CameraPair], geometry: PixelGeometry) -> list[FloatArray]:
-    """Predict the disparities of given pixels for several positions or calibrations of the real cameras.
+    """Predict the disparities at given pixels if the cameras are not where the calibration says.
 
-    Differences of the results give, for example, derivatives by the pose. To be fast, the surface is replaced by its tangent
-    planes, so that no ray is traced again.
+    Differences of the results give the derivatives of the disparities by pose or calibration. Images are rectified with the
+    stated (nominal) calibration, so that an error of the real cameras shows in the disparities. To be fast, the surface is
+    replaced by its tangent plane at each pixel's point, and no ray is traced again.
 
     Parameters
     ----------
-    nominal : The pair with its stated calibration, with which the images are rectified.
-    real : The pairs as they might really be.
+    nominal : The pair with its stated calibration.
+    real : Pairs as they might really be, such as the nominal one with one camera rotated a little.
     geometry : n pixels of the left image, with the points of the reference surface that they see and its normals.
 
     Returns
     -------
-    For each real pair the (n,) disparities, px.
+    A list with the (n,) disparities, px, for each of the real pairs.
     """
     u, v = on_device(mi.Float64, geometry.u), on_device(mi.Float64, geometry.v)
     point, normal = vectors_on_device(geometry.point), vectors_on_device(geometry.normal)
@@ -320,13 +321,13 @@ def moved_pair(pair: CameraPair, centre: FloatArray, vector: FloatArray, *, turn
     Parameters
     ----------
     pair : The cameras.
-    centre : (3,) point about which they are rotated, m.
+    centre : (3,) point about which they are rotated, m, in the frame of the pair.
     vector : (3,) shift, m, or small rotation vector, rad, in the frame of the pair.
     turned : Whether `vector` is a rotation.
 
     Returns
     -------
-    The moved pair, in the frame of the given one.
+    The moved pair, in the same frame.
     """
     if not turned:
         return pair.shifted("both", vector)
@@ -339,14 +340,17 @@ def moved_pair(pair: CameraPair, centre: FloatArray, vector: FloatArray, *, turn
     return CameraPair(*sides)
 
 
-def real_pair(nominal: NominalPair, effects: tuple[Effect, ...], measurement: StereoMeasurement) -> CameraPair:
-    """Return the cameras of a stereo pair with the errors of calibration and pose of a sensor model, in the wall frame.
+def real_pair(effects: tuple[Effect, ...], measurement: StereoMeasurement) -> CameraPair:
+    """Return the cameras of a stereo pair as a sensor model says they really are: with its errors of calibration and pose.
 
     Parameters
     ----------
-    nominal : The pair as calibrated. It is not used: `measurement` has the same cameras.
     effects : Effects of the sensor model; those that do not change the cameras are ignored.
     measurement : The measurement with its stated cameras, and the wall frame.
+
+    Returns
+    -------
+    The two cameras, wall frame.
     """
     pair = measurement.cameras
     for effect in effects:

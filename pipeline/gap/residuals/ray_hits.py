@@ -23,19 +23,19 @@ class RayGeometry(PulseGeometry):
     """Geometry of n laser rays with the measured ranges: the quantities on which errors of ranges depend.
 
     It has all fields of `PulseGeometry`: recorded directions, range to the reference surface, cosine of the incidence angle,
-    received power, scan line and time. Range and incidence angle are those of the direction in which the beam left under the
-    current sensor model. The last four fields below describe a reference whose points have errors.
+    received power, scan line and time. Range and incidence angle belong to the true direction of the beam, which the sensor
+    model predicts. The last four fields are for a reference surface whose vertices are noisy measured points.
 
     Attributes
     ----------
     measured_m : (n,) measured ranges, m.
-    bulge_m : (n,) how much nearer a curved surface through the reference's points lies than the triangle between them, m; it is
-        already subtracted from the field `range_m`. None if the triangles are used as they are.
-    corner : (n, 3) row numbers of the reference's vertices at the corners of the triangle that was hit; None if the vertices
-        have no errors of their own.
-    weight : (n, 3) barycentric weights of these vertices at the hit; None with `corner`.
-    plane_normal : (n, 3) normals, scanner frame, of planes on which a ray of slightly other direction is assumed to hit; None:
-        it hits the triangles.
+    bulge_m : (n,) how much nearer a curved surface through the vertices lies than the triangle between them, m. It is already
+        subtracted from the field `range_m`. None if the triangles are used as they are.
+    corner : (n, 3) row numbers of the vertices of the triangle that each ray hits; None if the vertices have no errors of their
+        own.
+    weight : (n, 3) barycentric weights of these vertices at the hit; None if `corner` is None.
+    plane_normal : (n, 3) normal of the plane on which a ray is assumed to hit if it is turned a little, scanner frame. None: it
+        is traced to the triangles.
     """
 
     measured_m: FloatArray = field(default_factory=lambda: np.zeros(0))
@@ -55,7 +55,7 @@ class RayGeometry(PulseGeometry):
 
     @property
     def departure(self) -> FloatArray:
-        """(n,) measured range minus that to the reference surface, m, without subtracting any effect of the sensor model."""
+        """(n,) measured range minus range to the reference surface, m. Predicted systematic range errors are still in it."""
         return np.asarray(self.measured_m - self.range_m)
 
 
@@ -63,10 +63,10 @@ class RayGeometry(PulseGeometry):
 class RayHits:
     """Where n rays of a laser scanner hit the reference surface, and how the surface lies there.
 
-    If the reference was itself measured as points, incidence angles refer to planes fitted to 24 neighbouring points. Its
-    triangles are tilted by the noise of their corners. The same noise is in the range, so it would imitate errors that depend
-    on the incidence angle. If noise rather than relief dominates the scatter of the points, the normals are those of the planes
-    too.
+    A reference that was itself measured consists of noisy points, and this noise tilts its triangles. It is also in the range,
+    so that it would imitate errors that depend on the incidence angle. Incidence angles are then those to planes fitted to 24
+    neighbouring points. If noise rather than relief dominates the scatter of the points about the planes, the normals are also
+    those of the planes.
 
     Attributes
     ----------
@@ -74,11 +74,12 @@ class RayHits:
     normal : (n, 3) unit normals, wall frame, of the triangle or of the plane.
     cos_incidence : (n,) cosine of the incidence angle.
     curvature : (n,) largest deviation of the surface from the triangle's plane within a beam's width, m, along the ray.
-    bulge : (n,) how much nearer a curved surface through the points lies than the triangle, m; already subtracted from
+    bulge : (n,) how much nearer a curved surface through the vertices lies than the triangle, m; already subtracted from
         `distance`. None if the triangles are used as they are.
     scatter : (n,) scatter of the reference's points about the planes, divided by its median; None without planes.
-    corner : (n, 3) row numbers of the vertices of the triangle that was hit; None if the vertices have no errors of their own.
-    weight : (n, 3) barycentric weights of these vertices at the hit; None with `corner`.
+    corner : (n, 3) row numbers of the vertices of the triangle that each ray hits; None if the vertices have no errors of their
+        own.
+    weight : (n, 3) barycentric weights of these vertices at the hit; None if `corner` is None.
     """
 
     distance: FloatArray
@@ -97,8 +98,9 @@ def cast_rays(measurement: TlsMeasurement, axes: list[FloatArray]) -> RayHits:
     Parameters
     ----------
     measurement : The scan, with the scanner's pose and the reference surface.
-    axes : Three arrays (n, 3), wall frame: unit directions of the rays, and unit vectors in which they move with growing
-        azimuth and with growing zenith angle. Rays beside each ray along these vectors show how much the surface bends.
+    axes : Three arrays (n, 3), wall frame. The first has the unit directions of the rays. The second and third have the unit
+        vectors in which a ray moves as its azimuth or its zenith angle grows; further rays are traced a little to these sides,
+        to find edges.
 
     Returns
     -------
@@ -126,16 +128,16 @@ def cast_rays(measurement: TlsMeasurement, axes: list[FloatArray]) -> RayHits:
 
 
 def redirect_hits(found: RayHits, nominal: FloatArray, real: FloatArray) -> RayHits:
-    """Compute where rays hit if they are deflected a little, by extending the plane that each nominal ray hits.
+    """Predict where rays hit if they are turned a little, on the plane that each ray hits in its recorded direction.
 
-    A ray is deflected if the model contains errors of the scanner's axes. This is used instead of tracing if the reference's
-    points are noisy: a ray traced anew would follow the tilt of a single triangle, which is noise.
+    Rays are turned if the sensor model contains errors of the scanner's axes. This is used instead of tracing if the
+    reference's points are noisy: a ray traced anew would follow the tilt of a single triangle, which is noise.
 
     Parameters
     ----------
-    found : Hits of the nominal rays (in the recorded directions).
-    nominal : (n, 3) unit directions of the nominal rays, wall frame.
-    real : (n, 3) unit directions of the deflected rays, wall frame.
+    found : Hits of the rays in the recorded directions.
+    nominal : (n, 3) unit vectors of the recorded directions, wall frame.
+    real : (n, 3) unit vectors of the turned rays, wall frame.
 
     Returns
     -------

@@ -28,8 +28,8 @@ _Columns = TypeVar("_Columns", bound="DataclassInstance")
 class Geometry(Protocol):
     """Interface of the geometry of n measured points: the quantities on which errors of the sensor depend.
 
-    Examples are the range, the incidence angle or the image position. Laser rays, matched pixels and points of a cloud without
-    cameras have a class each.
+    Examples are the range, the incidence angle and the position in the image. Subclasses are for laser rays, matched pixels,
+    and points of a cloud without cameras.
     """
 
     def __len__(self) -> int: ...
@@ -47,7 +47,7 @@ class Geometry(Protocol):
 
     @property
     def departure(self) -> FloatArray:
-        """(n,) measured observable minus that of the reference surface, before any effect of the sensor model is subtracted.
+        """(n,) measured observable minus that of the reference surface, with predicted systematic errors still in it.
 
         It is a range or a distance in m, or a disparity in px.
         """
@@ -59,7 +59,7 @@ def _order(values: FloatArray) -> NDArray[np.int32]:
 
 
 def select_rows(columns: _Columns, rows: Rows) -> _Columns:
-    """Return a copy of a dataclass of arrays that has only some of their rows, as for a subset of the points.
+    """Return a copy of a dataclass of arrays with chosen rows only, to restrict measured quantities to a subset of the points.
 
     Parameters
     ----------
@@ -136,17 +136,19 @@ class Residuals(ABC):
 
     @property
     def with_sigma_of_means(self) -> Self:
-        """Return the residuals with a standard deviation `sigma` for statistics of means over many neighbouring points.
+        """Return the residuals with a `sigma` that is right for means over many neighbouring points.
 
         Divided by sqrt(k), this `sigma` is the standard deviation of a mean of k neighbours. It is larger than that of single
-        points if neighbours share noise. Here they do not, so the residuals are returned unchanged; subclasses may differ.
+        points if neighbours share noise. This base class assumes that they do not and returns the residuals unchanged;
+        subclasses may differ.
         """
         return self
 
     def reference_covariance_with(self, other: NDArray[np.int64]) -> FloatArray:
         """Return the covariance of each point's residual with that of another point due to errors of the reference surface.
 
-        It is needed for the variance of differences of neighbouring residuals. Here it is zero; subclasses may differ.
+        It is needed for the variance of differences of neighbouring residuals. This base class returns zeros; subclasses may
+        differ.
 
         Parameters
         ----------
@@ -165,27 +167,27 @@ class Residuals(ABC):
 
     @property
     def total_departure(self) -> FloatArray:
-        """(n,) measured observable minus that of the reference surface, m or px, before any effect of the model is subtracted.
+        """(n,) measured observable minus that of the reference, m or px, with predicted systematic errors still in it.
 
-        With several epochs, the error of each epoch's own pose has been removed. With one epoch, the error of its pose is
-        still in it, and is fitted together with the effects.
+        With several epochs, the difference of each epoch's pose from the mean pose has been removed. The error of the mean (or
+        only) pose is still in it, and is fitted together with the effects.
         """
         return self.geometry.departure if self.epoch_offset is None else self.geometry.departure - self.epoch_offset
 
     @cached_property
     def sort_orders(self) -> dict[str, NDArray[np.int32]]:
-        """For each covariate by name, the (n,) row numbers that sort it in ascending order, for binning along it."""
+        """For each covariate by name, the (n,) row numbers that sort the points by it, to divide them into bins."""
         return dict(zip(self.covariates, map_in_threads(_order, self.covariates.values()), strict=True))
 
     def values_at(self, values: FloatArray, index: NDArray[np.int64]) -> FloatArray:
-        """Look up values of these residuals' points for points that are given by their row numbers in the measurement.
+        """Look up values of these residuals' points by the points' row numbers in the measurement.
 
         It serves to compare two residuals that do not have the same points.
 
         Parameters
         ----------
-        values : (n,) one value for each point of these residuals.
-        index : (m,) row numbers of points in the measurement.
+        values : (n,) one value for each of the n points of these residuals.
+        index : (m,) row numbers in the measurement of the points for which values are wanted.
 
         Returns
         -------
@@ -214,7 +216,7 @@ class Residuals(ABC):
         )
 
     def with_rows_from(self, known: BoolArray, other: Self) -> Self:
-        """Replace the residuals of some points, for example by those computed again with further effects in the sensor model.
+        """Replace the residuals of some points, for example by those under a sensor model with more effects.
 
         Values, predicted standard deviations, Jacobian, covariates and geometry are replaced; `usable` and `on_smooth_surface`
         stay.
@@ -259,7 +261,8 @@ class ExpectedPulses:
 def range_derivative(normal: FloatArray, direction: FloatArray, moved: FloatArray, distance: FloatArray) -> FloatArray:
     """Return how the range along a ray to a plane changes as the ray turns, for first-order effects of angle errors.
 
-    With t = (p - o)·n / (u·n), for a plane through p and a ray from o, the derivative is dt = -t (du·n) / (u·n).
+    The plane goes through a point p, and the ray starts at o. With the range t = (p - o)·n / (u·n), the derivative is
+    dt = -t (du·n) / (u·n).
 
     Parameters
     ----------

@@ -32,8 +32,8 @@ class DirectedScanner(LaserScanner):
     geometry : Directions of the n pulses. If it contains received powers or scan lines and times, these are used in the
         simulation.
     inclined : Whether the incidence angles of `geometry` are used instead of those to the triangles of the reference surface.
-    between : Geometry of the same rays for a reference surface that is made of noisy points. It corrects the simulated ranges
-        for the curvature between these points, and has the planes on which deflected pulses hit. None without correction.
+    between : For a reference surface of noisy points: geometry of the same n rays. Its field `bulge_m` corrects the ranges for
+        the curvature between the points, and `plane_normal` has the planes on which turned rays hit. None: no correction.
     """
 
     geometry: PulseGeometry = field(kw_only=True)
@@ -41,7 +41,7 @@ class DirectedScanner(LaserScanner):
     between: RayGeometry | None = None
 
     def emit(self) -> Pulses:
-        """Return one undisturbed pulse for each given direction, as the input of the scanner simulation."""
+        """Return one pulse for each direction of `geometry`, before any error, as the input of the scanner simulation."""
         angles, count = self.geometry, len(self.geometry.azimuth)
         index = dr.arange(mi.UInt32, count)
         zero = np.zeros(count)
@@ -65,7 +65,7 @@ class DirectedScanner(LaserScanner):
 
         Parameters
         ----------
-        scene : The surface, for casting rays on it, wall frame.
+        scene : The reference surface, wall frame, prepared for ray tracing.
         random : Source of the random numbers.
 
         Returns
@@ -76,15 +76,16 @@ class DirectedScanner(LaserScanner):
         return self._recorded_ranges(pulses, self.echo(scene, self._traced_pulses(pulses), beam, beam.combine_echoes), random)
 
     def ranges_by_mode(self, scene: RayCaster, random: KeyedRandom, modes: Sequence[Mode]) -> dict[Mode, FloatArray]:
-        """Simulate the ranges that the scanner records, for several ways to form a range from the echoes within one beam.
+        """Simulate the recorded ranges for several ways in which a scanner may combine the echoes within one beam.
 
-        A beam is simulated by several sub-rays over its footprint, which are traced only once for all ways.
+        A beam that meets a depth step returns several echoes. It is simulated by sub-rays over its footprint, which are traced
+        only once for all ways.
 
         Parameters
         ----------
-        scene : The surface, for casting rays on it, wall frame.
+        scene : The reference surface, wall frame, prepared for ray tracing.
         random : Source of the random numbers.
-        modes : Ways to combine the echoes of a footprint: strongest, mean or first.
+        modes : Ways to combine the echoes into one range: strongest, mean or first.
 
         Returns
         -------
@@ -115,8 +116,8 @@ class DirectedScanner(LaserScanner):
     def measured(self, pulses: Pulses, echo: Echo, random: KeyedRandom) -> Pulses:
         """Apply the errors that arise when an echo is recorded, such as range noise or a bias that depends on the intensity.
 
-        Where known, the recorded intensities replace the simulated power of the echoes, and incidence angles come from the
-        measurement. Ranges are corrected for the curvature of the surface between the reference's vertices.
+        Known recorded intensities and incidence angles of the measured scan replace the simulated ones. Ranges are corrected
+        for the curvature of the surface between the reference's vertices, where it is known.
 
         Parameters
         ----------
@@ -181,13 +182,15 @@ def simulate_ranges(measurement: TlsMeasurement, model: TlsModel, geometry: RayG
 def simulate_ranges_by_mode(
     measurement: TlsMeasurement, model: TlsModel, modes: Sequence[Mode], geometry: RayGeometry, random: KeyedRandom
 ) -> dict[Mode, FloatArray]:
-    """Simulate the ranges of a scanner with a wide beam, for several ways to form a range from the echoes within one beam.
+    """Simulate the ranges of a scanner with a wide beam, for several ways in which it may combine the echoes within one beam.
+
+    It serves to find out which way the scanner uses at depth steps.
 
     Parameters
     ----------
     measurement : The scan, with the scanner's pose and the reference surface.
     model : The sensor model, which states the width of the beam.
-    modes : Ways to combine the echoes of a footprint: strongest, mean or first.
+    modes : Ways to combine the echoes into one range: strongest, mean or first.
     geometry : The n measured rays.
     random : Source of the random numbers.
 

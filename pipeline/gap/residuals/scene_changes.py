@@ -106,13 +106,13 @@ class SceneChange:
 def find_scene_changes(residuals: Residuals, view: SensorView, eligible: BoolArray) -> tuple[list[SceneChange], BoolArray]:
     """Find regions where the rock changed between reference and measurement, so that they are not taken for sensor errors.
 
-    Residuals are compared with the local median and scatter. These are estimated again without the regions found, until no more
-    are found.
+    Residuals are compared with the local median and scatter of the others. Both are estimated again without the regions found,
+    and the search is repeated, at most three times in all.
 
     Parameters
     ----------
     residuals : Residuals of n points after a rough alignment.
-    view : How the sensor saw the same points.
+    view : Rays and neighbours of the same points, as the sensor saw them.
     eligible : (n,) true for points away from depth steps; only these are evidence of a change.
 
     Returns
@@ -144,7 +144,7 @@ def find_scene_changes(residuals: Residuals, view: SensorView, eligible: BoolArr
 
 
 def drop_duplicates(changes: list[SceneChange]) -> list[SceneChange]:
-    """Drop changed regions that were found in several scans of the same wall.
+    """Drop changed regions that were found more than once, in several scans of the same wall.
 
     changes: regions, largest volume first. One is dropped if its centre lies in the bounding box of an earlier one.
     """
@@ -157,15 +157,15 @@ def drop_duplicates(changes: list[SceneChange]) -> list[SceneChange]:
 
 
 def moved_share(residuals: Residuals, view: SensorView, eligible: BoolArray) -> float:
-    """Return the share of points that lie off the reference together with their neighbours, as where much of the rock moved.
+    """Return the share of points that lie off the reference with their neighbours, to detect that much of the rock moved.
 
     A point counts if the median residual of it and its eight neighbours exceeds three predicted standard deviations and 2 cm
-    (defaults). White noise moves such a median by only 0.4 standard deviations.
+    (defaults). White noise hardly ever does this: the median's standard deviation is only 0.4 times that of a single point.
 
     Parameters
     ----------
     residuals : Residuals of n points after alignment.
-    view : How the sensor saw the same points.
+    view : Rays and neighbours of the same points, as the sensor saw them.
     eligible : (n,) true for points that are considered.
 
     Returns

@@ -38,7 +38,7 @@ _FROM_AFAR, _STEEPEST = 1000.0, 0.2
 
 @dataclass(frozen=True)
 class SensorView:
-    """How the sensor saw n points: their rays, their neighbours in its field of view, and how a residual moves a point.
+    """The rays of n points, their neighbours in the sensor's field of view, and how a residual moves a point.
 
     It is used to find regions where the rock changed, and to measure their volumes.
 
@@ -65,12 +65,14 @@ class SensorView:
 
     @classmethod
     def of(cls, measurement: Measurement, residuals: Residuals) -> SensorView:
-        """Describe how the sensor of a measurement saw its points. A stereo pair views the wall from its left camera.
+        """Collect rays, ranges and field-of-view positions of a measurement's points, to find and measure changes of the rock.
+
+        The rays of a stereo pair start at its left camera.
 
         Parameters
         ----------
         measurement : The measurement.
-        residuals : Residuals of the points to describe.
+        residuals : Residuals of the n points to describe.
 
         Raises
         ------
@@ -98,7 +100,10 @@ class SensorView:
         return cls(plane, epoch, origin, towards / length[:, None], reference, disparity, slant)
 
     def part(self, rows: Rows) -> SensorView:
-        """Return how the sensor saw a subset of the n points, given as row numbers, a mask (n,) or a slice."""
+        """Return the view (rays and field-of-view positions) of a subset of the n points.
+
+        rows: row numbers, a mask (n,) or a slice.
+        """
         return replace(
             self,
             coordinates=self.coordinates[rows],
@@ -111,7 +116,7 @@ class SensorView:
         )
 
     def range_at_residual(self, rows: NDArray[np.int64], residual: FloatArray) -> FloatArray:
-        """Return the range of points that have given residuals, to locate a surface that differs from the reference.
+        """Convert residuals of points to ranges, to locate a surface that differs from the reference.
 
         A disparity residual r changes the range R of the reference to R d / (d + r), where d is the reference's disparity minus
         that at infinity.
@@ -119,11 +124,11 @@ class SensorView:
         Parameters
         ----------
         rows : (m,) row numbers of the points.
-        residual : (m,) residuals (measured minus predicted): m of range or of distance, or px of disparity.
+        residual : (m,) their residuals (measured minus predicted): m of range or of distance, or px of disparity.
 
         Returns
         -------
-        (m,) ranges, m.
+        (m,) ranges from the sensor, m.
         """
         if self.slant is not None:
             return np.asarray(self.reference_m[rows] + residual * self.slant[rows])
@@ -132,7 +137,7 @@ class SensorView:
         return np.asarray(self.reference_m[rows] * self.disparity[rows] / (self.disparity[rows] + residual))
 
     def points_at(self, rows: NDArray[np.int64], range_m: FloatArray) -> FloatArray:
-        """Return the positions at given ranges on the rays of some points.
+        """Convert ranges on the rays of some points to positions, to outline a surface that differs from the reference.
 
         Parameters
         ----------
@@ -148,7 +153,10 @@ class SensorView:
 
     @cached_property
     def scaled_coordinates(self) -> FloatArray:
-        """(n, 2) coordinates in the field of view, scaled so that the spacing of neighbouring points is 1 along both axes."""
+        """(n, 2) positions in the field of view, scaled so that neighbouring points are 1 apart along both axes.
+
+        Distances between them tell which points are neighbours.
+        """
         plane = (self.coordinates - self.coordinates.min(axis=0)) / np.maximum(np.ptp(self.coordinates, axis=0), 1e-300)
         rows = np.flatnonzero(self.epoch == self.epoch.min())
         apart = _axis_spacings(plane[rows])
@@ -168,13 +176,13 @@ class SensorView:
     def neighbour_pairs(self, rows: NDArray[np.int64], count: int = NEIGHBOURS) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Pair points with their neighbours in the sensor's field of view, to find connected groups of points.
 
-        Neighbours are the nearest points of the same epoch within three point spacings, and the point at the same place in the
-        next epoch.
+        Neighbours are the nearest points of the same epoch (repetition of the measurement) within three point spacings, and the
+        point at the same place in the next epoch.
 
         Parameters
         ----------
         rows : Row numbers of the points whose neighbours are wanted.
-        count : Number of neighbours of each point in its own epoch.
+        count : Largest number of neighbours of each point in its own epoch.
 
         Returns
         -------
@@ -199,7 +207,9 @@ class SensorView:
         return first[first != second], second[first != second]
 
     def neighbour_median(self, z: FloatArray) -> FloatArray:
-        """Return, for each point, the median of values over it and its eight nearest neighbours in the sensor's field of view.
+        """Return the median of values over each point and its eight nearest neighbours, to find changes that neighbours share.
+
+        Single outliers hardly influence it. Neighbours are those in the sensor's field of view.
 
         Parameters
         ----------
@@ -226,16 +236,18 @@ class SensorView:
         ]
 
     def near(self, rows: NDArray[np.int64], spacings: float) -> NDArray[np.bool_]:
-        """Tell which points lie near given ones in the sensor's field of view, whatever their epochs.
+        """Tell which points lie near chosen ones in the sensor's field of view, to set aside the surroundings of a change.
+
+        Points of all epochs (repetitions of the measurement) are compared.
 
         Parameters
         ----------
-        rows : Row numbers of the given points.
+        rows : Row numbers of the points near which others are wanted.
         spacings : Largest distance in the field of view, in spacings of neighbouring points.
 
         Returns
         -------
-        (n,) true for points within the distance of any of the given ones.
+        (n,) true for points within this distance of any of those in `rows`, and for these themselves.
         """
         distance = cKDTree(self.scaled_coordinates[rows]).query(
             self.scaled_coordinates, distance_upper_bound=spacings, workers=-1
@@ -245,9 +257,9 @@ class SensorView:
     def solid_angles(self, rows: NDArray[np.int64]) -> FloatArray:
         """Compute the solid angle that each of some points represents, to turn changes of range into volumes.
 
-        It is a third of the area of the Delaunay triangles, in the sensor's field of view, of which the point is a corner. The
-        points of one epoch thus share the area between them, including that of lost returns. A triangle across a gap counts at
-        most four times the median area.
+        The points of each epoch (repetition) are joined to Delaunay triangles in the sensor's field of view, and a third of the
+        solid angle of a triangle goes to each corner. Points beside lost returns thus represent these too. A triangle across a
+        gap counts at most four times the median triangle.
 
         Parameters
         ----------

@@ -17,10 +17,10 @@ from sensors.models.sensor_model import TlsModel
 
 
 def residuals_of_scans(measurement: TlsMeasurement) -> TlsResiduals:
-    """Compute the range residuals of a measurement that consists of several laser scans, in the order of its points.
+    """Compute the range residuals (measured minus predicted ranges) of a measurement that consists of several laser scans.
 
-    All scans share the sensor model. The pose Jacobian is (n, 6 k), with six columns (shift in m, rotation in rad) for each of
-    k set-ups (positions of the scanner).
+    All scans share the sensor model. The points keep the order of the measurement. The pose Jacobian is (n, 6 k), with six
+    columns (shift in m, rotation in rad) for each of k set-ups (positions of the scanner).
     """
     count = 1 + max((scan.set_up for scan in measurement.scans), default=0)
     parts = []

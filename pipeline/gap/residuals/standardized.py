@@ -31,9 +31,9 @@ _ENOUGH = 5_000
 def standardize(residuals: Residuals, view_xy: FloatArray, unchanged: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
     """Subtract the local median from residuals and divide by their local scatter, so that a change of the rock stands out.
 
-    The scatter is at least the predicted standard deviation. It is larger where points with a similar value of one covariate,
-    such as the incidence angle, scatter more than predicted. Noise that the model lacks thus raises it only where that noise
-    occurs.
+    The scatter is the predicted standard deviation, times a factor of at least 1. The factor is above 1 where points with a
+    similar value of some covariate, such as the incidence angle, scatter more than predicted. Noise that the sensor model lacks
+    thus raises the scatter only where that noise occurs.
 
     Parameters
     ----------
@@ -52,9 +52,10 @@ def standardize(residuals: Residuals, view_xy: FloatArray, unchanged: NDArray[np
 
 
 def nmad_along_covariates(residuals: Residuals, z: FloatArray, unchanged: NDArray[np.bool_]) -> FloatArray:
-    """Estimate how much larger the residuals' scatter is than predicted, at each point.
+    """Estimate at each point how much larger the residuals' scatter is than predicted.
 
-    The points are sorted into bins of each covariate, such as range or incidence angle, and the NMAD of each bin is computed.
+    The points are sorted into bins of each covariate, such as range or incidence angle. The robust standard deviation (NMAD) of
+    each bin is computed.
 
     Parameters
     ----------
@@ -64,7 +65,7 @@ def nmad_along_covariates(residuals: Residuals, z: FloatArray, unchanged: NDArra
 
     Returns
     -------
-    (n,) for each point the largest NMAD of z among its bins of all covariates and that over all points; about 1 if the
+    (n,) the largest of these NMADs of z: that over all points, and those of the point's bins of all covariates. About 1 if the
     prediction is right.
     """
 
@@ -94,7 +95,7 @@ def _local_median(view_xy: FloatArray, value: FloatArray, unchanged: NDArray[np.
 
 
 def group_medians(value: FloatArray, cell: NDArray[np.int64], count: int, fewest: int) -> FloatArray:
-    """Return the median of each group of values, such as of the points in each cell of a raster.
+    """Return the median of each group of values, such as the residuals of the points in each cell of a raster.
 
     Parameters
     ----------

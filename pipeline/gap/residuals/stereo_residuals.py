@@ -75,10 +75,7 @@ class StereoResiduals(Residuals):
 
     @property
     def depth_m(self) -> FloatArray:
-        """(n,) change of depth Z per px of disparity, m/px: negative.
-
-        The disparity f B / Z (f: focal length in px, B: base) falls with depth.
-        """
+        """(n,) change of depth per px of disparity, m/px. It is negative: a larger disparity means a nearer point."""
         return -self.unit_m
 
 
@@ -86,8 +83,8 @@ def move_onto_rays(left: Camera, points: FloatArray, u: FloatArray, v: FloatArra
     """Undo the registration of a stereo reconstruction: move its points rigidly so that they project into their matched pixels.
 
     A reconstruction lies on the rays of its pixels until it is registered to other data. Measured disparities can only be
-    computed from points on these rays. The motion is found by Gauss-Newton from some thousand points. It is applied only if it
-    reduces the reprojection error to less than a tenth.
+    computed from points on these rays. The motion is found by Gauss-Newton iteration from some thousand points. It is applied
+    only if it reduces the reprojection error to less than a tenth.
 
     Parameters
     ----------
@@ -97,7 +94,7 @@ def move_onto_rays(left: Camera, points: FloatArray, u: FloatArray, v: FloatArra
 
     Returns
     -------
-    (n, 3) moved points, m.
+    (n, 3) points, moved or not, m.
     """
     some = slice(None, None, max(len(points) // 4000, 1))
     found, centre = RigidTransform.identity(), points.mean(axis=0)
@@ -122,15 +119,15 @@ def _reprojection_error(left: Camera, points: FloatArray, u: FloatArray, v: Floa
 
 
 def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
-    """Compute the residuals of a stereo pair: measured disparities minus those of the reference surface and the sensor model.
+    """Compute the residuals of a stereo pair: measured disparities minus those that reference surface and sensor model predict.
 
-    They come with predicted standard deviations, covariates and pose Jacobian. Points whose pixel does not see the reference
-    are left out.
+    They come with predicted standard deviations, covariates and the derivatives by the pose. Points whose pixel does not see
+    the reference are left out.
     """
     nominal, model = NominalPair.of(measurement), measurement.model
     u, v, points = _pixels(nominal, measurement)
     measured = nominal.disparity(project(nominal.pair.left, points), project(nominal.pair.right, points))
-    real = real_pair(nominal, model.effects, measurement)
+    real = real_pair(model.effects, measurement)
     geometry, depth = _reference(nominal, real, measurement.scene, u, v, measured)
     about = _surroundings(measurement, nominal, real, geometry, depth)
     along_row, along_column = about.gradient.T
@@ -159,10 +156,10 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
 
 
 def with_surroundings(measurement: StereoMeasurement, found: StereoResiduals) -> StereoMeasurement:
-    """Store in a measurement how the rock looks around each pixel's place, so that it need not be traced again.
+    """Store in a stereo measurement what the rock is like around the place that each pixel sees, to save tracing it again.
 
-    Stored are depth steps, smoothness and visibility from the right camera. They stay valid for small moves of the cameras.
-    After a large move the visibility is wrong at a few points beside edges.
+    Stored are depth steps and visibility from the right camera. They stay valid for small moves of the cameras. After a large
+    move the visibility is wrong at a few points beside edges.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ def subsample_measurement(measurement: Measurement, random: KeyedRandom) -> tupl
     """Draw a random subsample of a laser scan or of a cloud without cameras that is too large for the memory.
 
     About two million points are kept (the threshold `points.most`). A stereo pair keeps all its points. Call `with_scan_order`
-    first: scan lines and times cannot be recovered from a subsample.
+    before it: the scan line and time of each pulse cannot be recovered from a subsample.
 
     Parameters
     ----------

@@ -44,7 +44,8 @@ _DIRECTIONS = np.linspace(0, np.pi / 2, 8, endpoint=False)
 class SurfaceNoise:
     """Noise of a photogrammetric cloud's distances to a reference surface, as estimated from the cloud itself.
 
-    Part of it is shared by neighbouring points: random values at the nodes of a grid, interpolated bilinearly to the points.
+    Part of it is shared by neighbouring points. It is modelled by a grid on the wall with random values at its nodes, which are
+    interpolated bilinearly to the points.
 
     Attributes
     ----------
@@ -63,7 +64,7 @@ class SurfaceNoise:
 
     @property
     def model(self) -> StereoModel:
-        """Return a sensor model that has this noise of the points, in m, and no systematic effects."""
+        """Return a sensor model with this estimated noise and no systematic errors, to diagnose the cloud with it."""
         return StereoModel(
             noise=StereoNoise(
                 parallax_sigma_px=0.0,
@@ -88,9 +89,9 @@ class SurfaceNoise:
 
 
 def estimate_surface_noise(measurement: SurfaceMeasurement, where: str) -> SurfaceNoise:
-    """Estimate the noise of a cloud's points from the semivariogram of its distances to the reference, after aligning it.
+    """Estimate the noise of a cloud from photographs by the semivariogram of its distances to the reference, after aligning it.
 
-    The noise that the measurement's sensor model states is ignored.
+    It is for clouds whose noise is not known; noise that the measurement's sensor model states is ignored.
 
     Parameters
     ----------
@@ -99,7 +100,7 @@ def estimate_surface_noise(measurement: SurfaceMeasurement, where: str) -> Surfa
 
     Returns
     -------
-    White and grid-correlated noise.
+    The standard deviations of white noise and of grid-correlated noise.
 
     Raises
     ------

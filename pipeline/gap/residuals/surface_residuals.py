@@ -53,7 +53,8 @@ _ROUNDING = 1e-6
 class SurfaceGeometry(SurfacePlaces):
     """Geometry of n points of a cloud without cameras: the place on the reference surface below each, and the distance to it.
 
-    The place has the fields of `SurfacePlaces`: point, normal, roughness, convexity and distance to the nearest edge.
+    The place is described by the fields of `SurfacePlaces`: point, normal, roughness, convexity and distance to the nearest
+    edge.
 
     Attributes
     ----------
@@ -84,10 +85,10 @@ class SurfaceResiduals(Residuals):
     Attributes
     ----------
     geometry : For each point the place on the reference below it.
-    pose_jacobian : (n, k) derivatives of the distances by the cloud's datum: those k combinations of shift, rotation and scale
-        that the relief of the reference can determine. It is evaluated at the places on the reference, because the noise of the
-        points would bias the scale.
-    datum : (7, k) these combinations, in terms of shift (m), rotation (rad) and scale.
+    pose_jacobian : (n, k) derivatives of the distances by the cloud's position, orientation and scale (its datum). There is a
+        column for each of the k combinations of shift, rotation and scale that the relief of the reference can determine. It is
+        evaluated at the places on the reference, because the noise of the points would bias the scale.
+    datum : (7, k) shift (m), rotation (rad) and scale that belong to a unit of each of these k combinations.
     """
 
     sensor = "stereo"
@@ -107,7 +108,7 @@ class SurfaceResiduals(Residuals):
     def candidates(self) -> Effects:
         """The effects (error terms) by which the residuals of a cloud without cameras may be explained, as classes.
 
-        Only noise of the points in metres: all other effects need the cameras.
+        These are only kinds of noise of the points, in metres: all other effects need the cameras.
         """
         return (PointNoise,)
 
@@ -115,8 +116,8 @@ class SurfaceResiduals(Residuals):
 def surface_residuals(measurement: SurfaceMeasurement) -> SurfaceResiduals:
     """Compute the residuals of a cloud without cameras: the distances of its points from the reference along its normals.
 
-    They come with predicted standard deviations, covariates and the derivatives by the cloud's datum. Points from which a line
-    along the normal does not hit the reference nearby are left out.
+    They come with predicted standard deviations, covariates and the derivatives by the cloud's position, orientation and scale.
+    Points from which a line along the normal does not hit the reference nearby are left out.
     """
     points, model = measurement.cloud.points, measurement.model
     spacing = point_spacing_m(points)
@@ -259,11 +260,11 @@ def predicted_sigma(model: StereoModel, residuals: SurfaceResiduals) -> FloatArr
 
 
 def datum_covariance(residuals: SurfaceResiduals, value: FloatArray, rows: BoolArray) -> FloatArray:
-    """Estimate the covariance of a cloud's datum (shift, rotation and scale) by a jackknife over wall blocks.
+    """Estimate the covariance of a cloud's datum (shift, rotation and scale) by a jackknife over squares of the wall.
 
-    A wall block is one of about thirty squares of the wall. Blocks are left out as a whole because errors are correlated within
-    them. Without block b the datum changes by -(A - A_b)⁻¹ r_b, where A is the matrix of the normal equations, and A_b and r_b
-    are the contributions of block b to their matrix and right side.
+    The wall is divided into about thirty squares. Each is left out in turn, as a whole, because errors are correlated within
+    it. Without square b the datum changes by -(A - A_b)⁻¹ r_b. A is the normal matrix of the alignment; A_b and r_b are what
+    the points of b contribute to the normal matrix and to the right side.
 
     Parameters
     ----------

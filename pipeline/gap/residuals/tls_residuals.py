@@ -42,10 +42,10 @@ class TlsResiduals(Residuals):
     Attributes
     ----------
     geometry : The rays of the points.
-    reference_error_m : Standard deviation of the error of each vertex of the reference surface along the rays, m; 0: no such
-        error.
-    error_is_relief : Whether that error is mostly relief between the reference's points, which is independent from ray to ray.
-        Otherwise rays that hit neighbouring triangles share the errors of common vertices.
+    reference_error_m : Standard deviation along the rays of the errors of the reference surface's vertices, m. Each vertex has
+        an error of its own. 0: the vertices have no such errors.
+    error_is_relief : Whether these errors stand mostly for relief between the vertices. They are then independent from ray to
+        ray. Otherwise rays that hit neighbouring triangles share the errors of common vertices.
     """
 
     sensor = "tls"
@@ -64,11 +64,11 @@ class TlsResiduals(Residuals):
 
     @property
     def with_sigma_of_means(self) -> Self:
-        """Return the residuals with larger standard deviations (n,), m, for statistics of means over many neighbouring points.
+        """Return the residuals with a `sigma` that is right for means over many neighbouring points.
 
-        Divided by sqrt(k), the new sigma is the standard deviation of a mean of k neighbours. The sigma of a single point
-        would give too small a value: neighbouring rays meet triangles of the reference that have vertices in common, so
-        that the errors of these vertices do not average out. Without errors of single vertices the residuals are returned
+        Divided by sqrt(k), the new sigma (n,), m, is the standard deviation of a mean of k neighbours. The sigma of single
+        points would give too small a value: neighbouring rays hit triangles of the reference with common vertices, and the
+        errors of these vertices do not average out. If the vertices have no errors of their own, the residuals are returned
         unchanged.
         """
         corner, weight = self.geometry.corner, self.geometry.weight
@@ -79,9 +79,10 @@ class TlsResiduals(Residuals):
         return replace(self, sigma=np.sqrt(variance))
 
     def reference_covariance_with(self, other: NDArray[np.int64]) -> FloatArray:
-        """Return the covariance of each ray's residual with that of another ray that hits a triangle with common vertices.
+        """Return the covariance of each ray's residual with that of another ray due to errors of the reference's vertices.
 
-        Only errors of the reference's vertices are considered.
+        Rays share such errors if they hit triangles with common vertices. It is needed for the variance of differences of
+        neighbouring residuals.
 
         Parameters
         ----------
@@ -98,9 +99,9 @@ class TlsResiduals(Residuals):
         return np.asarray(self.reference_error_m**2 * np.einsum("nab,na,nb->n", same, weight, weight[other]))
 
     def draw_reference_error(self, random: KeyedRandom) -> FloatArray:
-        """Simulate errors of the reference surface's vertices, to include them in simulated errors of the ranges.
+        """Draw random errors of the reference surface's vertices, and return the (n,) range errors that they cause, m.
 
-        random: source of the random numbers. Returns the (n,) range errors of the rays that they cause, m.
+        They are added to simulated ranges. random: source of the random numbers.
         """
         corner, weight = self.geometry.corner, self.geometry.weight
         if not self.reference_error_m or corner is None or weight is None:
@@ -117,10 +118,10 @@ class TlsResiduals(Residuals):
 
 
 def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
-    """Compute the residuals of one laser scan: measured ranges minus those to the reference surface under the sensor model.
+    """Compute the residuals of one laser scan: measured ranges minus those that reference surface and sensor model predict.
 
-    They come with predicted standard deviations, covariates and pose Jacobian. Points whose ray misses the reference are left
-    out.
+    They come with predicted standard deviations, covariates and the derivatives by the pose. Points whose ray misses the
+    reference are left out.
     """
     (position, rotation), model = measurement.station, measurement.model
     azimuth, zenith, measured = recorded_polar(measurement)
@@ -173,7 +174,7 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
         geometry=geometry,
         notes=_notes(measurement),
         reference_error_m=measurement.reference_error_m,
-        error_is_relief=measurement.planes is not None and not along_planes,
+        error_is_relief=measurement.error_is_relief,
     )
     return whole.part(hit)
 
@@ -186,10 +187,10 @@ def _reference_variance(error_m: float, geometry: RayGeometry) -> FloatArray:
 
 
 def with_scan_order(measurement: TlsMeasurement) -> TlsMeasurement:
-    """Return a laser scan with the scan line and the time of each point determined and stored.
+    """Find the scan line and the time of each point of a laser scan, and return the scan with both stored.
 
-    Call it before the scan is subsampled: a subsample has gaps from which they could not be recovered. Times are shares of the
-    scan's duration, from 0 to 1.
+    Some errors depend on them. Call it before the scan is subsampled: a subsample has gaps from which they could not be
+    recovered. Times are shares of the scan's duration, from 0 to 1.
     """
     if measurement.scans:
         found = [(rows, with_scan_order(one).order or (None, None)) for _, rows, one in measurement.each_scan() if len(rows)]
@@ -346,12 +347,12 @@ def find_expected_pulses(measurement: TlsMeasurement, residuals: TlsResiduals) -
 
 
 def pulse_count(pattern: ScanPattern) -> int:
-    """Return the number of pulses of a scan pattern, a raster of azimuths and zenith angles: lines times pulses in a line."""
+    """Return the number of pulses of a scan pattern, to know how many returns to expect: scan lines times pulses in a line."""
     return int(np.prod([len(sweep) for sweep in _sweeps(pattern)]))
 
 
 def pulse_number(pattern: ScanPattern, azimuth: FloatArray, zenith: FloatArray) -> NDArray[np.int64]:
-    """Find the pulse of a scan pattern whose nominal direction is nearest to each recorded direction.
+    """Find the pulse of the scan pattern whose nominal direction is nearest to each recorded one, to detect lost returns.
 
     Parameters
     ----------
@@ -360,7 +361,7 @@ def pulse_number(pattern: ScanPattern, azimuth: FloatArray, zenith: FloatArray) 
 
     Returns
     -------
-    (n,) numbers of the pulses, counted from 0 line after line.
+    (n,) numbers of the pulses, counted from 0, scan line by scan line.
     """
     sweeps = _sweeps(pattern)
     turn = 2 * np.pi * np.round((azimuth.mean() - sweeps[0].mean()) / (2 * np.pi))

@@ -23,11 +23,11 @@ BLOCK_CELLS = 3
 
 @dataclass(frozen=True)
 class WallCells:
-    """Square cells into which the wall is divided, for means of residuals over neighbouring points.
+    """Squares of equal size into which the wall is divided, to average residuals over neighbouring points.
 
     Attributes
     ----------
-    side_m : Side of a cell, m.
+    side_m : Side of a square (cell), m.
     cell : (n,) number of the cell in which each point lies; -1 for cells with fewer than three points, which are not used.
     centre : (m, 2) mean position of the points in each of the m used cells, x along the wall and y up, wall frame, m.
     """
@@ -38,9 +38,9 @@ class WallCells:
 
     @classmethod
     def over(cls, at: FloatArray) -> WallCells:
-        """Divide the wall into at most about 800 square cells of equal size that cover the given points.
+        """Divide the wall into at most about 800 squares of equal size, to average residuals over the points in each.
 
-        at: (n, 2) positions of the points, x along the wall and y up, wall frame, m.
+        at: (n, 2) positions of the points to be covered, x along the wall and y up, wall frame, m.
         """
         side = float(np.sqrt(np.prod(np.ptp(at, axis=0)) / _MOST_CELLS)) or 1.0
         column, row = (np.floor((at[:, axis] - at[:, axis].min()) / side).astype(np.int64) for axis in (0, 1))
@@ -60,12 +60,13 @@ class WallCells:
 def wall_block_numbers(at: FloatArray, side_m: float) -> NDArray[np.int64]:
     """Return the number of the wall block in which each point lies, for spatial cross-validation.
 
-    A wall block is a square of 3 by 3 cells of the wall. Residuals may be correlated within it, so it is used as a whole.
+    A wall block is a large square of the wall: 3 by 3 of the cells over which residuals are averaged. Errors may be correlated
+    within it, so all its points are used together, either for fitting or for validation.
 
     Parameters
     ----------
     at : (n, 2) positions of the points, x along the wall and y up, wall frame, m.
-    side_m : Side of a cell, m: a third of the side of a block.
+    side_m : Side of a cell, m: a third of the side of a wall block.
 
     Returns
     -------
@@ -76,16 +77,16 @@ def wall_block_numbers(at: FloatArray, side_m: float) -> NDArray[np.int64]:
 
 
 def wall_blocks_by_points(at: FloatArray, points: float) -> NDArray[np.int64]:
-    """Divide the wall into square blocks of equal size, chosen so that a block has a given number of points on average.
+    """Divide the wall into squares (wall blocks) with a wanted mean number of points, for resampling whole blocks.
 
     Parameters
     ----------
     at : (n, 2) positions of the points, x along the wall and y up, wall frame, m.
-    points : Mean number of points in a block.
+    points : Mean number of points in a wall block.
 
     Returns
     -------
-    (n,) number of the block in which each point lies, counted from 0.
+    (n,) number of the wall block in which each point lies, counted from 0.
     """
     side = float(np.sqrt(np.prod(np.ptp(at, axis=0)) / max(len(at) / points, 1.0))) or 1.0
     column, row = (np.floor((at[:, axis] - at[:, axis].min()) / side).astype(np.int64) for axis in (0, 1))
@@ -95,12 +96,12 @@ def wall_blocks_by_points(at: FloatArray, points: float) -> NDArray[np.int64]:
 def in_validation_blocks(at: FloatArray, side_m: float) -> NDArray[np.bool_]:
     """Tell which points are kept for validation and must not be used in any fit: those in every fifth wall block.
 
-    A wall block is a square of 3 by 3 cells. The blocks are spread evenly (each a knight's move from the next).
+    A wall block is a large square of the wall. The blocks kept are spread over the wall like knight's moves in chess.
 
     Parameters
     ----------
     at : (n, 2) positions of the points, x along the wall and y up, wall frame, m.
-    side_m : Side of a cell, m: a third of the side of a block.
+    side_m : A third of the side of a wall block, m.
 
     Returns
     -------

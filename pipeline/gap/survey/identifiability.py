@@ -48,13 +48,16 @@ REFERENCE_ERRORS_M = {"tls": 0.001, "stereo": 0.005}
 
 @dataclass(frozen=True)
 class SurveyExtension:
-    """A survey with one additional measurement, and how well it detects and distinguishes m effects.
+    """A survey with one additional measurement, to see how much better it detects and distinguishes m sensor effects.
+
+    A signature is the change of the observations by an effect, less what another pose of the sensor could explain.
 
     Attributes
     ----------
     name : The additional measurement, in words.
-    cosines : (m, m) absolute cosines between the effects' signatures (changes of the observations); 1: indistinguishable.
-    detectable_size : (m,) value of each effect's main parameter at a signal-to-noise ratio of 5.
+    cosines : (m, m) absolute cosines between the effects' signatures; 1: indistinguishable.
+    detectable_size : (m,) value of each effect's main parameter from which the extended survey detects it (signal-to-noise
+        ratio of 5).
     """
 
     name: str
@@ -63,28 +66,32 @@ class SurveyExtension:
 
     @property
     def nameable_size(self) -> tuple[float, ...]:
-        """(m,) value of each effect's main parameter from which the extended survey tells the effect from all others."""
+        """(m,) value of each effect's main parameter from which the extended survey tells the effect from all other effects."""
         return _nameable_size(self.cosines, self.detectable_size)
 
 
 @dataclass(frozen=True)
 class Identifiability:
-    """Which of m systematic effects a survey can detect, and which of them it can distinguish.
+    """Which of m systematic effects (sensor errors) a survey can detect, and which of them it can distinguish.
+
+    A signature is the change of the observations by an effect. A fit of the sensor's pose explains part of it; the other part
+    is left to detect the effect.
 
     Attributes
     ----------
     sensor : "tls" or "stereo".
     names : (m,) names of the effects, with the sensor as prefix.
-    survival : (m,) share of each effect's signature (its change of the observations) that a fit of the pose leaves.
-    cosines : (m, m) absolute cosines between the signatures that the pose fit leaves; 1: indistinguishable.
+    survival : (m,) share of each signature that is left after the pose fit, 0 to 1.
+    cosines : (m, m) absolute cosines between the signatures after the pose fit; 1: indistinguishable.
     parameters : (m,) name of each effect's main parameter.
-    detectable_size : (m,) value of that parameter at a signal-to-noise ratio of 5, with noise and reference error.
-    detectable_size_without_reference_error : (m,) the same with noise alone.
-    variants : (m,) the variant of each effect for which the numbers hold, such as one period or one camera, in words.
+    detectable_size : (m,) value of that parameter from which the effect is detected (signal-to-noise ratio of 5), with noise
+        and an error of the reference surface.
+    detectable_size_without_reference_error : (m,) the value if the reference has no error.
+    variants : (m,) the choice for which the numbers hold, such as one period or one camera, in words.
     extensions : The survey with each of several additional measurements.
     points : Number of points of the survey.
-    reference_error_m : Standard deviation of the reference's correlated error, m.
-    others : Effects on the noise and on missing returns.
+    reference_error_m : Standard deviation of the reference's error, which is correlated over metres, m.
+    others : Effects on the noise and on missing returns, each with its detectable size.
     """
 
     sensor: str
@@ -102,29 +109,39 @@ class Identifiability:
 
     @property
     def nameable_size(self) -> tuple[float, ...]:
-        """(m,) value of each effect's main parameter from which the survey tells the effect from all others."""
+        """(m,) value of each effect's main parameter from which the survey can also tell it from all other effects."""
         return _nameable_size(self.cosines, self.detectable_size)
 
     def best_extension(self, row: int) -> SurveyExtension:
-        """Return the survey extended by the one measurement with which an effect is told from others at the smallest size.
+        """Find the additional measurement that helps most to tell one effect from all others.
+
+        With it, the effect can be told from the others at a smaller size than with any other additional measurement.
 
         Parameters
         ----------
         row : Index of the effect in `names`.
+
+        Returns
+        -------
+        The survey with this additional measurement.
         """
         return min(self.extensions, key=lambda extension: extension.nameable_size[row])
 
     def similar_effects(self, row: int) -> list[int]:
-        """Return the indices of effects that can hardly be told from the effect `row`, most similar first.
+        """Return the effects that the survey can hardly tell from a given one, as indices into `names`, most similar first.
 
-        Their signatures (changes of the observations) have a cosine of at least 0.9 with its own. row: index of the effect in
-        `names`.
+        Their changes of the observations have a cosine of at least 0.9 with its own.
+
+        row: index of the given effect in `names`.
         """
         order = np.argsort(-self.cosines[row])
         return [int(other) for other in order if other != row and self.cosines[row, other] >= SIMILAR_COSINE]
 
     def similar_pairs(self) -> list[tuple[int, int]]:
-        """Return the pairs of effects that the survey can hardly tell apart, as indices into `names`, most similar first."""
+        """Return the pairs of effects that the survey can hardly tell apart, as indices into `names`, most similar first.
+
+        The cosine between their changes of the observations is at least 0.9.
+        """
         found = [(a, b) for a in range(len(self.names)) for b in range(a) if self.cosines[a, b] >= SIMILAR_COSINE]
         return sorted(found, key=lambda pair: -self.cosines[pair])
 
@@ -182,13 +199,15 @@ def _nameable_size(cosines: FloatArray, detectable_size: tuple[float, ...]) -> t
 
 
 def identifiability(survey: Survey, reference_error_m: float | None = None) -> Identifiability:
-    """Analyse which sensor effects a survey can detect and distinguish, and what additional measurements would add.
+    """Analyse which sensor effects (errors) a survey can detect and distinguish, and what additional measurements would add.
+
+    It helps to plan a survey before fieldwork.
 
     Parameters
     ----------
-    survey : The planned or measured survey: what each station or stereo pair sees of the wall.
-    reference_error_m : Standard deviation of the reference's correlated error, m; None: 1 mm for a laser scanner and 5 mm for a
-        stereo pair.
+    survey : The planned or measured survey: what each scanner station or stereo pair sees of the wall.
+    reference_error_m : Standard deviation of the error of the reference surface, which is correlated over metres, m; None: 1 mm
+        for a laser scanner and 5 mm for a stereo pair.
     """
     error = REFERENCE_ERRORS_M[survey.sensor] if reference_error_m is None else reference_error_m
     families = group_by_effect(view_signatures(survey.views[0]))
@@ -216,10 +235,10 @@ def identifiability(survey: Survey, reference_error_m: float | None = None) -> I
 
 
 def format_table(found: Identifiability) -> str:
-    """Format which effects a survey can detect and distinguish as a text table with a row for each effect.
+    """Format which effects (sensor errors) a survey can detect and distinguish, as a text table with a row for each.
 
-    The columns are the share of the effect's signature (its change of the observations) that a fit of the pose leaves, the
-    detectable size, and the most similar effect.
+    The columns are: the effect's name; the share of its change of the observations that is left after a fit of the sensor's
+    pose, in percent; its main parameter and detectable size; and the most similar effect, with the cosine between both changes.
     """
     cosines = found.cosines - np.eye(len(found.names))
     lines = [f"{'effect':<32}{'left by pose':>14}  {'detectable from (S/N 5)':<32}most similar (cosine)"]

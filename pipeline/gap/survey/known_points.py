@@ -40,12 +40,16 @@ _STEP = 0.01
 class KnownPoints:
     """Additional observations of points with known positions, such as targets, and how sensor effects change them.
 
+    They are used to find out how well an effect can be detected if a survey adds such points.
+
     Attributes
     ----------
     title : The points, in words.
-    pose_jacobian : (n, 6) derivatives of the observations by the pose of the first station: shift (m) and rotation (rad).
-    sigma : (n,) standard deviations of the observations, m (ranges) or px (disparities).
-    columns : Function from candidate effects to the (n, k) change of the observations per unit of each of their k coefficients.
+    pose_jacobian : (n, 6) derivatives of the observations by the pose of the first station or pair: shift (m) and rotation
+        (rad).
+    sigma : (n,) standard deviations of the observations, m (ranges) or px (image coordinates).
+    columns : Function that takes a list of effects and returns the (n, k) changes of the observations per unit of each of the k
+        coefficients of all these effects.
     """
 
     title: str
@@ -55,13 +59,13 @@ class KnownPoints:
 
 
 def known_points(view: TlsView | StereoView) -> KnownPoints:
-    """Return observations of points with known positions that a survey could add as control.
+    """Return observations of points with known positions that a survey could add, to find out how much they would help.
 
-    They are targets around a laser scanner, or check points in front of a stereo pair.
+    They are twelve targets around a laser scanner, or 24 check points in front of a stereo pair.
 
     Parameters
     ----------
-    view : What the first station or pair sees of the wall.
+    view : What the first scanner station or stereo pair sees of the wall.
     """
     return _targets(view) if isinstance(view, TlsView) else _check_points(view)
 
@@ -152,7 +156,7 @@ def _check_points(view: StereoView) -> KnownPoints:
     def column(effect: type[Effect], camera: str, key: str) -> FloatArray:
         extra: Any = effect.model_fields[key].json_schema_extra
         step = _STEP * float(extra["typical"] or 1e-3)
-        real = real_pair(nominal, (effect(**{"camera": camera, key: step}),), view.measurement)
+        real = real_pair((effect(**{"camera": camera, key: step}),), view.measurement)
         return np.asarray((seen(real) - base) / step)
 
     def columns(wanted: list[Candidate]) -> FloatArray:

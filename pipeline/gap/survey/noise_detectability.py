@@ -25,13 +25,14 @@ _NO_NUMBER = "no closed-form signature: gap tests it, but its detectable size is
 
 @dataclass(frozen=True)
 class NoiseOrLossEffect:
-    """An effect of the catalogue on the noise or on missing returns, and the size from which a survey can detect it.
+    """A sensor effect on the noise or on missing returns, and the size from which a survey can detect it.
 
     Attributes
     ----------
     name : Name of the effect, with the sensor as prefix.
     parameter : Name of its main parameter.
-    detectable_size : Value of that parameter at a signal-to-noise ratio of 5; NaN if it cannot be computed.
+    detectable_size : Value of that parameter from which the effect is detected (signal-to-noise ratio of 5); NaN if it cannot
+        be computed.
     note : Condition under which that size holds, or why there is none, in words.
     """
 
@@ -51,9 +52,9 @@ class NoiseOrLossEffect:
 
 
 def noise_and_loss_effects(survey: Survey) -> tuple[NoiseOrLossEffect, ...]:
-    """List every effect of the catalogue on the noise or on missing returns, with the size that a survey can detect.
+    """List the sensor effects on the noise and on missing returns, with the size from which a survey can detect each.
 
-    survey: the planned or measured survey. The size is NaN if it cannot be computed.
+    survey: the planned or measured survey; its first view is used. The size is NaN if it cannot be computed.
     """
     view = survey.views[0]
     found = {each.name: each for each in _variance_effects(view)}

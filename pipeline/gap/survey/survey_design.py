@@ -25,20 +25,21 @@ _NULL = 1e-9
 
 
 def view_signatures(view: SurveyView) -> list[Candidate]:
-    """Compute the signatures of all systematic effects: how each would change the observations of one station or pair.
+    """Compute how each systematic effect would change the observations of one scanner station or stereo pair (its signature).
 
-    An effect has several candidates if it has parameters that are not fitted: one for each trial value, such as each camera or
-    period. view: what the station or pair sees of the wall.
+    An effect with parameters that cannot be fitted, such as a camera or a period, is listed once for each trial value.
+
+    view: what the station or pair sees of the wall.
     """
     return systematic_candidates(view.residuals, view.measurement)
 
 
 def group_by_effect(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
-    """Group candidates by effect, and keep a few variants of each to analyse which effects can be distinguished.
+    """Group candidates by sensor effect, and keep the few of each that show which effects a survey can distinguish.
 
-    A variant is the effect with one choice of the values that are not fitted, such as the camera or a period. The first variant
-    represents the effect in tables. The others, such as other cameras, are alternatives that another effect may be confused
-    with. A wave of unknown period is represented by the middle one of the trial periods.
+    An effect has a candidate (variant) for each choice of what is not fitted, such as the camera. The first variant represents
+    the effect in tables. The others are kept because they may look like another effect. Of waves, only the one with the middle
+    of the trial periods is kept.
 
     Parameters
     ----------
@@ -68,9 +69,11 @@ def group_by_effect(candidates: list[Candidate]) -> dict[str, list[Candidate]]:
 
 
 def parameter_label(candidate: Candidate) -> str:
-    """Return the name of a candidate effect's main parameter, to which its detectable size refers.
+    """Return the name of an effect's main parameter for tables of detectable sizes, such as "amplitude_m".
 
-    Several parameters of the same kind are joined by commas.
+    Several parameters of one kind are joined by commas. The phase and the period of a wave are left out.
+
+    candidate: the effect.
     """
     hidden = {"phase_rad", "" if candidate.wave is None else candidate.wave.key}
     return ", ".join(name for name in candidate.names if name not in hidden)
@@ -87,21 +90,24 @@ def _scales(candidate: Candidate) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class SurveyDesign:
-    """Signatures of m effects (changes of n observations of a survey, over their standard deviations), with a pose fit.
+    """How m effects would change the n observations of a survey, to tell before fieldwork which it can detect and distinguish.
 
-    It tells before any fieldwork which effects the survey can detect and distinguish.
+    A signature is such a change, divided by the standard deviations of the observations. An effect may have several variants,
+    such as one for each camera, and a variant may have several fitted coefficients. Each of the k coefficients of all effects
+    has a column.
 
     Attributes
     ----------
-    projected : (n, k) signatures after the pose of each station is projected out, with a column for each of k coefficients.
-    signatures : (n, k) signatures before the pose is projected out.
+    projected : (n, k) signatures, less what a change of the stations' poses could explain.
+    signatures : (n, k) whole signatures.
     pose_basis : (n, p) orthonormal basis of the changes of the observations by the p pose parameters.
-    spans : For each effect, the slice of the k columns of each of its variants, such as other cameras or periods.
+    spans : For each effect, the slice of the k columns that belongs to each of its variants.
     scales : For each effect, the value of its main parameter per unit of each coefficient.
-    cells : Cells of the wall, between which the reference's error is correlated.
+    cells : Squares of the wall. The error of the reference surface is modelled as one value for each square, correlated with
+        those of other squares.
     sigma : (n,) standard deviations, m or px, reduced so that a subsample has the weight of all points.
     unit_m : Median metres of range or depth per unit of the observations (m or px).
-    wall_rows : Number of the n observations that are points on the wall; those of points with known positions follow.
+    wall_rows : How many of the n observations are points on the wall; those of points with known positions follow.
     """
 
     projected: FloatArray
@@ -118,13 +124,13 @@ class SurveyDesign:
     def of(
         cls, views: tuple[SurveyView, ...], families: dict[str, list[Candidate]], points: KnownPoints | None = None
     ) -> SurveyDesign:
-        """Compute how all effects would change the observations (their signatures), and project out the stations' poses.
+        """Compute how all effects would change the observations of a survey, with and without a fit of the stations' poses.
 
         Parameters
         ----------
-        views : What each station or stereo pair sees of the wall.
-        families : For the name of each effect, its variants, as `group_by_effect` gives them. A variant is the effect with one
-            choice of the values that are not fitted, such as the camera or a period.
+        views : What each scanner station or stereo pair sees of the wall.
+        families : The variants of each effect by its name, as `group_by_effect` gives them. A variant is the effect with one
+            choice of what is not fitted, such as the camera or a period.
         points : Additional observations of points with known positions, such as targets; None if the survey has none.
         """
         wanted = [variant for variants in families.values() for variant in variants]
@@ -156,19 +162,22 @@ class SurveyDesign:
         return cls(left, whole, base, spans, scales, WallCells.over(at), sigma, unit, wall)
 
     def survival(self) -> FloatArray:
-        """Return the (m,) share of each effect's change of the observations that a pose fit leaves; near 0, it is hidden."""
+        """Return the (m,) share of each effect's change of the observations that is left after a fit of the sensor's pose.
+
+        It is between 0 and 1. Near 0, another pose explains the same change, and the effect stays hidden.
+        """
         sizes = [
             (float(np.linalg.norm(self.projected[:, v[0]])), float(np.linalg.norm(self.signatures[:, v[0]]))) for v in self.spans
         ]
         return np.array([left / max(whole, 1e-300) for left, whole in sizes])
 
     def cosines(self) -> FloatArray:
-        """Return how similar the m effects look in the survey's observations: absolute cosines (m, m) between their signatures.
+        """Return how similar the m effects look: (m, m) absolute cosines between their changes of the survey's observations.
 
-        A signature is an effect's change of the observations, less what a different pose of the sensor could explain. Near 1,
-        the survey can hardly tell two effects apart. Where an effect has several variants, such as one for each camera, the value
-        is the largest canonical correlation of the first variant of one effect with any variant of the other, whichever of the
-        two effects comes first.
+        Near 1, the survey can hardly tell two effects apart. What another pose of the sensor could explain is left out. For
+        effects with several variants, such as one for each camera, the first variant of either is compared with all of the
+        other, and the largest value counts. Variants with several coefficients are compared by their largest canonical
+        correlation.
         """
         bases = [[self._basis(span) for span in variants] for variants in self.spans]
         count = len(bases)
@@ -191,11 +200,11 @@ class SurveyDesign:
 
         Parameters
         ----------
-        reference_error_m : Standard deviation of the reference's correlated error, m.
+        reference_error_m : Standard deviation of the reference surface's error, which is correlated over metres, m; 0 for none.
 
         Returns
         -------
-        tuple : (m,) values; infinite if the pose fit hides the effect altogether.
+        tuple : (m,) values; infinite if another pose of the sensor explains the effect altogether.
         """
         first = [list(range(variants[0].start, variants[0].stop)) for variants in self.spans]
         chosen = [column for group in first for column in group]
@@ -232,18 +241,17 @@ class SurveyDesign:
 
 
 def signature_columns(view: SurveyView, wanted: list[Candidate]) -> FloatArray:
-    """Return the signatures (changes of the observations) of given effects at the points of one station or stereo pair.
-
-    Waves have the periods of the given candidates, so that all stations of a survey use the same ones.
+    """Return how given effects would change the observations of one scanner station or stereo pair (their signatures).
 
     Parameters
     ----------
     view : What the station or pair sees of the wall.
-    wanted : Effects, each with one choice of the values that are not fitted, such as the camera or a period.
+    wanted : The effects, each with one choice of what is not fitted, such as the camera or the period of a wave. Pass the same
+        list for all stations of a survey, so that the columns of all have the same meaning.
 
     Returns
     -------
-    FloatArray : (n, k) change of the n observations, m or px, per unit of each of k coefficients.
+    FloatArray : (n, k) change of the n observations, m or px, per unit of each of the effects' k coefficients.
     """
     own = {_key(each): each for each in view_signatures(view)}
     parts = []

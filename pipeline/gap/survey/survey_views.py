@@ -48,7 +48,7 @@ class SurveyView:
     """What one scanner station or one stereo pair, real or planned, sees of the wall.
 
     Precision is predicted from the geometry alone, so that a planned station needs no measured values. A subsample of the
-    points is enough for this; `sigma` gives it the weight of all points.
+    points is enough for this.
 
     Attributes
     ----------
@@ -65,11 +65,11 @@ class SurveyView:
 
     @classmethod
     def of(cls, found: Residuals, whole: int, number: int, measurement: Measurement) -> Self:
-        """Make the view of one scanner station or stereo pair from the subsample's points on smooth parts of the wall.
+        """Make the view of one scanner station or stereo pair. Of a subsample of its points, those on smooth parts are kept.
 
         Parameters
         ----------
-        found : Geometry of a subsample of the view's points; residuals whose values have no meaning.
+        found : Geometry of the subsample, as residuals whose values have no meaning.
         whole : Number of points of the full view, before the subsample was drawn.
         number : Number of the station or pair; views with the same number share a pose.
         measurement : A measurement that holds the pose of the station or the cameras of the pair.
@@ -90,9 +90,9 @@ class SurveyView:
 
     @property
     def sigma(self) -> FloatArray:
-        """(n,) predicted standard deviations, m (ranges) or px (disparities), to weight n points of a subsample.
+        """(n,) standard deviations of the points of the subsample, m (ranges) or px (disparities), to predict precision.
 
-        They are reduced so that the subsample has the weight of all points.
+        They are smaller than those of single points, so that the subsample has the weight of all points of the view.
         """
         return self.residuals.sigma * np.sqrt(len(self.residuals) / max(self.point_count, 1))
 
@@ -103,8 +103,8 @@ class TlsView(SurveyView):
 
     Attributes
     ----------
-    residuals : Geometry of the rays of n points, a subsample; the residual values have no meaning, because only the geometry
-        is used.
+    residuals : Geometry of the rays of n points, a subsample on smooth parts; the residual values have no meaning, because only
+        the geometry is used.
     measurement : A measurement with the pose of the station. A planned station has simulated points without noise.
     """
 
@@ -118,8 +118,8 @@ class StereoView(SurveyView):
 
     Attributes
     ----------
-    residuals : Geometry of the pixels of n points, a subsample; the residual values have no meaning, because only the geometry
-        is used.
+    residuals : Geometry of the pixels of n points, a subsample on smooth parts; the residual values have no meaning, because
+        only the geometry is used.
     measurement : A measurement with the cameras of the pair.
     """
 
@@ -133,9 +133,10 @@ class TlsSurvey:
 
     Attributes
     ----------
-    views : What each station sees.
+    views : What each scanner station sees.
     centre : (3,) centre of the wall, wall frame, m.
-    observe : Function that simulates the view of a further station from a measurement with its pose and the pose's number.
+    observe : Function that simulates the view of a further station. Its arguments are a measurement with the pose of that
+        station, and the number to give to this pose.
     sensor, place : "tls", and what a place of observation is called in texts.
     """
 
@@ -165,7 +166,7 @@ class TlsSurvey:
         return self.observe(base.changed(station=(position, turn @ base.station[1])), number)
 
     def repeated(self, number: int) -> tuple[str, TlsView]:
-        """Return the first scan repeated in the other face of the instrument, to find out what this adds to the survey.
+        """Repeat the first station's scan in the other face of the instrument, to find out what this adds to the survey.
 
         In the second face, azimuths are larger by pi and zenith angles z become 2 pi - z.
 
@@ -191,7 +192,8 @@ class StereoSurvey:
     ----------
     views : What each pair sees.
     centre : (3,) centre of the wall, wall frame, m.
-    observe : Function that simulates the view of a further pair from a measurement with its cameras and the pose's number.
+    observe : Function that simulates the view of a further pair. Its arguments are a measurement with the cameras of that pair,
+        and the number to give to its pose.
     sensor, place : "stereo", and what a place of observation is called in texts.
     """
 
@@ -227,7 +229,9 @@ class StereoSurvey:
         return self.observe(base.changed(cameras=pair), number)
 
     def repeated(self, number: int) -> tuple[str, StereoView]:
-        """Simulate the first stereo pair repeated with its cameras rolled by 45 degrees in opposite directions.
+        """Simulate the first stereo pair once more with its cameras rolled, to find out what this adds to the survey.
+
+        The cameras are rolled by 45 degrees in opposite directions.
 
         Parameters
         ----------
@@ -248,12 +252,16 @@ Survey = TlsSurvey | StereoSurvey
 
 
 def planned_survey(config: SimulationConfig, sensor: SensorName) -> Survey:
-    """Simulate what the stations or cameras of a config would see of the wall, to judge a survey before fieldwork.
+    """Simulate what the scanner stations or cameras of a config would see of the wall, to judge a survey before fieldwork.
 
     Parameters
     ----------
-    config : The simulation config, with the wall and the sensor's places.
+    config : The simulation config, with the wall and the positions of the sensor.
     sensor : "tls" or "stereo".
+
+    Returns
+    -------
+    Survey : the views of all stations or pairs, the wall's centre, and a function that simulates further views.
 
     Raises
     ------
@@ -286,7 +294,7 @@ def measured_survey(measurement: Measurement, most: int = _MOST_PULSES) -> Surve
 
     Returns
     -------
-    Survey : the views, the wall's centre, and a function that simulates views from further stations.
+    Survey : the views of all stations or pairs, the wall's centre, and a function that simulates further views.
 
     Raises
     ------
