@@ -397,26 +397,6 @@ def test_outlines_grow_at_steps_that_are_high_enough() -> None:
     np.testing.assert_array_equal(EdgeFattening(radius_px=5).filtered(wall, 1.0, 4.0), expected)
 
 
-@pytest.mark.parametrize("window", ["disc", "square"])
-def test_a_window_takes_the_nearest_rock_on_slopes_too(window: str) -> None:
-    """Compared with a loop over the cells; unmatched cells stay unmatched and count as nothing."""
-    random = np.random.default_rng(4)
-    relief = np.add.outer(0.4 * np.arange(20), -0.7 * np.arange(24)) + random.random((20, 24))
-    relief[random.random(relief.shape) < 0.1] = np.nan
-    expected, radius = relief.copy(), 3
-    for row, column in np.argwhere(~np.isnan(relief)):
-        near = [
-            relief[i, j]
-            for i, j in np.ndindex(relief.shape)
-            if max(abs(i - row), abs(j - column)) <= radius
-            and (window == "square" or (i - row) ** 2 + (j - column) ** 2 <= radius**2)
-        ]
-        largest = np.nanmax(near)
-        expected[row, column] = largest if largest - relief[row, column] > 1.5 else relief[row, column]
-    effect = EdgeFattening.model_validate({"radius_px": 12.0, "step_px": 1.5, "window": window})
-    np.testing.assert_array_equal(effect.filtered(relief, 4.0, 4.0), expected)
-
-
 def test_the_foreground_of_a_step_grows_by_the_radius_over_the_half_occluded_strip() -> None:
     """The near plane ends at x = 0; its outline moves to x = -r Z / f, within a cell."""
     radius_px, cell = 12.0, 2 * 99.0 / rig().left.f_px

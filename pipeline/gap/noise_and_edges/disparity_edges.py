@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
-from pipeline.formats.measurements.measurement import StereoMeasurement
+from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect, WallBlocks, log_density, maximise_gain
 from pipeline.gap.residuals.alignment import AlignedMeasurement, align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
-from pipeline.gap.residuals.residuals import BoolArray
+from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.thresholds import thresholds
 from scene.common.threads import map_in_threads
@@ -32,8 +32,8 @@ from sensors.effects.smoothing import Smoothing
 _RADII = (1, 2, 3, 4, 5, 6, 8, 10)
 _RIM_STEPS, _WINDOW_STEPS_PX = (2.0, 4.0), (0.5, 1.0, 2.0, 4.0)
 _SIGMAS = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0)
-"""Radii of edge fattening in cells; depth steps of rims in the smallest one that counts, which is tried too, and of windows in px;
-and standard deviations of the low-pass in cells."""
+"""Radii of edge fattening, cells; depth steps of rims, in the smallest one that counts (which is tried too), and of windows, px;
+standard deviations of the low-pass, cells."""
 _REFINEMENT_FACTORS = (1.1, 1.03)
 _STEP_FACTORS = (1.2, 1.05)
 """Ratios of neighbouring steps in the refinements of a window's step."""
@@ -205,7 +205,9 @@ def find_disparity_edge_effects(
     while searches:
         current = replace(data, beside=[*known_effects, *(each.effect for each in found)])
         results = zip(searches, map_in_threads(partial(_run_search, current), searches.values()), strict=True)
-        tried = {name: each for name, each in results if each is not None}
+        # no prediction is exact, so a further effect must explain more than the inexact part of those before
+        needed = thresholds().mean.least_relative_gain * max([0.0, *(each.gain for each in found)])
+        tried = {name: each for name, each in results if each is not None and each.gain > needed}
         if not tried:
             break
         similar = [tried.pop(name) for name in (EdgeFattening.tag(), Smoothing.tag()) if name in tried]
@@ -241,29 +243,43 @@ def align_beside_fattening(
     -------
     AlignedMeasurement : the pair at the better one of both poses, without edge fattening in its model.
     """
-    after = aligned.residuals
-    if not aligned.pose.any() or not isinstance(after, StereoResiduals) or model_has_fattening(measurement):
+    if not aligned.pose.any() or any(isinstance(effect, EdgeFattening) for effect in measurement.model.effects):
         return aligned
-    log_likelihoods, best = [], None
-    for there, residuals in ((measurement, initial), (aligned.measurement, after)):
-        raster = DisparityRaster.of(there, residuals.geometry)
-        if raster is None:
-            return aligned
-        held_out = ~np.isin(residuals.index, np.intersect1d(trusted, np.intersect1d(initial.index, after.index)))
-        data, _ = _EdgeData.of(there, raster, residuals, fit_pose_robustly(residuals)[0], held_out)
-        best = most_likely_fattening(data) if best is None else best
-        log_likelihoods.append(float(data.registered_density([best] if there is measurement else []).sum()))
-    if best is None or log_likelihoods[0] < log_likelihoods[1] + thresholds().edges.least_gain:
+    given, plain = _gather_trusted(measurement, initial, trusted), _gather_trusted(*aligned[:2], trusted)
+    if given is None or plain is None:
+        return aligned
+    best, least = most_likely_fattening(given), thresholds().edges.least_gain
+    if given.registered_density([best]).sum() < plain.registered_density([]).sum() + least:
         return aligned
     fattened = measurement.changed(model=measurement.model.model_copy(update={"effects": (*measurement.model.effects, best)}))
-    pose = align(fattened, trusted).pose
+    pose = align(fattened, trusted, compute_residuals(fattened)).pose
     moved = measurement.moved(pose)
-    return AlignedMeasurement(moved, compute_residuals(moved), pose)
+    there = AlignedMeasurement(moved, compute_residuals(moved), pose)
+    before, after = (_log_likelihood_with_edge_effects(each, trusted) for each in (aligned, there))
+    return there if after > before + least else aligned
 
 
-def model_has_fattening(measurement: StereoMeasurement) -> bool:
-    """Tell whether the model of a measurement already contains edge fattening."""
-    return any(isinstance(effect, EdgeFattening) for effect in measurement.model.effects)
+def _gather_trusted(measurement: Measurement, residuals: Residuals, trusted: NDArray[np.int64]) -> _EdgeData | None:
+    """Gather what a search needs, from trusted points alone; None if the points lie on no pixel raster."""
+    if not isinstance(measurement, StereoMeasurement) or not isinstance(residuals, StereoResiduals):
+        return None
+    raster = DisparityRaster.of(measurement, residuals.geometry)
+    if raster is None:
+        return None
+    held_out = ~np.isin(residuals.index, trusted)
+    return _EdgeData.of(measurement, raster, residuals, fit_pose_robustly(residuals)[0], held_out)[0]
+
+
+def _log_likelihood_with_edge_effects(aligned: AlignedMeasurement, trusted: NDArray[np.int64]) -> float:
+    """Log-likelihood of the trusted points at a pose, with the edge effects that are found there."""
+    data = _gather_trusted(aligned.measurement, aligned.residuals, trusted)
+    measurement, residuals = aligned.measurement, aligned.residuals
+    if data is None or not isinstance(measurement, StereoMeasurement) or not isinstance(residuals, StereoResiduals):
+        return -np.inf
+    registered = fit_pose_robustly(residuals)[0]
+    found = find_disparity_edge_effects(measurement, residuals, registered, ~np.isin(residuals.index, trusted))
+    density = data.registered_density([each.effect for each in found])
+    return float(density.sum() / max(np.count_nonzero(~data.held_out), 1) * len(trusted))
 
 
 def _run_search(data: _EdgeData, search: _EffectSearch) -> EdgeEffect | None:
@@ -347,9 +363,7 @@ def most_likely_fattening(data: _EdgeData) -> EdgeFattening:
 
     rim = (0.0, *(height * smallest for height in _RIM_STEPS))
     steps = {"rim": rim, "disc": _WINDOW_STEPS_PX, "square": _WINDOW_STEPS_PX}
-    best = most_likely(
-        [trial(window, radius, step) for window, tried in steps.items() for step in tried for radius in _RADII]
-    )
+    best = most_likely([trial(window, radius, step) for window, tried in steps.items() for step in tried for radius in _RADII])
     if best.window == "rim":
         return best
     for factor in _STEP_FACTORS:
