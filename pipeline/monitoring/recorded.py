@@ -187,7 +187,7 @@ class RecordedMonitoring:
             level, _ = read_geotiff(self.folder / name.replace("difference", "lod"))
             event = events.get(name, np.zeros(grid.shape, dtype=bool))
             if not difference.shape == level.shape == event.shape:
-                raise InputError("its maps do not have the same size", where=str(self.folder / name), remedy=_AGAIN)
+                raise InputError("the map differs in size from its level of detection or from the masks of its events", where=str(self.folder / name), remedy=_AGAIN)
             known = np.isfinite(difference) & np.isfinite(level)
             standard = np.where(known, difference / np.where(known, level / NORMAL_95, 1.0), np.nan)
             found.append(StableMap(frame, grid, unchanged_pixels(standard, known), event))
