@@ -261,7 +261,8 @@ who wonder whether a default decides their case. `--set` changes a threshold for
     scarpsim gap my_measurement --set mean.class_margin=4 --set points.fewest=500 --out diagnosis
 
 Each threshold of `pipeline/gap/thresholds.py` was set to 0.7 and 1.4 times its value, on development cases of some thousand
-points of the [closed-form generator](gap_closed_form.md). For each of both values ("x 0.7", "x 1.4") the table has four columns:
+points of the [closed-form generator](gap_closed_form.md). The table has four columns for each of both values ("x 0.7",
+"x 1.4"):
 
 | column | cases that it counts |
 |---|---|

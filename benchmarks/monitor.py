@@ -352,7 +352,7 @@ def speed() -> Iterator[str]:
 
 def many() -> Iterator[str]:
     """Rows of the table of many epochs: the time of the command, and of a process that only reads the same files."""
-    yield "| epochs, points in each | what | time | processor time | over reading |"
+    yield "| epochs, points in each | what | time | processor time | processor time over reading |"
     yield "|---|---|---|---|---|"
     with tempfile.TemporaryDirectory() as folder:
         files = [f"{folder}/2026-03-01T{number // 2:02d}{30 * (number % 2):02d}.laz" for number in range(EPOCHS)]

@@ -358,7 +358,7 @@ def verdicts() -> dict[str, Verdict]:
             "example: \"" + STILL_OPEN + "\"",
             "See in the report on which covariate the disagreement depends, and in what form. In case 1, model_after.yaml holds "
             "the empirical term, which reproduces the disagreement in simulations, but only within the measured range of the "
-            "covariate (`along`, in the unit of the covariate: rad for angles). In case 2 it holds nothing new, and in case 3 "
+            "covariate (`along`, in the unit of the covariate: rad for angles). In case 2 it holds no further effect, in case 3 "
             "the named effects, which explain too little.",
             "The ranges of a scanner jump by 4 mm in the middle of the scan, as after a knock.",
             _case(seed=18, ranges=lambda scan: scan.R + 0.002 * np.where(scan.az > 1.6, 1.0, -1.0)),

@@ -16,7 +16,7 @@ What a long test covers as a whole also has short tests of its parts in `make te
 how many they hold, and what a file tests. The sentence below a heading says which shorter tests cover the same.
 
 On two cores, with a filled kernel cache, the 4,711 tests of `make test` took 14 minutes.
-Collecting them takes more than one of these.
+More than one of these minutes is spent on collecting them, before the first one runs.
 
 The names of the long tests are in `tests/validation.toml`.
 """

@@ -48,8 +48,8 @@ _LABELS = {
     "the same, as the angle to the nearest other effect lets it (1 - sin^2, median)": "its expectation from the angle to the "
     "nearest other effect, 1 - sin^2 (median)",
     "the same, where that angle leaves it 5 % at most": "the share that it closes where the expectation is 5 % at most",
-    "rightly named, but the gap is within its uncertainty": "answers with all true effects whose gap is too small to be told "
-    "from none",
+    "rightly named, but the gap is within its uncertainty": "answers that name all true effects although the gap is "
+    "too small to be told from none",
     "the same, where every true effect was named": "the same intervals, where every true effect was named",
 }
 """Rows of the results whose names need more words on the page."""

@@ -232,7 +232,9 @@ def _rates(results: list[Result]) -> str:
         "p-values of what remains below 0.01, without an effect": share(sum(each < 0.01 for each in p), len(p)),
         "median time of a diagnosis, s": f"{np.median([each.answer['said']['seconds'] for each in results]):.0f}",
     }
-    return "| | |\n|---|---|\n" + "".join(f"| {key} | {value} |\n" for key, value in rows.items())
+    return "| what | share (95 % interval), or value |\n|---|---|\n" + "".join(
+        f"| {key} | {value} |\n" for key, value in rows.items()
+    )
 
 
 def _alarmed(result: Result) -> bool:

@@ -95,10 +95,10 @@ class Calibration:
 
     @property
     def parameters(self) -> pandas.DataFrame:
-        """The fitted noise of the sensor, one row per parameter.
+        """The fitted noise of the sensor, one row per parameter, such as range_sigma_m.
 
-        The columns are the value and the low and high end of its confidence interval, in the unit with which the parameter's
-        name ends.
+        The columns are value, and low and high, the ends of its confidence interval (95 % unless the config says otherwise),
+        in the unit with which the parameter's name ends.
         """
         found = self.figures.found
         values = {name: np.exp(each) for name, each in (("value", found.x), ("low", found.low), ("high", found.high))}

@@ -95,7 +95,10 @@ class Comparison:
     def table(self) -> pandas.DataFrame:
         """Main results of the compared sensors, one row per sensor, indexed by name; SI units.
 
-        The columns include noise, level of detection, smallest block that is detected, and completeness.
+        The columns include nmad_m (noise over stable ground), level_of_detection_m (median of the wall), smallest_block_m
+        (size from which 95 % of the blocks are detected), blocks_in_view and blocks_seen (numbers of blocks in the sensor's
+        view, and of those detected), visible (share of the wall that the sensor can see) and complete (share of the map with
+        data).
         """
         return frame(map(_row, self.figures.found)).set_index("name")
 

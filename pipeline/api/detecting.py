@@ -109,9 +109,11 @@ class Detections:
 
     @property
     def events(self) -> geopandas.GeoDataFrame:
-        """The detected rockfalls, one row per event: image, number, position, area, depth, volume, score; SI units.
+        """The detected rockfalls, one row per event; SI units.
 
-        The geometry of a row is the event's bounding rectangle, wall frame, m.
+        The columns include image and number (of the map, and of the event in it), x_m and y_m (centre, wall frame), area_m2,
+        depth_m (largest), volume_m3 and score (confidence, 0 to 1). The geometry of a row is the event's bounding rectangle,
+        wall frame, m.
         """
         bounds = [
             [each.x_m - each.width_m / 2, each.y_m - each.height_m / 2, each.x_m + each.width_m / 2, each.y_m + each.height_m / 2]

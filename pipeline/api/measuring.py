@@ -231,9 +231,9 @@ class Diagnosis:
     def effects(self) -> pandas.DataFrame:
         """Effects that explain why measurement and sensor model disagree.
 
-        One row per parameter of each effect, SI units. The columns include the fitted value, its standard deviation (std), the
-        kind of effect, the effects that the data cannot distinguish from it (cannot_be_told_from), and the p-value of the
-        effect.
+        One row per parameter of each effect, SI units. The columns are effect and parameter (names), value (fitted), std (its
+        standard deviation), kind ("physical", or "empirical" if its cause is unknown), cannot_be_told_from (effects that
+        explain the data as well), split_by (a further measurement that would tell them apart) and p_value (of the effect).
         """
         rows = []
         for each in self.found.effects:

@@ -142,9 +142,12 @@ class Monitoring:
 
     @property
     def events(self) -> geopandas.GeoDataFrame:
-        """Detected rockfalls and other changes, one row per event and epoch, with the columns of events.csv.
+        """Detected rockfalls and other changes, one row per event and epoch, with the columns of events.csv; SI units.
 
-        The geometry of a row is the event's outline in survey coordinates, m.
+        The columns include id (one event has the same in all epochs), epoch, kind ("missing" or "added" rock), area_m2,
+        depth_median_m, volume_m3 with its standard deviation volume_std_m3, first_seen_after and first_seen_by (the epochs
+        between which it began), and the position in the wall frame (x_m, y_m) and in survey coordinates (world_x_m, ...). The
+        geometry of a row is its outline in survey coordinates, m.
         """
         geopandas, shapely = library("geopandas"), library("shapely")
         outlines = [shapely.MultiPolygon([shapely.Polygon(ring) for ring in each]) for each in self.result.outlines()]

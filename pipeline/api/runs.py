@@ -175,8 +175,8 @@ class Run:
     def statistics(self) -> pandas.DataFrame:
         """Noise of the run, one row per epoch.
 
-        The columns are statistics of the difference map outside the fallen blocks (count, median_m, nmad_m, ...) and the RMS of
-        the epoch's registration.
+        The columns are statistics of the difference map outside the fallen blocks (count, median_m, nmad_m, ...) and
+        registration_rms_m (RMS of the residuals of the epoch's registration).
         """
         return frame(each.statistics for each in self.epochs)
 
@@ -279,17 +279,20 @@ class Epoch:
 
     @property
     def blocks(self) -> geopandas.GeoDataFrame:
-        """The blocks that fell in this epoch, one row each: true values, and what the difference map shows.
+        """The blocks that fell in this epoch, one row each, to compare the measured sizes with the true ones.
 
-        The geometry of a row is the bounding rectangle of the block's niche, wall frame, m.
+        The columns include volume_m3 and size_x_m, ... (true), measured_volume_m3 (in the difference map), position_x_m, ...
+        (wall frame) and annotated (whether it is labelled for training). The geometry of a row is the bounding rectangle of
+        the block's niche, wall frame, m.
         """
         return _blocks([self])
 
     @property
     def statistics(self) -> dict[str, Any]:
-        """Noise of the epoch, SI units.
+        """Noise of the epoch by name, SI units.
 
-        It has the statistics of the difference map outside the blocks, and the RMS of the epoch's registration.
+        The names are statistics of the difference map outside the fallen blocks (count, median_m, nmad_m, ...) and
+        registration_rms_m (RMS of the residuals of the epoch's registration).
         """
         outside = self.record.get("statistics", {}).get("outside_blocks")
         if outside is None:

@@ -51,7 +51,7 @@ _GREEDY_OBSERVATIONS = 300
 
 @dataclass(frozen=True)
 class OrientationPatterns:
-    """Tell which orientation parameters (angles or coordinates) of a stereo pair's cameras a calibration can tell apart.
+    """Say which orientation parameters (angles or coordinates) of a stereo pair's cameras a calibration can tell apart.
 
     An error of each parameter causes a difference map of its own. Parameters with similar maps cannot be told apart. A
     map is that of an error of the left camera, or of both cameras if the sensor model moves them alike, after

@@ -48,9 +48,10 @@ def greedy_search(
     This is the method of the thesis that the noise models follow (section 4.1.5). It is a baseline for the calibration's
     search.
 
-    Parameters ---------- simulate : Function that simulates difference maps from (k,) parameter values, a number of
-    epochs and a random source, and
-        returns the logarithms of the summary statistics of their noise.
+    Parameters
+    ----------
+    simulate : Function that simulates difference maps from (k,) parameter values, a number of epochs and a random source,
+        and returns the logarithms of the summary statistics of their noise.
     parameters : Names and bounds of the k noise parameters.
     start : (k,) parameter values. The search begins at a multiple of them that gives four times the measured noise.
     std : Index of the standard deviation among the summary statistics.

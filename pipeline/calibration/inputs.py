@@ -43,12 +43,16 @@ _REACH_PX = 2
 class CalibrationInputs:
     """Input of a calibration: measured difference maps on one grid, their stable ground, and the site to simulate.
 
-    Attributes ---------- names : (e,) names of the maps. grid : Raster that all maps share. maps : (e, h, w) differences,
-    m; NaN without data. stable : (h, w) true on stable ground (where nothing fell) that has data in every map. drawn :
-    Whether the config or the measurement states the stable areas; otherwise they were detected in the maps. site : The
-    wall or reference surface, with the sensor in front of it. of_points : True if a pixel's value is the mean distance of
-    the points in it from the reference surface; false if it is the
-        difference between two reconstructed surfaces.
+    Attributes
+    ----------
+    names : (e,) names of the maps.
+    grid : Raster that all maps share.
+    maps : (e, h, w) differences, m; NaN without data.
+    stable : (h, w) true on stable ground (where nothing fell) that has data in every map.
+    drawn : Whether the config or the measurement states the stable areas; otherwise they were detected in the maps.
+    site : The wall or reference surface, with the sensor in front of it.
+    of_points : True if a pixel's value is the mean distance of the points in it from the reference surface; false if it
+        is the difference between two reconstructed surfaces.
     reference_error : Error of a reference surface that is made of points; None if it is unknown or zero.
     measurement : The measured points, if a pixel is a mean of points; else None.
     """

@@ -21,10 +21,12 @@ vertices; it is about 0.6 where points lie anywhere.
 class ReferenceError:
     """Random error of a reference surface that is a mesh of measured points; it adds to the differences from the surface.
 
-    Attributes ---------- sigma_m : Standard deviation of a vertex's error along the ray from the sensor, m. shared :
-    Whether errors are shared within a triangle. True: a vertex has one error, and the surface between three vertices
-        interpolates theirs, as if the vertices are noisy. False: each compared point has an error of its own, as if the
-        mesh misses relief of the rock between its vertices.
+    Attributes
+    ----------
+    sigma_m : Standard deviation of a vertex's error along the ray from the sensor, m.
+    shared : Whether errors are shared within a triangle. True: a vertex has one error, and the surface between three
+        vertices interpolates theirs, as if the vertices are noisy. False: each compared point has an error of its own, as
+        if the mesh misses relief of the rock between its vertices.
     repeated : Whether the points lie in the directions of the vertices, as where later scans repeat those of the reference. A
         point then has the error of the nearest vertex.
     eye : (3,) position of the sensor, wall frame, m.

@@ -86,7 +86,10 @@ class Simulations:
     s: FloatArray
 
     def with_more(self, other: Simulations) -> Simulations:
-        """Return the simulations of this set followed by those of another, to fit a response surface to both."""
+        """Return the simulations of this set followed by those of another, to fit a response surface to both.
+
+        other: the further simulations, of the same parameters and statistics.
+        """
         return Simulations(np.concatenate([self.x, other.x]), np.concatenate([self.s, other.s]))
 
     def at(self, rows: NDArray[Any]) -> Simulations:
@@ -242,9 +245,10 @@ class SearchResult:
 class NoiseSearch:
     """Search for the noise parameters with which simulated maps have the same summary statistics as the measured ones.
 
-    Parameters ---------- simulate : Function that simulates difference maps from (k,) parameter values, a number of
-    epochs and a random source, and
-        returns the (m,) summary statistics of their noise.
+    Parameters
+    ----------
+    simulate : Function that simulates difference maps from (k,) parameter values, a number of epochs and a random source,
+        and returns the (m,) summary statistics of their noise.
     parameters : The k noise parameters and their bounds.
     epochs : Number of measured epochs.
     random : Source of random numbers; each simulation draws its own, by its number.

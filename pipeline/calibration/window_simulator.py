@@ -70,8 +70,7 @@ class WindowSimulator:
     windows : The k windows of n x n pixels, on the grid of the measured maps, in which measured and simulated maps are
         compared.
     of_points : True if a pixel's value is the mean distance of the points in it from the wall; false if it is the
-    difference
-        between two surfaces.
+        difference between two surfaces.
     reference_error : Error of the surface that the points are compared with; None for none.
 
     Attributes

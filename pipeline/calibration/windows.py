@@ -70,9 +70,10 @@ class Windows:
 def stable_ground(maps: Sequence[NDArray[np.floating]]) -> BoolArray:
     """Detect stable ground, where no difference map shows a change of the wall, for a user who drew no stable areas.
 
-    A change is large in extent or in size. First, the medians of squares of 5 x 5 pixels are compared with their running
-    median over 15 x 15 squares: three or more adjacent squares that deviate by more than four NMADs are a change, with
-    one square around them. Second, places of at least 3 x 3 pixels that all deviate by more than four NMADs are a change.
+    There are two signs of a change. First, the medians of squares of 5 x 5 pixels are compared with their running median
+    over 15 x 15 squares: three or more adjacent squares that deviate by more than four NMADs are a change, with one square
+    around them. Second, the pixels are compared with the same running median: places of at least 3 x 3 pixels that all
+    deviate in one direction by more than four NMADs are a change.
     Single gross errors, and thin strips along edges, count as noise.
 
     Parameters

@@ -142,8 +142,16 @@ def difference(reference: SurfaceRaster, epoch: SurfaceRaster) -> NDArray[np.flo
 class DifferenceStatistics:
     """Statistics of the differences in a difference map, m; NaN if there are none.
 
-    `count` is the number of differences, `rmse` is about zero, and `nmad` is 1.4826 median(|d - median|), a robust standard
-    deviation.
+    Attributes
+    ----------
+    count : int
+        Number of differences.
+    median, mean, standard_deviation : float
+        Their median, mean and standard deviation, m.
+    rmse : float
+        Root mean square of the differences, m.
+    nmad : float
+        Robust standard deviation 1.4826 median(|d - median|) of the differences d, m.
     """
 
     count: int
@@ -187,7 +195,13 @@ def statistics(values: NDArray[np.floating]) -> DifferenceStatistics:
 
 @dataclass(frozen=True)
 class BlockStatistics:
-    """Statistics of a difference map inside the niches of fallen blocks and outside of them, where only noise is expected."""
+    """Statistics of a difference map apart for fallen blocks and the rest of the wall, where only noise is expected.
+
+    Attributes
+    ----------
+    inside, outside : DifferenceStatistics
+        Statistics of the pixels inside the niches of the blocks, and outside of them.
+    """
 
     inside: DifferenceStatistics
     outside: DifferenceStatistics

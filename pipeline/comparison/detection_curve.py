@@ -71,11 +71,9 @@ class DetectionCurve:
     smallest_95_m : Size from which 95 % are detected, m. None if it is known less well than to a factor of 1.5, or if the
         curve stays below 95 %.
     between_m : Only if `smallest_95_m` is not known well enough: the neighbouring block sizes between which it lies, m.
-    The lower
-        one is None if it lies below all sizes, the upper one if it lies above all.
+        The lower one is None if it lies below all sizes, the upper one if it lies above all.
     interval_m : 95 % confidence interval of the size from which 95 % are detected, m; None for an end that the blocks do
-    not
-        bound.
+        not bound.
     """
 
     count: int

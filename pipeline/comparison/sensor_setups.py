@@ -57,15 +57,16 @@ def sensor_setups(
 ) -> list[SensorSetup]:
     """Read which sensors to compare, and put all of them in front of the first config's wall.
 
-    Parameters ---------- names : What to compare, in any mix. A config file, a bundled site, a run's folder or its
-    run.json gives its sensor, or two if it
-        has both kinds. A scanner preset (such as riegl_vz400i) or a noise model (such as glendale_high), by name or file,
-        describes only a sensor; it is put into the first config, or into the demo's if there is none. A pair of a name
-        and a config is used as it is, with overrides and seed already applied.
-    overrides : Settings "key=value" that replace those of every config (the `--set` options). seed : Seed of the random
-    numbers, which replaces those of the configs; None: theirs. own_step : Whether scanner presets use their own angular
-    step. By default they use the first config's, so that instruments
-        are compared and not scan times.
+    Parameters
+    ----------
+    names : What to compare, in any mix. A config file, a bundled site, a run's folder or its run.json gives its sensor,
+        or two if it has both kinds. A scanner preset (such as riegl_vz400i) or a noise model (such as glendale_high), by
+        name or file, describes only a sensor; it is put into the first config, or into the demo's if there is none. A
+        pair of a name and a config is used as it is, with overrides and seed already applied.
+    overrides : Settings "key=value" that replace those of every config (the `--set` options).
+    seed : Seed of the random numbers, which replaces those of the configs; None: theirs.
+    own_step : Whether scanner presets use their own angular step. By default they use the first config's, so that
+        instruments are compared and not scan times.
 
     Returns
     -------

@@ -9,7 +9,7 @@ from scene.common.config import Config
 
 
 class CalibrationConfig(Config):
-    """How `scarpsim calibrate` compares maps and searches the noise."""
+    """How `scarpsim calibrate` compares maps and searches for the noise parameters."""
 
     stable_areas: tuple[Area, ...] = Field(
         (), description="where nothing moved: boxes [x0, y0, x1, y1] or polygons [[x, y], ...], wall frame [m]; none: found"

@@ -114,7 +114,13 @@ class ProductsConfig(Config):
 
 
 class SimulationConfig(Config):
-    """A simulation of one wall, observed before and after rocks fall."""
+    """A simulation of one wall, observed before and after rocks fall.
+
+    Sections that have no description of their own: `rockfall` says which blocks fall, and `stations` how several
+    positions of the scanner are joined. `surface` and `fusion` say how points become a surface, and `difference` how
+    large the pixels of difference maps are. `annotation` says which blocks are labelled for training, and `products` what
+    is written. `planning` has the settings of `scarpsim inspect`, and `calibration` those of `scarpsim calibrate`.
+    """
 
     seed: int = Field(1, ge=0, lt=2**63, description="seed of all random numbers")
     epochs: int = Field(1, ge=1, le=9999, description="number of epochs after the reference, each with its own rockfalls")

@@ -72,7 +72,7 @@ class NoiseLevel(Config):
     tls: ScaledModel | None = Field(None, description="model of the laser scanner")
 
     def of(self, sensor: SensorName) -> ScaledModel | None:
-        """Return the model of a sensor with the factor of its noise, at this level of noise; None if there is no such model."""
+        """Return the model of a sensor at this level, with the factor of its noise; None if the level has none."""
         return self.stereo if sensor == "stereo" else self.tls
 
 
@@ -105,7 +105,10 @@ MOST_EPOCHS = 100_000
 
 
 class DatasetConfig(Config):
-    """Config of a data set of annotated difference map tiles, on which detectors of rockfall are trained and tested."""
+    """Config of a data set of annotated difference map tiles, on which detectors of rockfall are trained and tested.
+
+    `tiles` says how difference maps are cut into tiles, and `annotation` which fallen blocks are annotated in them.
+    """
 
     name: str = Field("rockfall", pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name of the data set")
     seed: int = Field(1, ge=0, lt=2**63, description="seed of all random numbers")
@@ -215,8 +218,8 @@ def load_dataset_config(path: Path, overrides: Sequence[str | Override] = (), se
     Parameters
     ----------
     path : Config file. Paths in it are relative to its folder.
-    overrides : `--set` options.
-    seed : Replaces the seed of the config.
+    overrides : Values to change, `key.path=value`, as the option `--set` gives them.
+    seed : Replaces the seed of the config; None: its own.
 
     Raises
     ------
@@ -234,7 +237,12 @@ def dataset_config(values: Any, overrides: Sequence[str | Override], seed: int |
     values : Content of a config file.
     overrides : Values to change, `key.path=value`.
     seed : Replaces the seed of the config; None: its own.
-    path : The file, or how errors should call it.
+    path : The config file, for errors; paths in the config are relative to its folder.
+
+    Raises
+    ------
+    InputError
+        If anything in the config is wrong.
     """
     if not isinstance(values, dict):
         raise InputError("the file is not a mapping of keys", where=str(path), remedy="start from configs/datasets/small.yaml")

@@ -94,7 +94,7 @@ def file_damage(folder: Path, file: str, digest: str, where: str) -> list[Damage
 
     Returns
     -------
-    The damage; empty if the file is as it should be.
+    A list with the damage; empty if the file is as it should be.
 
     Raises
     ------

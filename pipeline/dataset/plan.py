@@ -172,10 +172,10 @@ class TileRegion:
 
 
 def tile_region(split: Split, share: float, grid: Grid, config: TileConfig) -> TileRegion:
-    """Return the region of a split's tiles on a wall.
+    """Return the region of a split's tiles on a wall, so that training and validation see different parts of it.
 
-    Training uses the columns of tiles from the left; validation uses those at the right end. Strata run along the wall, so both
-    contain all of them. Tests use the whole wall.
+    Training uses the columns of tiles from the left, validation those at the right end. Rock strata run along the wall, so both
+    parts show all of them. Tests use the whole wall.
 
     Parameters
     ----------

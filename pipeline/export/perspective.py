@@ -86,9 +86,10 @@ class PerspectiveView:
         return cls(middle @ axes - distance * forward, axes, width, max(height, 2), focal_px)
 
     def rays(self, times: int) -> FloatArray:
-        """Return the directions in which a picture's pixels look, wall frame, to render it by ray casting.
+        """Return the directions in which the pixels of the picture look, wall frame, to render it by ray casting.
 
-        times: each pixel is divided into times x times parts. Returns (h * times * w * times, 3), row by row.
+        times: each pixel is divided into times x times parts, for smooth edges. Returns an array
+        (height * width * times^2, 3) with one direction for each part, row by row.
         """
         columns, rows = np.meshgrid(*((np.arange(size * times) + 0.5) / times for size in (self.width, self.height)))
         right, down = columns - self.width / 2, rows - self.height / 2

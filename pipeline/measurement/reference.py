@@ -62,7 +62,7 @@ class Reference:
 
 @dataclass(frozen=True)
 class MeasuredPointNoise:
-    """Noise of the points of a reference, as it is known from elsewhere than their own scatter.
+    """Noise of the measured points of which a reference is made, found by repeated measurements instead of from their neighbours.
 
     Attributes
     ----------
@@ -133,12 +133,12 @@ def reference_from_scans(
     Parameters
     ----------
     scans : The scans, all in one frame, m.
-    path : Their file or folder.
+    path : Their file or folder, for the description of the reference.
     position : (3,) place as seen from which they are meshed, m, in the same frame.
     rotation : (3, 3) rotation from a frame at that place to the frame of the scans.
     seen_from : That place in words, for the description of the reference.
-    noise : Noise of a point along the lines of sight, if it is known, and relief between the points does not show; None: it is
-        estimated from the scatter of neighbours, relief included.
+    noise : Known noise of a point along the lines of sight, without the relief between points; None: it is estimated from the
+        scatter of neighbouring points, which includes the relief.
 
     Raises
     ------

@@ -355,7 +355,8 @@ class Catalogue:
     def identified(self, regions: Sequence[ChangedRegion]) -> list[ChangedRegion]:
         """Return the changed regions of the next epoch with the numbers of their events (changes at one place over all epochs).
 
-        A region that overlaps one of an earlier epoch gets its number; others get the next free numbers.
+        A region that overlaps one of the same kind in an earlier epoch gets that one's number; others get the next free
+        numbers.
         """
         named, taken = [], set()
         for region in sorted(regions, key=lambda each: -each.volume_m3):

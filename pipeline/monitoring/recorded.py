@@ -74,7 +74,7 @@ class _StatedMonitoring(_StatedPart):
 
 @dataclass(frozen=True)
 class StableMap:
-    """Which rock of one epoch is stable in one view (separately mapped part) of the wall.
+    """Where one view (separately mapped part) of the wall shows stable rock in one epoch, and where events.
 
     Attributes
     ----------

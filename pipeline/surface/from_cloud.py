@@ -44,9 +44,14 @@ class CloudConfig(Config):
 
 @dataclass(frozen=True)
 class CloudSurface:
-    """Hold the triangle mesh made from a point cloud, in the cloud's frame, m, and remarks on the cloud to show to the user.
+    """Hold the triangle mesh made from a point cloud, and remarks on the cloud to show to the user.
 
-    A remark says, for example, that coordinates are coarsely rounded.
+    Attributes
+    ----------
+    mesh : TriangleMesh
+        The mesh in the cloud's frame, m.
+    notes : tuple of str
+        The remarks as sentences, for example that coordinates are coarsely rounded.
     """
 
     mesh: TriangleMesh

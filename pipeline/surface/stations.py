@@ -106,8 +106,9 @@ def _register_to_first(meshes: Sequence[TriangleMesh], config: IcpConfig, random
 def merge_stations(scanners: Sequence[LaserScanner], meshes: Sequence[TriangleMesh], config: DifferenceConfig) -> TriangleMesh:
     """Merge the meshes of a wall from several scanner positions (stations), taking each place from the most precise station.
 
-    The most precise one has the smallest expected variance of the mean of its points per area. Where two stations meet, their
-    triangles overlap by less than one triangle. Every pixel centre has a surface if any station has one there.
+    That is the station whose points, averaged over a small area there, have the smallest expected variance. Where two
+    stations meet, their triangles overlap by less than one triangle. Every pixel centre has a surface if any station has
+    one there.
 
     Parameters
     ----------
