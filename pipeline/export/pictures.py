@@ -77,7 +77,7 @@ def save_scan(run: ExportedRun, number: int, path: Path) -> None:
     """
     if run.record["sensor"] != "tls":
         raise InputError(
-            "is a run of a stereo pair, whose points are all recorded at once, so there is no scan to animate",
+            "this is a run of a stereo pair, whose points are all recorded at once, so there is no scan to animate",
             where=str(run.folder),
             allowed="a run of a laser scanner",
             remedy="export `epochs` or `picture` instead",

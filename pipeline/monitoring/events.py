@@ -47,6 +47,9 @@ _ISLAND = 0.3
 """Share of the largest part of a mask below which another part is no part of the outline."""
 _EDGE_PX = 5
 """Side of the square about a pixel in which an edge of the rock would be spread."""
+_NOISE_LEVELS, _NOISE_SHARE = 2.0, 0.35
+"""Times the level of detection, and share of the region's largest depth: a pixel below both is noise beside the region, over
+which it grew, and not part of the outline."""
 _EDGE_SHARE = 0.35
 """Share of the largest depth in that square from which a pixel belongs to the outline. A vertical face, spread over 3 x 3 pixels,
 then keeps its place, and blocks that taper off towards their outline lose about 10 % of their area."""
@@ -256,7 +259,9 @@ def _measured(mask: NDArray[np.bool_], row: int, column: int, kind: Kind, change
     rim = whole & ~ndimage.binary_erosion(whole)
     rough = _GAP_SHARE * depth[whole & ~mask].sum(), _RIM_SHARE * np.abs(depth[rim]).sum()
     deepest = ndimage.grey_dilation(np.where(whole, depth, 0.0), size=(_EDGE_PX, _EDGE_PX))
-    inner = _without_islands(whole & (depth >= _EDGE_SHARE * deepest))
+    level = _NOISE_LEVELS * change.significance.level[window][mask].astype(np.float64).mean()
+    least = min(level, _NOISE_SHARE * float(depth[whole].max()))
+    inner = _without_islands(whole & (depth >= np.maximum(_EDGE_SHARE * deepest, least)))
     rows, columns = np.nonzero(inner)
     volume = float(depth[whole].sum()) * gsd**2
     volume_std = float(np.sqrt((noise(mask) * pixels) ** 2 + rough[0] ** 2 + rough[1] ** 2)) * gsd**2

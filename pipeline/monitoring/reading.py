@@ -218,18 +218,18 @@ def find_epochs(paths: Sequence[Path], times: Sequence[str] = ()) -> list[EpochS
         raise InputError(
             f"only {len(found)} epoch is given",
             where="EPOCH",
-            allowed="two and more",
+            allowed="two epochs or more",
             remedy="give at least two epochs, the reference first",
         )
     if times and len(times) != len(found):
         raise InputError(
-            f"contains {len(times)} times for {len(found)} epochs", where="--times", remedy="give one time for each epoch"
+            f"{len(times)} times are given for {len(found)} epochs", where="--times", remedy="give one time for each epoch"
         )
     seen: dict[Path, str] = {}
     for source in found:
         for file in source.files:
             if (real := file.resolve()) in seen:
-                raise InputError("is given twice", where=str(file), remedy="name each epoch once")
+                raise InputError("the epoch is given twice", where=str(file), remedy="name each epoch once")
             seen[real] = source.name
     timed = [
         EpochSource(source.path, source.files, time_of(source.path if source.run is None else source.files[0], given), source.run)
@@ -253,7 +253,7 @@ def read_epoch(source: EpochSource, options: MonitorOptions) -> EpochData:
         return parts[0]
     if any(part.mesh is not None for part in parts):
         raise InputError(
-            "contains a mesh or an elevation model beside scans, which cannot be joined",
+            "the folder contains a mesh or an elevation model beside scans, which cannot be joined",
             where=str(source.path),
             allowed="scans only, or one mesh",
             remedy="move the mesh or the elevation model to a folder of its own",
@@ -299,9 +299,9 @@ def _sampled(files: tuple[Path, ...], unit: str | None) -> EpochData:
         count += len(chunk)
     if first is None:
         raise InputError(
-            "contains no points but those flagged as withheld, synthetic or noise",
+            "the file contains no points but those flagged as withheld, synthetic or noise",
             where=str(files[0]),
-            remedy="export it again, with its points, or clear these flags",
+            remedy="export the file again, with its points, or clear these flags",
         )
     bounds = bounding_box(np.concatenate(boxes))
     large = LargeFiles(files, unit, count, first, bounds, tuple(kept))
@@ -325,7 +325,7 @@ def _sources(path: Path) -> list[EpochSource]:
     files = tuple(epoch_files(path))
     if not files:
         raise InputError(
-            "contains no scan",
+            "the folder contains no scan",
             where=str(path),
             allowed=f"files of scans ({', '.join(_ANY)}), or a run of simulate",
             remedy="copy the scans into this folder, or name another one",
@@ -337,12 +337,14 @@ def _epochs_of_run(folder: Path) -> list[EpochSource]:
     record = read_run(folder / RUN_FILE, "make the run again with scarpsim simulate")
     if not record.get("wall_frame"):
         raise InputError(
-            "does not state its wall frame", where=str(folder / RUN_FILE), remedy="make the run again with scarpsim simulate"
+            "the run does not state its wall frame",
+            where=str(folder / RUN_FILE),
+            remedy="make the run again with scarpsim simulate",
         )
     epochs = sorted(each for each in folder.glob("epoch_*") if (each / "points.laz").is_file())
     if not epochs:
         raise InputError(
-            "is a run without a finished epoch", where=str(folder), remedy="finish the run with scarpsim simulate --resume"
+            "this is a run without a finished epoch", where=str(folder), remedy="finish the run with scarpsim simulate --resume"
         )
     return [EpochSource(each, (each / "points.laz",), EpochTime(None, ""), record) for each in epochs]
 

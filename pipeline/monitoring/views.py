@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.registration.rigid import RigidTransform
+from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 
 MOST_VIEWS = 6
@@ -95,7 +96,7 @@ def divided(points: FloatArray, towards: FloatArray, main: FloatArray, count: in
     """
     if count == 1:
         return None
-    patches = points[:: max(len(points) // _PATCHES, 1)]
+    patches = _spread(points)
     normals, neighbours = _normals(patches, towards)
     if count is None and _share_beyond(normals @ main, _STEEP_DEG) <= _MUCH:
         return None
@@ -113,6 +114,14 @@ def divided(points: FloatArray, towards: FloatArray, main: FloatArray, count: in
     return _in_cells(patches, label, directions)
 
 
+def _spread(points: FloatArray) -> FloatArray:
+    """Return a random subset of the points: every n-th of a raster or of scan lines may be a few columns of it."""
+    if len(points) <= _PATCHES:
+        return points
+    random = KeyedRandom(0).child("monitor", "views").generator()
+    return points[np.unique(random.integers(0, len(points), _PATCHES))]
+
+
 def _normals(patches: FloatArray, towards: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
     """(n, 3) unit normals towards the outer side of planes through neighbouring patches, and (n, k) those neighbours."""
     from scipy.spatial import cKDTree
@@ -121,8 +130,34 @@ def _normals(patches: FloatArray, towards: FloatArray) -> tuple[FloatArray, NDAr
     local = patches[neighbours] - patches[neighbours].mean(axis=1, keepdims=True)
     _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))
     normals = vectors[:, :, 0]
-    outward = np.einsum("ni,ni->n", normals, towards - patches) >= 0
-    return np.where(outward[:, None], normals, -normals), neighbours
+    return _outward(normals, neighbours, towards - patches), neighbours
+
+
+def _outward(normals: FloatArray, neighbours: NDArray[np.int64], to: FloatArray) -> FloatArray:
+    """Turn the normals (n, 3) of patches to the outer side, of which the vectors `to` (n, 3) only tell most.
+
+    Rough patches of a part that lies nearly along these vectors face away from them. So each patch first takes the side of the
+    neighbour that is most nearly parallel (Hoppe et al. 1992, "Surface reconstruction from unorganized points", section 3.3),
+    and a connected surface then the side that most of it has.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+
+    count, near = neighbours.shape
+    one, other = np.repeat(np.arange(count), near - 1), neighbours[:, 1:].ravel()
+    unlike = 1.0 - np.abs(np.einsum("ni,ni->n", normals[one], normals[other])) + 1e-6
+    tree = minimum_spanning_tree(coo_array((unlike, (one, other)), shape=(count, count)).tocsr())
+    parts, part = connected_components(tree, directed=False)
+    found = normals.copy()
+    for number in range(parts):
+        first = int(np.flatnonzero(part == number)[0])
+        order, before = breadth_first_order(tree, first, directed=False)
+        for patch in order[1:]:
+            if found[patch] @ found[before[patch]] < 0:
+                found[patch] *= -1
+        if np.einsum("ni,ni->n", found[order], to[order] / np.linalg.norm(to[order], axis=1, keepdims=True)).sum() < 0:
+            found[order] *= -1
+    return found
 
 
 def _share_beyond(cosines: FloatArray, angle_deg: float) -> float:

@@ -68,7 +68,7 @@ def open_results(folder: Path, detections: Path | None = None) -> Results:
     if (folder / "annotations.json").exists():
         return TileResults(folder)
     raise InputError(
-        "contains no results that can be shown",
+        "the folder contains no results that can be shown",
         where=str(folder),
         allowed="a run (run.json), a result of scarpsim gap (gap.json) or monitor (monitor.json), "
         "a split of a data set (annotations.json)",

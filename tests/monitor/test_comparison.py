@@ -8,10 +8,10 @@ from monitor_cases import HEIGHT_M, WIDTH_M, depth
 
 from pipeline.monitoring.alignment import RasterPair, applied, refine
 from pipeline.monitoring.comparison import ReferenceHeights, compare_epoch
-from pipeline.monitoring.events import Catalogue
+from pipeline.monitoring.events import Catalogue, Change, find_regions
 from pipeline.monitoring.gridding import WallPoints, gridded
 from pipeline.monitoring.magnitude import fit_power_law
-from pipeline.monitoring.significance import significance
+from pipeline.monitoring.significance import Significance, significance
 from pipeline.registration.rigid import RigidTransform
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
@@ -106,6 +106,21 @@ def test_a_change_of_a_few_pixels_is_no_event() -> None:
     points[stray, 2] += 0.3
     found = compare_epoch(ReferenceHeights.of(cloud(1), [GRID]), WallPoints.of(points), None, 1).regions
     assert [round(each.x_m) for each in found] == [4]
+
+
+def test_noise_beside_a_niche_is_no_part_of_its_outline() -> None:
+    """A niche of 6 x 6 pixels, 0.2 m deep, and a trail of noise, 1.2 levels of detection, that leads away from its corner."""
+    raster = gridded(wall(1), GRID)
+    difference = np.zeros(GRID.shape, dtype=np.float32)
+    difference[50:56, 60:66] = 0.2
+    for step in range(12):
+        difference[55 + step, 65 + step : 68 + step] = np.maximum(difference[55 + step, 65 + step : 68 + step], 0.006)
+    level = np.full(GRID.shape, 0.005, dtype=np.float32)
+    noise = Significance(level, np.array([1.0, 63.0]), np.array([1.0, 1.0 / 63.0]))
+    (region,) = find_regions(Change(difference, noise, np.full_like(difference, 1e-4), raster, raster))
+    assert region.area_m2 == pytest.approx(36 * GRID.gsd**2)
+    assert (region.width_m, region.height_m) == pytest.approx((6 * GRID.gsd, 6 * GRID.gsd))
+    assert region.x_m == pytest.approx(GRID.x_min + 63 * GRID.gsd)
 
 
 def test_nothing_is_found_where_nothing_fell() -> None:

@@ -129,6 +129,26 @@ def test_a_wall_without_a_corner_has_one_view() -> None:
     assert divided(wall, np.array([0.0, -50.0, 0.0]), np.array([0.0, -1.0, 0.0]), None) is None
 
 
+def test_points_in_the_order_of_a_raster_have_one_view() -> None:
+    """A rough elevation model whose every eighth height lies in every eighth column."""
+    x, y = np.meshgrid(0.1 * np.arange(200), 0.1 * np.arange(120))
+    z = 0.3 * np.sin(2 * x) * np.cos(2 * y) + 0.1 * np.sin(9 * x + 7 * y)
+    heights = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
+    assert divided(heights, np.array([10.0, 6.0, 100.0]), np.array([0.0, 0.0, 1.0]), None) is None
+
+
+def test_a_rough_face_is_whole_from_a_place_nearly_in_its_plane() -> None:
+    """The face x = 0 is rough, and the place stands at 6 degrees to it: all of it faces +x, as its mean does."""
+    points = corner(1)
+    face = points[:, 0] < 1.0
+    points[face, 0] += 0.3 * np.sin(3 * points[face, 1]) * np.cos(2.5 * points[face, 2])
+    found = divided(points, np.array([4.0, -40.0, 4.0]), np.array([0.0, -1.0, 0.0]), None)
+    assert found is not None
+    far = np.flatnonzero(face & (points[:, 1] < -2.5))
+    facing = found.directions[found.of(points[far])] @ np.array([1.0, 0.0, 0.0])
+    assert (facing > 0.5).mean() > 0.97
+
+
 def test_the_number_of_views_can_be_given(tmp_path: Path) -> None:
     files = [las(tmp_path / "a.las", corner(1)), las(tmp_path / "b.las", corner(2))]
     one = monitor_paths(files, tmp_path / "one", MonitorOptions(position=STATION, views=1))
