@@ -108,10 +108,10 @@ def _folder_of_monitoring(arguments: argparse.Namespace, given: Path, out: Path)
     for name in ("reference", "unit", "reference_unit", "columns", "cameras", "photographs", "pair", "scan"):
         if getattr(arguments, name):
             raise InputError(
-                "cannot be combined with a folder of scarpsim monitor, which knows its files",
+                "the option cannot be combined with a folder of scarpsim monitor, which knows its files",
                 where=f"--{name.replace('_', '-')}",
                 allowed="--scanner, --model and --position",
-                remedy="leave it out, or give the raw scans instead of the folder",
+                remedy="leave the option out, or give the raw scans instead of the folder",
             )
     empty_folder(out)
     found = build_from_monitoring(given, out, scanner=arguments.scanner, model=arguments.model, position=arguments.position)

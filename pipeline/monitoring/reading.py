@@ -272,9 +272,9 @@ def read_laser_scans(source: EpochSource, options: MonitorOptions) -> list[RawSc
     """
     if source.is_surface:
         raise InputError(
-            "is a mesh or an elevation model, but the points of a laser scanner are needed",
+            "the file is a mesh or an elevation model, but the points of a laser scanner are needed",
             where=source.name,
-            remedy="run scarpsim monitor on the scans that it was made from",
+            remedy="run scarpsim monitor on the scans that the mesh or model was made from",
         )
     if source.run is None:
         return [scan for file in source.files for scan in read_scans(file, options.unit, options.columns)]
