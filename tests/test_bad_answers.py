@@ -49,7 +49,7 @@ CAMERA = Camera(1000, 800, 1000.0, *[0.0] * 10, position=np.zeros(3), rotation=n
     ("values", "nodata", "words"),
     [
         (np.zeros((4, 5), np.complex64), "nan", "complex64"),
-        (np.zeros((4, 5), np.float32), "none", "states 'none' for missing data"),
+        (np.zeros((4, 5), np.float32), "none", "states 'none' as its value for missing data"),
         (np.full((4, 5), 1e300), "nan", "infinite or huge"),
     ],
 )

@@ -335,11 +335,11 @@ def _table(values: ArrayLike, name: str, rows: int | None = None) -> Any:
     array = np.asarray(values, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3 or not len(array) or (rows is not None and len(array) != rows):
         raise InputError(
-            f"have the shape {array.shape}",
+            f"the array has the shape {array.shape}",
             where=name,
             allowed=f"({'n' if rows is None else rows}, 3)",
             remedy="give an array of rows x, y, z",
         )
     if not np.isfinite(array).all():
-        raise InputError("contains values that are NaN or infinite", where=name, remedy="remove these rows")
+        raise InputError("the array contains values that are NaN or infinite", where=name, remedy="remove these rows")
     return array

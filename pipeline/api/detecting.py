@@ -154,7 +154,7 @@ def _several(maps: Any) -> list[Any]:
     found = list(maps) if isinstance(maps, list | tuple) else [maps]
     found = [part for each in found for part in (list(each) if _is_array(each) and each.ndim == 3 else [each])]
     if not found:
-        raise InputError("got no map", where="detect", remedy="give at least one difference map or run")
+        raise InputError("no map is given", where="detect", remedy="give at least one difference map or run")
     return found
 
 

@@ -79,7 +79,7 @@ def raster_of(array: Any, where: str) -> tuple[NDArray[np.float32], Grid]:
     """
     if set(array.dims) != {"y", "x"}:
         raise InputError(
-            f"has the dimensions {', '.join(map(str, array.dims))}",
+            f"the map has the dimensions {', '.join(map(str, array.dims))}",
             where=where,
             allowed="y, x",
             remedy="give a two-dimensional map with the dimensions y and x",
@@ -87,12 +87,14 @@ def raster_of(array: Any, where: str) -> tuple[NDArray[np.float32], Grid]:
     array = array.sortby("y", ascending=False).sortby("x").transpose("y", "x")
     x, y = (np.asarray(array[name], dtype=np.float64) for name in ("x", "y"))
     if min(len(x), len(y)) < 2:
-        raise InputError(f"has {len(y)} x {len(x)} pixels", where=where, allowed="at least 2 x 2", remedy="give a larger map")
+        raise InputError(
+            f"the map has {len(y)} x {len(x)} pixels", where=where, allowed="at least 2 x 2", remedy="give a larger map"
+        )
     steps = np.concatenate([np.diff(x), -np.diff(y)])
     gsd = float(np.median(steps))
     if not (gsd > 0 and np.ptp(steps) <= _SPREAD * gsd):
         raise InputError(
-            f"has pixels of {steps.min():g} to {steps.max():g} m",
+            f"the map has pixels with sides of {steps.min():g} to {steps.max():g} m",
             where=where,
             allowed="square pixels of one size",
             remedy="resample the map with xarray's array.interp to equal steps in x and y",

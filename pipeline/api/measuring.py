@@ -99,7 +99,7 @@ def measure(
         return Measurement(read_measurement(Path(given)))
     if reference is None or points is None:
         raise InputError(
-            "got neither a folder nor both reference and points",
+            "neither a folder nor both reference and points are given",
             where="measure",
             remedy="give the folder of a measurement, or both reference= and points=",
         )
@@ -108,7 +108,7 @@ def measure(
     pair = nominal_pair(Path(cameras)) if isinstance(cameras, str | os.PathLike) else cameras
     if sensor == "stereo" and not isinstance(pair, CameraPair | None):
         raise InputError(
-            f"got {type(pair).__name__}",
+            f"the argument is of the type {type(pair).__name__}",
             where="cameras",
             allowed="a CameraPair, a file, or None if unknown",
             remedy="give one of them as cameras=",
@@ -372,7 +372,7 @@ def _clouds(points: Any) -> dict[str, PointCloud]:
         array = np.asarray(each, dtype=np.float64)
         if array.ndim != 2 or array.shape[1] != 3 or not len(array):
             raise InputError(
-                f"have the shape {array.shape}", where=name, allowed="(n, 3)", remedy="give an array of rows x, y, z"
+                f"the array has the shape {array.shape}", where=name, allowed="(n, 3)", remedy="give an array of rows x, y, z"
             )
         found[name] = PointCloud(array)
     return found

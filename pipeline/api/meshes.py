@@ -50,21 +50,21 @@ class Mesh(TriangleMesh):
         for name, array in (("vertices", corners), ("faces", triangles)):
             if array.ndim != 2 or array.shape[1] != 3 or not len(array):
                 raise InputError(
-                    f"have the shape {array.shape}",
+                    f"the array has the shape {array.shape}",
                     where=name,
                     allowed="(n, 3)",
                     remedy="give an array with the three columns x, y and z, in m",
                 )
         if triangles.dtype.kind not in "iu" or triangles.min() < 0 or triangles.max() >= len(corners):
             raise InputError(
-                "are not all indices of vertices",
+                "the faces contain numbers that are not indices of vertices",
                 where="faces",
                 allowed=f"whole numbers from 0 to {len(corners) - 1}",
                 remedy="correct the faces; vertices are counted from 0",
             )
         if not np.isfinite(corners).all():
             raise InputError(
-                "contain values that are NaN or infinite",
+                "the vertices contain values that are NaN or infinite",
                 where="vertices",
                 remedy="remove these vertices and the faces that use them",
             )

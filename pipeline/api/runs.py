@@ -109,7 +109,7 @@ class Run:
     def _files(self) -> RunFiles:
         if not (self.folder / RUN_FILE).exists():
             raise InputError(
-                f"is not the folder of a run, because it contains no {RUN_FILE}",
+                f"this is not the folder of a run, because it contains no {RUN_FILE}",
                 where=str(self.folder),
                 remedy="give the folder that scarpsim simulate wrote",
             )
@@ -230,7 +230,7 @@ class Epoch:
         if not path.is_file():
             kinds = [name for name in PICTURES if (self.run.folder / f"{name}_{self.number:03d}{suffix}").is_file()]
             raise InputError(
-                f"epoch {self.number} has no '{kind}'",
+                f"epoch {self.number} has no file of the kind '{kind}'",
                 where=str(self.run.folder),
                 allowed=", ".join(kinds) or "none",
                 remedy="choose one of these products, or simulate with it (`products` in the config)",

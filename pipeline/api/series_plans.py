@@ -122,7 +122,7 @@ class SeriesForecast:
         promises = {each.scans: each for each in self.promise.promises}
         if scans not in promises:
             raise InputError(
-                f"got {scans}",
+                f"the number of scans in an epoch is {scans}",
                 where="scans",
                 allowed=", ".join(map(str, promises)),
                 remedy="choose one of these numbers of scans",

@@ -20,6 +20,7 @@ from pipeline.calibration.greedy import GreedyResult, greedy_search
 from pipeline.calibration.inputs import CalibrationInputs, read_inputs
 from pipeline.calibration.parameters import Model, NoiseParameters, noise_parameters
 from pipeline.calibration.search import OBSERVATION_S, NoiseSearch, SearchResult, cost_of_new_simulations
+from pipeline.calibration.single_ranges import SingleRanges
 from pipeline.calibration.summary_statistics import SummaryStatistics
 from pipeline.calibration.window_simulator import WindowSimulator
 from pipeline.calibration.windows import Windows
@@ -118,6 +119,7 @@ class CalibrationResult:
     rate : Simulated measurements of the wall (observations) per second.
     cells : Number of depth-map pixels or laser pulses that each simulated observation traces.
     seconds : Duration of the whole calibration, s.
+    single_ranges : Scatter of single ranges beside the fitted noise, for points of a laser scanner; else None.
     """
 
     config: SimulationConfig
@@ -138,6 +140,7 @@ class CalibrationResult:
     rate: float
     cells: int
     seconds: float
+    single_ranges: SingleRanges | None = None
 
     @property
     def confidence(self) -> float:
@@ -270,6 +273,7 @@ def calibrate_inputs(
         rate=rate,
         cells=len(simulator.cells),
         seconds=time.perf_counter() - began,
+        single_ranges=SingleRanges.of(inputs.measurement, fitted.model(np.exp(found.x))),
     )
 
 

@@ -54,6 +54,7 @@ class CalibrationInputs:
     of_points : True if a pixel's value is the mean distance of the points in it from the reference surface; false if it
         is the difference between two reconstructed surfaces.
     reference_error : Error of a reference surface that is made of points; None if it is unknown or zero.
+    measurement : The measured points, if a pixel is a mean of points; else None.
     """
 
     names: tuple[str, ...]
@@ -64,6 +65,7 @@ class CalibrationInputs:
     site: SensorSite
     of_points: bool
     reference_error: ReferenceError | None = None
+    measurement: Measurement | None = None
 
     def windows(self, config: SimulationConfig) -> Windows:
         """Choose the windows, square parts of the maps on stable ground, in which measured and simulated maps are compared.
@@ -149,15 +151,15 @@ def read_inputs(paths: Sequence[Path], config: SimulationConfig, sensor: SensorN
     measured, names = _maps(paths, config, random)
     _check_noise(measured.maps, names)
     of_points = bool(measured.points)
-    if of_points:
-        measurement = read_measurement(paths[0])
+    measurement = read_measurement(paths[0]) if of_points else None
+    if measurement is not None:
         site, error = _measured_site(measurement, config), ReferenceError.of(measurement)
     else:
         site, error = prepare_site(config, sensor, random), None
     areas = config.calibration.stable_areas
     drawn = area_mask(areas, measured.grid) if areas else measured.stable
     stable = _covered(measured.maps, of_points) & (stable_ground(list(measured.maps)) if drawn is None else drawn)
-    return CalibrationInputs(names, measured.grid, measured.maps, stable, drawn is not None, site, of_points, error)
+    return CalibrationInputs(names, measured.grid, measured.maps, stable, drawn is not None, site, of_points, error, measurement)
 
 
 def _maps(paths: Sequence[Path], config: SimulationConfig, random: KeyedRandom) -> tuple[MeasuredMaps, tuple[str, ...]]:

@@ -150,7 +150,7 @@ def _bounds(base: Model, name: str) -> tuple[float, float]:
             raise InputError(
                 "the model has no orientation noise to scale: the standard deviations of all camera angles and positions are 0",
                 where="calibration.fit",
-                remedy="remove orientation there, or use a model with such noise, for example --set sensor=glendale_high",
+                remedy="remove orientation from this list, or use a model with this noise, such as --set sensor=glendale_high",
             )
         return _BOUNDS[name]
     sigma = getattr(base.noise.orientation, name.removeprefix(f"{ORIENTATION}.")).sigma
@@ -158,6 +158,6 @@ def _bounds(base: Model, name: str) -> tuple[float, float]:
         raise InputError(
             f"the sigma of {name} is 0 in the model, so the bounds for fitting it are unknown",
             where="calibration.fit",
-            remedy="give it a sigma in the sensor model, or remove it from calibration.fit",
+            remedy="give this parameter a sigma above 0 in the sensor model, or remove it from calibration.fit",
         )
     return _OF_SIGMA[0] * sigma, _OF_SIGMA[1] * sigma

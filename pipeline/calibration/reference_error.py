@@ -11,6 +11,11 @@ from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray, barycentric
 from scene.ray_casting.raycast import RayCaster
 
+_SAMPLE, _REPEATED = 5_000, 0.85
+"""Points whose place in their triangle is looked at, and the median of their largest barycentric weight above which they lie at
+vertices; it is about 0.6 where points lie anywhere.
+"""
+
 
 @dataclass(frozen=True)
 class ReferenceError:
@@ -22,12 +27,15 @@ class ReferenceError:
     shared : Whether errors are shared within a triangle. True: a vertex has one error, and the surface between three
         vertices interpolates theirs, as if the vertices are noisy. False: each compared point has an error of its own, as
         if the mesh misses relief of the rock between its vertices.
+    repeated : Whether the points lie in the directions of the vertices, as where later scans repeat those of the reference. A
+        point then has the error of the nearest vertex.
     eye : (3,) position of the sensor, wall frame, m.
     """
 
     sigma_m: float
     shared: bool
     eye: FloatArray
+    repeated: bool = False
 
     @classmethod
     def of(cls, measurement: Measurement) -> ReferenceError | None:
@@ -37,7 +45,9 @@ class ReferenceError:
         """
         if not isinstance(measurement, TlsMeasurement) or not measurement.reference_error_m:
             return None
-        return cls(measurement.reference_error_m, not measurement.error_is_relief, measurement.viewpoint)
+        return cls(
+            measurement.reference_error_m, not measurement.error_is_relief, measurement.viewpoint, _at_vertices(measurement)
+        )
 
     def moved(self, points: FloatArray, wall: RayCaster, random: KeyedRandom) -> FloatArray:
         """Shift points along their rays so that their distances from the reference surface contain its simulated errors.
@@ -61,9 +71,23 @@ class ReferenceError:
         distance, face = wall.cast(self.eye, np.nan_to_num(ray, nan=1.0))
         corners = wall.mesh.faces[np.maximum(face, 0)]
         weight = barycentric(self.eye + distance[:, None] * ray, wall.mesh.vertices[corners])
+        if self.repeated:
+            weight = (weight == weight.max(axis=1, keepdims=True)).astype(np.float64)
         drawn = random.generator()
         if self.shared:
             off = np.sum(weight * drawn.standard_normal(len(wall.mesh.vertices))[corners], axis=1)
         else:
             off = np.linalg.norm(weight, axis=1) * drawn.standard_normal(len(points))
         return points - np.where(face >= 0, self.sigma_m * off, 0.0)[:, None] * ray
+
+
+def _at_vertices(measurement: TlsMeasurement) -> bool:
+    """Return whether most points of a measurement lie in the directions of the reference's vertices."""
+    points = measurement.cloud.points[:: max(len(measurement.cloud.points) // _SAMPLE, 1)]
+    ray = points - measurement.viewpoint
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    distance, face = measurement.scene.cast(measurement.viewpoint, ray)
+    hit = face >= 0
+    corners = measurement.reference.vertices[measurement.reference.faces[face[hit]]]
+    weight = barycentric(measurement.viewpoint + distance[hit, None] * ray[hit], corners)
+    return bool(hit.any() and np.median(weight.max(axis=1)) > _REPEATED)

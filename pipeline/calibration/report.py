@@ -46,6 +46,7 @@ def summary(result: CalibrationResult) -> str:
     found = result.found
     lines = [f"{_maps(len(result.epochs))} of a {_INSTRUMENTS[result.sensor]}"]
     lines += [f"  {name:<26}{text}" for name, text in _values(result)]
+    lines += [f"  {result.single_ranges.words}"] if result.single_ranges is not None else []
     lines += [f"  {warning}" for warning in warnings(result)]
     lines.append(f"  {found.maps:,} simulated maps, {result.rate:.1f} observations a second, {result.seconds:.0f} s in all")
     return "\n".join(lines)
@@ -154,6 +155,7 @@ def write_calibration_report(path: Path, result: CalibrationResult, shown: Pictu
         title=f"Noise of a {_INSTRUMENTS[result.sensor]}, calibrated",
         answer=_answer(result),
         summary=_sentence(result),
+        single_ranges=None if result.single_ranges is None else result.single_ranges.words,
         warnings=warnings(result),
         tables=_tables(result),
         pictures=shown,

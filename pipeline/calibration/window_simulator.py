@@ -281,7 +281,7 @@ def _supported_sensor(config: SimulationConfig, site: SensorSite) -> StereoPair 
         raise InputError(
             "a calibration needs a single scanner station, but the config has several",
             where="station",
-            remedy="keep only the one that measured the maps",
+            remedy="keep only the station that measured the maps",
         )
     if config.reconstruction != "direct" or config.surface.method != "grid" or config.surface.holes != "keep":
         raise InputError(

@@ -149,6 +149,7 @@ def to_dict(result: CalibrationResult) -> dict[str, Any]:
             "cells_per_observation": result.cells,
             "seconds": result.seconds,
         },
+        "single_ranges": None if result.single_ranges is None else result.single_ranges.to_dict(),
         "greedy": None if result.baseline is None else _baseline(result, result.baseline),
     }
 

@@ -75,7 +75,7 @@ def raster_grid(bounds: FloatArray, config: DifferenceConfig) -> Grid:
         raise InputError(
             f"pixels of {config.gsd_m:g} m would take {pixels:.3g} pixels and "
             f"{pixels * _BYTES_PER_PIXEL / 1e9:,.0f} GB of memory, "
-            f"{available / 1e9:.1f} GB are free",
+            f"but only {available / 1e9:.1f} GB are free",
             where="difference.gsd_m",
             allowed=allowed,
             remedy="choose a larger gsd_m",

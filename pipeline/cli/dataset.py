@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> CommandOutput:
     """Make, verify, merge or split a data set of annotated difference map tiles."""
     if arguments.workers and arguments.scheduler:
-        raise InputError("cannot be combined", where="--workers and --scheduler", remedy="give one of them")
+        raise InputError("the two options cannot be combined", where="--workers and --scheduler", remedy="give only one of them")
     action, *folders = arguments.words
     for option, given, goes_with in (
         ("--by", arguments.by is not None, "split"),
@@ -60,7 +60,7 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
     ):
         if given and action != goes_with:
             raise InputError(
-                f"works only with {goes_with}, not with '{action}'",
+                f"the option works only with scarpsim dataset {goes_with}, not with '{action}'",
                 where=option,
                 remedy=f"write scarpsim dataset {goes_with} DIR, or leave the option out",
             )
@@ -140,7 +140,7 @@ def _single_folder(folders: list[str], action: str) -> Path:
     """Return the only folder in a list; raise InputError if there are none or several."""
     if len(folders) != 1:
         raise InputError(
-            f"takes one folder, got {len(folders)}",
+            f"the command takes one folder, but got {len(folders)}",
             where=f"scarpsim dataset {action}",
             remedy="give one folder, and run the command once for each",
         )
@@ -150,7 +150,7 @@ def _single_folder(folders: list[str], action: str) -> Path:
 def _output_folder(arguments: argparse.Namespace) -> Path:
     """Return the folder given with --out; raise InputError without one."""
     if arguments.out is None:
-        raise InputError("needs a folder for the results", where="scarpsim dataset", remedy="add --out DIR")
+        raise InputError("the command needs a folder for the results", where="scarpsim dataset", remedy="add --out DIR")
     return Path(arguments.out)
 
 

@@ -76,12 +76,17 @@ def _check_options(arguments: argparse.Namespace) -> None:
     for option, forms in allowed.items():
         if getattr(arguments, option) is not None and arguments.form not in forms:
             raise InputError(
-                f"the option works only with {', '.join(forms)}", where=f"--{option.replace('_', '-')}", remedy="leave it out"
+                f"the option works only with {', '.join(forms)}",
+                where=f"--{option.replace('_', '-')}",
+                remedy="leave the option out",
             )
     suffix = _SUFFIXES.get(arguments.form)
     if suffix and arguments.out is not None and not arguments.out.name.lower().endswith(suffix):
         raise InputError(
-            f"got '{arguments.out.name}'", where="--out", allowed=suffix, remedy="choose a file name with this ending"
+            f"the file name '{arguments.out.name}' has another ending",
+            where="--out",
+            allowed=suffix,
+            remedy="choose a file name with this ending",
         )
 
 

@@ -85,7 +85,7 @@ def _measurement_folder(arguments: argparse.Namespace, out: Path) -> Path:
         return given[0]
     if not arguments.reference:
         raise InputError(
-            "is a raw file, and no reference is given to compare it with",
+            "this is a raw file, and no reference is given to compare it with",
             where=str(given[0]),
             remedy="add --reference (a mesh, a cloud or the word half) and --scanner, or --photographs for a cloud from "
             "photographs without cameras; or give the folder of a measurement",
@@ -108,10 +108,10 @@ def _folder_of_monitoring(arguments: argparse.Namespace, given: Path, out: Path)
     for name in ("reference", "unit", "reference_unit", "columns", "cameras", "photographs", "pair", "scan"):
         if getattr(arguments, name):
             raise InputError(
-                "cannot be combined with a folder of scarpsim monitor, which knows its files",
+                "the option cannot be combined with a folder of scarpsim monitor, which knows its files",
                 where=f"--{name.replace('_', '-')}",
                 allowed="--scanner, --model and --position",
-                remedy="leave it out, or give the raw scans instead of the folder",
+                remedy="leave the option out, or give the raw scans instead of the folder",
             )
     empty_folder(out)
     found = build_from_monitoring(given, out, scanner=arguments.scanner, model=arguments.model, position=arguments.position)
@@ -152,7 +152,7 @@ def _identifiability(arguments: argparse.Namespace, out: Path) -> CommandOutput:
 
     if len(arguments.measurement) > 1:
         raise InputError(
-            f"got {len(arguments.measurement)} inputs",
+            f"the option takes one input, but got {len(arguments.measurement)}",
             where="--identifiability",
             allowed="one",
             remedy="give one measurement or config",

@@ -72,10 +72,10 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
 
     if not 0 <= arguments.offset_m <= MOST_OFFSET_M:
         raise InputError(
-            f"got {arguments.offset_m:g}",
+            f"the offset is {arguments.offset_m:g} m",
             where="--offset-m",
             allowed=f"0 to {MOST_OFFSET_M:g} m",
-            remedy="give a length in metres",
+            remedy="give a length in this range",
         )
     out = empty_folder(arguments.out or new_folder(Path("runs"), "icp_study"))
     with shown_progress(quiet=arguments.quiet) as progress:

@@ -39,9 +39,9 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
     out = arguments.out
     if arguments.dataset and (arguments.site or arguments.scanner or arguments.mesh or arguments.cameras):
         raise InputError(
-            "cannot be combined with --site, --scanner, --mesh or --cameras",
+            "the option cannot be combined with --site, --scanner, --mesh or --cameras",
             where="--dataset",
-            remedy="leave it out, or name the sites of the walls in the data set's config",
+            remedy="leave --dataset out, or name the sites of the walls in the data set's config",
         )
     kind = "dataset" if arguments.dataset else "simulation"
     meshes = [_relative_to_config(out, path) for path in arguments.mesh or ()]
@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
         with out.open("x", encoding="utf-8") as file:
             file.write(schema_line(kind) + text)
     except FileExistsError:
-        raise InputError("exists already", where=str(out), remedy="choose another name with --out") from None
+        raise InputError("the file exists already", where=str(out), remedy="choose another name with --out") from None
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(
             "there is no such folder", where=str(out.parent), remedy="create this folder first, or choose another one with --out"

@@ -114,7 +114,7 @@ def build_measurement_folder(arguments: argparse.Namespace, scans: list[Path], o
     empty_folder(out)
     request = _request(arguments, scans)
     if arguments.cameras and arguments.photographs:
-        raise InputError("cannot be combined with --cameras", where="--photographs", remedy="leave one of them out")
+        raise InputError("the option cannot be combined with --cameras", where="--photographs", remedy="leave one of them out")
     if arguments.photographs:
         return build_surface(request, out)
     return build_stereo(request, arguments.cameras, arguments.pair, out) if arguments.cameras else build(request, out)
@@ -126,7 +126,7 @@ def _request(arguments: argparse.Namespace, scans: list[Path]) -> Request:
 
     if arguments.reference is None:
         raise InputError(
-            "is missing",
+            "the option is missing",
             where="--reference",
             remedy="give a mesh, a cloud or another epoch, or the word half: half of the points then serve as reference",
         )

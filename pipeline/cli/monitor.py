@@ -121,7 +121,7 @@ def _options(arguments: argparse.Namespace) -> MonitorOptions:
     from pipeline.monitoring.options import MonitorOptions, read_areas
 
     if arguments.scanner and arguments.model:
-        raise InputError("cannot be combined with --model", where="--scanner", remedy="give one of them")
+        raise InputError("the option cannot be combined with --model", where="--scanner", remedy="give only one of them")
     return MonitorOptions(
         position=None if arguments.position is None else np.array(arguments.position),
         direction=None if arguments.direction is None else np.array(arguments.direction),

@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> CommandOutput:
     """Simulate a wall before and after rockfall as a sensor observes it, or continue a simulation, and write the report."""
     if arguments.resume and not arguments.out:
-        raise InputError("needs the folder of the run to continue", where="--resume", remedy="add --out DIR")
+        raise InputError("the option needs the folder of the run to continue", where="--resume", remedy="add --out DIR")
     if arguments.threads:
         _use_threads(arguments.threads)
     from pipeline.config.bundled import bundled_config, config_path

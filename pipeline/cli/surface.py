@@ -62,9 +62,11 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
     """Reconstruct a surface from a point cloud and write it as a PLY file."""
     out = arguments.out
     if out.suffix.lower() != ".ply":
-        raise InputError(f"got '{out.suffix}'", where="--out", allowed=".ply", remedy="choose a file name that ends in .ply")
+        raise InputError(
+            f"the file name ends in '{out.suffix}'", where="--out", allowed=".ply", remedy="choose a file name that ends in .ply"
+        )
     if out.exists():
-        raise InputError("exists already", where=str(out), remedy="choose another name with --out")
+        raise InputError("the file exists already", where=str(out), remedy="choose another name with --out")
     import numpy as np
 
     from pipeline.formats.meshes.ply import write_ply

@@ -73,7 +73,7 @@ def compare_sensors(
     """
     if sizes_m is not None and not 0 < sizes_m[0] <= sizes_m[1]:
         raise InputError(
-            f"the block sizes {sizes_m[0]:g} and {sizes_m[1]:g} m are not a smallest and a largest size",
+            f"{sizes_m[0]:g} m is no smallest block size above 0 for a largest size of {sizes_m[1]:g} m",
             where="--sizes-m",
             allowed="0 < smallest <= largest",
             remedy="give the smallest size first, both in metres",

@@ -101,9 +101,8 @@ def _check_given_once(names: Sequence[Given]) -> None:
             path if path.exists() or is_path(name) else _bundled(name)
         )  # Path.resolve raises at a loop of links
         if file in given:
-            as_what = "" if given[file] == name else f", as {given[file]} and as {name}"
             raise InputError(
-                f"the sensor is given twice{as_what}",
+                f"the sensor is given twice: it was already given as '{given[file]}'",
                 where=name,
                 remedy="name each sensor once; to compare two settings of one sensor, give a copy of its config file",
             )

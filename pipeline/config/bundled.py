@@ -77,7 +77,7 @@ def config_path(kind: str, given: Path) -> Path:
         return bundled_config(kind, given.name)
     except InputError as error:
         raise InputError(
-            "is no file, and no bundled config has that name",
+            "this is no file, and no bundled config has that name",
             where=str(given),
             allowed=error.allowed,
             remedy=error.remedy or "give the path of an existing config",

@@ -83,7 +83,7 @@ def _place(container: Any, part: str, name: str, where: str) -> str | int:
         return part
     if not isinstance(container, list):
         raise InputError(
-            f"'{name}' is {container!r} and has no '{part}' in it",
+            f"'{name}' is the value {container!r}, which contains no key '{part}'",
             where=where,
             remedy=f"remove '{part}' from the key, or set '{name}' as a whole",
         )

@@ -94,7 +94,7 @@ def with_preset(values: dict[str, Any]) -> dict[str, Any]:
         return values
     if not isinstance(own["preset"], str):
         raise InputError(
-            f"expected the name or the file of a scanner preset, got {own['preset']!r:.80}",
+            f"the value must be the name or the file of a scanner preset, but is {own['preset']!r:.80}",
             where="scanner.preset",
             remedy="write for example preset: riegl_vz400i",
         )

@@ -359,7 +359,7 @@ def resolved(
         raise InputError(
             f"the only sensor model is of '{config.sensor[0].sensor}', and --sensor is {sensor}",
             where=f"{path}: sensor",
-            remedy=f"add a model with `sensor: {sensor}`, or take the other --sensor",
+            remedy=f"add a model with `sensor: {sensor}`, or give the other sensor with --sensor",
         )
     return config
 

@@ -87,7 +87,7 @@ def simulation_of(config: DatasetConfig, epoch: PlannedEpoch) -> SimulationConfi
     level = config.noise[epoch.noise].of(epoch.sensor)
     if level is None:  # the config's validation excludes this
         raise InputError(
-            f"has no model for the {epoch.sensor} sensor",
+            f"the noise level has no model for the {epoch.sensor} sensor",
             where=f"noise.{epoch.noise}",
             remedy=f"add `{epoch.sensor}: {{model: ...}}`, or leave the sensor out of `sensors`",
         )
@@ -116,9 +116,9 @@ def block_count(config: DatasetConfig, size: str, grid: Grid) -> int:
     count = config.sizes[size].blocks_per_m2 * area
     if count > MOST_BLOCKS:
         raise InputError(
-            f"this gives {count:,.3g} blocks on {area:,.0f} m2",
+            f"this density gives {count:,.3g} blocks on {area:,.0f} m2",
             where=f"sizes.{size}.blocks_per_m2",
-            allowed=f"up to {MOST_BLOCKS / area:.3g}, {MOST_BLOCKS:,} blocks",
+            allowed=f"up to {MOST_BLOCKS / area:.3g} per m2, which gives {MOST_BLOCKS:,} blocks",
             remedy="lower blocks_per_m2",
         )
     return max(1, round(count))
@@ -196,11 +196,11 @@ def tile_region(split: Split, share: float, grid: Grid, config: TileConfig) -> T
     kept = round(share * columns)
     if not 0 < kept < columns:
         raise InputError(
-            f"{share:g} of {columns} columns of tiles rounds to {'none' if kept == 0 else 'all'}: the difference maps are "
-            f"{grid.width} px wide (gsd {grid.gsd:.3g} m) and a tile {config.size_px} px",
+            f"a share of {share:g} of {columns} columns of tiles rounds to {'none' if kept == 0 else 'all'}: the "
+            f"difference maps are {grid.width} px wide (gsd {grid.gsd:.3g} m) and a tile {config.size_px} px",
             where="validation_region",
             allowed="0, or a share that gives training and validation at least one column",
-            remedy="use smaller tiles, a finer gsd or a longer wall",
+            remedy="use smaller tiles (tiles.size_px), a finer difference.gsd_m or a longer wall",
         )
     boundary = (columns - kept) * step
     return TileRegion(0, boundary) if split == "train" else TileRegion(boundary, float("inf"))
@@ -220,17 +220,18 @@ def check_tiles_filled(split: Split, where: TileRegion, grid: Grid, config: Tile
     if filled >= config.minimum_valid_share and filled > 0:
         return
     wall = f"the difference maps are {grid.width} x {grid.height} px (gsd {grid.gsd:.3g} m)"
-    tile = f"a tile of {config.size_px} px {{}}, and tiles.minimum_valid_share is {config.minimum_valid_share:g}"
+    least = f"tiles.minimum_valid_share is {config.minimum_valid_share:g}"
     if whole < config.minimum_valid_share:
         raise InputError(
-            f"{wall}, which fill {tile.format(f'to {100 * whole:.0f} % at most')}",
+            f"{wall}, which fill a tile of {config.size_px} px to {100 * whole:.0f} % at most, and {least}",
             where="tiles",
             remedy="use smaller tiles (tiles.size_px), a finer difference.gsd_m or a larger wall",
         )
     columns = f"{max(min(where.end, grid.width) - where.first, 0):.0f} px"
     part = "the validation region" if split == "val" else f"what the validation region leaves to {split}"
     raise InputError(
-        f"{wall}, and {part} is {columns} wide: it fills {tile.format(f'to {100 * filled:.0f} % at most')}",
+        f"{wall}, and {part} is {columns} wide: it fills a tile of {config.size_px} px "
+        f"to {100 * filled:.0f} % at most, and {least}",
         where="validation_region",
         remedy=f"{'raise' if split == 'val' else 'lower'} validation_region, the share of the wall for validation, or use "
         "smaller tiles (tiles.size_px), a finer difference.gsd_m or a longer wall",

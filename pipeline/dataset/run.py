@@ -51,7 +51,7 @@ class Workers:
         cores = len(os.sched_getaffinity(0))
         if self.count > _MOST_WORKERS * cores:
             raise InputError(
-                f"got {self.count:,} workers",
+                f"the number of workers is {self.count:,}",
                 where="--workers",
                 allowed=f"1 to {_MOST_WORKERS * cores} here, {_MOST_WORKERS} for each of {cores} cores",
                 remedy="choose a number in this range",
@@ -148,7 +148,8 @@ def _claim(out: Path, config: DatasetConfig, command: str) -> None:
         known = read_dataset_file(out)
         if list(known["sources"]) != [source]:
             raise InputError(
-                f"the folder holds the set {known['name']} ({', '.join(known['sources'])}), but the config gives {source}",
+                f"the folder holds the set {known['name']} ({', '.join(known['sources'])}), "
+                f"but the given config makes the set {source}",
                 where=str(out),
                 remedy="use the config that the set was started with, or choose another --out",
             )
@@ -224,7 +225,7 @@ def _stages(known: dict[str, Any], source: str, folder: Path) -> list[tuple[str,
     config = parse(DatasetConfig, entry["config"], where)
     if fingerprint(config) != source:
         raise InputError(
-            f"the config of {source} was changed after its epochs were made",
+            f"the config of the set {source} was changed after its epochs were made",
             where=where,
             remedy="restore dataset.json and the files that it names from a copy, or make the set again in another folder",
         )

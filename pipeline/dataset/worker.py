@@ -89,11 +89,11 @@ def require_same_versions(entry: dict[str, Any], where: str) -> None:
     before, here = entry["versions"], package_versions()
     differ = sorted(key for key in before if key != "platform" and here.get(key) != before[key])
     if differ:
-        told = ", ".join(f"{key} {before[key]} (here {here.get(key, 'none')})" for key in differ)
+        packages_before_and_here = ", ".join(f"{key} {before[key]} (here {here.get(key, 'none')})" for key in differ)
         raise InputError(
-            f"the set was started with other versions: {told}",
+            f"the set was started with other versions of packages: {packages_before_and_here}",
             where=where,
-            remedy="use the same versions, or make the set in another folder",
+            remedy="install the earlier versions again, or make the set in another folder",
         )
 
 

@@ -23,7 +23,9 @@ class ExportedRun(RunFiles):
         found = super().record
         if len(found["epochs"]) < 2:
             raise InputError(
-                "contains no finished epoch", where=str(self.folder), remedy="continue the run with scarpsim simulate --resume"
+                "the run contains no finished epoch",
+                where=str(self.folder),
+                remedy="continue the run with scarpsim simulate --resume",
             )
         return found
 
@@ -40,7 +42,7 @@ class ExportedRun(RunFiles):
         statistics = self.record["epochs"][number].get("statistics")
         if not statistics:
             raise InputError(
-                f"has no statistics of epoch {number}",
+                f"the run has no statistics of epoch {number}",
                 where=str(self.folder / RUN_FILE),
                 remedy="continue the run with scarpsim simulate --resume",
             )

@@ -14,7 +14,7 @@ def splits_of(folder: Path) -> dict[str, Tiles]:
     splits = [split for split in SPLITS if (folder / split / "annotations.json").is_file()]
     if not splits:
         raise InputError(
-            "contains no split of a data set",
+            "the folder contains no split of a data set",
             where=str(folder),
             allowed=f"a folder with {', '.join(SPLITS)}",
             remedy="give the folder that scarpsim dataset made",

@@ -89,7 +89,7 @@ def _library() -> Any:
         import datasets
     except ImportError as error:
         raise InputError(
-            f"needs the library datasets, which does not load ({error})",
+            f"the export needs the library datasets, which does not load ({error})",
             where="export huggingface",
             remedy=how_to_install("huggingface"),
         ) from None

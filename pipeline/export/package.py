@@ -32,13 +32,15 @@ def package(folder: Path) -> dict[str, Any]:
     for path in found:
         if path.is_symlink() and not path.resolve().is_relative_to(folder.resolve()):
             raise InputError(
-                f"is a link out of the folder, to {path.resolve()}",
+                f"the path is a link out of the folder, to {path.resolve()}",
                 where=str(path),
-                remedy="replace it by the file that it points to, or remove it",
+                remedy="replace the link by the file that it points to, or remove it",
             )
     files = [path for path in found if path.is_file()]
     if not files:
-        raise InputError("contains no file", where=str(folder), remedy="give a folder with results of a scarpsim command")
+        raise InputError(
+            "the folder contains no file", where=str(folder), remedy="give a folder with results of a scarpsim command"
+        )
     return {"$schema": _PROFILE, "name": _slug(folder.resolve().name), "resources": [_resource(folder, path) for path in files]}
 
 

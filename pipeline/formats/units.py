@@ -86,8 +86,8 @@ def agreed_units(stated: AxisUnits | None, given: str | None, where: str, option
     if given is None or all(same_unit(each, METRES[given]) for each in stated.metres):
         return stated
     raise InputError(
-        f"states its unit, {stated.name}, in {stated.source}, but {option} says {unit_name(METRES[given])}", where=where,
-        remedy=f"leave out {option} if the file is right, else export it with the right coordinate system or names",
+        f"the file states its unit, {stated.name}, in {stated.source}, but {option} says {unit_name(METRES[given])}", where=where,
+        remedy=f"leave out {option} if the file is right; otherwise export it again with the right unit",
     )  # fmt: skip
 
 
@@ -111,12 +111,12 @@ def not_understood(text: str, where: str) -> str:
     text: the system as the file states it. where: name of the file, for errors. Raises InputError instead if the text names a
     foot or yard.
     """
-    problem = f"states a coordinate system that is not understood: '{text:.60}'"
+    problem = f"the file states a coordinate system that is not understood: '{text:.60}'"
     if word := re.search(r"foot|feet|yard|\bft\b|us-ft", text, re.IGNORECASE):
         raise InputError(
-            f"{problem}, and names the unit '{word[0]}'", where=where, remedy="export the file with its EPSG code or valid WKT"
+            f"{problem}, which names the unit '{word[0]}'", where=where, remedy="export the file with its EPSG code or valid WKT"
         )
-    return f"the file {problem}; its coordinates are read as metres"
+    return f"{problem}; its coordinates are read as metres"
 
 
 def units_of_crs(crs: Any, where: str) -> AxisUnits | None:
@@ -139,10 +139,10 @@ def units_of_crs(crs: Any, where: str) -> AxisUnits | None:
     """
     plane, *further = [_plain(each) for each in (crs.sub_crs_list if crs.is_compound else [_plain(crs)])]
     if plane.is_geographic:
-        problem = f"has coordinates in degrees, of the coordinate system '{crs.name}'"
+        problem = f"the file has coordinates in degrees, of the coordinate system '{crs.name}'"
         raise InputError(problem, where=where, allowed="projected coordinates", remedy=_PROJECT)
     if plane.is_geocentric:
-        problem = f"has coordinates from the Earth's centre, of the coordinate system '{crs.name}', in which z is not up"
+        problem = f"the file has coordinates from the Earth's centre, of the coordinate system '{crs.name}', in which z is not up"
         raise InputError(problem, where=where, allowed="projected coordinates", remedy=_PROJECT)
     level = [axis for axis in plane.axis_info if axis.direction not in ("up", "down")]
     upright = [axis for part in (plane, *further) for axis in part.axis_info if axis.direction in ("up", "down")]

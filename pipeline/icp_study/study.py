@@ -116,7 +116,7 @@ def surfaces_of_run(folder: Path, epochs: int) -> tuple[SimulationConfig, str, l
     path = folder / RUN_FILE
     if not path.exists():
         raise InputError(
-            f"is not the folder of a run, because it contains no {RUN_FILE}",
+            f"this is not the folder of a run, because it contains no {RUN_FILE}",
             where=str(folder),
             remedy="name a run's folder or a config file",
         )
@@ -124,11 +124,11 @@ def surfaces_of_run(folder: Path, epochs: int) -> tuple[SimulationConfig, str, l
     sensor, records = run["sensor"], [(record["epoch"], _applied(record)) for record in run.get("epochs", [])]
     if len(records) < 2:
         raise InputError(
-            "has no epoch after the reference", where=str(folder), remedy="finish the run with scarpsim simulate --resume"
+            "the run has no epoch after the reference", where=str(folder), remedy="finish the run with scarpsim simulate --resume"
         )
     if epochs >= len(records):
         raise InputError(
-            f"asks for {epochs} epochs",
+            f"the option asks for {epochs} epochs",
             where="--epochs",
             allowed=f"1 to {len(records) - 1}, as many epochs as {folder} has",
             remedy="choose a number in this range",

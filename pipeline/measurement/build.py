@@ -213,7 +213,7 @@ def _scans(request: Request) -> list[RawScan]:
     found = []
     twice = [path for number, path in enumerate(request.scans) if path in request.scans[:number]]
     if twice:
-        raise InputError(f"a file is given twice: {twice[0]}", where="SCAN", remedy="give one file for each epoch")
+        raise InputError(f"a file is given twice: {twice[0]}", where="SCAN", remedy="give another file for each epoch")
     for path in request.scans:
         each = read_scans(path, request.unit, request.columns)
         if request.number is not None:
@@ -241,7 +241,8 @@ def _stations(scans: list[RawScan], request: Request) -> list[Station]:
     for scan, station in zip(scans[1:], stations[1:], strict=True):
         if request.reference == HALF and (away := _distance_m(station, stations[0])) > _ONE_PLACE_M:
             raise InputError(
-                f"its scanner stood {away:.3g} m from that of {scans[0].name}, whose half is the reference", where=scan.name,
+                f"the scanner of this scan stood {away:.3g} m from that of {scans[0].name}, whose half is the reference",
+                where=scan.name,
                 remedy="name a mesh, a cloud or a DEM with --reference, or pick one scan of the file with --scan N",
             )  # fmt: skip
     return stations

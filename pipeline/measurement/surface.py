@@ -83,7 +83,7 @@ def _check(request: Request) -> None:
             remedy="leave out --scanner or --photographs",
         )
     if len(set(request.scans)) < len(request.scans):
-        raise InputError("a file is given twice", where="SCAN", remedy="give one file for each epoch")
+        raise InputError("a file is given twice", where="SCAN", remedy="give another file for each epoch")
 
 
 def _read(path: Path, request: Request) -> RawScan:

@@ -288,12 +288,12 @@ def _compared(pair: RasterPair, areas: StableRock | None) -> NDArray[np.bool_]:
 def _check_enough(count: int, given: bool) -> None:
     if count >= _LEAST_PIXELS:
         return
-    place = "in the stable areas" if given else "of the maps"
+    in_or_of = "in the stable areas" if given else "of the maps"
     remedy = "give larger stable areas" if given else "give epochs of the same wall, or a larger --gsd"
     raise InputError(
-        f"only {count:,} pixels {place} have data in both epochs",
+        f"only {count:,} pixels {in_or_of} have data in both epochs",
         where="registration",
-        allowed=f"at least {_LEAST_PIXELS}",
+        allowed=f"at least {_LEAST_PIXELS} pixels",
         remedy=remedy,
     )
 

@@ -70,10 +70,12 @@ def follow(
         be used is reported to `told` and left out.
     """
     if not folder.is_dir():
-        raise InputError("is not a folder", where=f"--follow {folder}", remedy="name the folder into which new scans are written")
+        raise InputError(
+            "the path is not a folder", where=f"--follow {folder}", remedy="name the folder into which new scans are written"
+        )
     if times:
         raise InputError(
-            "cannot be combined with --follow, which reads the time of each epoch from its file",
+            "the option cannot be combined with --follow, which reads the time of each epoch from its file",
             where="--times",
             remedy="leave --times out",
         )

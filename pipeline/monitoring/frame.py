@@ -61,7 +61,7 @@ def towards_sensor(data: EpochData, options: MonitorOptions, name: str) -> tuple
         station = find_station(RawScan(name, PointCloud(data.in_order)))
     except InputError:
         raise InputError(
-            "does not say from which side the wall was measured",
+            "the file does not say from which side the wall was measured",
             where=name,
             remedy="give --position X,Y,Z: where the scanner stood, or any place before the wall, in the file's coordinates",
         ) from None

@@ -26,7 +26,7 @@ def scanner_model(options: MonitorOptions) -> TlsModel | None:
         model = read_model(options.model)
         if not isinstance(model, TlsModel):
             raise InputError(
-                "is the model of a stereo pair, but `monitor` needs the model of a laser scanner",
+                "the file is the model of a stereo pair, but `monitor` needs the model of a laser scanner",
                 where=str(options.model),
                 allowed="sensor: tls",
                 remedy="give the model of a laser scanner, or leave --model out",

@@ -101,11 +101,13 @@ def read_areas(path: Path) -> tuple[StableArea, ...]:
     except ValidationError as error:
         wrong = error.errors()[0]["msg"]
         raise InputError(
-            f"is not a list of areas ({wrong})",
+            f"the file is not a list of areas ({wrong})",
             where=str(path),
             allowed="boxes [x0, y0, x1, y1] or polygons [[x, y], ...] on the map, or the same with x, y, z in survey coordinates",
             remedy="write the stable areas in this form, in metres",
         ) from None
     if not found:
-        raise InputError("contains no area", where=str(path), remedy="add a box or polygon to the file, or leave --stable out")
+        raise InputError(
+            "the file contains no area", where=str(path), remedy="add a box or polygon to the file, or leave --stable out"
+        )
     return found

@@ -35,7 +35,7 @@ def check_motion(motion: RigidTransform, points: FloatArray, site: ReferenceSite
     if turned <= _MOST_TURNED_DEG and moved <= _MOST_MOVED * site.grid.gsd * max(site.grid.width, site.grid.height):
         return
     raise InputError(
-        f"could not be registered on {site.source.name}: the best fit of the rock turns it by {turned:.0f} degrees and moves "
+        f"the epoch could not be registered on {site.source.name}: the best fit of the rock turns it by {turned:.0f} degrees and moves "
         f"it by {moved:.2g} m",
         where=name,
         allowed="epochs that overlap, and are aligned to some metres and degrees",
@@ -54,7 +54,7 @@ def remarks(found: EpochChange, site: ReferenceSite, name: str) -> list[str]:
     level, expected = (float(np.median(np.concatenate(each))) for each in _levels(found))
     if level > _BEYOND_NOISE * expected and compared < _NO_OVERLAP * seen:
         raise InputError(
-            f"could not be registered on {site.source.name}: only {compared:.0f} m² of its {seen:.0f} m² lie in both, and do not "
+            f"the epoch could not be registered on {site.source.name}: only {compared:.0f} m² of its {seen:.0f} m² lie in both, and do not "
             "fit there",
             where=name,
             allowed="epochs that overlap, and are aligned to some metres and degrees",

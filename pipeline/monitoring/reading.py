@@ -20,7 +20,6 @@ from pipeline.measurement.scans import RawScan, read_scans
 from pipeline.monitoring.gridding import SAMPLE, WallPoints
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.times import SIDECAR, EpochTime, check_order, time_of
-from pipeline.report.words import counted
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.bounds import bounding_box
@@ -224,18 +223,18 @@ def find_epochs(paths: Sequence[Path], times: Sequence[str] = ()) -> list[EpochS
         raise InputError(
             f"only {len(found)} epoch is given",
             where="EPOCH",
-            allowed="two and more",
+            allowed="two epochs or more",
             remedy="give at least two epochs, the reference first",
         )
     if times and len(times) != len(found):
         raise InputError(
-            f"names {counted(len(times), 'time')} for {len(found)} epochs", where="--times", remedy="give one time for each epoch"
+            f"{len(times)} times are given for {len(found)} epochs", where="--times", remedy="give one time for each epoch"
         )
     seen: dict[Path, str] = {}
     for source in found:
         for file in source.files:
             if (real := file.resolve()) in seen:
-                raise InputError("is given twice", where=str(file), remedy="name each epoch once")
+                raise InputError("the epoch is given twice", where=str(file), remedy="name each epoch once")
             seen[real] = source.name
     _check_contents(found)
     timed = [
@@ -262,7 +261,7 @@ def _check_contents(sources: Sequence[EpochSource]) -> None:
         for file in files if len(files) > 1 else ():
             first = seen.setdefault(sha256(file), file)
             if first is not file:
-                raise InputError(f"is a copy of {first}", where=str(file), remedy="name each epoch once")
+                raise InputError(f"the epoch is a copy of {first}", where=str(file), remedy="name each epoch once")
 
 
 def read_epoch(source: EpochSource, options: MonitorOptions) -> EpochData:
@@ -279,7 +278,7 @@ def read_epoch(source: EpochSource, options: MonitorOptions) -> EpochData:
         return parts[0]
     if any(part.mesh is not None for part in parts):
         raise InputError(
-            "contains a mesh or an elevation model beside scans, which cannot be joined",
+            "the folder contains a mesh or an elevation model beside scans, which cannot be joined",
             where=str(source.path),
             allowed="scans only, or one mesh",
             remedy="move the mesh or the elevation model to a folder of its own",
@@ -298,9 +297,9 @@ def read_laser_scans(source: EpochSource, options: MonitorOptions) -> list[RawSc
     """
     if source.is_surface:
         raise InputError(
-            "is a mesh or an elevation model, but the points of a laser scanner are needed",
+            "the file is a mesh or an elevation model, but the points of a laser scanner are needed",
             where=source.name,
-            remedy="run scarpsim monitor on the scans that it was made from",
+            remedy="run scarpsim monitor on the scans that the mesh or model was made from",
         )
     if source.run is None:
         return [scan for file in source.files for scan in read_scans(file, options.unit, options.columns)]
@@ -325,9 +324,9 @@ def _sampled(files: tuple[Path, ...], unit: str | None) -> EpochData:
         count += len(chunk)
     if first is None:
         raise InputError(
-            "contains no points but those flagged as withheld, synthetic or noise",
+            "the file contains no points but those flagged as withheld, synthetic or noise",
             where=str(files[0]),
-            remedy="export it again, with its points, or clear these flags",
+            remedy="export the file again, with its points, or clear these flags",
         )
     bounds = bounding_box(np.concatenate(boxes))
     large = LargeFiles(files, unit, count, first, bounds, tuple(kept))
@@ -352,7 +351,7 @@ def _sources(path: Path) -> list[EpochSource]:
     files = tuple(epoch_files(path))
     if not files:
         raise InputError(
-            "contains no scan",
+            "the folder contains no scan",
             where=str(path),
             allowed=f"files of scans ({', '.join(_ANY)}), or a run of simulate",
             remedy="copy the scans into this folder, or name another one",
@@ -364,12 +363,14 @@ def _epochs_of_run(folder: Path) -> list[EpochSource]:
     record = read_run(folder / RUN_FILE, "make the run again with scarpsim simulate")
     if not record.get("wall_frame"):
         raise InputError(
-            "does not state its wall frame", where=str(folder / RUN_FILE), remedy="make the run again with scarpsim simulate"
+            "the run does not state its wall frame",
+            where=str(folder / RUN_FILE),
+            remedy="make the run again with scarpsim simulate",
         )
     epochs = sorted(each for each in folder.glob("epoch_*") if (each / "points.laz").is_file())
     if not epochs:
         raise InputError(
-            "is a run without a finished epoch", where=str(folder), remedy="finish the run with scarpsim simulate --resume"
+            "this is a run without a finished epoch", where=str(folder), remedy="finish the run with scarpsim simulate --resume"
         )
     return [EpochSource(each, (each / "points.laz",), EpochTime(None, ""), record) for each in epochs]
 

@@ -187,7 +187,7 @@ class RecordedMonitoring:
             level, _ = read_geotiff(self.folder / name.replace("difference", "lod"))
             event = events.get(name, np.zeros(grid.shape, dtype=bool))
             if not difference.shape == level.shape == event.shape:
-                raise InputError("its maps do not have the same size", where=str(self.folder / name), remedy=_AGAIN)
+                raise InputError("the maps of this epoch do not have the same size", where=str(self.folder / name), remedy=_AGAIN)
             known = np.isfinite(difference) & np.isfinite(level)
             standard = np.where(known, difference / np.where(known, level / NORMAL_95, 1.0), np.nan)
             found.append(StableMap(frame, grid, unchanged_pixels(standard, known), event))
@@ -207,9 +207,9 @@ def read_monitoring(folder: Path) -> RecordedMonitoring:
     where = folder / MONITOR_FILE
     if not where.is_file():
         raise InputError(
-            "is a monitoring that is not finished",
+            "the monitoring in this folder is not finished",
             where=str(folder),
-            remedy="finish it first: repeat the command scarpsim monitor with --resume",
+            remedy="repeat the command scarpsim monitor with --resume, which finishes it",
         )
     values = read_json(where, remedy=_AGAIN)
     record = parse(_StatedMonitoring, values, str(where))
@@ -221,7 +221,7 @@ def read_monitoring(folder: Path) -> RecordedMonitoring:
         epochs = [(number, sources[number], motions[number]) for number in sorted(motions)]
         reference = sources[0]
     except (KeyError, TypeError, ValueError, ValidationError):
-        raise InputError("is damaged or is not a record of scarpsim monitor", where=str(where), remedy=_AGAIN) from None
+        raise InputError("the file is damaged or is not a record of scarpsim monitor", where=str(where), remedy=_AGAIN) from None
     return RecordedMonitoring(
         folder,
         options,
@@ -243,7 +243,9 @@ def _source(given: _StatedInput, folder: Path) -> EpochSource:
     source = EpochSource(given.path, tuple(given.sha256), EpochTime(None, ""), _run_of(given.path))
     for path, checksum in source.checksums().items():
         if checksum != given.sha256[Path(path)]:
-            raise InputError(f"was changed after scarpsim monitor had read it as epoch {given.epoch}", where=path, remedy=_AGAIN)
+            raise InputError(
+                f"the file was changed after scarpsim monitor had read it as epoch {given.epoch}", where=path, remedy=_AGAIN
+            )
     return source
 
 
@@ -260,7 +262,7 @@ def _event_masks(path: Path) -> dict[str, NDArray[np.bool_]]:
         images = {each["id"]: (str(each["file_name"]), int(each["height"]), int(each["width"])) for each in record["images"]}
         outlines = [(*images[each["image_id"]], each["segmentation"]) for each in record["annotations"]]
     except (KeyError, TypeError, ValueError):
-        raise InputError("is damaged or was not written by scarpsim monitor", where=str(path), remedy=_AGAIN) from None
+        raise InputError("the file is damaged or was not written by scarpsim monitor", where=str(path), remedy=_AGAIN) from None
     for name, height, width, outline in outlines:
         mask = coco_mask.decode(run_lengths(outline, height, width, str(path))) > 0
         found[name] = mask | found[name] if name in found else mask

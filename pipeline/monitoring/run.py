@@ -298,7 +298,7 @@ def _check_same_site(data: EpochData, site: ReferenceSite, source: EpochSource) 
     if not inside.mean() > _TENTH:
         unit = " or units" if ratio > _UNLIKE_UNITS or ratio < 1 / _UNLIKE_UNITS else ""
         raise InputError(
-            f"lies elsewhere than the reference {site.source.name}: its middle is "
+            f"the epoch lies elsewhere than the reference {site.source.name}: its middle is "
             f"{np.linalg.norm(np.median(wall, axis=0)):,.0f} m from the wall's corner; their coordinate systems{unit} differ",
             where=source.name,
             allowed="epochs of one coordinate system",
@@ -306,7 +306,7 @@ def _check_same_site(data: EpochData, site: ReferenceSite, source: EpochSource) 
         )
     if data.crs and site.crs and data.crs != site.crs and not _same_system(data.crs, site.crs):
         raise InputError(
-            "is in another coordinate system than the reference",
+            "the epoch is in another coordinate system than the reference",
             where=source.name,
             remedy="transform one of the two into the coordinate system of the other",
         )

@@ -98,7 +98,7 @@ def _request(monitoring: RecordedMonitoring, scanner: str | None, model: Path | 
         scanner, model = monitoring.options.scanner, monitoring.options.model
     if scanner is None and model is None:
         raise InputError(
-            "was made without a model of the scanner, so its noise is unknown",
+            "the monitoring was made without a model of the scanner, so its noise is unknown",
             where=str(monitoring.folder),
             remedy="add --scanner with a preset such as riegl_vz400i, or --model FILE",
         )
@@ -111,7 +111,7 @@ def _check_laser(monitoring: RecordedMonitoring) -> None:
     if not monitoring.options.photographs and all(run["sensor"] == "tls" for run in runs):
         return
     raise InputError(
-        "its epochs are not of a laser scanner but from photographs, whose errors gap cannot tell from monitored epochs",
+        "the epochs are not of a laser scanner but from photographs, whose errors scarpsim gap cannot find here",
         where=str(monitoring.folder),
         allowed="epochs of a laser scanner",
         remedy="compare one epoch with a known surface: scarpsim gap EPOCH --reference FILE --photographs",
@@ -130,7 +130,7 @@ def _stable_scans(monitoring: RecordedMonitoring, epoch: RecordedEpoch, position
         name = epoch.source.name if number == 0 else f"{epoch.source.name}, scan {number + 1}"
         if len(rows) < _FEWEST:
             raise InputError(
-                f"has only {len(rows)} points on stable rock",
+                f"the epoch has only {len(rows)} points on stable rock",
                 where=name,
                 allowed=f"{_FEWEST} or more",
                 remedy="name stable areas with scarpsim monitor --stable, or leave this epoch out",
@@ -176,9 +176,9 @@ def _reference(monitoring: RecordedMonitoring, given: FloatArray | None, later: 
     stations = [_station(scan, given) for scan in scans]
     if any(np.linalg.norm(each.position - stations[0].position) > _ONE_PLACE_M for each in stations[1:]):
         raise InputError(
-            f"has {len(scans)} scans from different places, but the reference has to be seen from one",
+            f"the reference has {len(scans)} scans from different places, but must be seen from a single place",
             where=source.name,
-            remedy="mesh it (scarpsim surface), and give the mesh to scarpsim gap EPOCH ... --reference MESH",
+            remedy="make a mesh of the reference (scarpsim surface), and give it to scarpsim gap EPOCH ... --reference MESH",
         )
     position, rotation = stations[0].position, stations[0].rotation
     noise = (

@@ -53,7 +53,7 @@ def read_targets(path: Path) -> Targets:
     table = csv.DictReader(io.StringIO(read_text(path)))
     if not set(_COLUMNS) <= set(table.fieldnames or ()):
         raise InputError(
-            f"lacks a column; it has {', '.join(table.fieldnames or ()) or 'none'}",
+            f"the file lacks a column; it has {', '.join(table.fieldnames or ()) or 'none'}",
             where=str(path),
             allowed=", ".join(_COLUMNS),
             remedy="name all of these columns in the first line, separated by commas",
@@ -93,7 +93,7 @@ def fit_targets(targets: Targets, reference: str, epoch: str, frame: WallFrame) 
     common = sorted(set(before) & set(after))
     if len(common) < _FEWEST:
         raise InputError(
-            f"{len(common)} targets are measured in both {reference} and {epoch}",
+            f"only {len(common)} targets are measured in both {reference} and {epoch}",
             where="--targets",
             allowed=f"at least {_FEWEST}",
             remedy="measure three targets in both epochs; write the epochs' file names into the file's column `epoch`",

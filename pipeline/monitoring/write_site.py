@@ -34,7 +34,7 @@ def write_site(result: Result, path: Path) -> None:
     wall = path.with_name(f"{path.stem}_wall.ply")
     for file in (path, wall):
         if file.exists():
-            raise InputError("exists already", where=str(file), remedy="choose another name with --write-site")
+            raise InputError("the file exists already", where=str(file), remedy="choose another name with --write-site")
     mesh = _mesh(site)
     if not len(mesh.faces):
         raise InputError(

@@ -183,7 +183,9 @@ def checked_cloud(points: FloatArray, name: str) -> FloatArray:
     """
     points = np.ascontiguousarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"expected shape (n, 3), got {points.shape}", where=name, remedy="give one row x, y, z for each point")
+        raise InputError(
+            f"the array has the shape {points.shape}, not (n, 3)", where=name, remedy="give one row x, y, z for each point"
+        )
     if len(points) < LEAST_POINTS:
         raise InputError(f"{len(points)} points are too few", where=name, allowed=f"at least {LEAST_POINTS}", remedy=_SEES)
     finite = np.isfinite(points)
@@ -192,7 +194,7 @@ def checked_cloud(points: FloatArray, name: str) -> FloatArray:
         raise InputError(
             f"{bad:,} of {len(points):,} points have coordinates that are NaN or infinite",
             where=name,
-            remedy="remove them before registering",
+            remedy="remove these points before registering",
         )
     if _on_a_line(points[:: max(len(points) // _BLOCK, 1)]) and _on_a_line(
         points
@@ -214,7 +216,7 @@ def _unit(normals: FloatArray, count: int) -> FloatArray:
     """Normalise the normals. Raises InputError if their number or length is wrong."""
     if np.shape(normals) != (count, 3):
         raise InputError(
-            f"expected shape ({count}, 3), got {np.shape(normals)}",
+            f"the array has the shape {np.shape(normals)}, not ({count}, 3)",
             where="reference normals",
             remedy="give one normal x, y, z for each reference point",
         )

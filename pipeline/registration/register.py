@@ -329,7 +329,7 @@ def _normals(surface: ReferenceSurface, config: IcpConfig) -> FloatArray | None:
         return None
     if surface.normals is None:
         raise InputError(
-            "point_to_plane needs the reference's normals", where="icp.method", remedy="give normals, or set point_to_point"
+            "point_to_plane needs the reference's normals", where="icp.method", remedy="give normals, or use point_to_point"
         )
     return surface.normals
 
@@ -444,12 +444,12 @@ class _Alignment:
 
     def _too_few(self, blocks: list[FloatArray], pose: RigidTransform, gate: float, inliers: int) -> InputError:
         """Make the error for too few pairs within the outlier threshold."""
-        distance, _ = self.surface.tree.query(pose.apply(blocks[0]))
+        median_m = np.median(self.surface.tree.query(pose.apply(blocks[0]))[0])
         return InputError(
-            f"only {inliers} of {sum(map(len, blocks)):,} points lie within {gate:g} m of the reference, "
-            f"the median distance is {np.median(distance):.3g} m",
+            f"only {inliers} of {sum(map(len, blocks)):,} points lie within {gate:g} m of the reference; "
+            f"the median distance is {median_m:.3g} m",
             where="icp.outlier_distance_threshold",
-            remedy=f"raise it above {np.median(distance):.3g} m, or raise icp.outlier_threshold_decay_iteration to begin wider",
+            remedy=f"raise this threshold above {median_m:.3g} m, or raise icp.outlier_threshold_decay_iteration to begin wider",
         )
 
     def _in_full_coordinates(self, pose: RigidTransform) -> RigidTransform:
@@ -469,7 +469,7 @@ def _point_step(moments: FloatArray) -> _Step:
     u, singular, vt = np.linalg.svd(spread + cross)
     if not singular[1] > ON_A_LINE * singular[0]:
         raise InputError(
-            "all points this near the reference lie on one line", where="icp.outlier_distance_threshold", remedy="raise it"
+            "all points within this distance lie on one line", where="icp.outlier_distance_threshold", remedy="raise the limit"
         )
     rotation = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
     turn = rotation - np.eye(3)

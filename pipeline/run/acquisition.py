@@ -85,7 +85,7 @@ def acquire(config: SimulationConfig, site: SensorSite, scene: RayCaster, random
         if not isinstance(sensor, StereoPair):
             allowed = "direct, for the tls sensor" if isinstance(sensor, LaserScanner) else "direct, colmap, for matcher: sgbm"
             raise InputError(
-                "`vertices` needs a stereo pair with simulated matching",
+                "the reconstruction `vertices` needs a stereo pair with simulated matching",
                 where="reconstruction",
                 allowed=allowed,
                 remedy="choose one of these reconstructions",
@@ -95,7 +95,7 @@ def acquire(config: SimulationConfig, site: SensorSite, scene: RayCaster, random
     if not isinstance(sensor, StereoPair | MatchedStereoPair):
         if colmap:
             raise InputError(
-                "colmap needs the depth maps of a stereo pair",
+                "the reconstruction colmap needs the depth maps of a stereo pair",
                 where="reconstruction",
                 allowed="direct, for the tls sensor",
                 remedy="set reconstruction to direct, or simulate a stereo pair",

@@ -229,7 +229,7 @@ class Series:
         wall = self.config.wall
         if not isinstance(wall, ImportedWall):
             raise InputError(
-                "own meshes of the epochs need a wall that is imported from a mesh",
+                "meshes of the single epochs need a wall that is imported from a mesh",
                 where="series.surfaces",
                 remedy="leave `wall` out: the first of these meshes is then the wall",
             )

@@ -142,7 +142,7 @@ def simulate(
     identity["inputs"] = _inputs(config)
     run = _Run(out, identity, progress)
     if resume and not (out / RUN_FILE).exists():
-        raise InputError("contains no run to resume", where=f"--out {out}", remedy="start it without --resume")
+        raise InputError("the folder contains no run to resume", where=f"--out {out}", remedy="start the run without --resume")
     with locked(out), noting() as written:
         _claim(run, resume)
         try:

@@ -86,7 +86,7 @@ def mesh_observation(observation: Observation, config: SurfaceConfig) -> Triangl
     used = cells.used(block.shape)
     if not used.any():
         raise InputError(
-            f"no triangle between the {int(observation.valid.sum()):,} points of the {observation.sensor} observation",
+            f"no triangle was made between the {int(observation.valid.sum()):,} points of the {observation.sensor} observation",
             where="surface",
             remedy="enlarge surface.depth_step_m, choose a smaller sampling step, or turn the sensor towards the wall",
         )

@@ -51,7 +51,7 @@ class MonitorResults:
             self._events = [dict(each) for each in self._record["events"]]
         except (KeyError, TypeError, ValueError):
             raise InputError(
-                "is damaged or is not a record of scarpsim monitor", where=str(folder / MONITOR_FILE), remedy=_REMEDY
+                "the file is damaged or is not a record of scarpsim monitor", where=str(folder / MONITOR_FILE), remedy=_REMEDY
             ) from None
         self.title = (
             f"{folder.name}: {len(epochs)} {'epoch' if len(epochs) == 1 else 'epochs'} against {names.get('0', 'the reference')}"
@@ -61,7 +61,9 @@ class MonitorResults:
             for key, view in self._views.items()
         }
         if not self.steps:
-            raise InputError("contains no epoch that was compared with the reference", where=str(folder), remedy=_REMEDY)
+            raise InputError(
+                "the folder contains no epoch that was compared with the reference", where=str(folder), remedy=_REMEDY
+            )
         self._map = lru_cache(6)(read_geotiff)
         self._cloud = lru_cache(1)(read_laz)
         self._numbers = lru_cache(2)(self._event_raster)

@@ -46,7 +46,7 @@ class RunResults:
         self._epochs = {str(each["epoch"]): each for each in record.get("epochs", []) if each["epoch"] > 0}
         if not self._epochs or "wall" not in record or any("statistics" not in each for each in self._epochs.values()):
             raise InputError(
-                "contains no finished epoch", where=str(folder), remedy="continue the run with scarpsim simulate --resume"
+                "the run contains no finished epoch", where=str(folder), remedy="continue the run with scarpsim simulate --resume"
             )
         self.world_to_wall = np.array(record["wall_frame"]["matrix_world_to_wall"]) if "wall_frame" in record else np.eye(4)
         self.title = f"{folder.name}: {INSTRUMENTS[record['sensor']]}, {record['wall']['name']}"
@@ -56,7 +56,7 @@ class RunResults:
         if detections and not set(self._found) & set(self.steps):
             maps = ", ".join(f"difference_{int(key):03d}.tif" for key in self.steps)
             raise InputError(
-                "contains no detections of this run's maps",
+                "the folder contains no detections of this run's maps",
                 where=str(detections),
                 allowed=f"detections in {maps}",
                 remedy="give the folder that scarpsim detect filled for this run",
@@ -187,7 +187,9 @@ def _detections(folder: Path) -> dict[str, list[Item]]:
     tables = sorted((_confidence(path), path) for path in folder.glob("events_*.csv"))
     if not tables:
         raise InputError(
-            "contains no table of events (events_*.csv)", where=str(folder), remedy="give the folder that scarpsim detect filled"
+            "the folder contains no table of events (events_*.csv)",
+            where=str(folder),
+            remedy="give the folder that scarpsim detect filled",
         )
     found: dict[str, list[Item]] = {}
     for event in read_events(tables[0][1]):
@@ -205,7 +207,7 @@ def _confidence(path: Path) -> float:
         value = np.nan
     if not 0 <= value <= 1:
         raise InputError(
-            "is not the name of a table of events",
+            "the file name is not that of a table of events",
             where=str(path),
             allowed="such as events_0.9.csv",
             remedy="give the file the name that scarpsim detect gave it",

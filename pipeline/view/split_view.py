@@ -122,7 +122,7 @@ def check_same_wall(first: FloatArray, second: FloatArray, extent_m: float, wher
     difference = np.abs(first - second)
     if float(difference[:3, :3].max()) * extent_m > _APART_M or float(difference[:3, 3].max()) > _APART_M:
         raise InputError(
-            "shows another wall or uses another wall frame than the first run",
+            "the run shows another wall or uses another wall frame than the first run",
             where=where,
             remedy="compare runs of one wall, as `scarpsim compare` makes them",
         )

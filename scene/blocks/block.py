@@ -283,10 +283,11 @@ class _PositionSearch:
     def _no_room(self, index: int) -> InputError:
         """Make the error for a block that finds no position."""
         placed, (width, height) = int(np.isfinite(self.boxes[:, 0, 0]).sum()), np.ptp(self._solids[index].bbox[:, :2], axis=0)
-        steep = f" ({self._hung[index]} times it would have hung in front of a steep wall)" if self._hung[index] else ""
+        times_hung = f" ({self._hung[index]} times it would have hung in front of a steep wall)" if self._hung[index] else ""
         return InputError(
-            f"no room for a block of {width:.2f} x {height:.2f} m in {self._config.maximum_attempts} attempts{steep}, "
-            f"{placed} of {len(self._solids)} blocks are placed",
+            f"no room was found for a block of {width:.2f} x {height:.2f} m in "
+            f"{self._config.maximum_attempts} attempts{times_hung}; "
+            f"{placed} of {len(self._solids)} blocks have a place",
             where="rockfall",
             remedy="lower count, size_m, minimum_distance_m or safe_zone_offset_m, or raise maximum_attempts",
         )
@@ -297,7 +298,7 @@ def _require_room(area: FloatArray, zone: SafeZone) -> None:
     room = zone.free.sum() * zone.grid.gsd**2
     if area.sum() > room:
         raise InputError(
-            f"{len(area)} blocks take {area.sum():,.0f} m2, the safe zone of the wall has {room:,.0f} m2",
+            f"{len(area)} blocks take {area.sum():,.0f} m2, but the safe zone of the wall has only {room:,.0f} m2",
             where="rockfall",
             remedy="lower count, size_m or safe_zone_offset_m",
         )
@@ -374,7 +375,7 @@ def _require_fit(solids: Sequence[BlockShape], mesh: TriangleMesh) -> None:
             f"{too_large.sum()} of {len(solids)} blocks are larger than the wall (up to {width:.3g} x {height:.3g} m)",
             where="size_m",
             allowed=f"below {wall[0]:.3g} x {wall[1]:.3g} m",
-            remedy="give sizes in metres or lower them",
+            remedy="give smaller sizes, in metres",
         )
 
 

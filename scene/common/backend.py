@@ -31,7 +31,7 @@ def _choose() -> str:
     if wanted:
         if wanted not in (CUDA, LLVM):
             raise InputError(
-                f"the variable is '{wanted}'",
+                f"the variable has the unknown value '{wanted}'",
                 where=_VARIANT_VARIABLE,
                 allowed=f"{CUDA}, {LLVM}",
                 remedy="set the variable to one of them, or unset it",

@@ -59,13 +59,15 @@ def parse(model: type[ConfigT], values: Any, where: str) -> ConfigT:
     """
     if not isinstance(values, Mapping):
         raise InputError(
-            f"expected a mapping of keys, got {type(values).__name__}", where=where, remedy="write `key: value` lines"
+            f"the content must be a mapping of keys, but is of the type {type(values).__name__}",
+            where=where,
+            remedy="write `key: value` lines",
         )
     try:
         return model.model_validate(dict(values))
     except pydantic.ValidationError as error:
         raise InputError(
-            f"keys or values are wrong: {_listed([_describe(model, item) for item in error.errors()])}", where=where
+            f"keys or values are wrong: {_listed([_mistake_and_hint(model, item) for item in error.errors()])}", where=where
         ) from None
 
 
@@ -81,11 +83,11 @@ def load_yaml(path: Path) -> Any:
     if path.suffix == ".json":
         return read_json(path)
     try:
-        return parse_yaml(read_text(path, most_bytes=_MOST_YAML_BYTES, smaller="give it as .json, which is fast"))
+        return parse_yaml(read_text(path, most_bytes=_MOST_YAML_BYTES, if_too_large="give it as .json, which is fast"))
     except yaml.YAMLError as error:
         problem = " ".join(str(error).split())
         raise InputError(
-            f"is not valid YAML: {problem}",
+            f"the file is not valid YAML: {problem}",
             where=str(path),
             remedy="correct the syntax in the line that is named",
         ) from None
@@ -103,7 +105,7 @@ def _listed(mistakes: list[str]) -> str:
     return "; ".join(mistakes[:_MOST_MISTAKES] + ([f"and {more} more"] if more > 0 else []))
 
 
-def _describe(model: type[BaseModel], item: ErrorDetails) -> str:
+def _mistake_and_hint(model: type[BaseModel], item: ErrorDetails) -> str:
     """Describe one validation error as `section.key: message, got value`, with a suggestion for an unknown key."""
     keys, sections = _place(model, item["loc"])
     key = ".".join(keys)

@@ -25,7 +25,7 @@ _COMMA = re.compile(r"[+-]?(\d+,\d*|\d*,\d+)([eEdD][+-]?\d+)?")
 _GROUPED = re.compile(r"[+-]?\d{1,3}([.,'\u2019\u00a0\u202f_ ]\d{3})+([.,]\d*)?")
 _MISSING = {"", "null", "none", "na", "n/a", "nil", "nan", "+nan", "-nan", "nan(ind)", "-nan(ind)", "1.#qnan", "1.#ind"}
 _INFINITE = {"inf", "+inf", "-inf", "infinity", "-infinity", "1.#inf"}
-GROUPED = "digits are grouped by a thousands separator"
+GROUPED = "are grouped by a thousands separator"
 _UNGROUPED = "export the numbers without thousands separators, as 6389450.123"
 
 
@@ -163,7 +163,7 @@ def _value(word: str, form: RowForm, found: RowsFound, where: str) -> float:
     if _POINT.fullmatch(word):
         if form.decimal_comma and "." in word:
             raise InputError(
-                f"'{word:.40}' has a decimal point, where other numbers of the file have decimal commas",
+                f"'{word:.40}' has a decimal point, but other numbers of the file have decimal commas",
                 where=where,
                 remedy="export all numbers with decimal points",
             )
@@ -179,26 +179,25 @@ def _value(word: str, form: RowForm, found: RowsFound, where: str) -> float:
 def _no_number(word: str, form: RowForm, where: str) -> InputError:
     """Make the error for a word that is not a number."""
     if is_grouped(word, decimal_comma=form.decimal_comma):
-        return InputError(f"'{word:.40}': {GROUPED}", where=where, allowed="plain numbers", remedy=_UNGROUPED)
+        return InputError(f"the digits of '{word:.40}' {GROUPED}", where=where, allowed="plain numbers", remedy=_UNGROUPED)
     if _COMMA.fullmatch(word):
         return InputError(
-            f"'{word:.40}' has a decimal comma, where other numbers of the file have decimal points",
+            f"'{word:.40}' has a decimal comma, but other numbers of the file have decimal points",
             where=where,
             remedy="export all numbers with decimal points",
         )
     return InputError(
         f"'{word:.40}' is not a number",
         where=where,
-        allowed="numbers, one point a line",
+        allowed="numbers, with one point in each line",
         remedy="correct or remove the line, or export the file again",
     )
 
 
-def _wrong_width(text: str, width: int, number: int, form: RowForm, where: str) -> InputError:
+def _wrong_width(text: str, value_count: int, number: int, form: RowForm, where: str) -> InputError:
     """Make the error for a row with too many or too few values."""
-    values = "value" if width == 1 else "values"
     return InputError(
-        f"has {width} {values} ('{text:.60}')", where=f"{where}, line {number:,}",
-        allowed=f"{form.columns}, as the rows before",
-        remedy="correct or remove the line; where it is the last one, the file was cut off: copy or export it again",
+        f"the number of values in this line is {value_count} ('{text:.60}')", where=f"{where}, line {number:,}",
+        allowed=f"{form.columns} values, as in the lines before",
+        remedy="correct or remove the line; if it is the last line, the file was cut off: copy or export it again",
     )  # fmt: skip

@@ -38,7 +38,9 @@ def load_plug_ins(group: str, needs: str, is_one: Callable[[Any], bool], taken: 
         where = f"entry point '{entry.name} = {entry.value}' of {group}"
         if entry.name in taken or entry.name in found:
             raise InputError(
-                f"the name '{entry.name}' is already in use", where=where, remedy="choose another name in the entry point"
+                f"the name '{entry.name}' is already in use",
+                where=where,
+                remedy="choose another name in the entry point of this package",
             )
         try:
             value = entry.load()

@@ -20,7 +20,7 @@ READ_LIMIT = "SCARPSIM_READ_GB"
 """Environment variable that raises both limits, in GB."""
 
 
-def check_file(path: Path, *, most_bytes: int | None = None, remedy: str = "", smaller: str = "give a smaller file") -> Path:
+def check_file(path: Path, *, most_bytes: int | None = None, remedy: str = "", if_too_large: str = "give a smaller file") -> Path:
     """Check that a path is a regular file that can be read, before it is opened; return the path.
 
     Parameters
@@ -31,7 +31,7 @@ def check_file(path: Path, *, most_bytes: int | None = None, remedy: str = "", s
         Size limit; none by default.
     remedy : str
         What the message advises if the file cannot be used, after the advice to give a readable file.
-    smaller : str
+    if_too_large : str
         What the message advises if the file is too large.
 
     Raises
@@ -41,37 +41,39 @@ def check_file(path: Path, *, most_bytes: int | None = None, remedy: str = "", s
         large.
     """
     where = str(path)
-    advice = f"; {remedy}" if remedy else ""
+    further_advice = f"; {remedy}" if remedy else ""
     try:
         state = path.stat()
     except (OSError, ValueError) as error:  # ValueError: a null character
         problem = getattr(error, "strerror", None) or "a null character in its name"
         raise InputError(
-            f"cannot be read ({problem})", where=where, remedy=f"give the path of an existing file that you may read{advice}"
+            f"the file cannot be read ({problem})",
+            where=where,
+            remedy=f"give the path of an existing file that you may read{further_advice}",
         ) from None
     if stat.S_ISDIR(state.st_mode):
         raise InputError(
-            "cannot be read (Is a directory)",
+            "the path cannot be read (Is a directory)",
             where=where,
             allowed="a file",
-            remedy=f"give the path of a file, not of a folder{advice}",
+            remedy=f"give the path of a file, not of a folder{further_advice}",
         )
     if not stat.S_ISREG(state.st_mode):
         raise InputError(
-            "is a pipe, a device or a socket",
+            "the path is a pipe, a device or a socket",
             where=where,
             allowed="a file",
             remedy="write its output into a regular file, and give that file",
         )
     if most_bytes is not None and state.st_size > most_bytes:
-        problem = f"has {state.st_size / 1e6:,.0f} MB"
+        problem = f"the file has {state.st_size / 1e6:,.0f} MB"
         raise InputError(
-            problem, where=where, allowed=f"up to {most_bytes / 1e6:,.0f} MB", remedy=f"the file is too large: {smaller}"
+            problem, where=where, allowed=f"up to {most_bytes / 1e6:,.0f} MB", remedy=f"the file is too large: {if_too_large}"
         )
     return path
 
 
-def read_text(path: Path, *, most_bytes: int | None = None, remedy: str = "", smaller: str | None = None) -> str:
+def read_text(path: Path, *, most_bytes: int | None = None, remedy: str = "", if_too_large: str | None = None) -> str:
     """Read a UTF-8 text file.
 
     Parameters
@@ -82,7 +84,7 @@ def read_text(path: Path, *, most_bytes: int | None = None, remedy: str = "", sm
         Size limit, bytes. By default 512 MB, or what the environment variable SCARPSIM_READ_GB allows if that is more.
     remedy : str
         What the message advises if the file cannot be used, after the advice to give a readable file.
-    smaller : str, optional
+    if_too_large : str, optional
         What the message advises if the file is too large; by default to give a smaller one or to raise the limit.
 
     Raises
@@ -91,16 +93,23 @@ def read_text(path: Path, *, most_bytes: int | None = None, remedy: str = "", sm
         If the file is missing, not a regular file, too large or not UTF-8.
     """
     most = max(MOST_TEXT_BYTES, int(read_limit_gb() * 1e9)) if most_bytes is None else most_bytes
-    check_file(path, most_bytes=most, remedy=remedy, smaller=smaller or f"give a smaller file, or set the variable {READ_LIMIT}")
+    check_file(
+        path,
+        most_bytes=most,
+        remedy=remedy,
+        if_too_large=if_too_large or f"give a smaller file, or set the variable {READ_LIMIT}",
+    )
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
         raise InputError(
-            f"cannot be read ({error.strerror})", where=str(path), remedy="give the path of an existing file that you may read"
+            f"the file cannot be read ({error.strerror})",
+            where=str(path),
+            remedy="give the path of an existing file that you may read",
         ) from None
     except UnicodeDecodeError as error:
         raise InputError(
-            f"is no text in UTF-8 (byte {error.start:,}: {error.reason})",
+            f"the file is no text in UTF-8 (byte {error.start:,}: {error.reason})",
             where=str(path),
             remedy="save the file as UTF-8 in a text editor, or give another file if this is no text file",
         ) from None
@@ -118,10 +127,12 @@ def read_json(path: Path, *, remedy: str = "make the file again with the command
         needed = _json_gb(path, size, most)
     except OSError as error:
         raise InputError(
-            f"cannot be read ({error.strerror})", where=str(path), remedy="give the path of an existing file that you may read"
+            f"the file cannot be read ({error.strerror})",
+            where=str(path),
+            remedy="give the path of an existing file that you may read",
         ) from None
     if needed > most:
-        problem = f"is so large that reading it may take {needed:.1f} GB of memory"
+        problem = f"the file is so large that reading it may take {needed:.1f} GB of memory"
         raise InputError(
             problem,
             where=str(path),
@@ -133,9 +144,7 @@ def read_json(path: Path, *, remedy: str = "make the file again with the command
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         problem = " ".join(str(error).split()) or "nested too deeply"
-        raise InputError(
-            f"is not JSON ({problem})", where=str(path), remedy=f"correct the file, or give another: {remedy}"
-        ) from None
+        raise InputError(f"the file is not JSON ({problem})", where=str(path), remedy=f"correct the file, or {remedy}") from None
 
 
 def read_limit_gb() -> float:
@@ -152,7 +161,10 @@ def read_limit_gb() -> float:
         most = math.nan
     if not most > 0:
         raise InputError(
-            f"got '{given}'", where=READ_LIMIT, allowed="gigabytes, above 0", remedy="set it to a number such as 8, or unset it"
+            f"the variable is set to '{given}'",
+            where=READ_LIMIT,
+            allowed="a number of gigabytes, above 0",
+            remedy="set the variable to a number such as 8, or unset it",
         )
     return most
 

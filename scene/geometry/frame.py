@@ -63,9 +63,9 @@ class FrameConfig(Config):
             )
         if np.dot(towards - middle, normal) < 0:
             raise InputError(
-                f"{self.normal} points away from the sensors",
+                f"the normal of the wall, {self.normal}, points away from the sensors",
                 where="frame.normal",
-                remedy="change its sign: the wall frame's z axis points towards the sensors",
+                remedy="change the sign of the normal: the wall frame's z axis points towards the sensors",
             )
         return WallFrame.along(normal / np.linalg.norm(normal), vertices)
 

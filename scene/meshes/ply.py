@@ -76,18 +76,20 @@ def read_elements(path: Path, only: str = "") -> dict[str, Columns]:
             return found
     except OSError as error:
         raise InputError(
-            f"cannot be read ({error.strerror})", where=str(path), remedy="give the path of an existing file that you may read"
+            f"the file cannot be read ({error.strerror})",
+            where=str(path),
+            remedy="give the path of an existing file that you may read",
         ) from None
     except InputError as error:  # raised by read_rows, which does not know the path
         raise InputError(
-            f"the values cannot be read: {error.what}",
+            f"the numbers of the file cannot be read: {error.what}",
             where=f"{path}, {error.where}",
             allowed=error.allowed,
             remedy=f"in the PLY file, {error.remedy}",
         ) from None
     except (ValueError, IndexError, KeyError, OverflowError) as error:
         raise InputError(
-            f"is not a whole PLY file ({error})",
+            f"the file is not a whole PLY file ({error})",
             where=str(path),
             remedy="copy the complete file again, or export it again as PLY",
         ) from None

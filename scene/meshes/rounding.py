@@ -134,12 +134,12 @@ def check_steps(rounded: Sequence[RoundedAxis], spacing_m: float, where: str, sp
     """
     limit = max(_HARMLESS_M, _SHARE_OF_EDGE * spacing_m)
     limits = {each.axis: min(limit, _HARMFUL_M) if each.binary else limit for each in rounded}
-    harmful = [each for each in rounded if each.step_m > limits[each.axis]]
-    if harmful:
+    axes_and_steps = [each for each in rounded if each.step_m > limits[each.axis]]
+    if axes_and_steps:
         raise InputError(
-            f"the coordinates were rounded, {', '.join(map(str, harmful))}; {spacing} {spacing_m:.3g} m (median)",
+            f"the coordinates were rounded: {', '.join(map(str, axes_and_steps))}; {spacing} {spacing_m:.3g} m (median)",
             where=where,
-            allowed=f"steps of up to {limits[harmful[0].axis]:.2g} m",
+            allowed=f"steps of up to {limits[axes_and_steps[0].axis]:.2g} m",
             remedy="export the mesh again in double precision, or subtract an offset from the coordinates before the export",
         )
     return tuple(f"the coordinates are rounded, {each}" for each in rounded if each.step_m > _HARMFUL_M)

@@ -85,7 +85,7 @@ def drawn_rockfalls(rate: RockfallRate, precursor: PrecursorConfig | None, end_h
     mean = rate.rate_per_day * span / 24
     if mean > MOST_EVENTS:
         raise InputError(
-            f"{rate.rate_per_day:g} rockfalls per day make {mean:,.0f} in this series",
+            f"{rate.rate_per_day:g} rockfalls per day make {mean:,.0f} rockfalls in this series",
             where="series.rockfall.rate_per_day",
             allowed=f"up to {MOST_EVENTS:,} rockfalls",
             remedy="lower the rate, or shorten the series",

@@ -100,7 +100,7 @@ def place_block(
             )
         tried += _BATCH
     raise InputError(
-        f"no room for a block of {request.volume_m3:g} m3 in {config.maximum_attempts} attempts",
+        f"no room was found for a block of {request.volume_m3:g} m3 in {config.maximum_attempts} attempts",
         where=request.name,
         remedy="lower the volumes or rockfall.safe_zone_offset_m",
     )

@@ -182,7 +182,7 @@ def _read(path: Path, unit: str) -> TriangleMesh:
     check_file(path)
     if kind == "ply" and (plain := _plain_ply(path)) is not None:
         return plain
-    check_file(path, most_bytes=_MOST_BYTES, smaller="export it as a binary PLY of triangles, which can have any size")
+    check_file(path, most_bytes=_MOST_BYTES, if_too_large="export it as a binary PLY of triangles, which can have any size")
     options: dict[str, Any] = {"skip_materials": True} if kind == "obj" else {}
     try:
         source = _obj_text(path, unit) if kind == "obj" else b""
@@ -196,19 +196,21 @@ def _read(path: Path, unit: str) -> TriangleMesh:
         raise
     except OSError as error:
         raise InputError(
-            f"cannot be read ({error.strerror or error})", where=where, remedy="give yourself the permission to read the file"
+            f"the file cannot be read ({error.strerror or error})",
+            where=where,
+            remedy="give yourself the permission to read the file",
         ) from None
     except Exception as error:  # trimesh's readers may raise any exception on malformed data
         problem = " ".join(str(error).split())[:200] or type(error).__name__
         raise InputError(
-            f"is not a valid {kind} file: {problem}",
+            f"the file is not a valid {kind} file: {problem}",
             where=where,
             remedy="copy the complete file again, or export it again from the program that made it",
         ) from None
     faces = np.asarray(getattr(mesh, "faces", np.empty((0, 3))))
     if not len(faces):
         raise InputError(
-            "contains no triangles",
+            "the file contains no triangles",
             where=where,
             remedy="mesh the points first: scarpsim surface CLOUD --seen-from X Y Z --out wall.ply",
         )
@@ -216,8 +218,13 @@ def _read(path: Path, unit: str) -> TriangleMesh:
     if kind in _Y_UP and vertices.shape[1:] == (3,):
         vertices = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], axis=1)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
-        problem = f"has vertices of {vertices.shape[-1]} coordinates and faces of {faces.shape[-1]} corners"
-        raise InputError(problem, where=where, allowed="3 and 3", remedy="export the mesh again as triangles with x, y and z")
+        problem = f"the mesh has vertices of {vertices.shape[-1]} coordinates and faces of {faces.shape[-1]} corners"
+        raise InputError(
+            problem,
+            where=where,
+            allowed="3 coordinates and 3 corners",
+            remedy="export the mesh again as triangles with x, y and z",
+        )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(
             f"a triangle refers to vertex {faces.max()}, but there are {len(vertices)} vertices, counted from 0",
@@ -236,7 +243,7 @@ def _obj_text(path: Path, unit: str) -> bytes:
     stated = obj.unit_in_comments(text)
     if stated is not None and stated[0] != unit:
         raise InputError(
-            f"says in a comment that its unit is {stated[0]} ('{stated[1][:80]}'), but `unit` says {unit}",
+            f"the file says in a comment that its unit is {stated[0]} ('{stated[1][:80]}'), but `unit` says {unit}",
             where=str(path),
             remedy=f"set `unit` to {stated[0]}, or remove the comment if it is wrong",
         )

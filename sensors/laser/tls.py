@@ -123,9 +123,10 @@ class Pattern:
         most = min(psutil.virtual_memory().available // _BYTES_PER_PULSE, 2**31)
         if lines * pulses > most:
             raise InputError(
-                f"{lines:,} lines of {pulses:,} pulses would take {lines * pulses * _BYTES_PER_PULSE / 1e9:,.0f} GB of memory",
+                f"a scan of {lines:,} lines with {pulses:,} pulses each would take "
+                f"{lines * pulses * _BYTES_PER_PULSE / 1e9:,.0f} GB of memory",
                 where="scanner.azimuth_step_rad, scanner.zenith_step_rad",
-                allowed=f"up to {most:,} pulses in the free memory",
+                allowed=f"up to {most:,} pulses in all, which fit in the free memory",
                 remedy="choose larger steps, or a smaller window of azimuth and zenith",
             )
         return cls(azimuth[0], config.azimuth_step_rad, lines, zenith[0], config.zenith_step_rad, pulses)

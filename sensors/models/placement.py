@@ -186,5 +186,5 @@ def check_in_front(scene: RayCaster, position: FloatArray, where: str) -> None:
         raise InputError(
             f"{share} of the lines of sight meet the rock from behind: the sensor stands in or behind it",
             where=where,
-            remedy="move it in front of the wall; if a mesh's triangles are wound the wrong way round, set wall.flipped: true",
+            remedy="move the sensor in front of the wall; if a mesh's triangles are wound the wrong way, set wall.flipped: true",
         )

@@ -82,7 +82,7 @@ class SearchRange:
         count = 16 * int(np.ceil((largest + 2 - least) / 16))
         if count > MOST_DISPARITIES:
             raise InputError(
-                f"the surface spans {count} disparities",
+                f"the surface spans {count} disparities (offsets between the two images, px)",
                 where="matching",
                 allowed=f"at most {MOST_DISPARITIES}",
                 remedy="choose a depth_map with larger pixels, or a smaller depth_margin_m",

@@ -99,7 +99,7 @@ def test_a_mesh_wound_away_from_the_sensor_is_turned() -> None:
 @pytest.mark.parametrize(
     ("call", "problem"),
     [
-        (lambda: make_blocks([[0, 0]], [1.0]), r"centres: have the shape \(1, 2\)"),
+        (lambda: make_blocks([[0, 0]], [1.0]), r"centres: the array has the shape \(1, 2\)"),
         (lambda: make_blocks([[0, 0, 0]], [-1.0]), "allowed: above 0"),
         (lambda: make_blocks([[0, 0, np.nan]], [1.0]), "NaN or infinite"),
         (lambda: make_wall(stlye="bulga"), "did you mean 'style'"),

@@ -109,7 +109,7 @@ def test_meshes_go_to_others(run: Run, tmp_path: Path) -> None:
         assert np.allclose(other, truth.vertices, atol=1e-5)
     assert np.array_equal(truth.to_pyvista().cell_data["block"], truth.face_block)
     assert np.array_equal(Mesh.read(truth.save(tmp_path / "mesh.ply")).faces, truth.faces)
-    with pytest.raises(InputError, match="not all indices of vertices"):
+    with pytest.raises(InputError, match="are not indices of vertices"):
         Mesh.from_arrays([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 3]])
 
 

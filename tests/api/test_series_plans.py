@@ -46,7 +46,7 @@ def test_the_tables_hold_what_the_command_prints(monkeypatch: pytest.MonkeyPatch
     assert plans.plot().png.startswith(b"\x89PNG")
     assert "SeriesPlans: tls" in repr(plans)
     assert "are listed in 95 %" in plans._repr_html_()
-    with pytest.raises(InputError, match=r"scans: got 4; allowed: 1"):
+    with pytest.raises(InputError, match=r"scans: the number of scans in an epoch is 4; allowed: 1"):
         plan.probability(0.1, scans=4)
 
 

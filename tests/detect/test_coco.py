@@ -96,7 +96,7 @@ def test_boxes_alone_do_for_scores_of_boxes(tmp_path, capsys):
     paths = [str(path) for path in written(tmp_path, *contents)]
     assert main(["evaluate", *paths, "--iou", "bbox"]) == 0
     assert main(["evaluate", *paths]) == 2
-    assert "annotation 1: has no mask" in capsys.readouterr().err
+    assert "annotation 1: the annotation has no mask" in capsys.readouterr().err
 
 
 def test_a_plain_list_of_results_and_missing_boxes_are_filled_in(tmp_path):
@@ -159,27 +159,27 @@ OF_BOTH = {
     "images without id": (_change("images", "id", ...), "image 0 of the list: 'id' is missing"),
     "an image's id is a list": (_change("images", "id", [1]), "image 0 of the list: 'id'"),
     "images without file name": (_change("images", "file_name", ...), "image 1: 'file_name' is missing"),
-    "an image twice": (_change("images", "id", 2), "image 2: its id occurs twice"),
-    "a file twice": (_change("images", "file_name", "2.tif"), "its file_name '2.tif' occurs twice"),
-    "an annotation twice": (_change("annotations", "id", 2), "2: its id occurs twice"),
+    "an image twice": (_change("images", "id", 2), "image 2: the id of the entry occurs twice"),
+    "a file twice": (_change("images", "file_name", "2.tif"), "the file_name '2.tif' occurs twice"),
+    "an annotation twice": (_change("annotations", "id", 2), "2: the id of the entry occurs twice"),
     "an id of half": (_change("annotations", "id", 1.5), "'id': input should be a valid integer, got 1.5"),
     "another image": (_change("annotations", "image_id", 77), "77"),
     "no image id": (_change("annotations", "image_id", ...), "1: 'image_id' is missing"),
     "no category": (_change("annotations", "category_id", ...), "1: 'category_id' is missing"),
-    "another category": (_change("annotations", "category_id", 9), "1: its category 9 is not listed; allowed: 1"),
+    "another category": (_change("annotations", "category_id", 9), "1: the annotation's category 9 is not listed; allowed: 1"),
     "crowd": (_change("annotations", "iscrowd", "no"), "'iscrowd'"),
     "box of three": (_change("annotations", "bbox", [1, 2, 3]), "1: 'bbox'"),
     "box of text": (_change("annotations", "bbox", [1, 2, 3, "4"]), "1: 'bbox.3'"),
     "box with NaN": (_change("annotations", "bbox", [1, 2, 3, float("nan")]), "finite number, got nan"),
-    "box outside": (_change("annotations", "bbox", [60, 2, 30, 4]), "its bbox is [60, 2, 30, 4]; allowed: x, y, width"),
-    "box turned over": (_change("annotations", "bbox", [20, 20, -3, 4]), "its bbox is [20, 20, -3, 4]"),
+    "box outside": (_change("annotations", "bbox", [60, 2, 30, 4]), "the annotation's bbox is [60, 2, 30, 4]; allowed: x, y"),
+    "box turned over": (_change("annotations", "bbox", [20, 20, -3, 4]), "the annotation's bbox is [20, 20, -3, 4]"),
     "area": (_change("annotations", "area", float("inf")), "'area'"),
-    "no mask": (_mask(...), "1: has no mask; allowed: polygons"),
-    "null": (_mask(None), "1: has no mask"),
-    "text": (_mask("abc"), "its segmentation is 'abc'"),
-    "a number": (_mask(7), "its segmentation is 7"),
+    "no mask": (_mask(...), "1: the annotation has no mask; allowed: polygons"),
+    "null": (_mask(None), "1: the annotation has no mask"),
+    "text": (_mask("abc"), "the annotation's segmentation is 'abc'"),
+    "a number": (_mask(7), "the annotation's segmentation is 7"),
     "no polygon": (_mask([]), "has no polygon"),
-    "polygon of an odd count": (_mask([[1, 1, 9, 1, 9, 9, 1]]), "polygon 1 of its segmentation is invalid; allowed: x, y"),
+    "polygon of an odd count": (_mask([[1, 1, 9, 1, 9, 9, 1]]), "polygon 1 of the annotation's segmentation is invalid; allowed"),
     "polygon of two points": (_mask([[1, 1, 9, 1]]), "at least 3 points"),
     "the second polygon": (_mask([[1, 1, 9, 1, 9, 9], [1, 2]]), "polygon 2"),
     "polygon with NaN": (_mask([[1, 1, 9, 1, 9, float("nan")]]), "finite numbers"),
@@ -207,7 +207,7 @@ OF_TRUTH = {
         _change("images", "width", 10**7),
         "image 1: the image has 48 x 10000000 px; allowed: at most 250,000,000 px",
     ),
-    "no image": (lambda content: content.update(images=[]), "its list 'images' is empty"),
+    "no image": (lambda content: content.update(images=[]), "the list 'images' is empty"),
 }
 OF_DETECTIONS = {
     "no score": (_change("annotations", "score", ..., 1), "without a score"),

@@ -198,7 +198,7 @@ def test_inputs_that_are_none_are_refused(tmp_path):
     with pytest.raises(InputError, match="not a COCO annotation file"):
         find_inputs([tmp_path])
     (tmp_path / "annotations.json").write_text(json.dumps({"images": [], "annotations": [], "categories": []}))
-    with pytest.raises(InputError, match="its list 'images' is empty"):
+    with pytest.raises(InputError, match="the list 'images' is empty"):
         find_inputs([tmp_path])
     (tmp_path / "a.tif").write_bytes(b"II*\0garbage")
     with pytest.raises(InputError, match="TIFF"):

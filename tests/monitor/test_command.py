@@ -291,7 +291,7 @@ def mistakes(scans: Path, folder: Path) -> dict[str, tuple[list[str], str]]:
         "no overlap": ([first, str(folder / "no_overlap.las"), *station], "registered on"),
         "not there": ([first, "nowhere.laz", *station], "no such file"),
         "times backwards": ([second, first, *station], "is earlier than"),
-        "wrong number of times": ([first, second, *station, "--times", "2026-01-01"], "1 time for 2 epochs"),
+        "wrong number of times": ([first, second, *station, "--times", "2026-01-01"], "1 times are given for 2 epochs"),
         "no time": ([first, second, *station, "--times", "soon,later"], "ISO 8601"),
         "elsewhere": ([first, str(folder / "elsewhere.las"), *station], "lies elsewhere"),
         "other unit": ([first, str(folder / "feet.las"), *station], "lies elsewhere"),

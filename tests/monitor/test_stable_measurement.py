@@ -15,9 +15,14 @@ import pytest
 import yaml
 from monitor_cases import ANGLE_NOISE_RAD, NOISE_M, STATION, las, points, scan
 
+from pipeline.calibration.reference_error import ReferenceError
+from pipeline.calibration.single_ranges import SingleRanges
 from pipeline.cli import main as cli
+from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.formats.points.laz import read_laz
+from pipeline.monitoring.repeated_directions import repeated_noise
 from scene.geometry.mesh import FloatArray
+from sensors.models.sensor_model import TlsModel, TlsNoise
 
 POSITION = np.array([float(each) for each in STATION.split()])
 STEP_RAD = 0.0022
@@ -73,6 +78,18 @@ def test_what_fell_is_left_out_and_nothing_is_named(model: Path, tmp_path: Path)
     fallen = events.points[events.extra["event"] > 0]
     assert len(fallen) > 10
     assert np.linalg.norm(used[:, None] - fallen[None, ::10], axis=2).min() > 1e-3
+    measurement = read_measurement(tmp_path / "gap" / "measurement")
+    right = SingleRanges.of(measurement, measurement.model)
+    noisy = TlsNoise(range_sigma_m=3 * NOISE_M, angle_sigma_rad=ANGLE_NOISE_RAD)
+    wrong = SingleRanges.of(measurement, TlsModel(noise=noisy))
+    assert right is not None
+    assert wrong is not None
+    assert (right.agrees, wrong.agrees) == (True, False)
+    assert "both find the same noise" in right.words
+    assert "neighbouring points share errors" in wrong.words
+    error = ReferenceError.of(measurement)
+    assert error is not None
+    assert (error.shared, error.repeated) == (True, True)
 
 
 def test_an_error_of_the_later_epochs_is_named(model: Path, tmp_path: Path) -> None:
@@ -81,6 +98,22 @@ def test_an_error_of_the_later_epochs_is_named(model: Path, tmp_path: Path) -> N
     assert effect["name"] == "tls.range_incidence_bias"
     value = effect["parameters"]["coefficient_m"]
     assert abs(value["value"] - COEFFICIENT_M) < 4 * value["std"]
+
+
+@pytest.mark.parametrize("later", [1, 2, 3])
+def test_the_noise_of_a_reference_is_found_where_later_scans_repeat_its_directions(later: int) -> None:
+    clouds = [scan(seed, step_rad=STEP_RAD) for seed in range(later + 1)]
+    found = repeated_noise(clouds[0], clouds[1:], POSITION)
+    assert found is not None
+    assert found.sigma_m == pytest.approx(NOISE_M, rel=0.1)
+    assert repeated_noise(clouds[0], [*clouds[1:], scan(9, step_rad=1.37 * STEP_RAD)], POSITION) is None
+
+
+def test_more_noise_of_later_epochs_is_not_that_of_the_reference() -> None:
+    clouds = [scan(seed, step_rad=STEP_RAD, noise_m=noise) for seed, noise in enumerate([NOISE_M, 3 * NOISE_M, 3 * NOISE_M])]
+    found = repeated_noise(clouds[0], clouds[1:], POSITION)
+    assert found is not None
+    assert found.sigma_m == pytest.approx(NOISE_M, rel=0.25)
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +169,7 @@ def with_reference(folder: Path, out: Path) -> list[Any]:
         (photographs, "not of a laser scanner", "--photographs"),
         (unfinished, "is not finished", "--resume"),
         (lost, "the file of epoch 1 is not there", "move the file back"),
-        (with_reference, "--reference: cannot be combined", "leave it out"),
+        (with_reference, "--reference: the option cannot be combined", "leave the option out"),
     ],
 )
 def test_mistakes(

@@ -114,7 +114,7 @@ def test_maps_that_are_no_measurement_are_one_line(tmp_path: Path, capsys: pytes
     for words, message in (
         ([zero], "zero: the difference is 0 m everywhere"),
         ([once, once], "the map has the same values as once"),
-        ([flat], "its pixels are 0 x 0 units"),
+        ([flat], "the pixels are 0 x 0 units"),
     ):
         assert main(["calibrate", *map(str, words), "--sensor", "tls", "--out", str(out), "--quiet"]) == 2
         said = capsys.readouterr().err

@@ -153,7 +153,7 @@ def test_colmap_refuses_models_beyond_ours(tmp_path: Path) -> None:
     for line, what in (
         ("1 OPENCV_FISHEYE 640 480 500 500 320 240 0 0 0 0", "OPENCV_FISHEYE is not supported"),
         ("1 FULL_OPENCV 640 480 500 500 320 240 0 0 0 0 0 0.5 0 0", "k4 = 0.5"),
-        ("1 PINHOLE 640 480 500 500 320", "needs width, height and fx, fy, cx, cy"),
+        ("1 PINHOLE 640 480 500 500 320", "allowed: width, height and fx, fy, cx, cy"),
         ("2 PINHOLE 640 480 500 500 320 240", "names the camera 1"),
     ):
         (tmp_path / "cameras.txt").write_text(f"# comment\n{line}\n")
@@ -224,7 +224,7 @@ def test_a_camera_of_a_rig_is_no_unaligned_one(tmp_path: Path) -> None:
     [
         ('type="frame">\n', 'type="fisheye">\n', "model 'fisheye'"),
         ("<f>10250.5</f>", "", "no f"),
-        ("<k1>-0.05</k1>", "<k1>minus</k1>", "expected 1 numbers, got 'minus'"),
+        ("<k1>-0.05</k1>", "<k1>minus</k1>", "the value must have 1 numbers, but is 'minus'"),
         ("<k1>-0.05</k1>", "<k1>-50</k1>", "folds the image"),
         ('label="B"', 'label="A"', "labelled 'A'"),
         ('sensor_id="0" component_id="0" label="A"', 'component_id="0" label="A"', "sensor of camera"),
@@ -237,7 +237,7 @@ def test_a_camera_of_a_rig_is_no_unaligned_one(tmp_path: Path) -> None:
         (
             "0 0 0 1</transform></camera>",
             "0 0 0 1</transform><rolling_shutter>0 0.002 0 0 0 0</rolling_shutter></camera>",
-            "camera A: was aligned with rolling shutter compensation",
+            "camera A: the camera was aligned with rolling shutter compensation",
         ),
     ],
 )

@@ -218,13 +218,13 @@ def test_init_writes_once(capsys: pytest.CaptureFixture[str], tmp_path: Path, mo
     before = Path("site.yaml").read_text()
     capsys.readouterr()
     for words, expected in (
-        (["--out", "site.yaml"], "site.yaml: exists already; choose another name"),
+        (["--out", "site.yaml"], "site.yaml: the file exists already; choose another name"),
         (["--out", "none/site.yaml"], "none: there is no such folder"),
         (["--site", "glendal"], "configs/sites: there is no bundled config 'glendal'; allowed: bismantova,"),
         (["--site", "../demo"], "there is no bundled config '../demo'"),
         (["--scanner", "riegl_vz400"], "exists already"),
         (["--scanner", "riegl"], "configs/scanners: there is no bundled config 'riegl'"),
-        (["--dataset", "small", "--site", "glendale"], "--dataset: cannot be combined with --site"),
+        (["--dataset", "small", "--site", "glendale"], "--dataset: the option cannot be combined with --site"),
     ):
         assert cli.main(["init", "--out", "site.yaml", *words]) == 2
         assert expected in capsys.readouterr().err

@@ -281,7 +281,7 @@ def test_what_is_not_ours_is_left_alone(made: Path, tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(InputError, match="exists and is not empty"):
         make_dataset(tiny(), tmp_path)
-    with pytest.raises(InputError, match="but the config gives"):
+    with pytest.raises(InputError, match="but the given config makes the set"):
         make_dataset(tiny(seed=5), made)
     known = json.loads((made / "dataset.json").read_text())
     with pytest.raises(InputError, match="is not a data set"):
@@ -290,7 +290,7 @@ def test_what_is_not_ours_is_left_alone(made: Path, tmp_path: Path) -> None:
     changed = {known["fingerprint"]: {**source, "versions": {**source["versions"], "numpy": "0.1"}}}
     copy = tmp_path / "copy"
     write_dataset_file(copy, known["name"], changed, known["epochs"])
-    with pytest.raises(InputError, match=r"started with other versions: numpy 0.1 \(here"):
+    with pytest.raises(InputError, match=r"started with other versions of packages: numpy 0.1 \(here"):
         make_dataset(tiny(), copy)
 
 

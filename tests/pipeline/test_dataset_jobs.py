@@ -31,7 +31,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_two_jobs_on_one_folder_refuse_each_other(tmp_path: Path) -> None:
-    with locked(tmp_path / "set"), pytest.raises(InputError, match=rf"in use by process {os.getpid()} on .*wait for it"):
+    with (
+        locked(tmp_path / "set"),
+        pytest.raises(InputError, match=rf"in use by process {os.getpid()} on .*wait for that process"),
+    ):
         make_dataset(tiny(), tmp_path / "set")
     with locked(tmp_path / "set"):
         assert (tmp_path / "set" / LOCK).exists()

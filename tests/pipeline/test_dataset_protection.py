@@ -133,8 +133,8 @@ def prefixed(prefix: str) -> Callable[[dict[str, Any]], Any]:
 
 CHANGES: list[tuple[Callable[[dict[str, Any]], Any], str]] = [
     (lambda known: {}, "'schema' is missing"),
-    (lambda known: [], "expected a mapping"),
-    (lambda known: 3, "expected a mapping"),
+    (lambda known: [], "must be a mapping"),
+    (lambda known: 3, "must be a mapping"),
     (changed(epochs={"x": 10**30}), "epochs"),
     (changed(epochs=10**30), "epochs"),
     (changed(sources={}), "sources"),
@@ -258,9 +258,9 @@ def test_a_job_that_cannot_begin_leaves_nothing(
     file.write_text(json.dumps(TINY))
     for options, message in (
         (["--scheduler", "tcp://127.0.0.1:9"], "no scheduler answers"),
-        (["--workers", "100000"], "--workers: got 100,000 workers; allowed: 1 to"),
-        (["--by", "sensor"], "--by: works only with split"),
-        (["--report-only"], "--report-only: works only with verify"),
+        (["--workers", "100000"], "--workers: the number of workers is 100,000; allowed: 1 to"),
+        (["--by", "sensor"], "--by: the option works only with scarpsim dataset split"),
+        (["--report-only"], "--report-only: the option works only with scarpsim dataset verify"),
         (["--set", "tiles.size_px=4096"], "columns of tiles"),
     ):
         assert message in in_one_line(["dataset", str(file), "--out", str(out), "--quiet", *options], capsys)
@@ -304,7 +304,7 @@ def test_what_stands_in_the_place_of_a_folder_is_named(
     shutil.rmtree(copy / name, ignore_errors=True)
     make(copy / name)
     before = sorted(copy.rglob("*"))
-    assert f"{name}: is not a folder" in in_one_line(["dataset", "verify", str(copy), "--quiet"], capsys)
+    assert f"{name}: the path is not a folder" in in_one_line(["dataset", "verify", str(copy), "--quiet"], capsys)
     assert sorted(copy.rglob("*")) == before
 
 

@@ -142,7 +142,7 @@ def test_a_package_refuses_links_out_of_its_folder(tmp_path: Path, capsys: pytes
         link = folder / name
         link.symlink_to(target)
         assert export(folder, "package", "--out", tmp_path / "package.json") == 2
-        assert f"{link}: is a link out of the folder, to {target}" in capsys.readouterr().err
+        assert f"{link}: the path is a link out of the folder, to {target}" in capsys.readouterr().err
         link.unlink()
 
 
@@ -151,7 +151,7 @@ def test_a_package_refuses_links_out_of_its_folder(tmp_path: Path, capsys: pytes
     [
         (["epochs", "--epoch", "1"], "--epoch: the option works only with picture, gltf, scan"),
         (["picture", "--epoch", "9"], "--epoch: there is no epoch 9; allowed: 0 to 2"),
-        (["gltf", "--out", "wall.obj"], "--out: got 'wall.obj'; allowed: .glb"),
+        (["gltf", "--out", "wall.obj"], "--out: the file name 'wall.obj' has another ending; allowed: .glb"),
         (["movie"], "got 'movie'; allowed: picture"),
         (["yolo"], "contains no split of a data set"),
     ],

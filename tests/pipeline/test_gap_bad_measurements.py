@@ -99,10 +99,10 @@ def sweeps(azimuth: list[float], zenith: list[float]) -> Callable[[Path], None]:
 
 BAD: dict[str, tuple[Callable[[Path], None], str]] = {
     "no files": (changed(points=[]), "names no file"),
-    "step of the pattern": (sweeps([0.9, 2.3, 1e-12], [0.8, 1.7, 0.01]), "pulses for"),
+    "step of the pattern": (sweeps([0.9, 2.3, 1e-12], [0.8, 1.7, 0.01]), "too many for"),
     "pattern in degrees": (sweeps([50.0, 130.0, 0.7], [45.0, 95.0, 0.7]), "angles are in radians"),
     "zenith beyond nadir": (sweeps([0.9, 2.3, 0.012], [0.8, 5.0, 0.012]), "straight down"),
-    "elevation for zenith": (sweeps([0.9, 2.3, 0.012], [0.0, 0.7, 0.012]), "'pattern' contains"),
+    "elevation for zenith": (sweeps([0.9, 2.3, 0.012], [0.0, 0.7, 0.012]), "'pattern' contains only"),
     "world taken for scanner": (in_world, "`frame: world`"),
     "scanner taken for world": (changed(frame="world"), "`frame: scanner`"),
     "no noise": (silent, "range_sigma_m"),

@@ -222,9 +222,9 @@ BAD = {
     "all NaN": "no point with finite values",
     "scanner": "needs laser scans",
     "half": "half works only with laser scans",
-    "cameras too": "--photographs: cannot be combined with --cameras",
+    "cameras too": "--photographs: the option cannot be combined with --cameras",
     "a model in pixels": "a model whose noise is in metres",
-    "cameras in the model": "the model has focal_length",
+    "cameras in the model": "the model has effects of cameras (focal_length",
 }
 
 

@@ -156,7 +156,7 @@ def test_a_raster_from_south_to_north_is_turned(tmp_path: Path) -> None:
     ("transform", "problem"),
     [
         (rasterio.Affine(0.5, 0.1, 0.0, 0.1, -0.5, 0.0), "rotated relative to the axes"),
-        (rasterio.Affine(0.5, 0.0, 0.0, 0.0, -0.25, 0.0), r"its pixels are 0\.5 x 0\.25 units"),
+        (rasterio.Affine(0.5, 0.0, 0.0, 0.0, -0.25, 0.0), r"the pixels are 0\.5 x 0\.25 units"),
     ],
 )
 def test_pixels_that_are_turned_or_not_square_are_refused(tmp_path: Path, transform: rasterio.Affine, problem: str) -> None:

@@ -99,7 +99,7 @@ def test_what_is_recommended() -> None:
 @pytest.mark.parametrize(
     ("record", "words", "message"),
     [
-        ("5", [], "run.json: expected a mapping"),
+        ("5", [], "run.json: the content must be a mapping"),
         (
             '{"sensor": "tls", "config": {}, "epochs": 3}',
             [],
@@ -111,7 +111,7 @@ def test_what_is_recommended() -> None:
             [],
             "run.json: keys or values are wrong: 'epochs.1.registration.rotation'",
         ),
-        ("{", [], "run.json: is not JSON"),
+        ("{", [], "run.json: the file is not JSON"),
         ('{"sensor": "tls", "config": {}, "epochs": [{"epoch": 0}]}', [], "no epoch after the reference"),
         ('{"sensor": "tls", "config": {}, "epochs": [{"epoch": 0}, {"epoch": 1}]}', ["--epochs", "99"], "allowed: 1 to 1"),
         ("{}", ["--offset-m", "1e300"], "allowed: 0 to 100 m"),

@@ -146,7 +146,7 @@ def test_columns_are_taken_as_named(case: Case, tmp_path: Path) -> None:
     cloud = read_scans(path, columns=["y", "x", "z", "-", "-", "-", "intensity"])[0].cloud
     np.testing.assert_allclose(cloud.points[:, [1, 0, 2]], in_world(case), atol=1e-6)
     assert cloud.intensity is None, "constant"
-    with pytest.raises(InputError, match="has 7 columns, named x, y"):
+    with pytest.raises(InputError, match="has 7 columns, but --columns names x, y"):
         read_scans(path, columns=["x", "y"])
 
 
@@ -402,7 +402,7 @@ BAD: dict[str, tuple[Callable[[Case, Path], list[str]], str]] = {
     "behind the scanner": (move(lambda points: 2 * POSITION - points), "export both|in directions in which"),
     "position of two numbers": (asked("--position", "1,2"), "3 numbers separated by commas"),
     "no such unit": (asked("--unit", "inch"), "allowed: m, cm, mm, ft, us-ft"),
-    "columns": (asked("--columns", "x,y"), "has 4 columns, named x, y"),
+    "columns": (asked("--columns", "x,y"), "has 4 columns, but --columns names x, y"),
     "second scan of one": (asked("--scan", "2"), "allowed: 1 to 1"),
 }  # fmt: skip
 

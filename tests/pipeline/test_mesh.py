@@ -225,7 +225,7 @@ def test_poisson_of_an_observation_is_repeatable():
 
 
 def test_errors_name_the_remedy():
-    with pytest.raises(InputError, match="no triangle between the 0 points of the synthetic observation"):
+    with pytest.raises(InputError, match="no triangle was made between the 0 points of the synthetic observation"):
         mesh_observation(observation(np.full((*SHAPE, 3), np.nan)), SurfaceConfig())
     with pytest.raises(InputError, match="30 points are too few"):
         mesh_cloud(np.zeros((30, 3)), np.zeros(30, dtype=np.int32), VIEWPOINT, SurfaceConfig())

@@ -21,7 +21,7 @@ def test_what_is_no_folder(make: Callable[[Path], object], tmp_path: Path) -> No
     require_own_folder(tmp_path / ".epoch_001")
     make(tmp_path / ".epoch_001")
     for refuse in (lambda: require_own_folder(tmp_path / ".epoch_001"), lambda: _remove_unfinished(tmp_path)):
-        with pytest.raises(InputError, match=r"\.epoch_001: is not a folder"):
+        with pytest.raises(InputError, match=r"\.epoch_001: the path is not a folder"):
             refuse()
     assert os.path.lexists(tmp_path / ".epoch_001")
 
@@ -35,4 +35,4 @@ def test_a_training_to_go_on_with(
     (tmp_path / "out/losses.png").touch()
     make(tmp_path / "out" / name)
     assert main(["train", str(tmp_path / "set"), "--resume", "--out", str(tmp_path / "out")]) == 2
-    assert f"{name}: is not a folder" in capsys.readouterr().err
+    assert f"{name}: the path is not a folder" in capsys.readouterr().err

@@ -123,7 +123,7 @@ def test_a_damaged_e57_is_named(tmp_path: Path, cloud: PointCloud, keep: float) 
     path = tmp_path / "a.e57"
     write_e57(path, [scan(cloud)])
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * keep)])
-    with pytest.raises(InputError, match=r"a\.e57: is not a complete E57 file"):
+    with pytest.raises(InputError, match=r"a\.e57: the file is not a complete E57 file"):
         read_e57(path)
 
 
@@ -239,7 +239,7 @@ def test_xyz_layouts(tmp_path: Path, text: str, names: list[str]) -> None:
         ("", "no line of numbers"),
         ("1 2\n3 4\n", "no line of numbers"),
         ("1 2 3\n4 five 6\n", "line 2, column 2: 'five' is not a number"),
-        ("1 2 3\n4 5\n", "line 2: has 2 values"),
+        ("1 2 3\n4 5\n", "line 2: the number of values in this line is 2"),
         ("a rock wall\n", "no line of numbers"),
     ],
 )

@@ -149,9 +149,9 @@ def patched(path: Path, at: int, form: str, value: float) -> Path:
         (131, "<d", 1e-3, "states a box from .* and its points lie from"),
         (155, "<d", 0.0, "states a box from .* and its points lie from"),
         (179, "<d", 600_050.0, "states a box from .* and its points lie from"),
-        (247, "<Q", 400, "states 400 points but has room for 500"),
-        (247, "<Q", 600, "states 600 points but has room for 500"),
-        (107, "<I", 499, "states 500 points and, in the field of older versions, 499"),
+        (247, "<Q", 400, "states 400 points, but the file has room for 500"),
+        (247, "<Q", 600, "states 600 points, but the file has room for 500"),
+        (107, "<I", 499, "states 500 points, but 499 in the field of older"),
     ],
 )
 def test_a_las_header_that_the_points_contradict_is_an_error(
@@ -388,7 +388,7 @@ def test_ptx_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
     ("how", "problem"),
     [
         ({"size": (2, 4)}, r"scan 1 states 2 x 4 = 8 cells but has 6 lines"),
-        ({"size": (2, 2)}, r"line 15: has more lines than the grid of scan 1 has cells: '7.0 8.0"),
+        ({"size": (2, 2)}, r"line 15: the file has more lines than the grid of scan 1 has cells: '7.0 8.0"),
         (
             {"place": "10 20 5", "matrix": "10 20 7"},
             "two poses of the scanner: its position is 10 20 5 .* but 10 20 7",

@@ -113,7 +113,7 @@ def test_a_grid_of_heights_is_no_list_of_points(tmp_path: Path) -> None:
     [
         ("Latitude;Longitude;Height\n", "coordinates in degrees"),
         ("X [deg];Y [deg];Z [m]\n", "coordinates in degrees"),
-        ("X [cubit];Y [cubit];Z [cubit]\n", "an unknown unit 'cubit'"),
+        ("X [cubit];Y [cubit];Z [cubit]\n", "the unknown unit 'cubit'"),
         ("X;Y;Z;Intensity\n", "names 4 columns .* but the rows have 3"),
         ("Vorn;Seite;Oben\n", "which do not include x, y and z"),
         ("azimuth;elevation;range\n", "which do not include x, y and z"),
@@ -153,7 +153,9 @@ def test_commas_between_values_are_no_decimal_marks(tmp_path: Path) -> None:
 def test_thousands_separators_are_refused_by_name(tmp_path: Path, line: str, place: str) -> None:
     decimal = "," if ",1" in line and "." not in line.split(";")[2] and line.endswith(",125") else "."
     before = "" if place == "first" else rows(";", decimal) * 200
-    with pytest.raises(InputError, match=r"line \d+.*digits are grouped by a thousands separator.*without thousands separators"):
+    with pytest.raises(
+        InputError, match=r"line \d+.*digits of .* are grouped by a thousands separator.*without thousands separators"
+    ):
         read_points(written(tmp_path, before + line + "\n" + rows(";", decimal)))
 
 
@@ -168,10 +170,10 @@ def test_whole_numbers_beside_commas_before_three_digits_are_grouped(tmp_path: P
     ("text", "line", "problem"),
     [
         (rows() + "4 five 6\n" + rows(), 4, "'five' is not a number"),
-        (rows() + "4 5\n" + rows(), 4, r"has 2 values \('4 5'\).*allowed: 3"),
+        (rows() + "4 5\n" + rows(), 4, r"the number of values in this line is 2 \('4 5'\).*allowed: 3"),
         (rows() + "345217.0 63894", 4, "the file was cut off"),
-        ("# a\n\n" + rows(";") + "4,5;5;6\n", 6, "decimal comma, where other numbers"),
-        (rows(";", ",") + "4.5;5,1;6,1\n", 4, "decimal point, where other numbers"),
+        ("# a\n\n" + rows(";") + "4,5;5;6\n", 6, "decimal comma, but other numbers"),
+        (rows(";", ",") + "4.5;5,1;6,1\n", 4, "decimal point, but other numbers"),
     ],
 )
 def test_a_line_that_is_no_row_is_named(tmp_path: Path, text: str, line: int, problem: str) -> None:
@@ -184,7 +186,7 @@ def test_a_line_that_is_no_row_is_named(tmp_path: Path, text: str, line: int, pr
 
 @pytest.mark.parametrize(("stated", "suffix"), [(2, ".pts"), (4, ".pts"), (9, ".xyz")])
 def test_a_count_that_the_rows_do_not_agree_with_is_an_error(tmp_path: Path, stated: int, suffix: str) -> None:
-    with pytest.raises(InputError, match=f"states {stated} points but has 3"):
+    with pytest.raises(InputError, match=f"states {stated} points, but 3 follow"):
         read_points(written(tmp_path, f"{stated}\n" + rows(), name=f"a{suffix}"))
     np.testing.assert_array_equal(read_points(written(tmp_path, "3\n" + rows(), name=f"a{suffix}")).points, POINTS)
 
@@ -192,7 +194,7 @@ def test_a_count_that_the_rows_do_not_agree_with_is_an_error(tmp_path: Path, sta
 def test_a_pts_file_of_several_scans_has_a_count_before_each(tmp_path: Path) -> None:
     both = read_points(written(tmp_path, "3\n" + rows() + "3\n" + rows(), name="a.pts")).points
     np.testing.assert_array_equal(both, np.concatenate([POINTS, POINTS]))
-    with pytest.raises(InputError, match=r"line 5.*states 5 points but has 3"):
+    with pytest.raises(InputError, match=r"line 5.*states 5 points, but 3 follow"):
         read_points(written(tmp_path, "3\n" + rows() + "5\n" + rows(), name="a.pts"))
 
 

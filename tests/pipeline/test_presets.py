@@ -220,7 +220,7 @@ def test_a_scanner_of_ones_own_is_a_file_away(tmp_path: Path, bare: Path) -> Non
     ("override", "message"),
     [
         ("scanner=riegl_vz40i", "no bundled config 'riegl_vz40i'.*did you mean 'riegl_vz400i'"),
-        ("scanner=nowhere.yaml", "nowhere.yaml: cannot be read"),
+        ("scanner=nowhere.yaml", "nowhere.yaml: the file cannot be read"),
         ("scanner={preset: leica_p40, azimuth_stp_rad: 0.1}", "did you mean 'azimuth_step_rad'"),
         ("scanner=7", "'scanner'"),
         ('scanner="a\\0/b"', "null character"),
@@ -251,5 +251,5 @@ def test_a_bundled_config_is_found_by_its_name_and_by_its_path_in_a_checkout(
     Path("glendale").write_text("seed: 1\n")  # one's own goes before
     for own in ("glendale", "mine.yaml", "configs/sites/none.yaml", "folder/glendale"):
         assert config_path("sites", Path(own)) == Path(own)
-    with pytest.raises(InputError, match=r"glendal: is no file, and no bundled .* did you mean 'glendale'"):
+    with pytest.raises(InputError, match=r"glendal: this is no file, and no bundled .* did you mean 'glendale'"):
         config_path("sites", Path("glendal"))

@@ -317,10 +317,10 @@ def test_errors_name_what_is_wrong(reference: ReferenceSurface) -> None:
         (np.zeros((0, 3)), points, normals, {}, "moving points: 0 points are too few"),
         (points[:5], points, normals, {}, "moving points: 5 points are too few"),
         (points, points[:5], normals[:5], {}, "reference points: 5 points"),
-        (points[:, :2], points, normals, {}, r"expected shape \(n, 3\)"),
+        (points[:, :2], points, normals, {}, r"not \(n, 3\)"),
         (holes, points, normals, {}, "moving points: 1 of 240 points have coordinates that are NaN or infinite; remove"),
         (line, points, normals, {}, "moving points: the points lie on one line"),
-        (points, points, normals[:-1], {}, r"reference normals: expected shape \(240, 3\)"),
+        (points, points, normals[:-1], {}, r"reference normals: the array has the shape \(239, 3\), not \(240, 3\)"),
         (points, points, normals * 0, {}, "reference normals: 240 of 240 normals are zero"),
         (points, points, None, {}, "icp.method: point_to_plane needs"),
         (

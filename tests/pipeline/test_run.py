@@ -285,7 +285,7 @@ def test_what_cannot_be_simulated_ends_in_one_clear_line(
         ("sensor: {sensor: tls, noise: {range_sigma_m: -0.001}}", "greater than or equal to 0"),
         ("sensor: {sensor: tls, effects: [{name: range_ofset}]}", "did you mean 'range_offset'"),
         ("sensor: {sensor: lidar}", "sensor: tls"),
-        ("sensor: {sensor: stereo}", "take the other --sensor"),
+        ("sensor: {sensor: stereo}", "give the other sensor with --sensor"),
         ("rockfall: {count: many}", "valid integer"),
         ("wall: {style: glendele}", "glendale"),
         ("wall: {style: glendale, mesh: a.ply}", "style"),

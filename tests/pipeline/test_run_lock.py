@@ -50,7 +50,7 @@ def test_a_run_is_not_resumed_while_it_goes_on(tmp_path: Path, monkeypatch: pyte
 
     def meanwhile(*arguments: Any) -> Any:
         for resume in (True, False):
-            with pytest.raises(InputError, match=rf"in use by process {os.getpid()} on .*wait for it") as caught:
+            with pytest.raises(InputError, match=rf"in use by process {os.getpid()} on .*wait for that process") as caught:
                 simulate(config(**COARSE), "tls", out, resume=resume)
             answers.append(caught.value)
         return real(*arguments)
@@ -156,7 +156,7 @@ def test_a_folder_in_the_place_of_a_product_is_named(finished: Path, tmp_path: P
     out = copied(finished, tmp_path / "run")
     (out / "difference_001.tif").unlink()
     (out / "difference_001.tif").mkdir()
-    with pytest.raises(InputError, match=r"difference_001.tif: cannot be a file \(Is a directory\)"):
+    with pytest.raises(InputError, match=r"difference_001.tif: the path cannot be a file \(Is a directory\)"):
         simulate(config(**COARSE), "tls", out, resume=True)
 
 

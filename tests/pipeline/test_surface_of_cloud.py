@@ -92,7 +92,7 @@ def test_rounded_points_are_refused_as_those_of_a_wall() -> None:
     ("words", "problem"),
     [
         (["--seen-from", "0", "0", "0", "--out", "wall2.ply"], "--seen-from: the sensor's place lies 6,398,"),
-        (["--seen-from", "0", "0", "0", "--out", "wall.obj"], "--out: got '.obj'; allowed: .ply"),
+        (["--seen-from", "0", "0", "0", "--out", "wall.obj"], "--out: the file name ends in '.obj'; allowed: .ply"),
         (["--out", "wall2.ply"], "required: --seen-from"),
         (["--method", "poison", "--seen-from", "0", "0", "0", "--out", "wall2.ply"], "invalid choice: 'poison'"),
     ],

@@ -222,8 +222,8 @@ def test_a_coarse_wall_of_two_triangles() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"count": 500}, "500 blocks take [0-9,]+ m2, the safe zone of the wall has [0-9,]+ m2.*lower count"),
-        ({"count": 100, "maximum_attempts": 8}, "no room for a block of .* blocks are placed.*lower count"),
+        ({"count": 500}, "500 blocks take [0-9,]+ m2, but the safe zone of the wall has only [0-9,]+ m2.*lower count"),
+        ({"count": 100, "maximum_attempts": 8}, "no room was found for a block of .* blocks have a place.*lower count"),
         ({"size_m": 30.0}, "40 of 40 blocks are larger than the wall.*allowed: below 11.9"),
         ({"safe_zone_offset_m": 5.0}, "leaves no room on a wall"),
         ({"size_m": -0.1}, "a length of -0.1 m was drawn"),

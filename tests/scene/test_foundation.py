@@ -230,7 +230,7 @@ def test_config_mistakes_are_named_with_the_nearest_key() -> None:
         parse(Outer, {}, "file.yaml")
     with pytest.raises(InputError, match=r"'inner\.step_m'.*greater than 0, got -1"):
         parse(Outer, {"count": 1, "inner": {"step_m": -1}}, "file.yaml")
-    with pytest.raises(InputError, match="expected a mapping"):
+    with pytest.raises(InputError, match="must be a mapping"):
         parse(Outer, [1], "file.yaml")
     with pytest.raises(InputError, match=r"got \{'a': \{'b': \{\.\.\.\}\}\}$"):
         parse(Outer, {"count": {"a": {"b": {"c": {"d": 1}}}}}, "file.yaml")

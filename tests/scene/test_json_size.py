@@ -71,5 +71,5 @@ def test_the_limit_is_a_number(given: str, tmp_path: Path, monkeypatch: pytest.M
     path = tmp_path / "a.json"
     path.write_text("{}")
     monkeypatch.setenv(regular_file.READ_LIMIT, given)
-    with pytest.raises(InputError, match="SCARPSIM_READ_GB: got"):
+    with pytest.raises(InputError, match="SCARPSIM_READ_GB: the variable is set to"):
         read_json(path)

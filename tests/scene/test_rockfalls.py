@@ -157,7 +157,7 @@ def test_what_has_no_room_is_said() -> None:
     wall = plane_wall(4, 3)
     with pytest.raises(InputError, match=r"no block of 0.1 m3 can be cut out at \(40, 2\) m"):
         advanced(WallState(0.0, wall), 2.0, rules(wall, [{"after_h": 1.0, "volume_m3": 0.1, "position_m": [40.0, 2.0]}]))
-    with pytest.raises(InputError, match="no room for a block of 500 m3"):
+    with pytest.raises(InputError, match="no room was found for a block of 500 m3"):
         advanced(WallState(0.0, wall), 2.0, rules(wall, [{"after_h": 1.0, "volume_m3": 500.0}]))
     with pytest.raises(InputError, match="needs either `time` or `after_h`"):
         parse(EventConfig, {"volume_m3": 0.1}, "test")

@@ -14,7 +14,7 @@ from scene.walls.imported import read_mesh, read_reference
 def refused(path, words, **keys):
     with pytest.raises(InputError, match=words) as caught:
         read_mesh(path, **keys)
-    assert str(caught.value).startswith(f"{path}: the coordinates were rounded, ")
+    assert str(caught.value).startswith(f"{path}: the coordinates were rounded: ")
     assert "\n" not in str(caught.value)
     assert "double precision" in str(caught.value)
 

@@ -243,5 +243,5 @@ def test_a_pattern_may_fill_the_free_memory_and_no_more(monkeypatch: pytest.Monk
         if fits:
             assert Pattern.over(*windows, settings).pulses == 20
         else:
-            with pytest.raises(InputError, match="10 lines of 20 pulses"):
+            with pytest.raises(InputError, match="10 lines with 20 pulses"):
                 Pattern.over(*windows, settings)

@@ -155,9 +155,9 @@ ROW |= {"depth_m": "0.1", "mean_depth_m": "0.05", "volume_m3": "0.015", "score":
 @pytest.mark.parametrize(
     ("name", "row", "said"),
     [
-        ("events_all.csv", ROW, "is not the name of a table"),
-        ("events_nan.csv", ROW, "is not the name of a table"),
-        ("events_0.9.csv", {**ROW, "x_m": "left"}, "line 2: 'x_m' is 'left'"),
+        ("events_all.csv", ROW, "is not that of a table"),
+        ("events_nan.csv", ROW, "is not that of a table"),
+        ("events_0.9.csv", {**ROW, "x_m": "left"}, "line 2: the column 'x_m' has the value 'left'"),
         ("events_0.9.csv", {**ROW, "x_m": "nan"}, "finite numbers"),
         ("events_0.9.csv", {"image": "a.tif"}, "not a table of events"),
         ("events_0.9.csv", {**ROW, "more": "1"}, "not a table of events"),
@@ -323,9 +323,9 @@ def test_windows_beyond_the_raster_keep_a_pixel() -> None:
     [
         (lambda _: Path("/nowhere"), "there is no such folder"),
         (lambda folder: folder, "contains no results that can be shown"),
-        (lambda folder: _written(folder, "run.json", "{"), "run.json: is not JSON"),
+        (lambda folder: _written(folder, "run.json", "{"), "run.json: the file is not JSON"),
         (lambda folder: _written(folder, "run.json", '{"sensor": "tls", "config": {}}'), "contains no finished epoch"),
-        (lambda folder: _written(folder, "gap.json", "[]"), "gap.json: expected a mapping"),
+        (lambda folder: _written(folder, "gap.json", "[]"), "gap.json: the content must be a mapping"),
         (lambda folder: _written(folder, "annotations.json", "{}"), "is not a COCO annotation file"),
     ],
 )

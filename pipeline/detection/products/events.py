@@ -128,7 +128,7 @@ def read_events(path: Path) -> list[Event]:
     except ValidationError as error:
         wrong = error.errors()[0]
         raise InputError(
-            f"'{wrong['loc'][0]}' is {wrong['input']!r:.80}",
+            f"the column '{wrong['loc'][0]}' has the value {wrong['input']!r:.80}",
             where=f"{path}, line {table.line_num}",
             allowed="finite numbers and an image's name",
             remedy=remedy,

@@ -59,7 +59,9 @@ def detector(model: str, *, mirrored: bool = False) -> Detector:
     if model == BASELINE:
         if mirrored:
             raise InputError(
-                f"the option needs a neural network as detector, not '{BASELINE}'", where="--mirrored", remedy="leave it out"
+                f"the option needs a neural network as detector, not '{BASELINE}'",
+                where="--mirrored",
+                remedy="leave the option out",
             )
         return baseline.detect
     from pipeline.detection.network.keras_backend import import_keras

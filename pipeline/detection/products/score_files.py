@@ -178,7 +178,7 @@ def _groups(images: Sequence[Mapping[str, Any]], keys: Sequence[str], where: str
                 else f"the images have no '{key}'",
                 where=where,
                 allowed=", ".join(known),
-                remedy=nearest(key, known) or "use another --by",
+                remedy=nearest(key, known) or "choose another key with --by",
             )
         for value in sorted({image[key] for image in images}, key=str):
             groups[f"{key} {value}"] = [image["id"] for image in images if image[key] == value]

@@ -30,9 +30,9 @@ def read_oriented(path: Path) -> MetashapeCameras | None:
         return read_metashape(path)
     if root or _is_opencv_yaml(path):
         raise InputError(
-            "contains a calibration but no poses",
+            "the file contains a calibration but no poses",
             where=str(path),
-            remedy="name it as `calibration:` of a camera in cameras.yaml, beside position_m and rotation",
+            remedy="name this file as `calibration:` of a camera in cameras.yaml, beside position_m and rotation",
         )
     return None
 
@@ -55,7 +55,9 @@ def read_lens(path: Path) -> Camera:
     """
     root = _xml_root(path)
     if root == "document":
-        raise InputError("is a camera XML, not a calibration", where=str(path), remedy="name it as cameras.file in the config")
+        raise InputError(
+            "the file is a camera XML, not a calibration", where=str(path), remedy="name this file as cameras.file in the config"
+        )
     if root not in ("", "opencv_storage"):
         return read_calibration(path)
     return read_opencv_text(path) if path.suffix.lower() == ".txt" else read_opencv(path)
@@ -79,10 +81,13 @@ def stereo_pair(found: MetashapeCameras, left: str | None, right: str | None, wh
     """
     known = ", ".join(found.cameras)
     for label in (label for label in (left, right) if label is not None and label not in found.cameras):
-        why = "is not aligned" if label in found.unaligned else "is not in the file"
-        why = "belongs to a rig, whose relative poses cannot be read" if label in found.rigged else why
+        problem = "is not aligned" if label in found.unaligned else "is not in the file"
+        problem = "belongs to a rig, whose relative poses cannot be read" if label in found.rigged else problem
         raise InputError(
-            f"the pair cannot be read: camera '{label}' {why}", where=where, allowed=known, remedy="choose one of these cameras"
+            f"the pair cannot be read: the camera '{label}' {problem}",
+            where=where,
+            allowed=known,
+            remedy="choose one of these cameras",
         )
     if left is not None and right is not None:
         return CameraPair(found.cameras[left], found.cameras[right])
@@ -122,7 +127,7 @@ def _start(path: Path) -> bytes:
             return file.read(4096).lstrip()
     except OSError as error:
         raise InputError(
-            f"cannot be read ({error.strerror})",
+            f"the file cannot be read ({error.strerror})",
             where=str(path),
             remedy="give the path of an existing camera file that you may read",
         ) from None

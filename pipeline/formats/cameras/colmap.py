@@ -113,13 +113,15 @@ def read_map(path: Path) -> NDArray[np.float32]:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(
-            f"cannot be read ({error.strerror})", where=str(path), remedy="give the path of an existing file that you may read"
+            f"the file cannot be read ({error.strerror})",
+            where=str(path),
+            remedy="give the path of an existing file that you may read",
         ) from None
     header = _MAP_HEADER.match(data)
     width, height, depth = (int(number) for number in header.groups()) if header else (0, 0, 0)
     if header is None or len(data) != header.end() + 4 * width * height * depth:
         raise InputError(
-            "is not a complete depth or normal map of COLMAP",
+            "the file is not a complete depth or normal map of COLMAP",
             where=str(path),
             remedy="compute the depth and normal maps again with COLMAP",
         )
@@ -164,8 +166,9 @@ def _camera(words: list[str], where: str, pose: Pose) -> Camera:
     values = _numbers(words[2:], where)
     if len(values) != 2 + len(MODELS[model]) or min(values[:3]) <= 0:
         raise InputError(
-            f"the camera model {model} needs width, height and {', '.join(MODELS[model])}",
+            f"the values of the camera model {model} are incomplete, or its size or focal length is not above 0",
             where=where,
+            allowed=f"width, height and {', '.join(MODELS[model])}",
             remedy="export the model again as text",
         )
     named = dict(zip(MODELS[model], values[2:].tolist(), strict=True))
@@ -202,9 +205,9 @@ def _numbers(words: list[str], where: str) -> FloatArray:
         values = np.array([np.nan])
     if not (np.abs(values) <= _LARGEST).all():
         raise InputError(
-            f"expected numbers, got '{' '.join(words)[:60]}'",
+            f"the values '{' '.join(words)[:60]}' are not all numbers in the allowed range",
             where=where,
-            allowed=f"up to {_LARGEST:g}",
+            allowed=f"numbers up to {_LARGEST:g}",
             remedy="correct the line, or export the model again as text",
         )
     return values

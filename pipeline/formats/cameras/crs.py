@@ -25,11 +25,11 @@ def wkt_of(name: str, where: str) -> str:
             remedy="correct the code, or leave the key out",
         ) from None
     if any(axis.unit_conversion_factor != 1 or "degree" in axis.unit_name for axis in crs.axis_info):
-        problem = f"'{crs.name}' has the unit {crs.axis_info[0].unit_name}"
+        problem = f"the coordinate system '{crs.name}' has the unit {crs.axis_info[0].unit_name}"
         raise InputError(
             problem,
             where=where,
-            allowed="a projected coordinate system, m",
+            allowed="a projected coordinate system in metres",
             remedy="name the system in which the coordinates are eastings and northings in metres",
         )
     return str(crs.to_wkt("WKT1_GDAL"))

@@ -80,7 +80,9 @@ class Projection:
             crs = CRS.from_user_input(self.text)
         except (CRSError, UnicodeError) as error:
             raise InputError(
-                f"names an unknown coordinate system ({' '.join(str(error).split())[:100]})", where=self.where, remedy=_REMEDY
+                f"the file names an unknown coordinate system ({' '.join(str(error).split())[:100]})",
+                where=self.where,
+                remedy=_REMEDY,
             ) from None
         self._check(crs)
         return crs.sub_crs_list[0] if crs.is_compound else crs
@@ -90,10 +92,10 @@ class Projection:
         plane, *vertical = crs.sub_crs_list if crs.is_compound else [crs]
         problem = ""
         if not plane.is_projected:
-            problem = f"has poses in geocentric coordinates, but its coordinate system '{crs.name}' is not projected"
+            problem = f"the file has poses in geocentric coordinates, but its coordinate system '{crs.name}' is not projected"
         elif any(axis.unit_conversion_factor != 1 for axis in plane.axis_info):
-            problem = f"has the coordinate system '{crs.name}', whose unit is {plane.axis_info[0].unit_name}"
+            problem = f"the file has the coordinate system '{crs.name}', whose unit is {plane.axis_info[0].unit_name}"
         elif any("ellipsoid" not in each.to_wkt().lower().split("cs[")[0] for each in vertical):
-            problem = f"has the coordinate system '{crs.name}' with heights above a geoid, but its poses have ellipsoidal heights"
+            problem = f"the coordinate system '{crs.name}' has heights above a geoid, but the poses have ellipsoidal heights"
         if problem:
-            raise InputError(problem, where=self.where, allowed="a projected coordinate system, m", remedy=_REMEDY)
+            raise InputError(problem, where=self.where, allowed="a projected coordinate system in metres", remedy=_REMEDY)

@@ -118,13 +118,13 @@ def read_calibration(path: Path) -> Camera:
     root = read_root(path)
     if root.tag != "calibration":
         raise InputError(
-            f"is not a calibration XML of Metashape (its root is <{root.tag}>)",
+            f"the file is not a calibration XML of Metashape (its root is <{root.tag}>)",
             where=str(path),
-            remedy="export it with Tools > Camera Calibration > Save",
+            remedy="export the calibration with Tools > Camera Calibration > Save",
         )
     if (projection := root.findtext("projection", "frame")) != "frame":
         raise InputError(
-            f"has the projection '{projection}'",
+            f"the calibration has the projection '{projection}'",
             where=str(path),
             allowed="frame",
             remedy="use a camera of type frame in Metashape",
@@ -149,7 +149,11 @@ def _chunk(path: Path) -> ElementTree.Element:
     root = read_root(path)
     chunk = root.find("chunk") if root.tag == "document" else None
     if chunk is None:
-        raise InputError("is not a Metashape camera XML", where=str(path), remedy="export it with File > Export > Export Cameras")
+        raise InputError(
+            "the file is not a Metashape camera XML",
+            where=str(path),
+            remedy="export the cameras with File > Export > Export Cameras",
+        )
     return chunk
 
 
@@ -168,7 +172,7 @@ def _similarity(element: ElementTree.Element, path: Path) -> FloatArray:
     scale = float(_numbers(transform.findtext("scale", "1"), 1, where)[0])
     if scale <= 0:
         raise InputError(
-            f"has the scale {scale:g}",
+            f"the transform has the scale {scale:g}",
             where=where,
             allowed="greater than 0",
             remedy="export the cameras again with File > Export > Export Cameras",
@@ -184,11 +188,16 @@ def _sensor_camera(sensor: ElementTree.Element, pose: FloatArray, where: str) ->
     adjusted = [calibration for calibration in calibrations if calibration.get("class") == "adjusted"] or calibrations
     resolution = sensor.find("resolution")
     if resolution is None or not adjusted:
-        raise InputError("has no resolution or no calibration", where=where, remedy="align the cameras before the export")
+        raise InputError(
+            "the sensor has no resolution or no calibration", where=where, remedy="align the cameras before the export"
+        )
     for kind in (sensor.get("type", "frame"), adjusted[0].get("type", "frame")):
         if kind != "frame":
             raise InputError(
-                f"has the model '{kind}'", where=where, allowed="frame", remedy="use a camera of type frame in Metashape"
+                f"the sensor has the model '{kind}'",
+                where=where,
+                allowed="frame",
+                remedy="use a camera of type frame in Metashape",
             )
     width, height = (_whole(resolution.get(side, "0"), where) for side in ("width", "height"))
     return _camera(adjusted[0], (width, height), pose, where)
@@ -199,10 +208,10 @@ def _check_shutter(camera: ElementTree.Element, where: str) -> None:
     for motion in camera.iter("rolling_shutter"):
         if any(value != 0 for value in _numbers_of(motion.itertext())):
             raise InputError(
-                "was aligned with rolling shutter compensation, so that each row has its own pose, which is not supported",
+                "the camera was aligned with rolling shutter compensation: each row has its own pose, which is not supported",
                 where=where,
                 allowed="one pose for each picture",
-                remedy="switch off the compensation in Metashape's camera calibration, align again and export",
+                remedy="switch off the compensation in Metashape's camera calibration, align the cameras again, and export them",
             )
 
 
@@ -213,7 +222,7 @@ def _check_parameters(calibration: ElementTree.Element, where: str) -> None:
         if unknown and any(value != 0 for value in _numbers_of([child.text or ""])):
             allowed = ", ".join(_TAGS)
             raise InputError(
-                f"has the lens parameter {child.tag} = {(child.text or '').strip()[:20]}, which is not supported",
+                f"the calibration has the lens parameter {child.tag} = {(child.text or '').strip()[:20]}, which is not supported",
                 where=where,
                 allowed=allowed,
                 remedy=f"fix {child.tag} at 0 in Metashape and optimise again",
@@ -245,7 +254,7 @@ def _camera(calibration: ElementTree.Element, size: tuple[int, int], pose: Float
     left, scales, right = np.linalg.svd(pose[:3, :3])  # the nearest rotation, without the similarity's scale
     if np.linalg.det(left @ right) < 0 or np.ptp(scales) > 1e-6 * scales[0]:
         raise InputError(
-            "a camera's transform is not a rotation with one scale",
+            "the camera's transform is not a rotation with one scale",
             where=where,
             remedy="export the cameras again with File > Export > Export Cameras",
         )
@@ -274,7 +283,7 @@ def _whole(text: str, where: str) -> int:
     """Parse a whole number."""
     value = float(_numbers(text, 1, where)[0])
     if value != int(value):
-        raise InputError(f"expected a whole number of pixels, got '{text}'", where=where, remedy="export it again from Metashape")
+        raise InputError(f"'{text}' is not a whole number of pixels", where=where, remedy="export the file again from Metashape")
     return int(value)
 
 
@@ -286,6 +295,8 @@ def _numbers(text: str, count: int, where: str) -> FloatArray:
         values = np.empty(0)
     if len(values) != count or not (np.abs(values) <= _LARGEST).all():
         raise InputError(
-            f"expected {count} numbers, got '{' '.join(text.split())[:60]}'", where=where, remedy="export it again from Metashape"
+            f"the value must have {count} numbers, but is '{' '.join(text.split())[:60]}'",
+            where=where,
+            remedy="export the file again from Metashape",
         )
     return values

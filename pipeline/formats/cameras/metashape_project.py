@@ -49,7 +49,7 @@ def project_files(path: Path) -> list[Path]:
     """
     root = read_root(path)
     if root.tag != "document" or root.get("path") is None:
-        raise InputError("is not a Metashape project", where=str(path), remedy=_EXPORT)
+        raise InputError("the file is not a Metashape project", where=str(path), remedy=_EXPORT)
     project = inside(path.parent, str(root.get("path")).replace("{projectname}", path.stem), path)
     document = _document(project, "document")
     chunks, listed = document.findall("chunks/chunk"), document.find("chunks")
@@ -57,7 +57,7 @@ def project_files(path: Path) -> list[Path]:
     chosen = [chunk for chunk in chunks if chunk.get("id") == number] or chunks
     if len(chosen) != 1:
         raise InputError(
-            f"has {len(chunks)} chunks, of which none is active",
+            f"the project has {len(chunks)} chunks, of which none is active",
             where=str(project),
             remedy="open the chunk in Metashape and save the project",
         )
@@ -82,7 +82,9 @@ def _unpacked(archive: Path) -> bytes:
             text = file.read(_DOCUMENT) if size <= MOST_TEXT_BYTES else b""
     except _DAMAGED as error:
         raise InputError(
-            f"is not an archive of a Metashape project ({' '.join(str(error).split())[:200]})", where=str(archive), remedy=_EXPORT
+            f"the file is not an archive of a Metashape project ({' '.join(str(error).split())[:200]})",
+            where=str(archive),
+            remedy=_EXPORT,
         ) from None
     if size > MOST_TEXT_BYTES:
         raise InputError(

@@ -73,7 +73,7 @@ class OpencvInterior:
         for name, meaning in (("b2", "skew"), ("k4", "radial distortion, r^8")):
             if getattr(camera, name) != 0:
                 raise InputError(
-                    f"{name} = {getattr(camera, name):g} ({meaning}) has no counterpart in OpenCV's camera model",
+                    f"the parameter {name} = {getattr(camera, name):g} ({meaning}) has no counterpart in OpenCV's camera model",
                     where=where,
                     allowed=f"{name} = 0",
                     remedy="write a Metashape XML instead, or calibrate the camera again without this parameter",
@@ -105,10 +105,10 @@ def shared_distortion(values: dict[str, float], where: str) -> dict[str, float]:
     for name, value in values.items():
         if name not in _SHARED and value != 0:
             raise InputError(
-                f"{name} = {value:g} has no counterpart in Metashape's camera model",
+                f"the distortion coefficient {name} = {value:g} has no counterpart in Metashape's camera model",
                 where=where,
                 allowed=f"{name} = 0",
-                remedy="calibrate with k1, k2, k3, p1, p2 only",
+                remedy="calibrate the camera again with k1, k2, k3, p1, p2 only",
             )
     return {name: value for name, value in values.items() if name in _SHARED}
 
@@ -125,12 +125,17 @@ def read_opencv(path: Path) -> Camera:
         storage.release()
     except (cv2.error, SystemError):  # OpenCV 5 may return with an error set, for which Python raises SystemError
         raise InputError(
-            "is not a complete file of OpenCV's FileStorage", where=str(path), remedy="save it again with cv2.FileStorage"
+            "this is not a complete file of OpenCV's FileStorage",
+            where=str(path),
+            remedy="save the calibration again with cv2.FileStorage",
         ) from None
     for part, value in parts.items():
         if value is None:
             raise InputError(
-                f"has no {part}", where=str(path), allowed=", ".join(_NAMES[part]), remedy="add it under one of these names"
+                f"the file has no {part}",
+                where=str(path),
+                allowed=", ".join(_NAMES[part]),
+                remedy=f"add the {part} under one of these names",
             )
     if np.ndim(parts["width"]) or np.ndim(parts["height"]):
         raise InputError(
@@ -171,13 +176,13 @@ def read_opencv_text(path: Path) -> Camera:
         values = np.array([float(word) for word in words])
     except ValueError as error:
         raise InputError(
-            f"contains something that is not a number ({error})",
+            f"the file contains something that is not a number ({error})",
             where=str(path),
             remedy="remove everything that is no number from the matrix and the distortion",
         ) from None
     if len(values) < 15:
         raise InputError(
-            f"has {len(values)} numbers",
+            f"the file has only {len(values)} numbers",
             where=str(path),
             allowed="2 (size), 9 (camera matrix), 4 to 14 (distortion)",
             remedy="write the size, the camera matrix and the distortion, in this order",
@@ -198,7 +203,7 @@ def _camera(size: tuple[float, float], matrix: FloatArray, distortion: FloatArra
     """Return the camera of a calibration."""
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or min(size) <= 0 or min(matrix[0, 0], matrix[1, 1]) <= 0:
         raise InputError(
-            "has no camera matrix with positive fx, fy and frame size",
+            "the calibration has no camera matrix with positive fx, fy and frame size",
             where=where,
             remedy="calibrate the camera again, and save the matrix and the image size",
         )
@@ -207,11 +212,11 @@ def _camera(size: tuple[float, float], matrix: FloatArray, distortion: FloatArra
             f"the camera matrix has the skew {matrix[0, 1]:g}",
             where=where,
             allowed="0, as in OpenCV's own model",
-            remedy="calibrate without skew",
+            remedy="calibrate the camera again without skew",
         )
     if len(distortion) not in _LENGTHS:
         raise InputError(
-            f"has {len(distortion)} distortion coefficients",
+            f"the calibration has {len(distortion)} distortion coefficients",
             where=where,
             allowed="4, 5, 8, 12 or 14",
             remedy="save all coefficients that OpenCV returned",

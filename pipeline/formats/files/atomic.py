@@ -167,7 +167,7 @@ def empty_folder(out: Path, remedy: str = "choose another --out") -> Path:
     """
     check_place(out)
     if out.exists() and any(out.iterdir()):
-        raise InputError("exists and is not an empty folder", where=f"--out {out}", remedy=remedy)
+        raise InputError("the path exists and is not an empty folder", where=f"--out {out}", remedy=remedy)
     return out
 
 
@@ -180,7 +180,7 @@ def check_place(out: Path) -> None:
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     except (OSError, ValueError) as error:  # ValueError: a null character
         reason = getattr(error, "strerror", None) or "a null character in its name"
-        raise InputError(f"cannot be used as a folder ({reason})", where=f"--out {out}", remedy=_ELSEWHERE) from None
+        raise InputError(f"the path cannot be used as a folder ({reason})", where=f"--out {out}", remedy=_ELSEWHERE) from None
     finally:
         _remove_empty(made)
 
@@ -246,14 +246,16 @@ def _as_input_error(error: OSError, path: Path) -> Exception:
     if code in _FULL:
         free = shutil.disk_usage(_existing(path)).free / 1e6
         return InputError(
-            f"the results cannot be written: {_FULL[code]}, {free:,.0f} MB are free",
+            f"the results cannot be written: {_FULL[code]}, and {free:,.0f} MB are free",
             where=where,
             remedy=f"make room or {_ELSEWHERE}",
         )
     if code in _FORBIDDEN:
-        return InputError(f"cannot be written ({error.strerror})", where=where, remedy=f"change the permissions or {_ELSEWHERE}")
+        return InputError(
+            f"the file cannot be written ({error.strerror})", where=where, remedy=f"change the permissions or {_ELSEWHERE}"
+        )
     if code in _NO_SUCH_PLACE:
-        return InputError(f"cannot be a file ({error.strerror})", where=where, remedy=_ELSEWHERE)
+        return InputError(f"the path cannot be a file ({error.strerror})", where=where, remedy=_ELSEWHERE)
     return error
 
 

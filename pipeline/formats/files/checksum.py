@@ -17,11 +17,13 @@ def sha256(path: Path) -> str:
 
     Raises InputError if it cannot be read or is too large.
     """
-    check_file(path, most_bytes=_MOST_BYTES, smaller="cut it to the scene")
+    check_file(path, most_bytes=_MOST_BYTES, if_too_large="cut it to the scene")
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise InputError(
-            f"cannot be read ({error.strerror})", where=str(path), remedy="give the path of an existing file that you may read"
+            f"the file cannot be read ({error.strerror})",
+            where=str(path),
+            remedy="give the path of an existing file that you may read",
         ) from None

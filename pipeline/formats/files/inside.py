@@ -16,25 +16,25 @@ def inside(folder: Path, name: Any, where: Path | str) -> Path:
     """
     if not isinstance(name, str) or not name.strip() or not name.isprintable():
         raise InputError(
-            f"contains {name!r:.80} where the name of a file is expected",
+            f"the file contains {name!r:.80} where the name of a file is expected",
             where=str(where),
             allowed="a file name",
-            remedy="restore the file from a copy, or run the command again that wrote it",
+            remedy="restore the file from a copy, or run the command that wrote it again",
         )
     pure, path = PurePosixPath(name), folder / name
     try:
         leads_out = pure.is_absolute() or ".." in pure.parts or not path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError) as error:  # too long, a loop of links
         raise InputError(
-            f"names the file '{name:.80}', which is impossible ({error})",
+            f"this file names the file '{name:.80}', which is impossible ({error})",
             where=str(where),
-            remedy="correct this name in the file",
+            remedy="correct this name",
         ) from None
     if leads_out:
         raise InputError(
-            f"names the file '{name:.80}', which lies outside of its folder",
+            f"this file names the file '{name:.80}', which lies outside of its folder",
             where=str(where),
             allowed=f"files in {folder}",
-            remedy="correct the name, or put the file there",
+            remedy="correct the name, or move the named file into this folder",
         )
     return path

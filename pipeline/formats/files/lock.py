@@ -24,7 +24,7 @@ def locked(folder: Path) -> Iterator[None]:
     lock, or the folder cannot be created.
     """
     if folder.exists() and not folder.is_dir():
-        raise InputError("is a file, but the results need a folder", where=f"--out {folder}", remedy="choose a folder")
+        raise InputError("the path is a file, but the results need a folder", where=f"--out {folder}", remedy="choose a folder")
     missing = [each for each in (folder, *folder.parents) if not each.exists()]
     path = folder / LOCK
     with explained(path):
@@ -52,10 +52,10 @@ def _held(path: Path) -> TextIO:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.exists() and not path.is_file():
             raise InputError(
-                "is not a file, so it cannot mark the folder as in use",
+                "the path is not a file, so it cannot mark the folder as in use",
                 where=str(path),
                 allowed="a lock file or none",
-                remedy="remove it, or choose another folder",
+                remedy="move it away, or choose another folder",
             )
         try:
             file = path.open("a+", encoding="utf-8")
@@ -68,7 +68,9 @@ def _held(path: Path) -> TextIO:
                 file.seek(0)
                 holder = file.read().strip() or "another process"
             raise InputError(
-                f"is in use by {holder}", where=str(path.parent), remedy="wait for it to end, or choose another folder"
+                f"the folder is in use by {holder}",
+                where=str(path.parent),
+                remedy="wait for that process to end, or choose another folder",
             ) from None
         with suppress(FileNotFoundError):
             if os.path.samestat(path.stat(), os.fstat(file.fileno())):

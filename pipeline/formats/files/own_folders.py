@@ -14,4 +14,6 @@ def require_own_folder(path: Path) -> None:
     A file, a pipe (at which `rmtree` waits forever) and a link are refused.
     """
     if os.path.lexists(path) and (path.is_symlink() or not path.is_dir()):
-        raise InputError("is not a folder", where=str(path), remedy="move it away, the command needs its own folder there")
+        raise InputError(
+            "the path is not a folder", where=str(path), remedy="move it away: the command needs its own folder there"
+        )

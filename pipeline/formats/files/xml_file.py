@@ -19,7 +19,7 @@ def read_root(path: Path) -> ElementTree.Element:
         text = path.read_bytes()
     except OSError as error:
         raise InputError(
-            f"cannot be read ({error.strerror})",
+            f"the file cannot be read ({error.strerror})",
             where=str(path),
             remedy="give the path of an existing XML file that you may read",
         ) from None
@@ -30,7 +30,7 @@ def parsed(text: bytes, where: str) -> ElementTree.Element:
     """Return the root element of XML text; `where` names its file for errors. Raises InputError as `read_root` does."""
     if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
         raise InputError(
-            "declares XML entities (abbreviations), which could fill the memory when they are replaced",
+            "the file declares XML entities (abbreviations), which could fill the memory when they are replaced",
             where=where,
             remedy="export the file again without entities in its DOCTYPE",
         )
@@ -38,7 +38,7 @@ def parsed(text: bytes, where: str) -> ElementTree.Element:
         return ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise InputError(
-            f"is not valid XML ({error})",
+            f"the file is not valid XML ({error})",
             where=where,
             remedy="copy the complete file again, or export it again from the program that made it",
         ) from None

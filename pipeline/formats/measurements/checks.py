@@ -260,7 +260,7 @@ def check_different(clouds: Mapping[str, PointCloud]) -> None:
         digest = hashlib.sha256(cloud.points.tobytes()).digest()
         if digest in known:
             raise InputError(
-                f"the cloud has the same points as {known[digest]}", where=name, remedy="give one file for each epoch"
+                f"the cloud has the same points as {known[digest]}", where=name, remedy="give another file for each epoch"
             )
         known[digest] = name
 
@@ -295,12 +295,13 @@ def check_pulses(azimuth: Sweep, zenith: Sweep, points: int, epochs: int, where:
     if points > _POINTS_PER_PULSE * pulses * epochs:
         raise InputError(
             f"'pattern' has {pulses:,.0f} pulses, too few for {points:,} points", where=where,
-            allowed=f"at least one for {_POINTS_PER_PULSE:g} points of an epoch",
+            allowed=f"at least one pulse for every {_POINTS_PER_PULSE:g} points of an epoch",
             remedy="correct the steps (third value of each axis, rad), or remove `pattern`",
         )  # fmt: skip
     if pulses > most:
         raise InputError(
-            f"'pattern' has {pulses:.3g} pulses for {points:,} points", where=where, allowed=f"at most {most:.3g}",
+            f"'pattern' has {pulses:.3g} pulses, too many for {points:,} points", where=where,
+            allowed=f"at most {most:.3g} pulses",
             remedy="correct the steps (third value of each axis, rad), or remove `pattern`",
         )  # fmt: skip
 
@@ -317,7 +318,7 @@ def check_inside(points: FloatArray, azimuth: Sweep, zenith: Sweep, where: str) 
     inside &= (down >= zenith[0] - zenith[2]) & (down <= zenith[1] + zenith[2])
     if inside.mean() < _FEWEST_INSIDE:
         raise InputError(
-            f"'pattern' contains {100 * inside.mean():.2g} % of the points", where=where,
+            f"'pattern' contains only {100 * inside.mean():.2g} % of the points", where=where,
             allowed=f"{100 * _FEWEST_INSIDE:g} % or more",
             remedy="correct `pattern`: "
             "azimuth is atan2(y, x), zenith is measured from +z, both in the scanner frame, rad; or remove `pattern`",

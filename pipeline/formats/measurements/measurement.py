@@ -409,7 +409,7 @@ def _scanner_pose(config: MeasurementConfig, where: str) -> ScannerPose:
 
 def _check_sensor(config: MeasurementConfig, model: TlsModel | StereoModel, where: str) -> None:
     if model.sensor != config.sensor:
-        what = f"the model is of sensor {model.sensor}, the measurement of {config.sensor}"
+        what = f"the model is of the sensor {model.sensor}, but the measurement is of the sensor {config.sensor}"
         raise InputError(what, where=where, remedy="name a model of the same sensor")
 
 

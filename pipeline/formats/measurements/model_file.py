@@ -34,5 +34,7 @@ def sensor_model(values: Any, where: str) -> TlsModel | StereoModel:
     values: keys and values. where: name of the file, for errors. Raises InputError, which names the wrong key.
     """
     if not isinstance(values, dict) or values.get("sensor") not in ("tls", "stereo"):
-        raise InputError("names no sensor", where=where, allowed="sensor: tls, sensor: stereo", remedy="add one of these lines")
+        raise InputError(
+            "the model names no sensor", where=where, allowed="sensor: tls, sensor: stereo", remedy="add one of these lines"
+        )
     return parse(_ModelFile, {"sensor": values}, where).sensor

@@ -104,11 +104,11 @@ def check_in_metres(model: StereoModel, where: str) -> None:
 
     Such a model must state noise in metres, and no errors of cameras. where: name of the file, for the error.
     """
-    of_cameras = [effect.name for effect in model.effects if effect.stage != Stage.POINT]
-    if of_cameras:
+    effects_of_cameras = [effect.name for effect in model.effects if effect.stage != Stage.POINT]
+    if effects_of_cameras:
         raise InputError(
-            f"the model has {', '.join(of_cameras)}, but the measurement has no `cameras`", where=where,
-            remedy="add `cameras` (cameras.yaml or a Metashape XML), or remove them from the model",
+            f"the model has effects of cameras ({', '.join(effects_of_cameras)}), but the measurement has no `cameras`",
+            where=where, remedy="add `cameras` (cameras.yaml or a Metashape XML), or remove these effects from the model",
         )  # fmt: skip
     if not model.noise.of_points.sigma_m and not model.noise.of_points.shared_sigma_m:
         raise InputError(

@@ -59,14 +59,14 @@ def read_ply(path: Path) -> TriangleMesh:
     vertex, face = elements.get("vertex"), elements.get("face")
     if vertex is None or face is None:
         raise InputError(
-            "contains only points, no mesh" if face is None else "contains no vertices",
+            "the file contains only points, no mesh" if face is None else "the file contains no vertices",
             where=str(path),
-            remedy="use a mesh; `scarpsim surface` makes one from points",
+            remedy="give a mesh; `scarpsim surface` makes one from points",
         )
     faces = next((face[name] for name in _FACE_LISTS if name in face), None)
     if faces is None or faces.ndim != 2 or faces.shape[1] != 3:
         raise InputError(
-            "contains faces that are not triangles",
+            "the file contains faces that are not triangles",
             where=str(path),
             remedy="triangulate the mesh in a mesh editor such as MeshLab",
         )
@@ -93,7 +93,7 @@ def read_ply_points(path: Path) -> PointCloud:
     """
     vertex = read_elements(path, only="vertex").get("vertex")
     if vertex is None:
-        raise InputError("contains no vertices", where=str(path), remedy="export it again, with its points")
+        raise InputError("the file contains no vertices", where=str(path), remedy="export the file again, with its points")
     names = [name for name in vertex if name not in ("x", "y", "z") and vertex[name].ndim == 1]
     extra = {_channel(name, vertex): _native(vertex[name]) for name in names}
     lists = [name for name in vertex if vertex[name].ndim != 1]
@@ -134,7 +134,9 @@ def _points(vertex: Columns, path: Path) -> NDArray[np.float64]:
     """Return the coordinates of the vertices."""
     missing = [name for name in "xyz" if name not in vertex]
     if missing:
-        raise InputError(f"has vertices without {', '.join(missing)}", where=str(path), remedy="export it again with x, y and z")
+        raise InputError(
+            f"the file has vertices without {', '.join(missing)}", where=str(path), remedy="export the file again with x, y and z"
+        )
     points = np.empty((len(vertex["x"]), 3))
     for axis, name in enumerate("xyz"):
         points[:, axis] = vertex[name]

@@ -106,7 +106,7 @@ def named_columns(layout: TextLayout, where: str) -> NamedColumns:
         if len(words) == layout.form.columns and (not line.comment or len(axes) == 2):
             named = ", ".join(f"'{word}'" for word in words)
             raise InputError(
-                f"names its columns {named:.200}, which do not include x, y and z",
+                f"the line names the columns {named:.200}, which do not include x, y and z",
                 where=f"{where}, line {line.number:,}",
                 allowed="x y z, easting northing height",
                 remedy=_HOW,
@@ -165,7 +165,7 @@ def _checked(
     if len(columns) == layout.form.columns:
         return columns
     raise InputError(
-        f"names {len(columns)} columns ({', '.join(words):.200}), but the rows have {layout.form.columns}",
+        f"the line names {len(columns)} columns ({', '.join(words):.200}), but the rows have {layout.form.columns} columns",
         where=f"{where}, line {line.number:,}", allowed="a name for each column", remedy=_HOW,
     )  # fmt: skip
 
@@ -224,7 +224,7 @@ def _column(meaning: str | None, name: str, unit: str, word: str, where: str) ->
     if meaning in _AXES:
         return _coordinate(str(meaning), unit, word, where)
     if _key(name) in _DEGREES:
-        raise InputError(f"names a column '{word}': coordinates in degrees", where=where, allowed="metres", remedy=_PROJECT)
+        raise InputError(f"the column '{word}' has coordinates in degrees", where=where, allowed="metres", remedy=_PROJECT)
     if meaning == "intensity":
         return Column("intensity", unit, 0.01 if unit == "%" else 1.0, decibels=unit == "db")
     if meaning == "gps_time":
@@ -240,12 +240,12 @@ def _coordinate(axis: str, unit: str, word: str, where: str) -> Column:
     if metres is not None:
         return Column(axis, unit, metres)
     if unit in _ANGLES:
-        raise InputError(f"names a column '{word}': coordinates in degrees", where=where, allowed="metres", remedy=_PROJECT)
+        raise InputError(f"the column '{word}' has coordinates in degrees", where=where, allowed="metres", remedy=_PROJECT)
     raise InputError(
-        f"names a column '{word}' with an unknown unit '{unit}'",
+        f"the column '{word}' has the unknown unit '{unit}'",
         where=where,
         allowed="m, cm, mm, km, ft, us-ft",
-        remedy="correct the name, or remove the unit",
+        remedy="correct the unit in the column's name, or remove it",
     )
 
 

@@ -106,11 +106,15 @@ def read_e57(path: Path) -> list[E57Scan]:
     except (libe57.E57Exception, RuntimeError, ValueError, KeyError) as error:
         if isinstance(error, InputError):
             raise
-        problem = f"is damaged: its {_part_of(error)} cannot be read"
+        problem = f"the file is damaged: its {_part_of(error)} cannot be read"
         raise InputError(problem, where=where, remedy="copy the complete file again, or export the scans again as E57") from None
     if not any(len(scan.cloud.points) for scan in scans):
-        problem = "has no scans" if not scans else "has no points: all records are marked as invalid, or there are none"
-        raise InputError(problem, where=where, remedy="export it again, with its points")
+        problem = (
+            "the file has no scans"
+            if not scans
+            else "the file has no points: all records are marked as invalid, or there are none"
+        )
+        raise InputError(problem, where=where, remedy="export the file again, with its points")
     return [replace(scan, cloud=scan.cloud.noted(*notes)) for scan in scans]
 
 
@@ -123,12 +127,12 @@ def _check_length(path: Path) -> None:
         start = file.read(_HEADER_BYTES)
     size, where = path.stat().st_size, str(path)
     if not start.startswith(_SIGNATURE):
-        begins = f"begins with {start[:8]!r}, not with {_SIGNATURE!r}" if start else "is empty"
-        problem = f"is not a complete E57 file: it {begins}"
-        raise InputError(problem, where=where, remedy="export it as E57, or give it the suffix of its format")
+        start_of_file = f"begins with {start[:8]!r}, not with {_SIGNATURE!r}" if start else "is empty"
+        problem = f"the file is not a complete E57 file: it {start_of_file}"
+        raise InputError(problem, where=where, remedy="export the scans as E57, or give the file the suffix of its format")
     stated = struct.unpack_from("<Q", start, _LENGTH_AT)[0] if len(start) == _HEADER_BYTES else _HEADER_BYTES
     if size < stated:
-        problem = f"is not a complete E57 file: its header states {stated:,} bytes, but it has {size:,}"
+        problem = f"the file is not a complete E57 file: its header states {stated:,} bytes, but it has {size:,}"
         raise InputError(
             problem, where=where, remedy="the file was cut off: copy the complete file again, or export the scans again as E57"
         )
@@ -148,8 +152,8 @@ def _check_metres(root: Any, where: str) -> tuple[str, ...]:
     units = units_of_crs(crs, where)
     if units is not None and not units.in_metres:
         raise InputError(
-            f"states {units.source}, whose unit is {units.name}, but E57 files are in metres", where=where,
-            remedy="export it with a coordinate system in metres, or as LAS with its present one",
+            f"the file states {units.source}, whose unit is {units.name}, but E57 files are in metres", where=where,
+            remedy="export the scans with a coordinate system in metres, or export them as LAS",
         )  # fmt: skip
     return ()
 
@@ -214,7 +218,7 @@ def _read_columns(image: Any, points: Any, where: str) -> tuple[dict[str, NDArra
     found = sum(len(next(iter(each.values()), ())) for each in pieces)
     if found != count:
         raise InputError(
-            f"has {found:,} points but states {count:,}", where=where,
+            f"the scan has {found:,} points but states {count:,}", where=where,
             remedy="copy the complete file again, or export the scans again as E57",
         )  # fmt: skip
     return {name: np.concatenate([each[name] for each in pieces]) for name in columns}, unread
@@ -226,10 +230,10 @@ def _points(columns: dict[str, NDArray[Any]], where: str) -> FloatArray:
         return np.stack([columns[name] for name in _CARTESIAN], axis=1)
     if not all(name in columns for name in _SPHERICAL):
         raise InputError(
-            "has points without coordinates",
+            "the scan has points without coordinates",
             where=where,
             allowed="cartesianX, Y, Z or sphericalRange, Azimuth, Elevation",
-            remedy="export it again, with its coordinates",
+            remedy="export the file again, with its coordinates",
         )
     distance, azimuth, elevation = (columns[name] for name in _SPHERICAL)
     level = distance * np.cos(elevation)

@@ -41,8 +41,8 @@ def stated_units(header: laspy.LasHeader, where: str) -> tuple[AxisUnits | None,
     by_keys = _by_keys(header, where)
     if by_wkt is not None and by_keys is not None and not np.allclose(by_wkt.metres, by_keys.metres, rtol=1e-8, atol=0):
         raise InputError(
-            f"states two units: {by_wkt.name} in {by_wkt.source}, {by_keys.name} in {by_keys.source}", where=where,
-            remedy="export it again with a coordinate system whose unit is that of the coordinates",
+            f"the file states two units: {by_wkt.name} in {by_wkt.source}, {by_keys.name} in {by_keys.source}", where=where,
+            remedy="export the file again with a coordinate system whose unit is that of the coordinates",
         )  # fmt: skip
     return by_wkt or by_keys, notes
 
@@ -72,7 +72,7 @@ def _by_keys(header: laspy.LasHeader, where: str) -> AxisUnits | None:
     if keys.get(_MODEL) in (_IN_DEGREES, _GEOCENTRIC) or (keys.get(_GEOGRAPHIC) and not codes[_PROJECTED] and _MODEL not in keys):
         what = "from the Earth's centre" if keys.get(_MODEL) == _GEOCENTRIC else "in degrees"
         raise InputError(
-            f"its GeoTIFF keys say that coordinates are {what} (geographic system {keys.get(_GEOGRAPHIC, 'none')})",
+            f"the file's GeoTIFF keys say that coordinates are {what} (geographic system {keys.get(_GEOGRAPHIC, 'none')})",
             where=where,
             allowed="projected coordinates",
             remedy=_PROJECT,
@@ -103,9 +103,9 @@ def _agreed(by_system: float | None, unit_code: int | None, what: str, where: st
     if by_system is not None and by_unit is not None and not np.isclose(by_system, by_unit, rtol=1e-8, atol=0):
         units = f"{by_system:.10g} m by the coordinate system, {by_unit:.10g} m by the key of the unit itself"
         raise InputError(
-            f"states two units of its {what} in its GeoTIFF keys: {units}",
+            f"the file states two units of its {what} in its GeoTIFF keys: {units}",
             where=where,
-            remedy="export it again with a coordinate system whose unit is that of the coordinates",
+            remedy="export the file again with a coordinate system whose unit is that of the coordinates",
         )
     return by_system if by_unit is None else by_unit
 
@@ -125,15 +125,15 @@ def check_box(header: laspy.LasHeader, points: FloatArray, where: str) -> tuple[
     found_low, found_high = bounding_box(points)
     single = np.spacing(np.minimum(np.maximum(np.abs(low), np.abs(high)), 1e30).astype(np.float32)).astype(float)
     reach = np.maximum(np.maximum(_OUTSIDE, single), 2 * np.array(header.scales))
-    said = f"a box from {_place(low)} to {_place(high)} in its header"
-    said = f"{said}, and its points lie from {_place(found_low)} to {_place(found_high)}"
+    places = f"its points lie from {_place(found_low)} to {_place(found_high)}"
+    places = f"a box from {_place(low)} to {_place(high)} in its header, and {places}"
     if ((found_low < low - reach) | (found_high > high + reach)).any():
         raise InputError(
-            f"states {said}", where=where,
+            f"the file states {places}", where=where,
             remedy="its scale, offset or box is wrong: export it again, or repair the header with LAStools' lasinfo -repair_bb",
         )  # fmt: skip
     larger = np.linalg.norm(high - low) > _MUCH_LARGER * np.linalg.norm(found_high - found_low) + 1
-    return (f"the file states {said}: it is part of a larger file, or its scale is wrong",) if larger else ()
+    return (f"the file states {places}: it is part of a larger file, or its scale is wrong",) if larger else ()
 
 
 def _place(values: FloatArray) -> str:
@@ -151,7 +151,7 @@ def check_counts(header: laspy.LasHeader, path: Path) -> None:
         (older,) = struct.unpack_from("<I", file.read(_OLDER_COUNT_AT + 4), _OLDER_COUNT_AT)
     if older and older != header.point_count:
         raise InputError(
-            f"states {header.point_count:,} points and, in the field of older versions, {older:,}",
+            f"the header states {header.point_count:,} points, but {older:,} in the field of older LAS versions",
             where=str(path),
             remedy="copy the complete file again, or export the points again as LAS or LAZ",
         )
@@ -163,7 +163,7 @@ def check_counts(header: laspy.LasHeader, path: Path) -> None:
     room = size // header.point_format.size
     if room != header.point_count:
         raise InputError(
-            f"states {header.point_count:,} points but has room for {room:,}", where=str(path),
+            f"the header states {header.point_count:,} points, but the file has room for {room:,}", where=str(path),
             remedy="the file was cut off, or its header is out of date: copy the complete file again, or "
             "export the points again as LAS or LAZ",
         )  # fmt: skip

@@ -200,7 +200,7 @@ def read_laz(path: Path) -> PointCloud:
         raise
     except OSError as error:
         raise InputError(
-            f"cannot be read ({error.strerror or error})",
+            f"the file cannot be read ({error.strerror or error})",
             where=where,
             remedy="give the path of an existing LAS or LAZ file that you may read",
         ) from None
@@ -208,7 +208,7 @@ def read_laz(path: Path) -> PointCloud:
         raise damaged(path, error) from None
     if len(las.points) < las.header.point_count:
         raise InputError(
-            f"has {len(las.points):,} of the {las.header.point_count:,} points that it states", where=where, remedy=_COPY
+            f"the file has {len(las.points):,} of the {las.header.point_count:,} points that it states", where=where, remedy=_COPY
         )
     check_quantisation(las.header, path)
     units, notes = stated_units(las.header, where)
@@ -237,10 +237,14 @@ def damaged(path: Path, error: BaseException) -> InputError:
     with path.open("rb") as file:
         start = file.read(4)
     if start != b"LASF":
-        problem = f"is not a LAS or LAZ file: it begins with {start!r}, not with b'LASF'" if start else "is empty"
-        return InputError(problem, where=str(path), remedy="export it as LAS or LAZ, or give it the suffix of its format")
-    told = f" ({error})" if type(error) is ValueError else ""
-    problem = f"is not a complete LAS or LAZ file{told}: what its header states is missing or damaged"
+        problem = (
+            f"the file is not a LAS or LAZ file: it begins with {start!r}, not with b'LASF'" if start else "the file is empty"
+        )
+        return InputError(
+            problem, where=str(path), remedy="export the points as LAS or LAZ, or give the file the suffix of its format"
+        )
+    reason = f" ({error})" if type(error) is ValueError else ""
+    problem = f"the file is not a complete LAS or LAZ file{reason}: what its header states is missing or damaged"
     return InputError(problem, where=str(path), remedy=_COPY)
 
 
@@ -252,9 +256,9 @@ def check_quantisation(header: laspy.LasHeader, path: Path) -> None:
     scales, offsets = np.asarray(header.scales), np.asarray(header.offsets)
     if not (np.isfinite(scales).all() and (scales > 0).all() and np.isfinite(offsets).all()):
         raise InputError(
-            f"has scale factors {scales.tolist()} and offsets {offsets.tolist()}",
+            f"the file has scale factors {scales.tolist()} and offsets {offsets.tolist()}",
             where=str(path),
-            allowed="finite ones, scales above 0",
+            allowed="finite numbers, scale factors above 0",
             remedy="export the file again with scale factors above 0",
         )
 

@@ -78,7 +78,7 @@ def read_chunks(path: Path, unit: str | None = None) -> Iterator[FloatArray]:
         raise damaged(path, error) from None
     if read < stated:
         raise InputError(
-            f"has {read:,} of the {stated:,} points that it states",
+            f"the file has {read:,} of the {stated:,} points that it states",
             where=where,
             remedy="copy the complete file again, or export the points again as LAZ",
         )

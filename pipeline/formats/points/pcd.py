@@ -47,7 +47,7 @@ def _stored(column: NDArray[Any], where: str) -> NDArray[Any]:
             f"the channel has the type {column.dtype}",
             where=where,
             allowed="one number for each point",
-            remedy="leave the channel out, or write LAZ",
+            remedy="leave the channel out, or write the points as LAZ",
         )
     little = column.dtype.newbyteorder("<")
     return column.astype("<f4") if column.dtype.itemsize == 2 and column.dtype.kind == "f" else column.astype(little)

@@ -88,7 +88,7 @@ def read_placed_scans(
     where = str(check_file(path))
     scans = _read(path, columns)
     if not any(len(scan.cloud.points) for scan in scans):
-        raise InputError("has no points", where=where, remedy="export it again, with its points")
+        raise InputError("the file has no points", where=where, remedy="export the file again, with its points")
     found = []
     for scan in scans:
         units = agreed_units(scan.cloud.stated_units, unit, where, option)
@@ -106,7 +106,8 @@ def check_reach(points: FloatArray, where: str) -> None:
     if len(far):
         raise InputError(
             f"{len(far):,} of {len(known):,} points have coordinates up to {known.max():.3g} m", where=where,
-            allowed=f"at most {_LARGEST_M:g} m", remedy="export the points in metres; correct the scale and offset in the header",
+            allowed=f"at most {_LARGEST_M:g} m", remedy="export the points in metres, or correct "
+            "the scale and offset in the header",
         )  # fmt: skip
 
 
@@ -145,7 +146,7 @@ def _read_plugged(path: Path) -> PointCloud:
     cloud = reader(path)
     if not isinstance(cloud, PointCloud):
         raise InputError(
-            f"its reader returned a {type(cloud).__name__}",
+            f"the reader of this format returned a {type(cloud).__name__}",
             where=str(path),
             allowed="a PointCloud",
             remedy="correct the reader in the package that provides it",

@@ -75,12 +75,16 @@ def read_ptx(path: Path) -> list[PtxScan]:
             scans = list(_scans(_Lines(file, where)))
     except OSError as error:
         raise InputError(
-            f"cannot be read ({error.strerror})", where=where, remedy="give the path of an existing PTX file that you may read"
+            f"the file cannot be read ({error.strerror})",
+            where=where,
+            remedy="give the path of an existing PTX file that you may read",
         ) from None
     if not scans:
-        raise InputError("has no scans", where=where, remedy="export it again, with its points")
+        raise InputError("the file has no scans", where=where, remedy="export the file again, with its points")
     if not any(len(scan.cloud.points) for scan in scans):
-        raise InputError("has no points: all cells are missing returns", where=where, remedy="export it again, with its points")
+        raise InputError(
+            "the file has no points: all cells are missing returns", where=where, remedy="export the file again, with its points"
+        )
     return scans
 
 
@@ -92,7 +96,7 @@ def orthonormal(rotation: FloatArray, where: str) -> tuple[FloatArray, tuple[str
     off = float(np.abs(rotation @ rotation.T - np.eye(3)).max()) if np.abs(rotation).max() < 2 else np.inf
     if off > 0.02 or np.linalg.det(rotation) < 0:
         raise InputError(
-            "the rotation is not a rotation matrix",
+            "the matrix of the pose is not a rotation matrix",
             where=where,
             remedy="give the matrix with more digits; its rows must be orthonormal, and its determinant +1",
         )
@@ -122,10 +126,10 @@ def _grid_size(text: str, lines: _Lines, count: int) -> int:
     if text.isdecimal():
         return int(text)
     if count > 1:
-        problem = f"has more lines than the grid of scan {count - 1} has cells: '{text:.60}' does not begin another scan"
+        problem = f"the file has more lines than the grid of scan {count - 1} has cells: '{text:.60}' does not begin another scan"
         raise InputError(problem, where=lines.here, remedy=_EXPORT)
-    problem = f"begins with '{text:.60}', but a PTX file begins with its numbers of columns and rows"
-    raise InputError(problem, where=lines.here, remedy="export it as PTX, or give it the suffix of its format")
+    problem = f"the file begins with '{text:.60}', but a PTX file begins with its numbers of columns and rows"
+    raise InputError(problem, where=lines.here, remedy="export the scans as PTX, or give the file the suffix of its format")
 
 
 def _row(lines: _Lines, count: int) -> list[float]:
@@ -148,7 +152,7 @@ def _check_pose(stated: FloatArray, matrix: FloatArray, where: str) -> None:
     if place > _ALIKE_M or axes > _ALIKE:
         there, here = (" ".join(f"{value:.6g}" for value in each[0]) for each in (stated, other))
         raise InputError(
-            f"states two poses of the scanner: its position is {there} in lines 3 to 6 of the header but {here} in the matrix",
+            f"the header states two poses of the scanner: its position is {there} in lines 3 to 6 but {here} in the matrix",
             where=where,
             allowed="the same pose in both",
             remedy="register the scans in the scanner's software, and export them again as PTX",

@@ -85,7 +85,10 @@ def encoding_of(path: Path) -> str:
     for start, (kind, suffix) in _BINARY_KINDS.items():
         if head.startswith(start):
             raise InputError(
-                f"is {kind} by its first bytes, not text", where=str(path), allowed=_ROWS, remedy=f"give it the suffix {suffix}"
+                f"the file is {kind} by its first bytes, not text",
+                where=str(path),
+                allowed=_ROWS,
+                remedy=f"give the file the suffix {suffix}",
             )
     for mark, name in _BYTE_ORDER_MARKS:
         if head.startswith(mark):
@@ -101,7 +104,9 @@ def encoding_of(path: Path) -> str:
     even, odd = head[::2].count(0), head[1::2].count(0)
     if max(even, odd) > 0.8 * len(head) / 2 and min(even, odd) < 0.1 * len(head) / 2:
         return "utf-16-be" if even > odd else "utf-16-le"
-    raise InputError("contains null bytes, like binary files", where=str(path), allowed=_ROWS, remedy="export the points as text")
+    raise InputError(
+        "the file contains null bytes, like binary files", where=str(path), allowed=_ROWS, remedy="export the points as text"
+    )
 
 
 def layout_of(path: Path) -> TextLayout:
@@ -127,11 +132,11 @@ def _check_kind(lines: Sequence[str], where: str) -> None:
     start = lines[0].strip().lower() if lines else ""
     problem, remedy = "", ""
     if start == "ply":
-        problem, remedy = "is a PLY file by its first line", "give it the suffix .ply"
+        problem, remedy = "the file is a PLY file by its first line", "give the file the suffix .ply"
     elif start.startswith("# .pcd"):
-        problem, remedy = "is a PCD file by its first line", "convert it to PLY or LAS"
+        problem, remedy = "the file is a PCD file by its first line", "convert it to PLY or LAS"
     elif any(line.lower().startswith(_GRID) for line in lines[:_HEADER_LINES]):
-        problem = "is a grid of heights (ESRI ASCII), not a list of points"
+        problem = "the file is a grid of heights (ESRI ASCII), not a list of points"
         remedy = "convert it to a GeoTIFF, for example with gdal_translate, and use that as an elevation model"
     if problem:
         raise InputError(problem, where=where, allowed=_ROWS, remedy=remedy)
@@ -192,7 +197,7 @@ def _check_grouping(rows: Sequence[Sequence[str]], decimal_comma: bool, first_li
 def _grouped(word: str, number: int, where: str) -> InputError:
     """Return the error for thousands separators."""
     return InputError(
-        f"'{word:.40}': {GROUPED}", where=f"{where}, line {number:,}", allowed="plain numbers",
+        f"the digits of '{word:.40}' {GROUPED}", where=f"{where}, line {number:,}", allowed="plain numbers",
         remedy="export the numbers without thousands separators, such as 6389450.123",
     )  # fmt: skip
 
@@ -231,11 +236,11 @@ def _no_rows(lines: Sequence[str], where: str) -> InputError:
     """Return the error for a file without rows."""
     if not any(line.strip() for line in lines):
         return InputError(
-            "has no points and no line of numbers", where=where, allowed=_ROWS, remedy="export the points again as text"
+            "the file has no points and no line of numbers", where=where, allowed=_ROWS, remedy="export the points again as text"
         )
     first = next(line.strip() for line in lines if line.strip())
     return InputError(
-        f"has no line of numbers, at least x y z, among its first {_HEADER_LINES} lines (it begins with '{first:.60}')",
+        f"the file has no line of numbers, at least x y z, among its first {_HEADER_LINES} lines (it begins with '{first:.60}')",
         where=where,
         allowed=_ROWS,
         remedy="use a file of points, or remove the lines before them",

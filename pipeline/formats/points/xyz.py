@@ -76,7 +76,9 @@ def read_xyz(path: Path, columns: Sequence[str] = ()) -> PointCloud:
         values, found = _values(path, layout)
     except OSError as error:
         raise InputError(
-            f"cannot be read ({error.strerror})", where=where, remedy="give the path of an existing text file that you may read"
+            f"the file cannot be read ({error.strerror})",
+            where=where,
+            remedy="give the path of an existing text file that you may read",
         ) from None
     _check_counts(len(values), layout, found, where)
     _check_end(path, layout)
@@ -118,7 +120,7 @@ def _check_end(path: Path, layout: TextLayout) -> None:
     *others, end = (len(word.partition(mark)[2]) for words in last for word in words or [""])
     if len(others) > _FEWEST_ALIKE and len(set(others)) == 1 and end < others[0]:
         raise InputError(
-            f"ends within a number: '{last[-1][0]}', while all numbers above have {others[0]} decimals", where=str(path),
+            f"the file ends within a number: '{last[-1][0]}', but all numbers above have {others[0]} decimals", where=str(path),
             remedy="the file was probably cut off: copy or export it again; if it is complete, add a line break at its end",
         )  # fmt: skip
 
@@ -129,7 +131,7 @@ def _check_counts(rows: int, layout: TextLayout, found: RowsFound, where: str) -
     for stated, count, place in ((layout.stated, first, where), *((s, n, f"{where}, line {at:,}") for s, n, at in found.blocks)):
         if stated is not None and stated != count:
             raise InputError(
-                f"states {stated:,} points but has {count:,}", where=place,
+                f"the count states {stated:,} points, but {count:,} follow", where=place,
                 remedy="the file was cut off or changed: copy or export it again, or correct or remove the line with the count",
             )  # fmt: skip
 
@@ -144,13 +146,17 @@ def _columns(
         names = [column.name for column in columns]
         if len(names) != count or not set("xyz") <= set(names):
             raise InputError(
-                f"has {count} columns, named {', '.join(given)}", where=where,
-                allowed="a name for each, x, y and z among them", remedy="name them with --columns, as x,y,z,intensity",
+                f"the file has {count} columns, but --columns names {', '.join(given)}", where=where,
+                allowed="a name for each column, with x, y and z among them",
+                remedy="name all columns with --columns, such as x,y,z,intensity",
             )  # fmt: skip
         return with_stated_units(columns, layout, where), ()
     if count < 3:
         raise InputError(
-            f"has {count} columns", where=where, allowed="x y z and more", remedy="export the points with at least x, y and z"
+            f"the file has {count} columns",
+            where=where,
+            allowed="3 columns (x y z) or more",
+            remedy="export the points with at least x, y and z",
         )
     found = named_columns(layout, where)
     if found.columns:
@@ -188,7 +194,7 @@ def _check_present(values: FloatArray, columns: Sequence[Column], where: str) ->
         raise InputError(
             f"column {empty[0] + 1}, read as {columns[empty[0]].name}, is empty in all {len(values):,} rows",
             where=where,
-            remedy="export it again, or give the right names of the columns with --columns",
+            remedy="export the file again, or give the right names of the columns with --columns",
         )
 
 
@@ -228,9 +234,9 @@ def _check_lines(path: Path) -> None:
         while len(part := file.read(LONGEST_LINE)) == LONGEST_LINE:
             if b"\n" not in part and b"\r" not in part:
                 raise InputError(
-                    f"has a line of more than {LONGEST_LINE:,} bytes, so it is no text file of points",
+                    f"the file has a line of more than {LONGEST_LINE:,} bytes, so it is no text file of points",
                     where=str(path), allowed="one point in each line",
-                    remedy="use a text file of points",
+                    remedy="give a text file of points",
                 )  # fmt: skip
 
 

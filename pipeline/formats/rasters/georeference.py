@@ -79,16 +79,16 @@ def georeference(tags: dict[int, Any], shape: tuple[int, int], path: Path) -> Ge
         return Georeference(None, False, linear, vertical, epsg)
     if keys.get(MODEL_TYPE) == _GEOGRAPHIC:
         raise InputError(
-            "is in geographic coordinates, degrees",
+            "the raster is in geographic coordinates, degrees",
             where=str(path),
             allowed="metres or feet",
-            remedy="reproject it to the projected coordinates of the points, in metres",
+            remedy="reproject the raster to the projected coordinates of the points, in metres",
         )
     gsd, step_y, x, y = (value * (linear or 1.0) for value in corner)
     if not (_SIDES_M[0] <= gsd <= _SIDES_M[1] and max(abs(x), abs(y)) <= _FARTHEST_M):
         place = f"a pixel of {gsd:g} m with its first corner at {x:g}, {y:g}"
         raise InputError(
-            f"has {place}",
+            f"the raster has {place}",
             where=str(path),
             allowed=f"sides of {_SIDES_M[0]:g} to {_SIDES_M[1]:g} m, coordinates of up to {_FARTHEST_M:g} m",
             remedy="export the raster again with pixels and coordinates in metres",
@@ -114,13 +114,13 @@ def _affine(tags: dict[int, Any], path: Path) -> tuple[float, float, float, floa
         step_x, step_y, x, y = (float(matrix[place]) for place in (0, 5, 3, 7))
         turned = max(abs(float(matrix[1])), abs(float(matrix[4]))) > _SQUARE * abs(step_x)
     elif tie is not None:
-        problem = f"states {len(tie) // 6} tie points but no size of its pixels"
+        problem = f"the file states {len(tie) // 6} tie points but no size of its pixels"
         raise InputError(problem, where=str(path), remedy="resample it to square pixels along the axes (gdalwarp)")
     else:
         return None
     if turned or not step_x > 0 or not np.isclose(step_x, abs(step_y), rtol=_SQUARE, atol=0):
         problem = (
-            "its pixels are rotated relative to the axes" if turned else f"its pixels are {step_x:g} x {abs(step_y):g} units"
+            "the pixels are rotated relative to the axes" if turned else f"the pixels are {step_x:g} x {abs(step_y):g} units"
         )
         raise InputError(
             problem,
@@ -141,7 +141,7 @@ def _corner(ties: FloatArray, step_x: float, step_y: float, path: Path) -> tuple
     farthest = float(np.abs(corners - corners[0]).max())
     if not farthest <= _TIES_AGREE * abs(step_x):
         raise InputError(
-            f"its {len(corners)} tie points disagree by up to {farthest:.4g} units with pixels of {step_x:g} units",
+            f"the raster's {len(corners)} tie points disagree by up to {farthest:.4g} units with pixels of {step_x:g} units",
             where=str(path),
             remedy="resample it to square pixels along the axes (gdalwarp)",
         )
@@ -156,7 +156,7 @@ def _geo_keys(tags: dict[int, Any], path: Path) -> dict[int, int]:
     rows = list(zip(*(tuple(values)[4 + part :: 4] for part in range(4)), strict=False))
     if len(values) < 4 or len(rows) < values[3]:
         raise InputError(
-            f"states {values[3] if len(values) > 3 else 0} GeoTIFF keys but has {len(rows)}",
+            f"the file states {values[3] if len(values) > 3 else 0} GeoTIFF keys but has {len(rows)} keys",
             where=str(path),
             remedy="export the GeoTIFF again, for example with gdal_translate",
         )
@@ -171,7 +171,7 @@ def _unit(keys: dict[int, int], key: int, path: Path) -> float | None:
     metres = metres_of_epsg_unit(code)
     if metres is None:
         raise InputError(
-            f"states the unit EPSG {code}, which is not a length",
+            f"the file states the unit EPSG {code}, which is not a length",
             where=str(path),
             allowed="a unit of length",
             remedy="reproject the raster to coordinates in metres",
@@ -204,7 +204,7 @@ def scale_and_offset(tags: dict[int, Any], path: Path) -> tuple[float, float]:
         found |= {str(item.get("role")): float(item.text or "") for item in items if item.get("role") in found}
     except ValueError:
         raise InputError(
-            "its scale or offset is not a number",
+            "the scale or the offset of the raster's values is not a number",
             where=f"{path}: GDAL_METADATA",
             remedy="export the GeoTIFF again, for example with gdal_translate",
         ) from None

@@ -216,7 +216,7 @@ def _read(path: Path) -> tuple[NDArray[np.float32], dict[int, Any], NDArray[np.b
         raise
     except OSError as error:
         raise InputError(
-            f"cannot be read ({error.strerror or error})",
+            f"the file cannot be read ({error.strerror or error})",
             where=str(path),
             remedy="give the path of an existing TIFF that you may read",
         ) from None
@@ -224,7 +224,7 @@ def _read(path: Path) -> tuple[NDArray[np.float32], dict[int, Any], NDArray[np.b
         raise _unreadable(path, " ".join(str(error).split())) from None
     if raster.ndim != 2 or raster.dtype.kind not in "fiub":
         raise InputError(
-            f"has the shape {raster.shape} and values of type {raster.dtype}",
+            f"the raster has the shape {raster.shape} and values of type {raster.dtype}",
             where=str(path),
             allowed="one band of numbers",
             remedy="export one band of the raster as float32",
@@ -244,13 +244,13 @@ def _unreadable(path: Path, problem: str) -> InputError:
     """Return the error for a file that tifffile cannot read; an unknown compression is not damage."""
     if "imagecodecs" in problem or "not supported" in problem or "not a known COMPRESSION" in problem:
         return InputError(
-            f"uses a compression that cannot be read ({problem})",
+            f"the file uses a compression that cannot be read ({problem})",
             where=str(path),
             allowed="no compression, deflate, LZW, PackBits, LZMA, Zstandard, LERC, JPEG",
             remedy="save the raster with deflate or without compression",
         )
     return InputError(
-        f"is not a complete TIFF file ({problem})",
+        f"the file is not a complete TIFF file ({problem})",
         where=str(path),
         remedy="copy the complete file again, or export the raster again",
     )
@@ -279,7 +279,7 @@ def _nodata(tags: dict[int, Any], path: Path) -> np.float32:
         return np.float32(text)
     except ValueError:
         raise InputError(
-            f"states '{text[:40]}' for missing data",
+            f"the file states '{text[:40]}' as its value for missing data",
             where=str(path),
             allowed="a number",
             remedy="set the tag GDAL_NODATA to a number, for example with gdal_edit.py -a_nodata -9999",
@@ -291,9 +291,9 @@ def _check_values(raster: NDArray[np.float32], path: Path) -> None:
     known = np.isnan(raster) | (np.abs(raster) <= _LARGEST)
     if not known.all():
         raise InputError(
-            f"has {int((~known).sum()):,} pixels of infinite or huge values, such as {raster[~known][0]:g}",
+            f"the raster has {int((~known).sum()):,} pixels of infinite or huge values, such as {raster[~known][0]:g}",
             where=str(path),
-            allowed=f"up to {_LARGEST:g}",
+            allowed=f"values up to {_LARGEST:g}",
             remedy="write NaN for missing data, or state the value in the tag GDAL_NODATA",
         )
 
@@ -312,10 +312,10 @@ def _check_size(page: tifffile.TiffPage, path: Path) -> None:
     if pixels > (most := most_pixels()):
         size = " x ".join(map(str, page.shape))
         raise InputError(
-            f"has {size} px, {pixels * depth / 1e9:.3g} GB in memory",
+            f"the raster has {size} px, which take {pixels * depth / 1e9:.3g} GB of memory",
             where=str(path),
             allowed=f"at most {most:,} px",
-            remedy=f"cut it into parts, export it with larger pixels, or set the variable {READ_LIMIT}",
+            remedy=f"cut the raster into parts, export it with larger pixels, or set the variable {READ_LIMIT}",
         )
 
 

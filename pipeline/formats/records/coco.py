@@ -112,7 +112,7 @@ def read_coco(path: Path, *, masks: bool = True) -> Coco:
             raise _no_coco(path, f"'{name}' is {'not a list' if name in content else 'missing'}")
     if not content["images"]:
         raise InputError(
-            "its list 'images' is empty",
+            "the list 'images' is empty",
             where=str(path),
             remedy="give the annotations file of the maps or tiles that are read here",
         )
@@ -146,10 +146,12 @@ def read_detections(path: Path, truth: Coco, *, masks: bool = True) -> list[Entr
     content = read_json(path, remedy=_REMEDY)
     entries = content.get("annotations") if isinstance(content, Mapping) else content
     if not isinstance(entries, list):
-        raise InputError("is not a list of COCO detections", where=str(path), remedy="use a detections.json of scarpsim detect")
+        raise InputError(
+            "the file is not a list of COCO detections", where=str(path), remedy="give a detections.json of scarpsim detect"
+        )
     if any(isinstance(entry, Mapping) and "score" not in entry for entry in entries):
         raise InputError(
-            "has annotations without a score",
+            "the file has annotations without a score",
             where=str(path),
             remedy="give a detections.json of scarpsim detect, not the true blocks",
         )
@@ -166,9 +168,9 @@ def read_detections(path: Path, truth: Coco, *, masks: bool = True) -> list[Entr
     strange = {entry["image_id"] for entry, _ in found} - set(ids)
     if strange:
         raise InputError(
-            f"has detections in {len(strange)} images that the truth does not have, such as id {min(strange)}",
+            f"the file has detections in {len(strange)} images that the truth does not have, such as id {min(strange)}",
             where=str(path),
-            remedy="compare with the annotations of the same maps",
+            remedy="give the annotations of the maps that were searched",
         )
     reader = _Masks({image["id"]: image for image in truth.images}, {each["id"] for each in truth.categories}, masks)
     return [reader.complete({**entry, "image_id": ids[entry["image_id"]]}, where) for entry, where in found]
@@ -188,7 +190,7 @@ class _Masks:
         if image is None:
             allowed = f"the id of one of the {len(self.images)} images"
             raise InputError(
-                f"refers to image {entry['image_id']}, which does not exist",
+                f"the annotation refers to image {entry['image_id']}, which does not exist",
                 where=where,
                 allowed=allowed,
                 remedy="leave the annotation out, or correct its image_id",
@@ -196,7 +198,7 @@ class _Masks:
         if entry["category_id"] not in self.categories:
             allowed = ", ".join(map(str, sorted(self.categories)[:20])) or "none, as the list is empty"
             raise InputError(
-                f"its category {entry['category_id']} is not listed",
+                f"the annotation's category {entry['category_id']} is not listed",
                 where=where,
                 allowed=allowed,
                 remedy="add the category to the list `categories`, or correct category_id",
@@ -210,7 +212,7 @@ class _Masks:
         if segmentation is None:
             allowed = FORMS if self.needed else f"a bbox, or a segmentation of {FORMS}"
             raise InputError(
-                "has no mask",
+                "the annotation has no mask",
                 where=where,
                 allowed=allowed,
                 remedy="draw the mask of this annotation, or leave the annotation out",
@@ -223,7 +225,7 @@ class _Masks:
 def _no_coco(path: Path, problem: str) -> InputError:
     """Return the error for a file that is not COCO."""
     return InputError(
-        f"is not a COCO annotation file ({problem})",
+        f"the file is not a COCO annotation file ({problem})",
         where=str(path),
         allowed="lists of images, annotations and categories",
         remedy="export the annotations as COCO again",
@@ -257,7 +259,10 @@ def _parsed(model: type[EntryT], entries: Sequence[Any], kind: str, path: Path) 
             ) from None
         if own in seen:
             raise InputError(
-                "its id occurs twice", where=where, allowed="a unique id", remedy="give each entry of the list an id of its own"
+                "the id of the entry occurs twice",
+                where=where,
+                allowed="a unique id",
+                remedy="give each entry of the list an id of its own",
             )
         if own is not None:
             seen.add(own)
@@ -281,7 +286,7 @@ def _unique(entries: Sequence[Entry], key: str, kind: str, path: Path) -> None:
     for entry in entries:
         if entry[key] in seen:
             raise InputError(
-                f"its {key} '{entry[key]}' occurs twice",
+                f"the {key} '{entry[key]}' occurs twice",
                 where=f"{path}: {kind} {entry['id']}",
                 remedy="leave out one of the two entries",
             )
@@ -306,7 +311,7 @@ def _check_box(box: Sequence[float], height: int, width: int, where: str) -> Non
     inside = min(x, y) >= -BEYOND_PX and x + across <= width + BEYOND_PX and y + down <= height + BEYOND_PX
     if min(across, down) < 0 or not inside:
         raise InputError(
-            f"its bbox is {list(box)}",
+            f"the annotation's bbox is {list(box)}",
             where=where,
             allowed=f"x, y, width, height inside the image of {width} x {height} px",
             remedy="write bbox as [x, y, width, height] in pixels: first the top-left corner, then the lengths",

@@ -39,7 +39,7 @@ def run_lengths(segmentation: Any, height: int, width: int, where: str) -> dict[
         return _checked(segmentation, height, width, where)
     if not isinstance(segmentation, Sequence) or isinstance(segmentation, str):
         raise InputError(
-            f"its segmentation is {_kind(segmentation)}",
+            f"the annotation's segmentation is {_kind(segmentation)}",
             where=where,
             allowed=FORMS,
             remedy="write the mask in one of these forms",
@@ -50,18 +50,25 @@ def run_lengths(segmentation: Any, height: int, width: int, where: str) -> dict[
 def _of_polygons(polygons: Sequence[Any], height: int, width: int, where: str) -> dict[str, Any]:
     """Draw polygons as a mask."""
     if not polygons:
-        raise InputError("its segmentation has no polygon", where=where, allowed=FORMS, remedy="leave the annotation out")
+        raise InputError(
+            "the annotation's segmentation has no polygon", where=where, allowed=FORMS, remedy="leave the annotation out"
+        )
     remedy = "draw the outline again, in pixels from the image's top-left corner"
     for number, polygon in enumerate(polygons, start=1):
         points = _numbers(polygon)
         if points is None or points.size < 6 or points.size % 2 or not np.isfinite(points).all():
             allowed = "x, y, x, y, ... of at least 3 points, finite numbers"
-            raise InputError(f"polygon {number} of its segmentation is invalid", where=where, allowed=allowed, remedy=remedy)
+            raise InputError(
+                f"polygon {number} of the annotation's segmentation is invalid", where=where, allowed=allowed, remedy=remedy
+            )
         beyond = points.reshape(-1, 2) - (width, height)
         if points.min() < -BEYOND_PX or beyond.max() > BEYOND_PX:
             allowed = f"x from 0 to {width}, y from 0 to {height}"
             raise InputError(
-                f"polygon {number} of its segmentation goes beyond the image", where=where, allowed=allowed, remedy=remedy
+                f"polygon {number} of the annotation's segmentation goes beyond the image",
+                where=where,
+                allowed=allowed,
+                remedy=remedy,
             )
     merged = coco_mask.merge(coco_mask.frPyObjects([list(map(float, polygon)) for polygon in polygons], height, width))
     return {"size": [height, width], "counts": merged["counts"].decode("ascii")}
@@ -73,7 +80,7 @@ def _checked(segmentation: Mapping[str, Any], height: int, width: int, where: st
     if size != [height, width]:
         allowed = f"[{height}, {width}], the image's height and width"
         raise InputError(
-            f"the image size of its segmentation (key `size`) is {_kind(size)}",
+            f"the image size of the annotation's segmentation (key `size`) is {_kind(size)}",
             where=where,
             allowed=allowed,
             remedy="use masks and images of the same data set",
@@ -82,7 +89,10 @@ def _checked(segmentation: Mapping[str, Any], height: int, width: int, where: st
     if lengths is None or (lengths < 0).any() or lengths.sum() != height * width:
         allowed = f"run lengths, plain or as pycocotools compresses them, of {height * width} pixels in all"
         raise InputError(
-            "its run lengths cannot be decoded", where=where, allowed=allowed, remedy="encode the mask again with pycocotools"
+            "the annotation's run lengths cannot be decoded",
+            where=where,
+            allowed=allowed,
+            remedy="encode the mask again with pycocotools",
         )
     plain = {"size": [height, width], "counts": lengths.tolist()}
     counts = counts if isinstance(counts, str) else coco_mask.frPyObjects(plain, height, width)["counts"].decode("ascii")

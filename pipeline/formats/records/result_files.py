@@ -22,7 +22,7 @@ def read_surface(path: Path) -> TriangleMesh:
     """
     mesh = read_ply(path)
     if not len(mesh.faces):
-        raise InputError("has no triangles", where=str(path), remedy=_REMEDY)
+        raise InputError("the file has no triangles", where=str(path), remedy=_REMEDY)
     _check(mesh.vertices, "vertices", path)
     return mesh
 
@@ -36,7 +36,7 @@ def read_own_points(path: Path) -> PointCloud:
 
     cloud = read_laz(path)
     if not len(cloud.points):
-        raise InputError("has no points", where=str(path), remedy=_REMEDY)
+        raise InputError("the file has no points", where=str(path), remedy=_REMEDY)
     _check(cloud.points, "points", path)
     return cloud
 
@@ -44,5 +44,5 @@ def read_own_points(path: Path) -> PointCloud:
 def _check(places: FloatArray, what: str, path: Path) -> None:
     """Raise InputError for coordinates that are not finite or too large."""
     if not np.isfinite(places).all():
-        raise InputError(f"has {what} with coordinates that are not numbers", where=str(path), remedy=_REMEDY)
+        raise InputError(f"the file has {what} with coordinates that are not numbers", where=str(path), remedy=_REMEDY)
     check_reach(places, str(path))

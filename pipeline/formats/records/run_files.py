@@ -78,6 +78,6 @@ class RunFiles:
             raise InputError(
                 f"the run did not write {name}",
                 where=str(path.parent),
-                remedy="add it to `products` in the config, and make the run again",
+                remedy=f"add {name} to `products` in the config, and make the run again",
             )
         return path

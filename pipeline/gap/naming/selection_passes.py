@@ -326,12 +326,18 @@ def _find_edge_effects(measurement: Measurement, residuals: Residuals, held_out_
     match measurement, residuals:
         case StereoMeasurement(), StereoResiduals():
             found = find_disparity_edge_effects(measurement, residuals, registered_residuals, held_out)
-        case TlsMeasurement(), TlsResiduals() if not model_has(measurement, BeamDivergence.tag()):
+        case TlsMeasurement(), TlsResiduals() if _can_show_footprints(measurement):
             found = find_footprint(measurement, residuals, registered_residuals, noise_ratio, held_out)
     touched = np.zeros((len(found), len(measurement.cloud.points)), dtype=bool)
     for row, each in zip(touched, found, strict=True):
         row[residuals.index] = each.touched
     return [replace(each, touched=row) for each, row in zip(found, touched, strict=True)]
+
+
+def _can_show_footprints(measurement: TlsMeasurement) -> bool:
+    """Whether the beam's footprint is to be found: not over noisy vertices, which a wide beam would seem to average."""
+    noisy = measurement.reference_error_m > 0 and not measurement.error_is_relief
+    return not noisy and not model_has(measurement, BeamDivergence.tag())
 
 
 def _with_edge_effects(

@@ -112,10 +112,10 @@ def estimate_surface_noise(measurement: SurfaceMeasurement, where: str) -> Surfa
     rows = np.flatnonzero(found.usable)
     if len(rows) < _FEWEST or not isinstance(found, SurfaceResiduals):
         raise InputError(
-            f"{len(rows)} points lie on smooth parts of the reference, too few to estimate their noise",
+            f"only {len(rows)} points lie on smooth parts of the reference, too few to estimate their noise",
             where=where,
-            allowed=f"{_FEWEST} and more",
-            remedy="use a denser cloud, or a reference that covers it",
+            allowed=f"{_FEWEST} points or more",
+            remedy="use a denser cloud, or a reference that covers the cloud",
         )  # fmt: skip
     return _fit_noise(found.geometry.point[rows], value[rows])
 

@@ -304,6 +304,8 @@ def _notes(measurement: TlsMeasurement) -> tuple[str, ...]:
     absent = {
         "no intensity: range_intensity_bias and range_noise_intensity were not tested": cloud.intensity is None,
         "no gps_time: times were estimated from the scan lines": cloud.gps_time is None,
+        "the reference's points have noise: beam_divergence was not tested": measurement.reference_error_m > 0
+        and not measurement.error_is_relief,
         "no pattern: missing returns (detection_limit, precipitation) were not tested": measurement.pattern is None,
     }
     return (*measurement.notes, *(note for note, true in absent.items() if true))
