@@ -35,8 +35,8 @@ def check_motion(motion: RigidTransform, points: FloatArray, site: ReferenceSite
     if turned <= _MOST_TURNED_DEG and moved <= _MOST_MOVED * site.grid.gsd * max(site.grid.width, site.grid.height):
         return
     raise InputError(
-        f"the epoch could not be registered on {site.source.name}: the best fit of the rock turns it by {turned:.0f} degrees and moves "
-        f"it by {moved:.2g} m",
+        f"the epoch could not be registered on {site.source.name}: the best fit of the rock turns it by {turned:.0f} degrees "
+        f"and moves it by {moved:.2g} m",
         where=name,
         allowed="epochs that overlap, and are aligned to some metres and degrees",
         remedy="give epochs of the same part of the wall, align them before, or name targets with --targets",
@@ -54,8 +54,8 @@ def remarks(found: EpochChange, site: ReferenceSite, name: str) -> list[str]:
     level, expected = (float(np.median(np.concatenate(each))) for each in _levels(found))
     if level > _BEYOND_NOISE * expected and compared < _NO_OVERLAP * seen:
         raise InputError(
-            f"the epoch could not be registered on {site.source.name}: only {compared:.0f} m² of its {seen:.0f} m² lie in both, and do not "
-            "fit there",
+            f"the epoch could not be registered on {site.source.name}: only {compared:.0f} m² of its {seen:.0f} m² lie in both, "
+            "and do not fit there",
             where=name,
             allowed="epochs that overlap, and are aligned to some metres and degrees",
             remedy="give epochs of the same part of the wall, align them before, or name targets with --targets",
@@ -90,6 +90,6 @@ def _levels(found: EpochChange) -> tuple[list[FloatArray], list[FloatArray]]:
     for change in found.changes:
         known = np.isfinite(change.significance.level)
         variance = change.reference.sigma[known] ** 2 + change.epoch.sigma[known] ** 2 + change.registration[known] ** 2
-        levels.append(change.significance.level[known])
-        expected.append(NORMAL_95 * np.sqrt(variance))
+        levels.append(change.significance.level[known].astype(np.float64))
+        expected.append(NORMAL_95 * np.sqrt(variance.astype(np.float64)))
     return levels, expected
