@@ -120,6 +120,12 @@ def _options(arguments: argparse.Namespace) -> MonitorOptions:
 
     from pipeline.monitoring.options import MonitorOptions, read_areas
 
+    if arguments.photographs and (arguments.scanner or arguments.model):
+        raise InputError(
+            "the option cannot be combined with --scanner or --model, which describe a laser scanner",
+            where="--photographs",
+            remedy="give one of them",
+        )
     if arguments.scanner and arguments.model:
         raise InputError("the option cannot be combined with --model", where="--scanner", remedy="give only one of them")
     return MonitorOptions(

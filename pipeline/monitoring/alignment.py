@@ -368,8 +368,7 @@ class _Columns:
         shown = [view for view, each in enumerate(few) if each.any()]
         weight = [_weights_by_sigma(pairs[view], few[view]) for view in shown]
         sigma = [np.hypot(pairs[view].reference.sigma[few[view]], pairs[view].epoch.sigma[few[view]]) for view in shown]
-        side = max(max(max(each.shape) for each in where) // _BLOCKS, 1)
-        block = [_block_numbers(few[view], side) + view * _MOST_BLOCKS for view in shown]
+        block = _blocks([few[view] for view in shown], max(_extent(pair) for pair in pairs))
         target = [pairs[view].difference[few[view]].astype(np.float64) for view in shown]
         weights = np.concatenate(weight)
         expected = float(np.median(np.sqrt(weights) * np.concatenate(sigma)))
@@ -435,6 +434,24 @@ def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
     values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
     kept = values > _UNDETERMINED * values[-1]
     return np.asarray(vectors[:, kept] @ ((vectors[:, kept].T @ (right / scale)) / values[kept]) / scale)
+
+
+def _extent(pair: RasterPair) -> int:
+    """Pixels along the longer side of the map; of what has data in both epochs where this is less than half of it."""
+    places = np.nonzero(np.isfinite(pair.difference))
+    compared = max((int(np.ptp(each)) + 1 for each in places if len(each)), default=0)
+    whole = max(pair.difference.shape)
+    return compared if 2 * compared < whole else whole
+
+
+def _blocks(where: Sequence[NDArray[np.bool_]], extent: int) -> list[NDArray[np.int64]]:
+    """Number of the block of the wall of each pixel, for each view; blocks are made smaller until there are two."""
+    side = max(extent // _BLOCKS, 1)
+    while True:
+        found = [_block_numbers(each, side) + view * _MOST_BLOCKS for view, each in enumerate(where)]
+        if side == 1 or len(np.unique(np.concatenate(found))) > 1:
+            return found
+        side //= 2
 
 
 def _block_numbers(where: NDArray[np.bool_], side: int) -> NDArray[np.int64]:

@@ -187,7 +187,9 @@ def _notes(views: Sequence[WallView]) -> list[str]:
         )
     seen = known / sum(view.raster.known.size for view in views)
     if len(views) == 1 and seen < _TENTH:
-        notes.append(f"only {100 * seen:.0f} % of the map has data: a larger --gsd has fewer gaps")
+        notes.append(
+            f"only {100 * seen:.0f} % of the map has data: give a larger --gsd, or remove stray points far from the wall"
+        )
     return notes
 
 

@@ -299,6 +299,7 @@ def mistakes(scans: Path, folder: Path) -> dict[str, tuple[list[str], str]]:
         "no areas": ([first, second, *station, "--stable", str(folder / "areas.yaml")], "is not a list of areas"),
         "empty folder": ([first, str(folder / "empty"), *station], "contains no scan"),
         "two models": ([first, second, *station, "--scanner", "riegl_vz400i", "--model", "m.yaml"], "--scanner"),
+        "photographs": ([first, second, *station, "--photographs", "--scanner", "riegl_vz400i"], "--photographs"),
         "pixel too large": ([first, second, *station, "--gsd", "50"], "--gsd"),
         "no detector": ([first, second, *station, "--detector", "nothing_here"], "nothing_here"),
     }
@@ -307,7 +308,7 @@ def mistakes(scans: Path, folder: Path) -> dict[str, tuple[list[str], str]]:
 @pytest.mark.parametrize("name", [
     "one epoch", "twice", "a copy", "millimetres", "no overlap",
     "not there", "times backwards", "wrong number of times", "no time", "elsewhere", "other unit",
-    "other system", "no areas", "empty folder", "two models", "pixel too large", "no detector",
+    "other system", "no areas", "empty folder", "two models", "photographs", "pixel too large", "no detector",
 ])  # fmt: skip
 def test_mistakes(name: str, scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words, problem = mistakes(scans, tmp_path)[name]

@@ -12,8 +12,10 @@ from pipeline.monitoring.events import Catalogue, Change, find_regions
 from pipeline.monitoring.gridding import WallPoints, gridded
 from pipeline.monitoring.magnitude import fit_power_law
 from pipeline.monitoring.significance import Significance, significance
+from pipeline.monitoring.stable_areas import StableRock
 from pipeline.registration.rigid import RigidTransform
 from scene.common.errors import InputError
+from scene.geometry.frame import WallFrame
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray
 
@@ -51,6 +53,16 @@ def test_a_motion_is_found_within_its_own_uncertainty() -> None:
     assert sigma[:3].max() < 1e-3
     assert found.rms_m == pytest.approx(np.sqrt(2) * 0.003 / np.sqrt(7), rel=0.6)
     assert not found.stable[0][:, :45].any()
+
+
+@pytest.mark.parametrize("width", [2500, int(WIDTH_M / 0.08)])
+def test_the_uncertainty_is_known_on_a_small_part_of_a_map(width: int) -> None:
+    """Stray points make the map twelve times as wide as the wall; and the stable rock is a single box of 1 m."""
+    grid = Grid(0.0, HEIGHT_M, 0.08, width, int(HEIGHT_M / 0.08))
+    areas = None if width > 1000 else StableRock(((4.6, 4.6, 6.4, 6.4),), WallFrame(np.eye(3), np.zeros(3)))
+    found = refine([RasterPair(gridded(wall(1), grid), gridded(wall(2), grid))], areas)
+    assert np.isfinite(found.covariance).all()
+    assert np.sqrt(np.diag(found.covariance))[:3].max() < (1e-3 if areas is None else 0.1)
 
 
 def test_heights_are_moved_as_their_points_are() -> None:
