@@ -186,7 +186,7 @@ RESOLVED = (
     '--set "detector.proposal.anchor_sizes_px=[6,14,32,64,128]" --set detector.proposal.convolution_px=3 '
     "--set training.batch=32 --set training.learning_rate=0.0005 --set training.warm_up_steps=300 --set training.epochs=17 "
     '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --out resnet',
-    "scarpsim train sets/both --config configs/detectors/fine.yaml --seed 9 --set training.start=default "
+    "scarpsim train sets/both --config configs/detectors/fine.yaml --set training.start=default "
     "--set training.learning_rate=0.0005 "
     '--set "training.loss_weights={proposal_box: 0.2, box: 0.5}" --set detector.head.mirrored=both --out more_yet',
 )

@@ -88,7 +88,7 @@ def save_scan(run: ExportedRun, number: int, path: Path) -> None:
         raise InputError(
             f"the points of epoch {number} have no valid times",
             where=str(run.folder),
-            allowed=f"numbers of seconds over at most {_LONGEST_SCAN_S:g} s",
+            allowed=f"a number for each point, in seconds; all within {_LONGEST_SCAN_S:g} s",
             remedy="make the run again with scarpsim simulate, in another folder",
         )
     order = np.argsort(clock, kind="stable")[:: max(1, count // _SCAN_POINTS)]

@@ -282,13 +282,6 @@ class EdgeThresholds(ThresholdGroup):
         "A selection pass is rejected if its residuals have more than this times the noise of the best pass.",
         JUDGEMENT,
     )
-    overdispersion: PositiveFloat = threshold_field(
-        2.0,
-        "ratio of standard deviations",
-        "If the residuals have more than this times the predicted noise, registration and noise are fitted anew for each trial "
-        "value of edge fattening. A value is then accepted only if the noise falls at least by this factor.",
-        JUDGEMENT,
-    )
     clear_step: PositiveFloat = threshold_field(
         1.3,
         "ratio of depth steps",

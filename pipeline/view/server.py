@@ -138,7 +138,7 @@ def open_second(folder: Path, first: Results) -> Results:
         raise InputError(
             "only two runs of one wall can be shown side by side",
             where=str(folder),
-            remedy="give two folders of scarpsim simulate",
+            remedy="give two run folders that scarpsim simulate made of one wall",
         )
     check_same_wall(first.world_to_wall, second.world_to_wall, first.extent_m, str(folder))
     return second

@@ -115,7 +115,8 @@ class Effect(Config, ABC):
     sets : tuple of tuples of str
         Sets of parameters that `scarpsim gap` fits; by default all that switch the effect on, together.
     trials : (str, tuple of float), optional
-        A parameter that `scarpsim gap` does not fit but tries at some values, and these values.
+        A parameter that `scarpsim gap` does not fit but tries at some values, and these values. A limit of a systematic error
+        is tried relative to the error's size: the values hold for the typical one.
     shared : bool
         For noise: whether neighbouring pixels have similar errors.
     held_out_gain : float

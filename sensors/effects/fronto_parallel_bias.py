@@ -32,6 +32,7 @@ class FrontoParallelBias(Effect):
     needs = ("along_row", "along_column")
     order = 5
     sets = (("slope_px",), ("row_px",))
+    trials = ("limit_px", (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0))
     slope_px: float = parameter(
         "bias per unit of the gradient's length",
         unit="px",

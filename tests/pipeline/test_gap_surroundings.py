@@ -60,7 +60,10 @@ def test_pixels_that_see_other_places_are_looked_at_again(
     assert not expected.on_smooth_surface.all()
     for pixels, again in ((0.3, False), (5.0, True)):
         beside = Surroundings(
-            about.point + np.array([pixels * pixel_m, 0, 0]), np.zeros(len(about.point)), np.zeros_like(about.hidden)
+            about.point + np.array([pixels * pixel_m, 0, 0]),
+            np.zeros(len(about.point)),
+            np.zeros_like(about.hidden),
+            np.zeros_like(about.gradient),
         )
         counts = _casts(monkeypatch)
         found = stereo_residuals(measurement.changed(surroundings=beside))

@@ -348,7 +348,10 @@ class MeanSearch:
         plain, fixed, _ = self._profile(())
         ratios = fixed[:, 0] - plain[0]
         found = [(ratio, each) for ratio, each in zip(ratios, self.design.families.plain, strict=True) if not each.empirical]
-        ranked = sorted(found, key=lambda item: -item[0])
+        # of variants that differ only in a trial value, such as a limit, the best one stands for all
+        ascending = sorted(found, key=lambda item: item[0])
+        best = {(each.name, each.names, each.fixed.get("camera")): (ratio, each) for ratio, each in ascending}
+        ranked = sorted(best.values(), key=lambda item: -item[0])
         least = max(thresholds().mean.refit_share * ranked[0][0], thresholds().mean.refit_gain) if ranked else 0.0
         return [each for ratio, each in ranked if ratio >= least][:_MOST_LEADING]
 

@@ -35,6 +35,8 @@ _SIDES = ("left", "right", "both")
 """Cameras that an effect may belong to."""
 _STEP = 0.1
 """Step of the finite differences, in typical sizes of the parameter."""
+_LEAST_SIZE = 1e-9
+"""Smallest size of an error, in typical ones, with which its limit is reported: a limit must be above 0."""
 _PHASE = "phase_rad"
 """Name of the parameter that holds a phase."""
 _MOST_PERIODS = 2000
@@ -98,9 +100,13 @@ def _families(effect: type[Effect], geometry: Geometry, fixed: dict[str, Any]) -
         )
     else:
         sizes = effect.typical_sizes()
+        limit, tried = effect.trials or ("", ())
         for keys in effect.sets or (tuple(sizes),):
-            columns = [effect(**fixed, **{key: sizes[key]}).mean(geometry) / sizes[key] for key in keys]
-            yield Candidate(effect.tag(), np.stack(columns, axis=1), partial(_by_name, keys), keys, fixed)
+            for limited in [{limit: value} for value in tried] or [{}]:
+                held = {**fixed, **limited}
+                columns = [effect(**held, **{key: sizes[key]}).mean(geometry) / sizes[key] for key in keys]
+                named = partial(_with_limits, keys, limited, sizes) if limited else partial(_by_name, keys)
+                yield Candidate(effect.tag(), np.stack(columns, axis=1), named, keys, held)
 
 
 def _sine_and_cosine(effect: type[Effect], geometry: Geometry, fixed: dict[str, Any]) -> FloatArray:
@@ -167,6 +173,15 @@ def _of_cameras(
 def _by_name(names: tuple[str, ...], values: FloatArray) -> dict[str, float]:
     """Return the coefficients by the names of their parameters."""
     return dict(zip(names, map(float, values), strict=True))
+
+
+def _with_limits(
+    names: tuple[str, ...], limits: dict[str, float], sizes: dict[str, float], values: FloatArray
+) -> dict[str, float]:
+    """Return the coefficients by name, and limits of the error, given for its typical size, that grow with its size."""
+    found = _by_name(names, values)
+    factor = max(abs(value) / sizes[name] for name, value in found.items())
+    return {**found, **{name: max(factor, _LEAST_SIZE) * value for name, value in limits.items()}}
 
 
 def _locking(geometry: PixelGeometry) -> list[SineGrid]:

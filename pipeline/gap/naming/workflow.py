@@ -39,6 +39,7 @@ from pipeline.gap.naming.verdict import (
     reduced_noise,
     verdict_of,
 )
+from pipeline.gap.noise_and_edges.disparity_edges import align_beside_fattening
 from pipeline.gap.noise_and_edges.heavy_tails import HeavyTails, find_heavy_tails
 from pipeline.gap.noise_and_edges.missing_returns import (
     LOSS_EFFECTS,
@@ -47,7 +48,7 @@ from pipeline.gap.noise_and_edges.missing_returns import (
     explain_missing_returns,
 )
 from pipeline.gap.noise_and_edges.variance_model import VarianceScore
-from pipeline.gap.residuals.alignment import align, compute_residuals, fit_pose_robustly
+from pipeline.gap.residuals.alignment import AlignedMeasurement, align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.scene_changes import SceneChange, moved_share
 from pipeline.gap.residuals.sensor_view import SensorView
@@ -171,6 +172,10 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     held_out_points[initial.index] = in_validation_blocks(initial.wall_xy, WallCells.over(initial.wall_xy).side_m)
     held_out_points |= _in_validation_epoch(measurement.epochs)
     aligned, plain, surveyed = align(measurement, initial.index[~held_out_points[initial.index]], initial)
+    if isinstance(measurement, StereoMeasurement) and isinstance(initial, StereoResiduals):
+        trusted = initial.index[~held_out_points[initial.index]]
+        found = AlignedMeasurement(aligned, plain, surveyed)
+        aligned, plain, surveyed = align_beside_fattening(measurement, initial, found, trusted)
     if isinstance(aligned, StereoMeasurement) and isinstance(plain, StereoResiduals):
         aligned = with_surroundings(aligned, plain)
     if isinstance(aligned, TlsMeasurement) and isinstance(plain, TlsResiduals):

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.change.robust import nmad
-from pipeline.formats.measurements.measurement import StereoMeasurement
+from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect, WallBlocks, log_density, maximise_gain
-from pipeline.gap.residuals.alignment import fit_pose_robustly
+from pipeline.gap.residuals.alignment import AlignedMeasurement, align, compute_residuals, fit_pose_robustly
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
-from pipeline.gap.residuals.residuals import BoolArray
+from pipeline.gap.residuals.residuals import BoolArray, Residuals
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from pipeline.gap.thresholds import thresholds
 from scene.common.threads import map_in_threads
@@ -29,16 +29,23 @@ from sensors.effects.occlusion_fill import OcclusionFill
 from sensors.effects.raster_effect import RasterEffect
 from sensors.effects.smoothing import Smoothing
 
-_RADII = (1, 2, 3, 4, 5, 6, 8)
-_STEPS = (1.0, 2.0, 4.0)
+_RADII = (1, 2, 3, 4, 5, 6, 8, 10)
+_RIM_STEPS, _WINDOW_STEPS_PX = (2.0, 4.0), (0.5, 1.0, 2.0, 4.0)
 _SIGMAS = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0)
-"""Radii of edge fattening in cells, depth steps in the smallest one that counts, and standard deviations of the low-pass in
-cells."""
+"""Radii of edge fattening, cells; depth steps of rims, in the smallest one that counts (which is tried too), and of windows, px;
+standard deviations of the low-pass, cells."""
 _REFINEMENT_FACTORS = (1.1, 1.03)
+_STEP_FACTORS = (1.2, 1.05)
+"""Ratios of neighbouring steps in the refinements of a window's step."""
+_ROUNDED_CELLS = 0.25, 1.5 / np.sqrt(12)
+"""Mean and standard deviation, cells, of a radius minus the whole cells that it reaches: a matcher may round it down, or to the
+nearest number, so that it lies between -0.5 and 1."""
 _FILLED_SHARE, _STRAY_SHARE = 0.9, 0.02
 """Probability that a cell of a strip holds a point where strips of its width are filled, and where they are not."""
 _EDGE_MARGIN_CELLS, _REGISTRATIONS = 2, 3
 """Cells beyond the radius of edge fattening that are unpredictable too, and registrations beside a low-pass."""
+_STEP_MARGIN = 1.1
+"""Ratio of steps between which it is uncertain whether a matcher counts a difference as a step."""
 _COPY_TOLERANCE = 0.02
 """Difference of neighbours, in standard deviations of the noise, up to which one is a copy of the other; 1 % are by chance."""
 _SMOOTHING_UNCERTAINTY = 0.02
@@ -70,6 +77,32 @@ class _EdgeData:
     held_out: BoolArray
     beside: list[Effect]
 
+    @classmethod
+    def of(
+        cls,
+        measurement: StereoMeasurement,
+        raster: DisparityRaster,
+        residuals: StereoResiduals,
+        registered_residuals: FloatArray,
+        held_out: BoolArray,
+    ) -> tuple[_EdgeData, NDArray[np.int64]]:
+        """Gather what a search needs, and return it with the numbers of its points among those of the residuals."""
+        scale = nmad((registered_residuals / residuals.sigma)[residuals.usable], 0.0)
+        known: list[Effect] = [effect for effect in measurement.model.effects if isinstance(effect, RasterEffect)]
+        known_shift = raster.added_by(known, residuals.geometry.disparity)
+        search_raster, points = raster.search_part()
+        part = residuals.part(points)
+        return cls(
+            replace(part, value=part.value + known_shift[points]),
+            search_raster,
+            part.geometry.disparity,
+            (registered_residuals + known_shift)[points],
+            scale * part.sigma,
+            WallBlocks.over(part.wall_xy),
+            held_out[points],
+            known,
+        ), points
+
     @cached_property
     def shift_without(self) -> FloatArray:
         """(n,) change of the disparities by the known effects alone, px."""
@@ -87,25 +120,36 @@ class _EdgeData:
     def gains(self, effect: Effect) -> FloatArray:
         """(n,) log-likelihood ratio of an effect beside the known ones."""
         shift = self.shift([effect])
-        counts = (shift != self.shift_without) & ~self.held_out
-        if isinstance(effect, EdgeFattening):
-            clear = np.maximum(
-                thresholds().edges.clear_sigmas * self.sigma, thresholds().edges.clear_step * self.raster.depth_step_px
-            )
-            counts &= np.abs(shift - self.shift_without) > clear
-        rows = np.flatnonzero(counts)
+        rows = np.flatnonzero((shift != self.shift_without) & ~self.held_out)
         gains = np.zeros(len(shift))
         gains[rows] = log_density(self.registered_residuals[rows], shift[rows], self.sigma[rows]) - self.density[rows]
         return gains
 
+    def registered_density(self, effects: list[Effect]) -> FloatArray:
+        """(n,) log density with further effects, and with the pose and the noise that are fitted beside them; 0 if held out."""
+        shift = self.shift(effects)
+        value, _, scale = fit_pose_robustly(replace(self.residuals, value=self.residuals.value - shift))
+        return np.where(self.held_out, 0.0, log_density(value + shift, shift, scale * self.residuals.sigma))
+
+    @cached_property
+    def registered_density_without(self) -> FloatArray:
+        """(n,) the same with the known effects alone."""
+        return self.registered_density([])
+
+    def clear_gains(self, effect: EdgeFattening) -> FloatArray:
+        """(n,) log-likelihood ratio of an effect beside the known ones; pose and noise are fitted to either model.
+
+        It is 0 at points that the effect does not move; for a rim, also where it moves them little, because matchers disagree on
+        small steps.
+        """
+        by = thresholds().edges
+        least = np.maximum(by.clear_sigmas * self.sigma, by.clear_step * self.raster.depth_step_px)
+        clear = np.abs(self.shift([effect]) - self.shift_without) > (least if effect.window == "rim" else 0.0)
+        return (self.registered_density([effect]) - self.registered_density_without) * clear
+
     def edge_effect(self, effect: Effect, std: dict[str, float], gain: float) -> EdgeEffect:
         """Return the result for an effect that was accepted beside the known ones."""
         return EdgeEffect(effect, std, gain, _unpredictable_points(effect, self.beside, self.raster, self.residuals))
-
-    @property
-    def noise_ratio(self) -> float:
-        """Observed over predicted standard deviation of the residuals."""
-        return float(self.sigma[0] / self.residuals.sigma[0])
 
     def registered_with(self, effect: Effect) -> _EdgeData:
         """Repeat the registration and the noise estimate with an effect beside the known ones."""
@@ -114,16 +158,8 @@ class _EdgeData:
         return replace(self, registered_residuals=value + shift, sigma=scale * self.residuals.sigma)
 
     def likelier(self, found: list[EdgeEffect]) -> EdgeEffect:
-        """Return the more likely of effects that can imitate each other, judged by the points that any of them moves clearly."""
-        shift = [self.shift([each.effect]) for each in found]
-        least = thresholds().edges.clear_sigmas * self.sigma
-        clear = ~self.held_out & np.any([np.abs(each - self.shift_without) > least for each in shift], axis=0)
-        registered_data = [self.registered_with(each.effect) for each in found]
-        gains = [
-            log_density(w.registered_residuals, each, w.sigma)[clear].sum()
-            for w, each in zip(registered_data, shift, strict=True)
-        ]
-        return found[int(np.argmax(gains))]
+        """Return the more likely of effects that can imitate each other."""
+        return max(found, key=lambda each: float(self.registered_density([each.effect]).sum()))
 
 
 _EffectSearch = Callable[[_EdgeData], EdgeEffect | None]
@@ -151,22 +187,8 @@ def find_disparity_edge_effects(
     raster = DisparityRaster.of(measurement, residuals.geometry)
     if raster is None:
         return []
-    scale = nmad((registered_residuals / residuals.sigma)[residuals.usable], 0.0)
-    known_effects: list[Effect] = [effect for effect in measurement.model.effects if isinstance(effect, RasterEffect)]
-    disparity = residuals.geometry.disparity
-    known_shift = raster.added_by(known_effects, disparity)
-    search_raster, points = raster.search_part()
-    part = residuals.part(points)
-    data = _EdgeData(
-        replace(part, value=part.value + known_shift[points]),
-        search_raster,
-        part.geometry.disparity,
-        (registered_residuals + known_shift)[points],
-        scale * part.sigma,
-        WallBlocks.over(part.wall_xy),
-        held_out[points],
-        known_effects,
-    )
+    data, points = _EdgeData.of(measurement, raster, residuals, registered_residuals, held_out)
+    known_effects = data.beside
     found: list[EdgeEffect] = []
 
     def smoothing(untouched: _EdgeData) -> EdgeEffect | None:
@@ -183,7 +205,9 @@ def find_disparity_edge_effects(
     while searches:
         current = replace(data, beside=[*known_effects, *(each.effect for each in found)])
         results = zip(searches, map_in_threads(partial(_run_search, current), searches.values()), strict=True)
-        tried = {name: each for name, each in results if each is not None}
+        # no prediction is exact, so a further effect must explain more than the inexact part of those before
+        needed = thresholds().mean.least_relative_gain * max([0.0, *(each.gain for each in found)])
+        tried = {name: each for name, each in results if each is not None and each.gain > needed}
         if not tried:
             break
         similar = [tried.pop(name) for name in (EdgeFattening.tag(), Smoothing.tag()) if name in tried]
@@ -200,6 +224,64 @@ def find_disparity_edge_effects(
     ]
 
 
+def align_beside_fattening(
+    measurement: StereoMeasurement, initial: StereoResiduals, aligned: AlignedMeasurement, trusted: NDArray[np.int64]
+) -> AlignedMeasurement:
+    """Estimate the pose again with edge fattening in the model, where that fits better at the surveyed pose.
+
+    A window that takes the nearest rock changes most disparities of a steep wall. Without it in the model, the pose that fits
+    best can be off by decimetres, and nothing is predicted rightly there.
+
+    Parameters
+    ----------
+    measurement : the stereo pair at its surveyed pose.
+    initial : its residuals.
+    aligned : the pair at the pose that fits best without any effect.
+    trusted : rows of the measurement's points from which the pose is estimated.
+
+    Returns
+    -------
+    AlignedMeasurement : the pair at the better one of both poses, without edge fattening in its model.
+    """
+    if not aligned.pose.any() or any(isinstance(effect, EdgeFattening) for effect in measurement.model.effects):
+        return aligned
+    given, plain = _gather_trusted(measurement, initial, trusted), _gather_trusted(*aligned[:2], trusted)
+    if given is None or plain is None:
+        return aligned
+    best, least = most_likely_fattening(given), thresholds().edges.least_gain
+    if given.registered_density([best]).sum() < plain.registered_density([]).sum() + least:
+        return aligned
+    fattened = measurement.changed(model=measurement.model.model_copy(update={"effects": (*measurement.model.effects, best)}))
+    pose = align(fattened, trusted, compute_residuals(fattened)).pose
+    moved = measurement.moved(pose)
+    there = AlignedMeasurement(moved, compute_residuals(moved), pose)
+    before, after = (_log_likelihood_with_edge_effects(each, trusted) for each in (aligned, there))
+    return there if after > before + least else aligned
+
+
+def _gather_trusted(measurement: Measurement, residuals: Residuals, trusted: NDArray[np.int64]) -> _EdgeData | None:
+    """Gather what a search needs, from trusted points alone; None if the points lie on no pixel raster."""
+    if not isinstance(measurement, StereoMeasurement) or not isinstance(residuals, StereoResiduals):
+        return None
+    raster = DisparityRaster.of(measurement, residuals.geometry)
+    if raster is None:
+        return None
+    held_out = ~np.isin(residuals.index, trusted)
+    return _EdgeData.of(measurement, raster, residuals, fit_pose_robustly(residuals)[0], held_out)[0]
+
+
+def _log_likelihood_with_edge_effects(aligned: AlignedMeasurement, trusted: NDArray[np.int64]) -> float:
+    """Log-likelihood of the trusted points at a pose, with the edge effects that are found there."""
+    data = _gather_trusted(aligned.measurement, aligned.residuals, trusted)
+    measurement, residuals = aligned.measurement, aligned.residuals
+    if data is None or not isinstance(measurement, StereoMeasurement) or not isinstance(residuals, StereoResiduals):
+        return -np.inf
+    registered = fit_pose_robustly(residuals)[0]
+    found = find_disparity_edge_effects(measurement, residuals, registered, ~np.isin(residuals.index, trusted))
+    density = data.registered_density([each.effect for each in found])
+    return float(density.sum() / max(np.count_nonzero(~data.held_out), 1) * len(trusted))
+
+
 def _run_search(data: _EdgeData, search: _EffectSearch) -> EdgeEffect | None:
     """Run one search; the order of arguments suits `functools.partial`."""
     return search(data)
@@ -212,9 +294,11 @@ def _unpredictable_points(effect: Effect, beside: list[Effect], raster: Disparit
     """
     at = residuals.geometry
     match effect:
-        case EdgeFattening():
+        case EdgeFattening(window="rim"):
             wider = effect.model_copy(update={"radius_px": effect.radius_px + _EDGE_MARGIN_CELLS * raster.step})
             return np.asarray(raster.added_by([wider], at.disparity) != 0)
+        case EdgeFattening():
+            return _uncertain_in_window(effect, raster, residuals)
         case Smoothing():
             return raster.near_border(effect.sigma_px)
     return raster.in_filled_occlusions(beside) | raster.copied_from_neighbour(
@@ -222,44 +306,72 @@ def _unpredictable_points(effect: Effect, beside: list[Effect], raster: Disparit
     )
 
 
-def _find_fattening(data: _EdgeData) -> EdgeEffect | None:
-    """Find edge fattening. Radii are whole cells, because the radii in between do the same.
+def _uncertain_in_window(effect: EdgeFattening, raster: DisparityRaster, residuals: StereoResiduals) -> BoolArray:
+    """(n,) points whose change by a window is uncertain by more than the noise.
 
-    What a matcher takes for a depth step, rather than for a slope, is not recorded, so several steps are tried. Outlines that do
-    not grow equally make the radius uncertain.
+    On smooth rock the change is as well known as the rock itself. It is not where the window reaches over a depth step, or
+    where the largest disparity is so near the step that counts that a little more or less decides.
     """
-    raster = data.raster
 
-    def gains(radius: float) -> FloatArray:
-        return current.gains(_fattening_of(int(radius), height, raster)) if radius else np.zeros(len(data.registered_residuals))
+    def shift(**changed: float) -> FloatArray:
+        return raster.added_by([effect.model_copy(update=changed)], residuals.geometry.disparity)
 
-    def gain_of(outline: tuple[int, float]) -> float:
-        return float(data.gains(_fattening_of(*outline, raster)).sum())
+    here = shift()
+    around = [shift(step_px=effect.step_px * factor) for factor in (_STEP_MARGIN, 1 / _STEP_MARGIN)]
+    uncertain = np.any([np.abs(each - here) > residuals.sigma for each in around], axis=0)
+    rim = EdgeFattening(radius_px=effect.radius_px)
+    return np.asarray(uncertain | _unpredictable_points(rim, [], raster, residuals))
 
-    current = data
-    outlines = [(radius, height) for height in _STEPS for radius in _RADII]
-    found = dict(zip(outlines, map_in_threads(gain_of, outlines), strict=True))
-    radius, height = max(outlines, key=lambda each: found[each])
-    if data.noise_ratio > thresholds().edges.overdispersion:
-        # strong edge fattening spoils the registration and the noise estimate, and with them the test itself
-        registered_data = map_in_threads(lambda each: data.registered_with(_fattening_of(*each, raster)), outlines)
-        outline, best = min(zip(outlines, registered_data, strict=True), key=lambda each: each[1].noise_ratio)
-        if best.noise_ratio < data.noise_ratio / thresholds().edges.overdispersion:
-            (radius, height), current = outline, best
+
+def _find_fattening(data: _EdgeData) -> EdgeEffect | None:
+    """Find edge fattening: the most likely outline, with the pose and the noise fitted beside it.
+
+    Radii are whole cells, because the radii in between do the same.
+    """
+    best = most_likely_fattening(data)
+
+    def of_radius(cells: float) -> EdgeFattening:
+        return best.model_copy(update={"radius_px": (cells + _ROUNDED_CELLS[0]) * data.raster.step})
+
+    def gains(cells: float) -> FloatArray:
+        return data.clear_gains(of_radius(cells)) if cells >= 1 else np.zeros(len(data.residuals))
+
+    radius = float(int(best.radius_px / data.raster.step))
     gain = data.blocks.total_if_agreed(gains(radius), by_signs=True)  # depth steps may occur in few places only
     if gain is None:
         return None
-    radius_error = min(current.blocks.std(gains, radius, 1.0), float(radius))
-    std = {"radius_px": raster.step * float(np.hypot(np.sqrt(1 / 12), radius_error))}
-    return data.edge_effect(_fattening_of(radius, height, raster), std, gain)
+    radius_error = min(data.blocks.std(gains, radius, 1.0), radius)
+    std = {"radius_px": data.raster.step * float(np.hypot(_ROUNDED_CELLS[1], radius_error))}
+    return data.edge_effect(best, std, gain)
 
 
-def _fattening_of(radius: int, height: float, raster: DisparityRaster) -> EdgeFattening:
-    """The effect of a radius in cells and a depth step in units of the smallest one that counts."""
-    reach = (radius + 0.5) * raster.step
-    return (
-        EdgeFattening(radius_px=reach) if height == 1 else EdgeFattening(radius_px=reach, step_px=height * raster.depth_step_px)
-    )
+def most_likely_fattening(data: _EdgeData) -> EdgeFattening:
+    """Return the edge fattening of largest likelihood, with the pose and the noise fitted beside each trial.
+
+    What a matcher takes for a depth step, rather than for a slope, is not recorded, nor the form of its window, so several are
+    tried: rims that grow, discs and squares.
+    """
+    cell, smallest = data.raster.step, data.raster.depth_step_px
+
+    def trial(window: str, radius: int, step_px: float) -> EdgeFattening:
+        chosen = {"step_px": step_px, **({} if window == "rim" else {"window": window})}
+        return EdgeFattening(radius_px=(radius + _ROUNDED_CELLS[0]) * cell, **(chosen if step_px else {}))
+
+    def most_likely(trials: list[EdgeFattening]) -> EdgeFattening:
+        sums = map_in_threads(lambda each: float(data.registered_density([each]).sum()), trials)
+        return trials[int(np.argmax(sums))]
+
+    rim = (0.0, *(height * smallest for height in _RIM_STEPS))
+    steps = {"rim": rim, "disc": _WINDOW_STEPS_PX, "square": _WINDOW_STEPS_PX}
+    best = most_likely([trial(window, radius, step) for window, tried in steps.items() for step in tried for radius in _RADII])
+    if best.window == "rim":
+        return best
+    for factor in _STEP_FACTORS:
+        radius = int(best.radius_px / cell)
+        tried = [best.step_px * factor**power for power in range(-3, 4)]
+        radii = [each for each in (radius - 1, radius, radius + 1) if each]
+        best = most_likely([trial(best.window, each, step) for each in radii for step in tried])
+    return best
 
 
 def _find_smoothing(data: _EdgeData) -> EdgeEffect | None:

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import StereoMeasurement
-from pipeline.gap.residuals.disparity_raster import DisparityRaster
+from pipeline.gap.residuals.disparity_raster import DisparityRaster, raster_cell_px
 from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, project
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
-from sensors.effects.base import Stage
+from sensors.effects.base import ShowsIn, Stage
 from sensors.effects.raster_effect import RasterEffect
 from sensors.models.sensor_model import StereoModel
 from sensors.stereo.stereo_pair import REDUCTION, StereoPair
@@ -31,7 +31,7 @@ def simulate_disparities(
 
     The simulated depth maps have cells of 2, 4 or 8 px. The size is chosen whose cell centres lie nearest to the pixels. The
     disparity of the reference is corrected for the distance of each pixel from the centre of its cell. If the measurement's own
-    raster has another spacing, edge fattening and smoothing are applied on that raster.
+    raster has another spacing, effects that depend on neighbouring cells are applied on that raster.
 
     Parameters
     ----------
@@ -68,13 +68,19 @@ def _on_own_raster(
     Returns the other pair and what these effects add to the disparities, (n,), px. Edge fattening grows by whole cells, so that
     it depends on their size.
     """
-    shapes = [effect for effect in pair.model.effects if isinstance(effect, RasterEffect) and effect.stage == Stage.MATCH]
-    raster = DisparityRaster.of(measurement.changed(model=pair.model), geometry) if shapes else None
-    if raster is None or abs(raster.step - step) < _SAME_STEP:
+    matching = (effect for effect in pair.model.effects if effect.stage == Stage.MATCH and effect.looks_at == "neighbours")
+    own = [effect for effect in matching if effect.shows_in != ShowsIn.SPREAD]
+    step_px = raster_cell_px(geometry.u, geometry.v)
+    if not own or step_px is None or abs(step_px - step) < _SAME_STEP:
         return pair, np.zeros(len(geometry))
-    others = tuple(effect for effect in pair.model.effects if effect not in shapes)
+    shapes = [effect for effect in own if isinstance(effect, RasterEffect)]
+    raster = DisparityRaster.of(measurement.changed(model=pair.model), geometry) if shapes else None
+    if shapes and raster is None:
+        return pair, np.zeros(len(geometry))
+    others = tuple(effect for effect in pair.model.effects if effect not in own)
     without = replace(pair, model=pair.model.model_copy(update={"effects": others}))
-    return without, raster.added_by(shapes, geometry.disparity)
+    added = np.asarray(sum((effect.mean(geometry) for effect in own if effect not in shapes), np.zeros(len(geometry))))
+    return without, added if raster is None else added + raster.added_by(shapes, geometry.disparity)
 
 
 def _points(

@@ -44,8 +44,8 @@ class PixelGeometry:
     tangent : (n,) vertical slope of the line of sight in the rectified left image: (row - principal row) / focal length in px.
     infinity : (n,) disparity of a point at infinity, px.
     shaped : (n,) change of the disparity by edge fattening, smoothing and filled occlusions of the sensor model, px; 0 without.
-    along_row, along_column : (n,) change of the reference's disparity from one pixel to the next along the row and along the
-        column of the left image, px per px; None if not computed.
+    along_row, along_column : (n,) change of the reference's disparity along the row and along the column of the left image,
+        between neighbouring cells of the matcher's raster, px per px; None if not computed.
     """
 
     u: FloatArray
@@ -74,6 +74,12 @@ class PixelGeometry:
     def sensor_coordinates(self) -> FloatArray:
         """(n, 2) column and row in the left image, px."""
         return np.stack([self.u, self.v], axis=1)
+
+    @property
+    def gradient(self) -> FloatArray:
+        """(n, 2) change of the reference's disparity along the row and along the column, px per px; 0 if not computed."""
+        sides = (self.along_row, self.along_column)
+        return np.stack([np.zeros(len(self)) if each is None else each for each in sides], axis=1)
 
     @property
     def departure(self) -> FloatArray:

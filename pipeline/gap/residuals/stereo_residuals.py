@@ -130,6 +130,8 @@ def stereo_residuals(measurement: StereoMeasurement) -> StereoResiduals:
     real = real_pair(model.effects, measurement)
     geometry, depth = _reference(nominal, real, measurement.scene, u, v, measured)
     about = _surroundings(measurement, nominal, real, geometry, depth)
+    along_row, along_column = about.gradient.T
+    geometry = replace(geometry, along_row=along_row, along_column=along_column)
     geometry = replace(geometry, shaped=_shaped_px(measurement, geometry))
     hit = np.isfinite(geometry.disparity)
     px_per_m = nominal.geometry.f * nominal.geometry.base_m / depth**2
@@ -169,7 +171,8 @@ def with_surroundings(measurement: StereoMeasurement, found: StereoResiduals) ->
     The measurement with the stored properties.
     """
     edge = found.covariates["edge_step"]
-    about = Surroundings(found.geometry.point, edge, ~found.on_smooth_surface & (edge < _EDGE_PX))
+    at = found.geometry
+    about = Surroundings(at.point, edge, ~found.on_smooth_surface & (edge < _EDGE_PX), at.gradient)
     everywhere = Surroundings.nowhere(len(measurement.cloud.points))
     return measurement.changed(surroundings=everywhere.changed(found.index, about))
 
@@ -210,20 +213,11 @@ def _reference(
     distance, face = scene.cast(left.position, ray)
     point = left.position + distance[:, None] * ray
     right, normal = project(camera, point), scene.mesh.normals[np.maximum(face, 0)]
-    disparity = nominal.disparity((u, v), right)
-
-    def change(du: float, dv: float) -> FloatArray:
-        """Change of the disparity from a pixel to one beside it that sees the same plane, (n,), px."""
-        beside = pixel_rays(left, u + du, v + dv)
-        plane = np.einsum("ni,ni->n", point - left.position, normal) / np.einsum("ni,ni->n", beside, normal)
-        seen = project(camera, left.position + plane[:, None] * beside)
-        return nominal.disparity((u + du, v + dv), seen) - disparity
-
     geometry = PixelGeometry(
         u=u,
         v=v,
         v_right=right[1],
-        disparity=disparity,
+        disparity=nominal.disparity((u, v), right),
         found=measured,
         point=point,
         normal=normal,
@@ -232,8 +226,6 @@ def _reference(
         tangent=nominal.tangent(u, v),
         infinity=np.full(len(u), nominal.geometry.offset),
         shaped=np.zeros(len(u)),
-        along_row=change(1.0, 0.0),
-        along_column=change(0.0, 1.0),
     )
     return geometry, distance
 
@@ -249,7 +241,29 @@ def _surroundings(
         return known
     moved = geometry.part(rows)
     edge = _edge_px(nominal, real.left, measurement.scene, moved)
-    return known.changed(rows, Surroundings(moved.point, edge, is_hidden(measurement.scene, real.right.position, moved.point)))
+    hidden = is_hidden(measurement.scene, real.right.position, moved.point)
+    step = raster_cell_px(geometry.u, geometry.v) or 1.0
+    return known.changed(rows, Surroundings(moved.point, edge, hidden, _gradient(nominal, real, measurement.scene, moved, step)))
+
+
+def _gradient(nominal: NominalPair, real: CameraPair, scene: RayCaster, geometry: PixelGeometry, step: float) -> FloatArray:
+    """(n, 2) change of the reference's disparity along the row and the column, px per px, between cells `step` px away.
+
+    A cell that sees nothing is left out: then the difference is one-sided, or 0 if both are missing.
+    """
+
+    def change(du: float, dv: float) -> FloatArray:
+        u, v = geometry.u + du, geometry.v + dv
+        ray = pixel_rays(real.left, u, v)
+        point = real.left.position + scene.cast(real.left.position, ray)[0][:, None] * ray
+        return nominal.disparity((u, v), project(real.right, point)) - geometry.disparity
+
+    slopes = []
+    for du, dv in ((step, 0.0), (0.0, step)):
+        sides = np.stack([change(du, dv), -change(-du, -dv)]) / step
+        known = np.isfinite(sides)
+        slopes.append(np.where(known, sides, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1))
+    return np.stack(slopes, axis=1)
 
 
 def _edge_px(nominal: NominalPair, left: Camera, scene: RayCaster, geometry: PixelGeometry) -> FloatArray:
