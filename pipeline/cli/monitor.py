@@ -92,14 +92,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> CommandOutput:
     """Compare the measured epochs of a wall with the first one, and write difference maps, events and report."""
     from pipeline.monitoring.follow import follow
+    from pipeline.monitoring.reading import with_reference
     from pipeline.monitoring.report import headline
     from pipeline.monitoring.run import monitor_paths
     from pipeline.monitoring.write_site import write_site
     from pipeline.report.progress import shown_progress
 
     options = _options(arguments)
-    paths = [arguments.reference, *arguments.epochs] if arguments.reference else arguments.epochs
-    keys = {"times": [each.upper() for each in arguments.times], "workers": arguments.workers, "resume": arguments.resume}
+    paths = with_reference(arguments.reference, arguments.epochs) if arguments.reference else arguments.epochs
+    keys = {"times": arguments.times, "workers": arguments.workers, "resume": arguments.resume}
     with shown_progress(quiet=arguments.quiet) as progress:
         if arguments.follow:
             result = follow(paths, arguments.follow, arguments.out, options, **keys)

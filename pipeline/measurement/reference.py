@@ -49,6 +49,7 @@ class Reference:
     of_points : Whether it was meshed from points. Noise and relief then tilt its triangles, so that incidence angles must not
         refer to them.
     noise_is_known : Whether `error_m` is noise of the vertices alone, without relief between them.
+    epsg : EPSG code of the coordinate system that an elevation model states; None: it states none, or it is another kind of file.
     """
 
     mesh: TriangleMesh
@@ -58,6 +59,7 @@ class Reference:
     rows: NDArray[Any] | None = None
     of_points: bool = False
     noise_is_known: bool = False
+    epsg: int | None = None
 
 
 @dataclass(frozen=True)
@@ -209,7 +211,7 @@ def reference_from_dem(path: Path, unit: str | None = None, option: str = "--uni
         "an elevation model has one height at each place: overhangs are missing, and steep faces are chords between pixels, "
         "whose error looks like an error of the sensor"
     )
-    return Reference(mesh, 0.0, (words, *notes), (limit,))
+    return Reference(mesh, 0.0, (words, *notes), (limit,), epsg=place.epsg)
 
 
 def reference_from_half(scan: RawScan, station: Station) -> Reference:

@@ -83,7 +83,8 @@ def _checked(scan: RawScan, where: str) -> RawScan:
     cloud = finite(scan.cloud, where)
     words = list(scan.words)
     if (lost := len(scan.cloud.points) - len(cloud.points)) > 0:
-        words.append(f"{lost:,} points with coordinates that are not numbers are left out")
+        note = f"{lost:,} points with coordinates that are not numbers are left out"
+        cloud, words = cloud.noted(note), [*words, note]
     if len(cloud.points) < _FEWEST:
         raise InputError(
             f"the scan has only {len(cloud.points)} points",

@@ -209,7 +209,16 @@ def coarse(surface: ReferenceSurface, points: FloatArray, gsd_m: float, seed: in
     """
     config = IcpConfig(outlier_distance_threshold=max(0.1, 3 * gsd_m))
     moving = points[:: max(len(points) // SAMPLE, 1)]
-    return register_to(surface, moving, config, KeyedRandom(seed)).transform
+    try:
+        return register_to(surface, moving, config, KeyedRandom(seed)).transform
+    except InputError:
+        away = float(np.median(surface.tree.query(moving - surface.origin)[0]))
+        raise InputError(
+            f"the epoch cannot be registered on the reference: half of its points are more than {away:.3g} m from it",
+            where="registration",
+            allowed="epochs of the same wall, aligned to some metres",
+            remedy="align the epochs before, name targets with --targets, or state the unit of their coordinates with --unit",
+        ) from None
 
 
 def refine(pairs: Sequence[RasterPair], areas: StableRock | None) -> Alignment:

@@ -82,6 +82,8 @@ class EpochChange:
     ----------
     transform : RigidTransform
         Moves the epoch's points, as they were read, to the reference, wall frame.
+    first : RigidTransform
+        The part of it that ICP found, or the targets.
     alignment : Alignment
         The final registration, with its uncertainty.
     changes : list of Change
@@ -91,6 +93,7 @@ class EpochChange:
     """
 
     transform: RigidTransform
+    first: RigidTransform
     alignment: Alignment
     changes: list[Change]
     regions: list[ChangedRegion]
@@ -132,7 +135,7 @@ def compare_epoch(
     changes = [_change(pair, alignment, view) for view, pair in enumerate(pairs)]
     regions = [replace(region, view=view) for view, change in enumerate(changes, start=1) for region in find_regions(change)]
     return EpochChange(
-        alignment.transform.after(first), alignment, changes, sorted(regions, key=lambda region: -region.volume_m3)
+        alignment.transform.after(first), first, alignment, changes, sorted(regions, key=lambda region: -region.volume_m3)
     )
 
 

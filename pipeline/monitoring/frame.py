@@ -19,6 +19,8 @@ _SAMPLE = 200_000
 """Points that the mean plane is fitted to."""
 _CELL_M, _POINTS_A_CELL, _ROUNDS = 0.5, 3.0, 3
 """Side of the cells by which the area that has points is counted: at first, m, then in distances of the points; and how often."""
+_ALONE, _MOST_ROUNDS = 0.5, 20
+"""Cells a point above which the cells are too small to count the area; rounds in all, in which they are enlarged."""
 _POINTS_APART = 1.5
 """Pixel side over the mean distance of neighbouring points: 3 x 3 pixels then hold some twenty points."""
 _MOST_COUNTED = 300_000
@@ -119,10 +121,14 @@ def _usual_gsd(points: FloatArray, count: int) -> float:
     """Return a round pixel size, m, somewhat above the mean distance of neighbouring points."""
     few = points[:: len(points) // _MOST_COUNTED + 1, :2]
     apart, cell = _CELL_M, _CELL_M
-    for _ in range(_ROUNDS):
+    counted = 0
+    for _ in range(_MOST_ROUNDS):
         cells = len(np.unique(np.floor(few / cell).astype(np.int64), axis=0))
         apart = float(np.sqrt(cells * cell**2 / count))
         cell = _POINTS_A_CELL * apart * float(np.sqrt(count / len(few)))
+        counted += cells <= _ALONE * len(few)
+        if counted == _ROUNDS:
+            break
     spacing = _POINTS_APART * apart
     power = 10.0 ** np.floor(np.log10(max(spacing, _FINEST_M)))
     return float(power * _ROUND[np.searchsorted(_ROUND, max(spacing, _FINEST_M) / power - 1e-9)])

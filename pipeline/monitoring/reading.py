@@ -19,7 +19,7 @@ from pipeline.measurement.reference import DEMS, is_cloud, reference_from_dem
 from pipeline.measurement.scans import RawScan, read_scans
 from pipeline.monitoring.gridding import SAMPLE, WallPoints
 from pipeline.monitoring.options import MonitorOptions
-from pipeline.monitoring.times import EpochTime, check_order, time_of
+from pipeline.monitoring.times import SIDECAR, EpochTime, check_order, time_of
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.bounds import bounding_box
@@ -198,6 +198,11 @@ def _spread_over(mesh: TriangleMesh, apart_m: float) -> FloatArray:
     return np.asarray(corners[face, 0] + np.einsum("nk,nki->ni", share, sides[face]))
 
 
+def with_reference(reference: Path, paths: Sequence[Path]) -> list[Path]:
+    """Return the paths of the epochs with the reference first; it is listed once, also where it is one of them."""
+    return [reference, *(path for path in paths if path.resolve() != reference.resolve())]
+
+
 def find_epochs(paths: Sequence[Path], times: Sequence[str] = ()) -> list[EpochSource]:
     """Find the epochs that the user's paths name, in order, with their times.
 
@@ -231,12 +236,32 @@ def find_epochs(paths: Sequence[Path], times: Sequence[str] = ()) -> list[EpochS
             if (real := file.resolve()) in seen:
                 raise InputError("the epoch is given twice", where=str(file), remedy="name each epoch once")
             seen[real] = source.name
+    _check_contents(found)
     timed = [
-        EpochSource(source.path, source.files, time_of(source.path if source.run is None else source.files[0], given), source.run)
+        EpochSource(source.path, source.files, _time_of(source, given), source.run)
         for source, given in zip(found, times or itertools.repeat(None, len(found)), strict=True)
     ]
     check_order([source.time for source in timed], [source.name for source in timed])
     return timed
+
+
+def _time_of(source: EpochSource, given: str | None) -> EpochTime:
+    """When an epoch was measured; that of a run is stated by its points."""
+    return time_of(source.files[0], given) if source.run is not None else time_of(source.path, given, source.files)
+
+
+def _check_contents(sources: Sequence[EpochSource]) -> None:
+    """Raise InputError if two epochs of one file each are copies of each other."""
+    by_size: dict[int, list[Path]] = {}
+    for source in sources:
+        if len(source.files) == 1:
+            by_size.setdefault(source.files[0].stat().st_size, []).append(source.files[0])
+    for files in by_size.values():
+        seen: dict[str, Path] = {}
+        for file in files if len(files) > 1 else ():
+            first = seen.setdefault(sha256(file), file)
+            if first is not file:
+                raise InputError(f"the epoch is a copy of {first}", where=str(file), remedy="name each epoch once")
 
 
 def read_epoch(source: EpochSource, options: MonitorOptions) -> EpochData:
@@ -311,7 +336,8 @@ def _sampled(files: tuple[Path, ...], unit: str | None) -> EpochData:
 
 def epoch_files(folder: Path) -> list[Path]:
     """Return the files of a folder that, by their suffix, contain scans, clouds, meshes or elevation models, sorted by name."""
-    return sorted(each for each in folder.iterdir() if each.suffix.lower() in _ANY and each.is_file())
+    found = (each for each in folder.iterdir() if each.suffix.lower() in _ANY and not each.name.endswith(SIDECAR))
+    return sorted(each for each in found if each.is_file())
 
 
 def _sources(path: Path) -> list[EpochSource]:
@@ -369,7 +395,7 @@ def _read_file(path: Path, options: MonitorOptions) -> EpochData:
     if suffix in DEMS:
         found = reference_from_dem(path, options.unit)
         above = found.mesh.vertices.mean(axis=0) + np.array([0.0, 0.0, _BEFORE_M])
-        return EpochData(found.mesh.vertices, found.mesh, above, "", found.words)
+        return EpochData(found.mesh.vertices, found.mesh, above, _crs_of_epsg(found.epsg), found.words)
     if not is_cloud(path):
         mesh, notes = read_mesh(path, options.unit or "m")
         return EpochData(mesh.vertices, mesh, _before(mesh), "", notes)
@@ -399,4 +425,30 @@ def _crs_of(path: Path) -> str:
             crs = reader.header.parse_crs()
     except Exception:  # an unreadable record of the coordinate system is none
         return ""
-    return "" if crs is None else str(crs.to_wkt())
+    return "" if crs is None else _in_metres(crs)
+
+
+def _crs_of_epsg(code: int | None) -> str:
+    """Return the WKT of a coordinate system; empty without a code, or for one that is not known."""
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    try:
+        return "" if code is None else _in_metres(CRS.from_epsg(code))
+    except CRSError:
+        return ""
+
+
+def _in_metres(crs: Any) -> str:
+    """Return the WKT of a coordinate system whose coordinates were converted to metres."""
+    import warnings
+
+    from pyproj import CRS
+
+    if all(axis.unit_conversion_factor == 1.0 for axis in crs.axis_info[:2]):
+        return str(crs.to_wkt())
+    with warnings.catch_warnings():  # of parameters that a PROJ string does not hold
+        warnings.simplefilter("ignore")
+        parts = {key: value for key, value in crs.to_dict().items() if key not in ("to_meter", "vunits", "vto_meter")}
+        metric = CRS.from_dict({**parts, "units": "m"}).to_json_dict()
+    return str(CRS.from_json_dict({**metric, "name": f"{crs.name}, converted to metres"}).to_wkt())

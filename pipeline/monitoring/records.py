@@ -18,6 +18,8 @@ from pipeline.registration.rigid import RigidTransform
 
 KEPT = ".monitor"
 """Folder of the records within the folder of the results."""
+CAUTION = "caution: "
+"""Beginning of the remarks on an epoch without which its result would mislead."""
 
 
 @dataclass(frozen=True)

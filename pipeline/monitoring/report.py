@@ -10,10 +10,11 @@ from matplotlib.figure import Figure
 
 from pipeline.formats.files.atomic import write_bytes, write_text
 from pipeline.formats.rasters.geotiff import read_geotiff
+from pipeline.monitoring.events import LEAST_PIXELS
 from pipeline.monitoring.magnitude import PowerLaw, fit_power_law
 from pipeline.monitoring.model import compared_in_words
 from pipeline.monitoring.products import Followed, Result, event_raster
-from pipeline.monitoring.records import KEPT, points_note
+from pipeline.monitoring.records import CAUTION, KEPT, points_note
 from pipeline.monitoring.significance import NORMAL_95
 from pipeline.monitoring.site import WallView
 from pipeline.report.figures import blocks_figure, difference_figure, hillshade_figure, label_axes, png_bytes
@@ -54,8 +55,29 @@ def write_report(result: Result) -> None:
         rows=rows[:_ROWS_SHOWN],
         more=max(len(rows) - _ROWS_SHOWN, 0),
         law=None if law is None else law_in_words(law),
+        two_digits=two_digits,
+        least_pixels=LEAST_PIXELS,
+        least_m2=LEAST_PIXELS * result.site.grid.gsd**2,
+        read=_inputs(result),
+        crs=_name_of_crs(result.site.crs),
     )
     write_text(result.folder / "report.html", text)
+
+
+def _inputs(result: Result) -> list[dict[str, Any]]:
+    """What was understood of each epoch, the reference first: name, number of points, time, and how the time is known."""
+    points = [result.site.points, *(epoch.record.points for epoch in result.epochs)]
+    return [
+        {"name": source.name, "points": count, "time": source.time.text or "unknown", "how": source.time.source}
+        for source, count in zip(result.sources, points, strict=True)
+    ]
+
+
+def _name_of_crs(wkt: str) -> str:
+    """Return the name of a coordinate system; empty for none."""
+    from pyproj import CRS
+
+    return str(CRS.from_wkt(wkt).name) if wkt else ""
 
 
 def headline(result: Result) -> list[str]:
@@ -69,7 +91,7 @@ def headline(result: Result) -> list[str]:
         doubtful = f" Edges, vegetation or noise may explain {marked} of {len(epoch.regions)} events (marked)." if marked else ""
         told.append(
             f"Epoch {epoch.number}, {epoch.source.name}{when}: {found}. The level of detection of "
-            f"a single pixel is {1e3 * epoch.record.level_m:.1f} mm (95 %, median).{doubtful}"
+            f"a single pixel is {1e3 * epoch.record.level_m:.1f} mm (95 %, median).{doubtful}{_cautions(epoch)}"
         )
     return told
 
@@ -89,6 +111,11 @@ def next_step(result: Result) -> str:
     return f"Find out with `{scanner}`{place}, which diagnoses the stable rock, and fit the noise there with `{noise}`."
 
 
+def _cautions(epoch: Followed) -> str:
+    """Remarks without which the numbers of an epoch would mislead, as sentences."""
+    return "".join(f" {note[0].upper()}{note[1:]}." for note in epoch.record.notes if note.startswith(CAUTION))
+
+
 def law_in_words(law: PowerLaw) -> str:
     """State the magnitude-frequency law of the rockfalls, with the 95 % interval of its exponent, as a sentence."""
     return (
@@ -105,7 +132,12 @@ def _kind_in_words(epoch: Followed, kind: str) -> str:
     sigma = float(np.sqrt(sum(region.volume_std_m3**2 for region in regions)))
     what = "of missing rock" if kind == "missing" else "of added material"
     places = counted(len(regions), "place")
-    return f"{volume:.3g} ± {NORMAL_95 * sigma:.2g} m³ {what} in {places}"
+    return f"{volume:.3g} ± {two_digits(NORMAL_95 * sigma)} m³ {what} in {places}"
+
+
+def two_digits(value: float) -> str:
+    """Format a positive number with two significant digits, also where the last one is zero, such as 0.050."""
+    return f"{value:#.2g}".rstrip(".")
 
 
 def _about(epoch: Followed, result: Result) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from pipeline.monitoring.detector import regions_of_detector
 from pipeline.monitoring.events import Catalogue
 from pipeline.monitoring.model import predicted_level, scanner_model
 from pipeline.monitoring.options import NO_DETECTOR, MonitorOptions
+from pipeline.monitoring.plausibility import check_motion, compared_area, remarks
 from pipeline.monitoring.point_writing import PointsInOrder, write_points_once
 from pipeline.monitoring.products import Followed, Result, write_results
 from pipeline.monitoring.reading import EpochData, EpochSource, find_epochs, read_epoch
@@ -240,8 +241,11 @@ def processed(
     by_targets = _by_targets(options, site, source)
     start = None if by_targets is None else by_targets.transform
     found = compare_epoch(site.reference, points, StableRock(options.stable, site.frame), options.seed, start)
-    if by_targets is not None:
+    if by_targets is None:
+        check_motion(found.first, points.sample, site, source.name)
+    else:
         notes.append(f"{by_targets.count} targets brought it near the reference, with an RMS of {1e3 * by_targets.rms_m:.1f} mm")
+    notes += remarks(found, site, source.name)
     regions = found.regions if options.detector == NO_DETECTOR else []
     for view, change in zip(site.views, found.changes, strict=True):
         difference = out / f"difference_{number:03d}{view.suffix}.tif"
@@ -251,7 +255,6 @@ def processed(
             detected = regions_of_detector(options.detector, difference, change)
             regions += [replace(region, view=view.number) for region in detected]
     levels = np.concatenate([change.significance.level[np.isfinite(change.significance.level)] for change in found.changes])
-    compared = sum(int(np.isfinite(change.difference).sum()) for change in found.changes)
     record = EpochRecord(
         number=number,
         inputs=source.checksums(),
@@ -261,7 +264,7 @@ def processed(
         registration={**found.alignment.to_dict(), **found.transform.to_dict()},
         level_m=float(np.median(levels)),
         predicted_level_m=_predicted(options, site, found),
-        area_m2=float(compared) * site.grid.gsd**2,
+        area_m2=compared_area(found, site),
         regions=tuple(regions),
     )
     record.write(out, fingerprint, [view.grid.shape for view in site.views])

@@ -21,6 +21,8 @@ from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray
 
 _TENTH = 0.1
+_WIDEST_M = 10_000.0
+"""Extent of a wall beyond which its coordinates are hardly metres."""
 _STEEP = float(np.tan(np.radians(65.0)))
 
 
@@ -103,6 +105,7 @@ def prepared(source: EpochSource, options: MonitorOptions) -> ReferenceSite:
     source: files of the reference. options: options of `monitor`. Raises InputError if the files cannot be used.
     """
     data = read_epoch(source, options)
+    _check_extent(data, options, source.name)
     towards, how = towards_sensor(data, options, source.name)
     frames, partition = _frames(data, towards, options)
     wall = frames[0]
@@ -114,6 +117,18 @@ def prepared(source: EpochSource, options: MonitorOptions) -> ReferenceSite:
     notes = [*data.notes, f"the wall was seen from its side of ({', '.join(f'{value:.2f}' for value in towards)}), {how}"]
     notes += _notes(views)
     return ReferenceSite(source, views, wall.to_wall(towards), reference, data.count, data.crs, tuple(notes))
+
+
+def _check_extent(data: EpochData, options: MonitorOptions, name: str) -> None:
+    """Raise InputError for a wall of many kilometres, unless the user stated the unit."""
+    extent = float(np.ptp(data.bounds, axis=0).max())
+    if options.unit is None and extent > _WIDEST_M:
+        raise InputError(
+            f"the wall is {extent / 1e3:,.0f} km long, if its coordinates are metres",
+            where=name,
+            allowed=f"up to {_WIDEST_M / 1e3:.0f} km without --unit",
+            remedy="state the unit of the coordinates with --unit (mm, cm, m, ft), or remove stray points far from the wall",
+        )
 
 
 def _frames(data: EpochData, towards: FloatArray, options: MonitorOptions) -> tuple[list[WallFrame], Partition | None]:

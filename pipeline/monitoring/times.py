@@ -49,19 +49,22 @@ class EpochTime:
         return "" if self.when is None else self.when.isoformat().replace("+00:00", "Z")
 
 
-def time_of(path: Path, given: str | None = None) -> EpochTime:
+def time_of(path: Path, given: str | None = None, files: Sequence[Path] = ()) -> EpochTime:
     """Find out when an epoch was measured.
 
     The time comes from the user, a file NAME.time.txt beside the epoch's, the LAS header or a date in the name, in this order.
 
-    path: file or folder of the epoch. given: the user's text, ISO 8601. Raises InputError if a text is no time.
+    path: file or folder of the epoch. given: the user's text, ISO 8601. files: the scans of a folder; their earliest header
+    counts. Raises InputError if a text is no time.
     """
     if given is not None:
         return EpochTime(parsed_time(given, "--times"), "as given by --times")
     beside = path.with_name(path.name + SIDECAR)
     if beside.is_file():
         return EpochTime(parsed_time(read_text(beside).strip(), str(beside)), f"from {beside.name}")
-    return _from_header(path) or _from_name(path.name) or EpochTime(None, "unknown: neither --times, header nor name says it")
+    headers = [found for file in files or (path,) if (found := _from_header(file)) is not None]
+    earliest = min(headers, key=lambda each: each.text, default=None)
+    return earliest or _from_name(path.name) or EpochTime(None, "unknown: neither --times, header nor name says it")
 
 
 def parsed_time(text: str, where: str) -> datetime:
@@ -70,7 +73,7 @@ def parsed_time(text: str, where: str) -> datetime:
     where: option or file that states it, for errors. Raises InputError for any other text.
     """
     try:
-        found = datetime.fromisoformat(text)
+        found = datetime.fromisoformat(text.upper())
     except ValueError:
         raise InputError(
             f"'{text[:60]}' is not a time that can be read", where=where, allowed=_ISO, remedy="write it in this form"
@@ -86,7 +89,7 @@ def check_order(times: Sequence[EpochTime], names: Sequence[str]) -> None:
             raise InputError(
                 f"{second} ({after:%Y-%m-%d %H:%M}) is earlier than {first} ({before:%Y-%m-%d %H:%M}), which comes before it",
                 where="EPOCH",
-                remedy="give the epochs in the order of their times, or state the times with --times",
+                remedy="give the epochs in the order of their times, the reference first, or state the times with --times",
             )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -20,11 +21,13 @@ from pipeline.cli import main as cli
 from pipeline.formats.meshes.ply import write_ply
 from pipeline.formats.points import laz_chunks
 from pipeline.formats.points.laz import read_laz
+from pipeline.formats.rasters.georeference import GEO_KEYS, georeference
 from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.monitoring import reading
 from pipeline.monitoring.follow import follow
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.run import monitor_paths
+from pipeline.monitoring.times import SIDECAR
 from pipeline.surface.raster_mesh import mesh_of_raster
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
@@ -32,6 +35,8 @@ from scene.geometry.grid import Grid
 BLOCKS = ((4.0, 3.0, 0.7, 0.2), (11.0, 6.5, 0.9, 0.1))
 VOLUME = 0.7**2 * 0.2 + 0.9**2 * 0.1
 COUNT = 120_000
+_UTM_KEYS = (1, 1, 0, 2, 1024, 0, 1, 1, 3072, 0, 1, 25832)
+"""GeoTIFF keys: projected coordinates, EPSG:25832."""
 
 
 @pytest.fixture(scope="module")
@@ -222,6 +227,50 @@ def test_too_little_stable_rock_is_said_and_the_result_goes_on(scans: Path, tmp_
     assert "stable rock lies in" in (tmp_path / "out" / "report.html").read_text()
 
 
+def test_an_epoch_with_few_points_says_how_much_of_the_wall_was_compared(
+    scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The reference is given again among the epochs, and the epoch is a folder with a file that states the time of its scan."""
+    first, _, _ = sorted(scans.glob("*.las"))
+    (tmp_path / "april").mkdir()
+    sparse = las(tmp_path / "april" / "scan.las", points(COUNT // 12, 4, BLOCKS))
+    (sparse.parent / (sparse.name + SIDECAR)).write_text("2026-04-01\n")
+    words = [str(first), str(sparse.parent), "--reference", str(first), "--position", ",".join(STATION.split())]
+    assert cli.main(["monitor", *words, "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    assert "could be compared" in capsys.readouterr().out
+    assert "could be compared" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_wall_that_moved_everywhere_is_said_to_have_no_stable_rock(scans: Path, tmp_path: Path) -> None:
+    first, _, _ = sorted(scans.glob("*.las"))
+    waves = points(COUNT, 2)
+    waves[:, 1] += 0.05 * np.sin(waves[:, 0]) * np.cos(waves[:, 2])
+    words = [str(first), str(las(tmp_path / "site_2026-04-01.las", waves)), "--position", ",".join(STATION.split())]
+    assert cli.main(["monitor", *words, "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    assert "hardly any rock is stable" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_feet_are_converted_with_their_coordinate_system(tmp_path: Path) -> None:
+    """US survey feet, EPSG:2264: outlines are in metres, and their coordinate system places them where the scan was."""
+    pyproj, geopandas = pytest.importorskip("pyproj"), pytest.importorskip("geopandas")
+    foot, place = 1200 / 3937, np.array([457_200.0, 182_880.0, 100.0]) - UTM
+    files = [
+        las(tmp_path / f"{month}.las", (points(60_000, seed, blocks) + place) / foot, crs=2264)
+        for month, seed, blocks in (("march", 1, ()), ("april", 2, BLOCKS))
+    ]
+    station = np.array([float(each) for each in STATION.split()]) + place
+    monitor_paths(files, tmp_path / "out", MonitorOptions(position=station))
+    events = geopandas.read_file(tmp_path / "out" / "events.gpkg")
+    found = events.to_crs(4269).geometry.iloc[0].centroid
+    middle = events.geometry.iloc[0].centroid
+    expected = pyproj.Transformer.from_crs(2264, 4269, always_xy=True).transform(middle.x / foot, middle.y / foot)
+    assert (found.x, found.y) == pytest.approx(expected, abs=1e-8)
+
+
+def test_an_elevation_model_keeps_its_coordinate_system() -> None:
+    assert "UTM zone 32N" in reading._crs_of_epsg(georeference({GEO_KEYS: _UTM_KEYS}, (2, 2), Path("dem.tif")).epsg)
+
+
 def mistakes(scans: Path, folder: Path) -> dict[str, tuple[list[str], str]]:
     """Words after `monitor` that are wrong, and what the answer names."""
     first, second, _ = map(str, sorted(scans.glob("*.las")))
@@ -229,11 +278,17 @@ def mistakes(scans: Path, folder: Path) -> dict[str, tuple[list[str], str]]:
     las(folder / "elsewhere.las", points(2000, 4) + np.array([5000.0, 0, 0]))
     las(folder / "feet.las", points(2000, 4) * np.array([3.28, 3.28, 3.28]), crs=None)
     las(folder / "zone33.las", points(2000, 4), crs=32633)
+    las(folder / "millimetres.las", 1000 * (points(2000, 4) - UTM), crs=None)
+    las(folder / "no_overlap.las", points(COUNT // 4, 4) + np.array([18.0, 0, 0]))
+    shutil.copy(first, folder / "copy.las")
     (folder / "areas.yaml").write_text("- [1, 2]\n")
     (folder / "empty").mkdir()
     return {
         "one epoch": ([first, *station], "only 1 epoch is given"),
         "twice": ([first, first, *station], "is given twice"),
+        "a copy": ([first, str(folder / "copy.las"), *station], "is a copy of"),
+        "millimetres": ([str(folder / "millimetres.las"), second, *station], "--unit"),
+        "no overlap": ([first, str(folder / "no_overlap.las"), *station], "registered on"),
         "not there": ([first, "nowhere.laz", *station], "no such file"),
         "times backwards": ([second, first, *station], "is earlier than"),
         "wrong number of times": ([first, second, *station, "--times", "2026-01-01"], "1 times are given for 2 epochs"),
@@ -250,7 +305,8 @@ def mistakes(scans: Path, folder: Path) -> dict[str, tuple[list[str], str]]:
 
 
 @pytest.mark.parametrize("name", [
-    "one epoch", "twice", "not there", "times backwards", "wrong number of times", "no time", "elsewhere", "other unit",
+    "one epoch", "twice", "a copy", "millimetres", "no overlap",
+    "not there", "times backwards", "wrong number of times", "no time", "elsewhere", "other unit",
     "other system", "no areas", "empty folder", "two models", "pixel too large", "no detector",
 ])  # fmt: skip
 def test_mistakes(name: str, scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

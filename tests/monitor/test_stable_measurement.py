@@ -169,7 +169,7 @@ def with_reference(folder: Path, out: Path) -> list[Any]:
         (photographs, "not of a laser scanner", "--photographs"),
         (unfinished, "is not finished", "--resume"),
         (lost, "the file of epoch 1 is not there", "move the file back"),
-        (with_reference, "--reference: cannot be combined", "leave the option out"),
+        (with_reference, "--reference: the option cannot be combined", "leave the option out"),
     ],
 )
 def test_mistakes(

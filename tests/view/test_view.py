@@ -157,7 +157,7 @@ ROW |= {"depth_m": "0.1", "mean_depth_m": "0.05", "volume_m3": "0.015", "score":
     [
         ("events_all.csv", ROW, "is not that of a table"),
         ("events_nan.csv", ROW, "is not that of a table"),
-        ("events_0.9.csv", {**ROW, "x_m": "left"}, "line 2: 'x_m' is 'left'"),
+        ("events_0.9.csv", {**ROW, "x_m": "left"}, "line 2: the column 'x_m' has the value 'left'"),
         ("events_0.9.csv", {**ROW, "x_m": "nan"}, "finite numbers"),
         ("events_0.9.csv", {"image": "a.tif"}, "not a table of events"),
         ("events_0.9.csv", {**ROW, "more": "1"}, "not a table of events"),

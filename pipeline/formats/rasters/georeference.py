@@ -38,12 +38,14 @@ class Georeference:
     grid : Position and size of the pixels, m; None if the file does not state them.
     flipped : Whether the first row of the file is the southernmost.
     linear_m, vertical_m : Length of the stated units of coordinates and heights, m; None if the file states none.
+    epsg : EPSG code of the projected coordinate system; None if the file states none.
     """
 
     grid: Grid | None
     flipped: bool
     linear_m: float | None
     vertical_m: float | None
+    epsg: int | None = None
 
 
 def georeference(tags: dict[int, Any], shape: tuple[int, int], path: Path) -> Georeference:
@@ -70,9 +72,11 @@ def georeference(tags: dict[int, Any], shape: tuple[int, int], path: Path) -> Ge
     keys = _geo_keys(tags, path)
     linear, vertical = (_unit(keys, key, path) for key in (LINEAR_UNITS, VERTICAL_UNITS))
     linear = _unit_of_code(keys, path) if linear is None else linear
+    code = keys.get(_PROJECTED, _USER_DEFINED)
+    epsg = code if 0 < code < _USER_DEFINED else None
     corner = _affine(tags, path)
     if corner is None:
-        return Georeference(None, False, linear, vertical)
+        return Georeference(None, False, linear, vertical, epsg)
     if keys.get(MODEL_TYPE) == _GEOGRAPHIC:
         raise InputError(
             "the raster is in geographic coordinates, degrees",
@@ -93,7 +97,7 @@ def georeference(tags: dict[int, Any], shape: tuple[int, int], path: Path) -> Ge
         x, y = x - gsd / 2, y - step_y / 2
     flipped = step_y > 0
     y_max = y + shape[0] * step_y if flipped else y
-    return Georeference(Grid(x, y_max, gsd, shape[1], shape[0]), flipped, linear, vertical)
+    return Georeference(Grid(x, y_max, gsd, shape[1], shape[0]), flipped, linear, vertical, epsg)
 
 
 def _affine(tags: dict[int, Any], path: Path) -> tuple[float, float, float, float] | None:
