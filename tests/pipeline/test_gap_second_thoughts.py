@@ -87,7 +87,7 @@ def test_where_a_free_form_fails_all_is_named_again_without_any(
     monkeypatch.setattr(workflow, "best_pass", named)
     monkeypatch.setattr(workflow, "validate_effects", scored)
     monkeypatch.setattr(workflow, "only_within_bounds", lambda _, items: (items, []))
-    monkeypatch.setattr(workflow, "_with_heavy_tails", lambda *given: (given[2], None))
+    monkeypatch.setattr(workflow, "_with_heavy_tails", lambda *given: (given[1], None))
     monkeypatch.setattr(workflow, "with_separating_measurements", lambda _, items: items)
     found = workflow._select_and_validate(PassInputs(there, plain, nowhere), KeyedRandom(1))
     assert [item.name for item in found.named] == kept
