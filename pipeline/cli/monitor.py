@@ -101,7 +101,7 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
     options = _options(arguments)
     paths = with_reference(arguments.reference, arguments.epochs) if arguments.reference else arguments.epochs
     keys = {"times": arguments.times, "workers": arguments.workers, "resume": arguments.resume}
-    with shown_progress(quiet=arguments.quiet) as progress:
+    with shown_progress(quiet=arguments.quiet or arguments.follow is not None) as progress:
         if arguments.follow:
             result = follow(paths, arguments.follow, arguments.out, options, **keys)
         else:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from pipeline.formats.files.atomic import empty_folder
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.products import Result
 from pipeline.monitoring.reading import epoch_files
@@ -66,8 +67,8 @@ def follow(
     Raises
     ------
     InputError
-        If the folder does not exist, the reference cannot be used, times are given, or no epoch arrived. A new file that cannot
-        be used is reported to `told` and left out.
+        If the folder does not exist, `out` holds anything else, the reference cannot be used, times are given, or no epoch
+        arrived. A new file that cannot be used is reported to `told` and left out.
     """
     if not folder.is_dir():
         raise InputError(
@@ -81,6 +82,8 @@ def follow(
         )
     keys: dict[str, Any] = {"workers": workers, "progress": Progress()}
     resume = resume or (out / "monitor.json").exists()
+    if not resume:
+        empty_folder(out)
     result = monitor_paths(paths, out, options, resume=resume, **keys) if len(paths) > 1 else None
     used, bad, before = list(paths), set[Path](), dict[Path, tuple[int, int]]()
     while not ended():

@@ -6,6 +6,7 @@ import shlex
 from typing import Any
 
 import numpy as np
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure
 
 from pipeline.formats.files.atomic import write_bytes, write_text
@@ -209,6 +210,10 @@ def _volumes_figure(result: Result) -> bytes:
         axes.errorbar(
             places, volumes, NORMAL_95 * np.sqrt(variances), color=colour, marker="o", markersize=3, capsize=2, label=kind
         )
+    if timed:
+        locator = AutoDateLocator(minticks=2, maxticks=7)
+        axes.xaxis.set_major_locator(locator)
+        axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))
     label_axes(axes, "time (UTC)" if timed else "epoch", "volume against the reference [m³]")
     axes.legend(fontsize=8, frameon=False)
     return png_bytes(figure)

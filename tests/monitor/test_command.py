@@ -206,6 +206,14 @@ def test_a_folder_is_followed_until_the_end(scans: Path, tmp_path: Path) -> None
     assert any("left out" in line and "broken.las" in line for line in said)
 
 
+def test_nothing_is_followed_into_a_folder_with_other_files(scans: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    (tmp_path / "incoming").mkdir()
+    with pytest.raises(InputError, match="--out"):
+        follow([min(scans.glob("*.las"))], tmp_path / "incoming", tmp_path / "out", MonitorOptions(), ended=lambda: False)
+
+
 def test_meshes_are_epochs_too(tmp_path: Path) -> None:
     grid = Grid(0.0, 10.0, 0.05, 320, 200)
     x, y = np.meshgrid(0.05 * np.arange(320), 0.05 * np.arange(200)[::-1])
