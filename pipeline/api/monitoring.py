@@ -17,6 +17,7 @@ from pipeline.api.tables import frame
 from pipeline.formats.rasters.geotiff import read_geotiff
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.products import COLUMNS, Result
+from pipeline.monitoring.reading import with_reference
 from pipeline.monitoring.report import headline
 from pipeline.monitoring.run import monitor_paths
 from pipeline.monitoring.site import WallView
@@ -89,9 +90,13 @@ def monitor(
     for name in _VECTORS:
         if values.get(name) is not None:
             values[name] = np.asarray(values[name], dtype=np.float64)
+    paths = [Path(each) for each in epochs]
+    if values.get("reference") is not None:
+        values["reference"] = Path(values["reference"])
+        paths = with_reference(values["reference"], paths)
     with python_progress(progress) as shown:
         found = monitor_paths(
-            [Path(each) for each in epochs],
+            paths,
             Path(out),
             MonitorOptions(**values),
             times=times,

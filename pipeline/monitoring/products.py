@@ -301,7 +301,7 @@ def _document(result: Result, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
                 "time": source.time.text or None,
                 "time_source": source.time.source,
                 "points": site.points if record is None else record.points,
-                "unit": result.options.unit or "m (stated by the file or taken)",
+                "unit": result.options.unit or _unit_of(site.notes if record is None else record.notes),
                 "crs": site.crs or None,
                 "notes": list(site.notes if record is None else record.notes),
             }
@@ -329,6 +329,12 @@ def _document(result: Result, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "events": list(rows),
         "versions": versions(),
     }
+
+
+def _unit_of(notes: Sequence[str]) -> str:
+    """Return the unit of an epoch's coordinates, as its reader noted it."""
+    stated = next((note for note in notes if note.startswith(("the coordinates were converted from ", "the file states "))), None)
+    return f"m ({stated})" if stated else "m (stated by the file or taken)"
 
 
 def _place_of(view: WallView) -> dict[str, Any]:

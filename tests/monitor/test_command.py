@@ -174,7 +174,9 @@ def test_a_killed_monitoring_goes_on(result: Path, scans: Path, tmp_path: Path) 
 
 def test_from_python(scans: Path, tmp_path: Path) -> None:
     pytest.importorskip("xarray")
-    found = monitor(sorted(scans.glob("*.las"))[:2], tmp_path / "out", position=[float(each) for each in STATION.split()])
+    first, second, _ = sorted(scans.glob("*.las"))
+    station = [float(each) for each in STATION.split()]
+    found = monitor([second], tmp_path / "out", reference=first, position=station)
     assert found.differences.dims == ("epoch", "y", "x")
     assert len(found.events) == 2
     assert found.events["volume_m3"].sum() == pytest.approx(VOLUME, rel=0.1)
@@ -268,6 +270,7 @@ def test_feet_are_converted_with_their_coordinate_system(tmp_path: Path) -> None
     ]
     station = np.array([float(each) for each in STATION.split()]) + place
     monitor_paths(files, tmp_path / "out", MonitorOptions(position=station))
+    assert "us-ft" in json.loads((tmp_path / "out" / "monitor.json").read_text())["inputs"][1]["unit"]
     events = geopandas.read_file(tmp_path / "out" / "events.gpkg")
     found = events.to_crs(4269).geometry.iloc[0].centroid
     middle = events.geometry.iloc[0].centroid
