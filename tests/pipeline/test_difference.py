@@ -111,7 +111,7 @@ def test_a_mesh_without_labels_is_wall():
 def test_gsd_finer_than_memory_allows(monkeypatch):
     bounds = np.array([[0.0, 0, 0], [70, 45, 2]])
     monkeypatch.setattr(module.psutil, "virtual_memory", lambda: types.SimpleNamespace(available=64 * 10_000_000))
-    with pytest.raises(InputError, match=r"3\.15e\+09 pixels and 202 GB of memory, 0\.6 GB are free") as caught:
+    with pytest.raises(InputError, match=r"3\.15e\+09 pixels and 202 GB of memory, but only 0\.6 GB are free") as caught:
         raster_grid(bounds, DifferenceConfig(gsd_m=0.001))
     finest = float(caught.value.allowed.split()[0])
     assert finest == pytest.approx(np.sqrt(70 * 45 / 1e7), rel=0.1)
