@@ -15,6 +15,7 @@ import random
 import statistics
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -157,12 +158,18 @@ class _WithTexts(ast.NodeTransformer):
         return self._texts.get(node.id, node)
 
 
+@cache
+def everything() -> dict[str, list[dict[str, str]]]:
+    """Return all that can be drawn, by kind."""
+    return {"definition": list(definitions()), "page": list(pages()), "message": list(messages())}
+
+
 def drawn(seed: int) -> list[dict[str, Any]]:
     """Draw the items of one round."""
     source = random.Random(seed)
     items: list[dict[str, Any]] = []
-    for kind, every in (("definition", definitions()), ("page", pages()), ("message", messages())):
-        items += [{"kind": kind, **each} for each in source.sample(list(every), COUNTS[kind])]
+    for kind, every in everything().items():
+        items += [{"kind": kind, **each} for each in source.sample(every, COUNTS[kind])]
     return [{"number": number, **each} for number, each in enumerate(items, start=1)]
 
 
