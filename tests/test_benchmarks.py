@@ -148,7 +148,7 @@ SCRIPTS: dict[str, Tiny] = {
     "tls": Tiny(values={"PULSES": 2000}, keys=COARSE_WALL),
     "tls_beam": Tiny(values={"PULSES": 500}, keys=COARSE_WALL),
     "tls_process": Tiny(values={"PULSES": 2000, "SUB_RAYS": {"one ray": 1}}),
-    "tls_steps": Tiny(values={"PULSES": 2000, "ROUNDS": 1}),
+    "tls_steps": Tiny(values={"PULSES": 2000, "WIDE_PULSES": 500, "ROUNDS": 1}),
     "upper_bound": Tiny(("--width", "6", "--height", "4"), values={"WAYS": (("vertices", "low", "relief"),)}),
 }
 
