@@ -22,6 +22,7 @@ from tls_beam import DIVERGENCE_RAD, SUB_RAYS, pulse_by_pulse
 from scene.common.backend import VARIANT, dr, mi
 from scene.common.config import parse
 from scene.common.keyed_random import KeyedRandom
+from scene.ray_casting.raycast import RayCaster
 from sensors.laser.tls import LaserScanner
 from sensors.models.sensor_model import TlsModel
 from sensors.numerics.device import rotated, vector
@@ -73,7 +74,7 @@ def main() -> None:
     print(f"{VARIANT}{lanes}, {dr.thread_count()} threads, {len(caster.mesh.faces):,} triangles, {count:,} pulses")
     print_steps(works, count)
     print_unavoidable(scanner, random)
-    wide_beam()
+    wide_beam(scanner, caster, random)
     print("\n| kernel of one scan | rays | operations | share of the kernels' time |\n|---|---|---|---|")
     kernels = history(lambda: scanner.observe(caster, random))
     total = sum(each["execution_time"] for each in kernels)
@@ -111,13 +112,18 @@ def print_unavoidable(scanner: LaserScanner, random: KeyedRandom) -> None:
         print(f"{name} of each pulse: {1e9 * seconds / count:.1f} ns of processor time")
 
 
-def wide_beam() -> None:
-    """Print the steps from the bare cast of all sub-rays of a wide beam to a scan with it."""
-    pencil, caster, random = prepared(WIDE_PULSES)
-    spread = parse(
-        TlsModel, {"effects": [{"name": "beam_divergence", "divergence_rad": DIVERGENCE_RAD, "sub_rays": SUB_RAYS}]}, ""
+def wide_beam(pencil: LaserScanner, caster: RayCaster, random: KeyedRandom) -> None:
+    """Print the steps from the bare cast of all sub-rays of a wide beam to a scan with it, with coarser angular steps."""
+    effect = {"name": "beam_divergence", "divergence_rad": DIVERGENCE_RAD, "sub_rays": SUB_RAYS}
+    grid, coarser = pencil.pattern, (PULSES / WIDE_PULSES) ** 0.5
+    pattern = replace(
+        grid,
+        azimuth_step=coarser * grid.azimuth_step,
+        zenith_step=coarser * grid.zenith_step,
+        lines=int(grid.lines / coarser),
+        pulses=int(grid.pulses / coarser),
     )
-    scanner = replace(pencil, model=spread)
+    scanner = replace(pencil, pattern=pattern, model=parse(TlsModel, {"effects": [effect]}, "benchmark"))
     origin, rays = vector(scanner.position), pulse_by_pulse(scanner)
     dr.eval(rays)
     pulses, beam = scanner.emitted(scanner.emit(), random)
