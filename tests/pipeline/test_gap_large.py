@@ -177,20 +177,29 @@ def test_slopes_do_not_serve_where_what_they_miss_is_as_much_as_something_gains(
     first = MeanSearch(with_fitted_variance(points.part, [], 1.0), points.families, KeyedRandom(1))
     chosen = first.select()[0]
     (leading, *_) = _strongest_single_fits(points, first, chosen)
-    linear = first.design.log_likelihood(np.where(leading.used, points.part.value, 0.0), leading.estimate.candidate)
-    wrong_by = abs(leading.log_likelihood - linear)
+    # beside other effects, the points that the refit leaves out count too
+    one, two = (
+        abs(
+            leading.log_likelihood
+            - first.design.log_likelihood(np.where(used, points.part.value, 0.0), leading.estimate.candidate)
+        )
+        for used in (leading.used, np.ones_like(leading.used))
+    )
     monkeypatch.setattr(first, "leading_effects", lambda: [leading.estimate.candidate])
     monkeypatch.setattr(nonlinear_refit, "_single_fit", lambda *_: leading)
     monkeypatch.setattr(nonlinear_refit, "_best_variants", lambda *_: [leading])
     monkeypatch.setattr(nonlinear_refit, "_with_alternatives", lambda _points, _first, alone, _names: alone)
-    by = Thresholds().model_copy(update={"mean": Thresholds().mean.model_copy(update={"linearisation_error": 2 * wrong_by})})
-    with use_thresholds(by):
-        assert _strongest_single_fits(points, first, [replace(chosen[0], log_likelihood_ratio=3 * wrong_by)]) == []
-        assert _strongest_single_fits(
-            points,
-            first,
-            [replace(chosen[0], log_likelihood_ratio=3 * wrong_by), replace(chosen[0], log_likelihood_ratio=1.5 * wrong_by)],
-        )
+
+    def refitted(wrong_by: float, *ratios: float) -> bool:
+        mean = Thresholds().mean.model_copy(update={"linearisation_error": 2 * wrong_by})
+        with use_thresholds(Thresholds().model_copy(update={"mean": mean})):
+            selected = [replace(chosen[0], log_likelihood_ratio=ratio * wrong_by) for ratio in ratios]
+            return bool(_strongest_single_fits(points, first, selected))
+
+    assert not refitted(one, 3)
+    assert refitted(one, 1.5)
+    assert not refitted(two, 3, 3)
+    assert refitted(two, 3, 1.5)
 
 
 def test_two_large_effects_are_found_where_all_together_fit_best(
