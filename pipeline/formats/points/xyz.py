@@ -234,7 +234,7 @@ def _check_lines(path: Path) -> None:
         while len(part := file.read(LONGEST_LINE)) == LONGEST_LINE:
             if b"\n" not in part and b"\r" not in part:
                 raise InputError(
-                    f"the file has a line of more than {LONGEST_LINE:,} bytes, so it is no text file of points",
+                    f"the file has a line of more than {LONGEST_LINE:,} bytes, so it is not a text file of points",
                     where=str(path), allowed="one point in each line",
                     remedy="give a text file of points",
                 )  # fmt: skip
