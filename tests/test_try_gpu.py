@@ -36,9 +36,9 @@ def results(folder: Path, farther_m: float = 0.0, deeper_m: float = 0.0, lost: i
     points = np.column_stack([np.arange(count), np.zeros(count), np.full(count, 30.0)]).astype(float)
     extra = {"true_range_m": np.full(count, 30.0 + farther_m)}
     write_laz(folder / "tls/epoch_000/points.laz", PointCloud(points, gps_time=np.arange(count) * 1e-3, extra=extra))
-    for sensor in ("tls", "stereo"):
-        (folder / sensor).mkdir(exist_ok=True)
-        write_geotiff(folder / sensor / "difference_001.tif", np.full((10, 20), deeper_m, dtype=np.float32), GRID)
+    (folder / "stereo/epoch_000").mkdir(parents=True)
+    for raster in ("tls/difference_001.tif", "stereo/difference_001.tif", "stereo/epoch_000/depth_left.tif"):
+        write_geotiff(folder / raster, np.full((10, 20), deeper_m, dtype=np.float32), GRID)
     np.savez(folder / "random.npz", uniforms=np.arange(8.0), normals=np.arange(8.0))
 
 

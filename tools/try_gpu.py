@@ -24,8 +24,12 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 CARD, PROCESSOR = "cuda_ad_mono", "llvm_ad_mono"
 SENSORS = ("tls", "stereo")
-NEAR_M, FLOAT32 = 1e-5, 1e-6
-"""Largest difference of a range or a map, m, and of a standard normal number."""
+NEAR_M, REGISTERED_M, NORMAL = 1e-5, 1e-4, 5e-5
+"""Largest difference of a range or a depth, m, of a difference map, m, and of a standard normal number.
+
+CUDA's sine and logarithm of float32 differ from the processor's by some units of the last place. One point more or fewer
+changes the sample on which a registration begins, and so where it stops.
+"""
 ASKED = "name,driver_version,memory.total"
 
 
@@ -40,7 +44,8 @@ class Trial:
     def step(self, name: str, words: list[str], limit_s: float, variant: str = "") -> str:
         """Run a command with a time limit; keep its log, its seconds and whether it worked; return what it printed."""
         start, left = time.monotonic(), max(self.end - time.monotonic(), 1.0)
-        environment = os.environ | {"PYTHONPATH": str(ROOT), "SCARPSIM_VARIANT": variant or self.card}
+        places = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+        environment = os.environ | {"PYTHONPATH": places, "SCARPSIM_VARIANT": variant or self.card}
         text, said = "", "works"
         try:
             how: dict[str, Any] = {"cwd": ROOT, "env": environment, "text": True, "start_new_session": True}
@@ -96,8 +101,8 @@ def install(trial: Trial, wheels: Path) -> None:
     place = trial.out.absolute() / "venv"
     trial.step("environment", [sys.executable, "-m", "venv", str(place)], 60)
     trial.python = str(place / "bin" / "python")
-    words = ["-m", "pip", "install", "-q", "--no-index", "--find-links", str(wheels.absolute()), "scarpsim", "pytest", "open3d"]
-    trial.step("installation", [trial.python, *words, "hypothesis", "pytest-xdist"], 240)
+    words = ["-m", "pip", "install", "-q", "--no-index", "--find-links", str(wheels.absolute())]
+    trial.step("installation", [trial.python, *words, "scarpsim", "pytest", "pytest-xdist", "hypothesis"], 240)
 
 
 def carry_out(trial: Trial, demo: list[str]) -> None:
@@ -138,15 +143,15 @@ def draw(out: Path) -> None:
 def compare(card: str, out: Path) -> dict[str, Any]:
     """Return the differences between the card's demo and the processor's, with what is allowed."""
     import numpy as np
+    import tifffile
 
     from pipeline.formats.points.laz import read_laz
-    from pipeline.formats.rasters.geotiff import read_geotiff
 
     first, second = out / card, out / PROCESSOR
     mine, other = (np.load(folder / "random.npz") for folder in (first, second))
     found: dict[str, Any] = {
         "uniform numbers are the same": bool(np.array_equal(mine["uniforms"], other["uniforms"])),
-        "normal numbers, largest difference": [float(np.abs(mine["normals"] - other["normals"]).max()), FLOAT32],
+        "normal numbers, largest difference": [float(np.abs(mine["normals"] - other["normals"]).max()), NORMAL],
     }
     scans = [read_laz(folder / "tls" / "epoch_000" / "points.laz") for folder in (first, second)]
     times = [scan.gps_time for scan in scans]
@@ -154,11 +159,13 @@ def compare(card: str, out: Path) -> dict[str, Any]:
     ranges = [scan.extra["true_range_m"][at] for scan, at in zip(scans, (rows, others), strict=True)]
     found["pulses that one of both misses, share"] = [1 - len(rows) / max(map(len, times)), 1e-4]
     found["true ranges, 99.9 %, m"] = [float(np.quantile(np.abs(ranges[0] - ranges[1]), 0.999)), NEAR_M]
-    for sensor in SENSORS:
-        maps = [read_geotiff(folder / sensor / "difference_001.tif")[0] for folder in (first, second)]
+    rasters = {"stereo depth map": ("stereo/epoch_000/depth_left.tif", NEAR_M)}
+    rasters |= {f"{sensor} difference map": (f"{sensor}/difference_001.tif", REGISTERED_M) for sensor in SENSORS}
+    for name, (file, near_m) in rasters.items():
+        maps = [tifffile.imread(folder / file).astype(float) for folder in (first, second)]
         both = np.isfinite(maps[0]) & np.isfinite(maps[1])
-        found[f"{sensor} map, 99 % of pixels, m"] = [float(np.quantile(np.abs(maps[0] - maps[1])[both], 0.99)), NEAR_M]
-        found[f"{sensor} map, pixels that one of both lacks, share"] = [1 - both.sum() / np.isfinite(maps[0]).sum(), 1e-3]
+        found[f"{name}, 99 % of pixels, m"] = [float(np.quantile(np.abs(maps[0] - maps[1])[both], 0.99)), near_m]
+        found[f"{name}, pixels that one of both lacks, share"] = [1 - both.sum() / np.isfinite(maps[0]).sum(), 1e-3]
     return found | {"as it should be": all(each if isinstance(each, bool) else each[0] <= each[1] for each in found.values())}
 
 

@@ -15,6 +15,7 @@ is too small where noise is correlated over more than a cylinder. Scales are rad
 from __future__ import annotations
 
 import logging
+import os
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -177,5 +178,6 @@ def _py4dgeo() -> Any:
             where="m3c2",
             remedy=how_to_install("m3c2"),
         ) from None
+    py4dgeo.set_py4dgeo_logfile(os.devnull)  # by default it writes py4dgeo.log into the current folder
     logging.getLogger("py4dgeo").setLevel(logging.WARNING)
     return py4dgeo

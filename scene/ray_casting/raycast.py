@@ -126,7 +126,8 @@ class RayCaster:
         corner, second, third = (dr.gather(mi.Array3f64, self._vertices, number) for number in vertex)
         normal = dr.cross(second - corner, third - corner)
         axis, largest = _largest_component(normal)
-        normal /= dr.abs(largest)  # NaN for a face without area, which is never hit
+        # not `/`, which multiplies by a reciprocal that CUDA approximates; NaN for a face without area, which is never hit
+        normal *= 1 / dr.abs(largest)
         following = dr.select(axis == 0, normal.y, dr.select(axis == 1, normal.z, normal.x))
         last = dr.select(axis == 0, normal.z, dr.select(axis == 1, normal.x, normal.y))
         code = mi.Float32(6 * labels + 2 * mi.Int32(axis) + dr.select(largest < 0, 1, 0))  # exact below 2^24: 2.7 million blocks
