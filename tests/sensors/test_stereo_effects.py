@@ -441,12 +441,12 @@ def test_occlusion_fill_fills_strips_up_to_its_reach_with_background() -> None:
             [{"name": "occlusion_fill", "reach_px": 1.3 * width_px}],
         )
     )
-    np.testing.assert_allclose(short.points, empty.points, rtol=1e-14)  # on a graphics card, another kernel may round otherwise
+    np.testing.assert_allclose(short.points, empty.points, atol=1e-12)  # a graphics card rounds each kernel in its own way
     new = filled.valid & ~empty.valid
     across = new.sum(axis=1)[new.any(axis=1)]
     assert np.median(across) * 2 == pytest.approx(width_px, abs=3.0)
     np.testing.assert_allclose(filled.points[new][:, 2], 0.0, atol=0.3)  # the background's disparity a little way on
-    np.testing.assert_allclose(filled.points[empty.valid], empty.points[empty.valid], rtol=1e-14)
+    np.testing.assert_allclose(filled.points[empty.valid], empty.points[empty.valid], atol=1e-12)
     row = filled.valid[filled.valid.shape[0] // 2]
     assert row[np.flatnonzero(row)[0] : np.flatnonzero(row)[-1]].all()
 
