@@ -28,6 +28,8 @@ from scene.geometry.mesh import TriangleMesh
 from scene.ray_casting.raycast import RayCaster
 from sensors.models.sensor_model import TlsModel
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 EYE = np.array([0.0, -30.0, 0.0])
 NOISE_M = 0.003
 SETTINGS = [
