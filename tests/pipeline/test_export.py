@@ -81,7 +81,7 @@ def test_a_place_is_drawn_where_it_projects() -> None:
 @pytest.mark.usefixtures("drawn")
 def test_a_run_as_picture_and_animations(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pictures, "_ANIMATED_PX", 320)
-    monkeypatch.setattr(pictures, "_SCAN_FRAMES", 3)
+    monkeypatch.setattr(pictures, "_SCAN_FRAMES", 5)
     assert export(run, "picture", "--epoch", 2, "--width", 400, "--out", tmp_path / "a.png") == 0
     with Image.open(tmp_path / "a.png") as picture:
         assert picture.width == 400
