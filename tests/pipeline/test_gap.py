@@ -78,7 +78,7 @@ def test_noise_that_falls_with_intensity_is_named(tmp_path: Path) -> None:
 
 
 def test_a_jump_in_azimuth_is_unknown(tmp_path: Path) -> None:
-    found = found_in(tmp_path, 18, ranges=lambda scan: scan.R + 0.002 * np.where(scan.az > 1.6, 1.0, -1.0))
+    found = found_in(tmp_path, 18, step_rad=0.013, ranges=lambda scan: scan.R + 0.003 * np.where(scan.az > 1.6, 1.0, -1.0))
     assert found.verdict == "unknown"
     assert found.effects[0].kind == "empirical"
     assert "depends on" in paragraph(found, rank_disagreements(found))
