@@ -38,6 +38,14 @@ def undrawn() -> Iterator[Callable[..., None]]:
 
 
 @pytest.fixture
+def undrawn_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write a blank picture for each figure of one test, in a module whose other tests look at theirs."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    monkeypatch.setattr(FigureCanvasAgg, "print_png", write_blank)
+
+
+@pytest.fixture
 def drawn(undrawn: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw figures in a test of a module that uses `undrawn`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg

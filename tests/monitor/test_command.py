@@ -39,7 +39,7 @@ pytestmark = pytest.mark.usefixtures("undrawn")
 
 BLOCKS = ((4.0, 3.0, 0.7, 0.2), (11.0, 6.5, 0.9, 0.1))
 VOLUME = 0.7**2 * 0.2 + 0.9**2 * 0.1
-COUNT = 120_000
+COUNT = 60_000
 _UTM_KEYS = (1, 1, 0, 2, 1024, 0, 1, 1, 3072, 0, 1, 25832)
 """GeoTIFF keys: projected coordinates, EPSG:25832."""
 

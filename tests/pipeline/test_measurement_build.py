@@ -44,7 +44,7 @@ SHARED = Path(__file__).parents[3] / "shared" / "data"
 FOREST = SHARED / "tls_forest_vz400i" / "TLS_scan.npz"
 ROCKS = SHARED / "tls_rock_blocks" / "Blocs_EGU_avant.txt"
 POSITION = np.array([42.0 * 0.42, -34.0, 2.5])
-STEP = 0.012
+STEP = 0.018
 UTM = np.array([547_000.0, 5_149_000.0, 700.0])
 Case = tuple[Path, PointCloud, np.ndarray]
 
@@ -396,7 +396,7 @@ BAD: dict[str, tuple[Callable[[Case, Path], list[str]], str]] = {
     "no such reference": (asked(reference="no.ply"), "no.ply: there is no such file"),
     "no such scanner": (asked(scanner="riegl_vz400j"), "riegl_vz400i"),
     "millimetres": (move(lambda points: 1000 * points), "add --unit mm"),
-    "few in millimetres": (move(lambda points: 1000 * points[::50]), "add --unit mm"),
+    "few in millimetres": (move(lambda points: 1000 * points[::20]), "add --unit mm"),
     "one point": (move(lambda points: points[:1]), "has only 1 points"),
     "identical points": (move(lambda points: np.repeat(points[:1], 500, axis=0)), "at the same place"),
     "NaN": (move(lambda points: points * np.nan), "no point with finite values"),

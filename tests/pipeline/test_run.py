@@ -32,12 +32,12 @@ pytestmark = pytest.mark.usefixtures("undrawn")
 
 SMALL: dict[str, Any] = {
     "seed": 3,
-    "wall": {"style": "glendale", "width_m": 8.0, "height_m": 5.0, "resolution_m": 0.05, "seed": 1},
+    "wall": {"style": "glendale", "width_m": 8.0, "height_m": 5.0, "resolution_m": 0.08, "seed": 1},
     "rockfall": {"count": 5, "size_m": {"kind": "gaussian", "mean": 0.5, "sigma": 0.05, "minimum": 0.3}},
     "cameras": {"distance_m": 20.0, "base_m": 5.0},
     "depth_map": "low",
     "station": {"distance_m": 20.0},
-    "scanner": {"azimuth_step_rad": 0.0015, "zenith_step_rad": 0.0015},
+    "scanner": {"azimuth_step_rad": 0.0025, "zenith_step_rad": 0.0025},
     "difference": {"gsd_m": 0.03},
 }
 FACING_AWAY = {
