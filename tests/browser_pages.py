@@ -9,9 +9,10 @@ from typing import Any
 
 from gap_cases import write_scan
 from monitor_cases import STATION, las, points
-from tiny_dataset import tiny_set
+from tiny_dataset import COMMAND, TINY, tiny
 
 from pipeline.cli.main import main
+from pipeline.dataset.run import make_dataset
 
 WIDE, NARROW = 1400, 420
 """Widths of a desktop's window and of a phone, px."""
@@ -28,7 +29,7 @@ cameras: {distance_m: 20.0, base_m: 5.0, width: 368, height: 246}
 depth_map: high
 difference: {gsd_m: 0.05}
 icp: {max_iteration: 5}
-planning: {gsd_m: 0.4}
+planning: {gsd_m: 0.4, block_size_m: [0.2]}
 calibration: {windows: 6, window_px: 16, simulations: 60}
 """
 
@@ -36,26 +37,31 @@ calibration: {windows: 6, window_px: 16, simulations: 60}
 class WatchedPage:
     """A page of Chromium, with what its console, network and scripts complained of in `complaints`.
 
-    `tally` counts what was done with the page and what came of it, for docs/validation/browser.md.
+    `tally` counts what was done with the page and what came of it, for docs/validation/browser.md. `page` is Playwright's page,
+    which several of these use in turn.
     """
 
-    def __init__(self, browser: Any) -> None:
-        self.page = browser.new_context(viewport={"width": WIDE, "height": 900}, reduced_motion="reduce").new_page()
+    def __init__(self, page: Any) -> None:
+        self.page = page
         self.complaints: list[str] = []
         self.tally: Counter[str] = Counter()
         self.axe = ""
         self._count_actions()
         self._awaited = 0
-        self.page.on("request", lambda _: self._ask())
-        for ended in ("requestfinished", "requestfailed"):
-            self.page.on(ended, lambda _: self._receive())
-        self.page.on("console", lambda said: said.type == "error" and self._complain("console errors", said.text))
-        self.page.on("pageerror", lambda error: self._complain("console errors", str(error)))
-        self.page.on("requestfailed", lambda asked: self._complain("missing files", f"{asked.url}: {asked.failure}"))
-        self.page.on(
-            "response",
-            lambda answer: answer.status >= 400 and self._complain("missing files", f"{answer.url}: {answer.status}"),
+        self._listeners: tuple[tuple[str, Callable[[Any], Any]], ...] = (
+            ("request", lambda _: self._ask()),
+            ("requestfinished", lambda _: self._receive()),
+            ("requestfailed", lambda _: self._receive()),
+            ("console", lambda said: said.type == "error" and self._complain("console errors", said.text)),
+            ("pageerror", lambda error: self._complain("console errors", str(error))),
+            ("requestfailed", lambda asked: self._complain("missing files", f"{asked.url}: {asked.failure}")),
+            (
+                "response",
+                lambda answer: answer.status >= 400 and self._complain("missing files", f"{answer.url}: {answer.status}"),
+            ),
         )
+        for event, listener in self._listeners:
+            self.page.on(event, listener)
 
     def _ask(self) -> None:
         self._awaited += 1
@@ -134,8 +140,13 @@ class WatchedPage:
         self.wait_for(lambda: self._awaited == 0, times=5)
 
     def close(self) -> None:
-        """Close the page."""
-        self.page.context.close()
+        """Leave what the page shows and listen no more; closing it again does nothing."""
+        for event, listener in self._listeners:
+            self.page.remove_listener(event, listener)
+        if self._listeners:
+            del self.page.click, self.page.keyboard.press  # those of Playwright again, which count nothing
+            self.page.goto("about:blank")
+        self._listeners = ()
 
 
 def make_outputs(folder: Path) -> None:
@@ -154,11 +165,12 @@ def make_outputs(folder: Path) -> None:
         "compare": ["compare", site, "--epochs", "2", "--sizes-m", "0.3", "0.6"],
         "inspect": ["inspect", site],
         "icp-study": ["icp-study", folder / "simulate_tls"],
-        "calibrate": ["calibrate", folder / "simulate_tls", "--no-greedy"],
+        "calibrate": ["calibrate", folder / "simulate_tls", "--no-greedy", "--set", "icp=null"],  # registers no simulated map
         "gap": ["gap", scan],
         "identifiability": ["gap", "--identifiability", scan],
         "monitor": ["monitor", before, after, "--position", ",".join(STATION.split())],
     }
     for name, words in commands.items():
         assert main([*map(str, words), "--out", str(folder / name)]) == 0, name
-    tiny_set(folder / "dataset")
+    part = {**TINY["parts"][0], "train": 0, "val": 0, "test": 1}
+    make_dataset(tiny(parts=[part]), folder / "dataset", command=COMMAND)

@@ -86,12 +86,15 @@ class _Deck:
         return chosen
 
 
-def make(case: Case, folder: Path, truth: Path) -> None:
-    """Write the measurement into `folder` and its truth into the file `truth`."""
+def make(case: Case, folder: Path, truth: Path, baselines: bool = True) -> None:
+    """Write the measurement into `folder` and its truth into the file `truth`.
+
+    baselines: whether the truth holds the answers of the baselines too, which take most of the time; the measurement is the same.
+    """
     random = np.random.default_rng([*case.seed, 2])
     folder.mkdir(parents=True, exist_ok=True)
     falls = {"none": 0, "change": int(random.integers(2, 7))}.get(case.stratum, int(random.choice([0, 0, 1, 2, 3])))
-    found = _MAKERS[case.sensor].make(folder, random, list(case.kinds), falls, case.points, case.nodes)
+    found = _MAKERS[case.sensor].make(folder, random, list(case.kinds), falls, case.points, case.nodes, baselines)
     truth.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps(plain({"number": case.number, "seed": case.seed, "stratum": case.stratum, **found}), indent=1)
     part = truth.with_suffix(".part")

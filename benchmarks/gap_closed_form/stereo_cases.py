@@ -93,8 +93,10 @@ class Set:
         return self.nominal.pair.moved(self.pose[:3], small_turn(self.pose[3:]))
 
 
-def make(folder: Path, random: Random, kinds: list[str], falls: int, points: int, nodes: int) -> dict[str, Any]:
-    """Write a measurement with the effects `kinds`, and return its truth."""
+def make(
+    folder: Path, random: Random, kinds: list[str], falls: int, points: int, nodes: int, baselines: bool = True
+) -> dict[str, Any]:
+    """Write a measurement with the effects `kinds`, and return its truth, with or without the answers of the baselines."""
     scene = _draw(random, kinds, falls, points, nodes)
     plain, where = _disparity(scene, scene.nominal.pair, scene.known)
     usable = np.isfinite(plain) & scene.nominal.pair.seen_by_right(scene.known, np.nan_to_num(where))
@@ -102,18 +104,12 @@ def make(folder: Path, random: Random, kinds: list[str], falls: int, points: int
     u, v = scene.u.ravel(), scene.v.ravel()
     size = scene.nominal.pair.left.width, scene.nominal.pair.left.height
     v_right = scene.nominal.pair.right.project(np.nan_to_num(where, nan=1.0))[1]
-    image = Image(u, v, plain, v_right, size)
     chosen = np.flatnonzero(usable & ~blob)
     part = Image(u[chosen], v[chosen], plain[chosen], v_right[chosen], size)
-    base, families = _columns(scene, part)
+    base, families = _columns(scene, part) if baselines or set(kinds) & set(_LINEAR) else (np.zeros((len(chosen), 0)), {})
     drawn = _drawn(scene, kinds, part, base, families, where[chosen], plain, chosen, random)
     found = _observe(scene, drawn, blob, random)
     kept = np.isfinite(found)
-    rows = kept[chosen]
-    sigma = np.full(int(rows.sum()), np.hypot(scene.noise[0], scene.noise[1] * 2 / 3))
-    data = Data((found - image.disparity)[chosen][rows], sigma, base[rows], where[chosen][rows][:, [0, 2]])
-    truth = [_signature(scene, name, p, part)[rows] for name, p, _ in drawn if name in (*effects.CAMERA, *effects.IMAGE)]
-    some = {name: [design[rows] for design in designs] for name, designs in families.items()}
     _write(folder, scene, found, kept)
     return {
         "sensor": "stereo",
@@ -128,8 +124,20 @@ def make(folder: Path, random: Random, kinds: list[str], falls: int, points: int
             "reference_m": scene.reference,
         },
         "known": [],
-        **rivals(data, some, {"parallax_noise": [np.ones(int(rows.sum()))]}, truth),
+        **(_rivals(scene, drawn, part, (found - plain)[chosen], base, families, where[chosen]) if baselines else {}),
     }
+
+
+def _rivals(
+    scene: Set, drawn: Drawn, part: Image, value: Array, base: Array, families: dict[str, list[Array]], where: Array
+) -> dict[str, Any]:
+    """Return the answers of the baselines to the disparity errors `value` (n,), NaN without a match, at the points `where`."""
+    rows = np.isfinite(value)
+    sigma = np.full(int(rows.sum()), np.hypot(scene.noise[0], scene.noise[1] * 2 / 3))
+    data = Data(value[rows], sigma, base[rows], where[rows][:, [0, 2]])
+    truth = [_signature(scene, name, p, part)[rows] for name, p, _ in drawn if name in (*effects.CAMERA, *effects.IMAGE)]
+    some = {name: [design[rows] for design in designs] for name, designs in families.items()}
+    return rivals(data, some, {"parallax_noise": [np.ones(int(rows.sum()))]}, truth)
 
 
 def _draw(random: Random, kinds: list[str], falls: int, points: int, nodes: int) -> Set:

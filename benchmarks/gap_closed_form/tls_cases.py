@@ -94,8 +94,10 @@ class Shot:
     blob: Array
 
 
-def make(folder: Path, random: Random, kinds: list[str], falls: int, points: int, nodes: int) -> dict[str, Any]:
-    """Write a measurement with the effects `kinds`, and return its truth."""
+def make(
+    folder: Path, random: Random, kinds: list[str], falls: int, points: int, nodes: int, baselines: bool = True
+) -> dict[str, Any]:
+    """Write a measurement with the effects `kinds`, and return its truth, with or without the answers of the baselines."""
     scene = _draw(random, kinds, falls, points, nodes)
     rays, pose, at = _expected(scene)
     albedo, blob = _albedo(scene, rays, random), _blobs(scene, at, random)
@@ -106,11 +108,6 @@ def make(folder: Path, random: Random, kinds: list[str], falls: int, points: int
     shot = _shoot(scene, [*((name, p) for name, p, _ in drawn), *scene.known_effects], albedo, blob, random)
     kept = np.isfinite(shot.ranges)
     rows = weighed & kept & np.isfinite(rays.R) & (rays.cos_i > _STEEP)
-    recorded = replace(rays, power=shot.rays.power).part(rows)
-    value = (shot.ranges - rays.R)[rows]
-    value = value - sum(effects.signature(name, p, recorded) for name, p in scene.known_effects)
-    data = Data(value, _sigma(scene, recorded), pose[rows], at[rows])
-    true_mean = [effects.signature(name, p, recorded) for name, p, _ in drawn if name in effects.MEAN]
     _write(folder, scene, shot, kept)
     return {
         "sensor": "tls",
@@ -121,8 +118,18 @@ def make(folder: Path, random: Random, kinds: list[str], falls: int, points: int
         "changes": [fall.world_box(scene.wall, scene.place) for fall in scene.falls],
         "nuisances": {"range_sigma_m": scene.sigma[0], "angle_sigma_rad": scene.sigma[1], "reference_m": scene.reference},
         "known": [name for name, _ in scene.known_effects],
-        **rivals(data, effects.families(recorded, scene.fields), effects.forms(recorded, scene.fields), true_mean),
+        **(_rivals(scene, drawn, rays, shot, rows, pose[rows], at[rows]) if baselines else {}),
     }
+
+
+def _rivals(scene: Set, drawn: list[Any], rays: Rays, shot: Shot, rows: Array, pose: Array, at: Array) -> dict[str, Any]:
+    """Return the answers of the baselines to the ranges in `rows`, whose columns of the pose and places are given."""
+    recorded = replace(rays, power=shot.rays.power).part(rows)
+    value = (shot.ranges - rays.R)[rows]
+    value = value - sum(effects.signature(name, p, recorded) for name, p in scene.known_effects)
+    data = Data(value, _sigma(scene, recorded), pose, at)
+    true_mean = [effects.signature(name, p, recorded) for name, p, _ in drawn if name in effects.MEAN]
+    return rivals(data, effects.families(recorded, scene.fields), effects.forms(recorded, scene.fields), true_mean)
 
 
 def _draw(random: Random, kinds: list[str], falls: int, points: int, nodes: int) -> Set:

@@ -6,9 +6,10 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
-from browser_pages import WatchedPage, make_outputs
+from browser_pages import WIDE, WatchedPage, make_outputs
 from browser_record import RECORD
 from shared_outputs import build_site, made_once
 
@@ -18,8 +19,12 @@ OFFLINE = "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[object]:
-    """Chromium without network; of a module, because Playwright's event loop would disturb those of other tests."""
+def tab() -> Iterator[Any]:
+    """Playwright's page in Chromium without network.
+
+    It is opened once for a module, because a new one takes a second. It does not outlive the module, because Playwright's event
+    loop would disturb those of other tests.
+    """
     if CHROMIUM is None:
         pytest.skip("there is no Chromium on this machine; `make setup-all` installs it where it may")
     from playwright.sync_api import sync_playwright
@@ -27,14 +32,14 @@ def browser() -> Iterator[object]:
     with sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS, OFFLINE])
         RECORD.chromium = chromium.version
-        yield chromium
+        yield chromium.new_context(viewport={"width": WIDE, "height": 900}, reduced_motion="reduce").new_page()
         chromium.close()
 
 
 @pytest.fixture
-def page(browser: object, request: pytest.FixtureRequest) -> Iterator[WatchedPage]:
+def page(tab: Any, request: pytest.FixtureRequest) -> Iterator[WatchedPage]:
     """Return an empty page; whatever its console, its network or its scripts complained of fails the test at the end."""
-    watched = WatchedPage(browser)
+    watched = WatchedPage(tab)
     yield watched
     watched.close()
     RECORD.add(request.node.name, watched.tally)

@@ -15,9 +15,12 @@ KINDS_OF_PAGES = (
     "explanation/how_gap_works",
     "reference/configuration",
     "reference/effects/tls.wobble",
+    "reference/api/scene.ray_casting",
+    "validation/gap_rendered_photographs",
     "reference/api/sensors.models",
     "validation/gap_closed_form",
 )
+"""One page of each kind for `make test`, and long ones of two kinds for `make validate`."""
 WITHOUT_PICTURE = "[...document.images].filter(image => image.complete && image.naturalWidth < 2).map(image => image.src)"
 
 

@@ -15,12 +15,11 @@ from pipeline.view.server import make_page_server, open_results, open_second
 
 TOKEN = "a-token_of-24-bytes"
 KINDS = {
-    "run": ("simulate_tls",),
-    "pair": ("simulate_tls", "simulate_stereo"),
     "gap": ("gap",),
     "data set": ("dataset/test",),
     "monitor": ("monitor",),
 }
+"""Folders of which each kind is opened alone; a run and a pair of runs are opened to use their controls."""
 
 
 @contextmanager
@@ -35,34 +34,32 @@ def served(folder: Path, second: Path | None = None) -> Iterator[str]:
     thread.join()
 
 
-def drawn(page: WatchedPage, address: str) -> Any:
-    """Open the viewer and wait until wall and map are drawn."""
-    opened = page.open(address)
+def drawn(page: WatchedPage, address: str, widths: tuple[int, ...]) -> Any:
+    """Open the viewer, and wait until wall and map are drawn; look for barriers, and for what is too wide at each width, px."""
+    opened = page.open(address, widths[0])
     opened.wait_for_selector("#map .heatmaplayer image")
     opened.wait_for_selector("#wall canvas")
     opened.wait_for_load_state("networkidle")
+    for width in widths:
+        opened.set_viewport_size({"width": width, "height": 900})
+        page.wait_for(lambda: page.overflow_px() <= 0)
+        assert width != WIDE or page.barriers() == []
     return opened
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_folder_in_the_viewer(kind: str, outputs: Path, page: WatchedPage) -> None:
     with served(*(outputs / name for name in KINDS[kind])) as address:
-        opened = drawn(page, address)
-        assert page.barriers() == []
-        for width in (WIDE, NARROW):
-            opened.set_viewport_size({"width": width, "height": 900})
-            page.wait_for(lambda: page.overflow_px() <= 0)
-        if kind == "pair":
-            assert "simulate_stereo" in opened.locator("#note").inner_text()
+        opened = drawn(page, address, (WIDE, NARROW))
         if kind != "gap":  # no scene change is in it
             opened.click("#next")
             opened.wait_for_selector("#facts table")
-        opened.close()
+        page.close()
 
 
 def test_the_controls_by_mouse(outputs: Path, page: WatchedPage) -> None:
     with served(outputs / "simulate_tls") as address:
-        opened = drawn(page, address)
+        opened = drawn(page, address, (NARROW, WIDE))
         assert "Share chart" not in opened.content()  # Plotly's own button would upload the chart
         opened.click("#next")
         page.says("#facts h2", "block 1")
@@ -82,13 +79,17 @@ def test_the_controls_by_mouse(outputs: Path, page: WatchedPage) -> None:
         page.says("#step-value", "epoch 1")
         opened.click("#play")
         page.says("#play", "play")
-        opened.close()
+        page.close()
 
 
 def test_the_controls_by_keyboard(outputs: Path, page: WatchedPage) -> None:
-    """Every control is reached with Tab alone, in the order of the page, and works with arrows, space and Enter."""
-    with served(outputs / "simulate_tls") as address:
-        opened = drawn(page, address)
+    """Every control is reached with Tab alone, in the order of the page, and works with arrows, space and Enter.
+
+    The folder is a pair of runs.
+    """
+    with served(outputs / "simulate_tls", outputs / "simulate_stereo") as address:
+        opened = drawn(page, address, (NARROW, WIDE))
+        assert "simulate_stereo" in opened.locator("#note").inner_text()
         opened.keyboard.press("Tab")
         assert opened.evaluate("document.activeElement.id") == "step"
         for key, chosen in (("Enter", "1"), ("ArrowDown", "2")):
@@ -111,4 +112,4 @@ def test_the_controls_by_keyboard(outputs: Path, page: WatchedPage) -> None:
         page.settle()
         opened.keyboard.press("Enter")
         page.says("#facts h2", "block 1")
-        opened.close()
+        page.close()

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import csv
 import json
+import pickle
 import shutil
 import subprocess
-import sys
 import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
 import pytest
 from monitor_cases import NOISE_M, STATION, UTM, las, points
+from pictures import ENVIRONMENT, command
 from pycocotools.coco import COCO
 
 from pipeline import monitor
@@ -23,7 +26,7 @@ from pipeline.formats.points import laz_chunks
 from pipeline.formats.points.laz import read_laz
 from pipeline.formats.rasters.georeference import GEO_KEYS, georeference
 from pipeline.formats.rasters.geotiff import read_geotiff
-from pipeline.monitoring import reading
+from pipeline.monitoring import reading, run
 from pipeline.monitoring.follow import follow
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.run import monitor_paths
@@ -32,9 +35,11 @@ from pipeline.surface.raster_mesh import mesh_of_raster
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 BLOCKS = ((4.0, 3.0, 0.7, 0.2), (11.0, 6.5, 0.9, 0.1))
 VOLUME = 0.7**2 * 0.2 + 0.9**2 * 0.1
-COUNT = 120_000
+COUNT = 60_000
 _UTM_KEYS = (1, 1, 0, 2, 1024, 0, 1, 1, 3072, 0, 1, 25832)
 """GeoTIFF keys: projected coordinates, EPSG:25832."""
 
@@ -150,12 +155,34 @@ def test_an_error_in_a_worker_is_one_line(scans: Path, tmp_path: Path, capsys: p
     assert told.count("\n") == 1
 
 
+def test_an_error_of_map_on_workers_is_one_line(
+    scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An epoch's error travels from its worker as bytes; here the worker is this process."""
+
+    def here(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], count: int) -> Iterator[Any]:
+        assert count == 2
+        for task in tasks:
+            try:
+                yield function(*pickle.loads(pickle.dumps(task)))
+            except InputError as error:
+                raise pickle.loads(pickle.dumps(error)) from None
+
+    monkeypatch.setattr(run, "map_on_workers", here)
+    first, second, _ = map(str, sorted(scans.glob("*.las")))
+    las(tmp_path / "site_2026-03-15.las", points(2000, 4) + np.array([5000.0, 0, 0]))
+    words = ["monitor", first, str(tmp_path / "site_2026-03-15.las"), second, "--position", ",".join(STATION.split())]
+    assert cli.main([*words, "--workers", "2", "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    told = capsys.readouterr().err
+    assert "lies elsewhere" in told
+    assert told.count("\n") == 1
+
+
 def test_a_killed_monitoring_goes_on(result: Path, scans: Path, tmp_path: Path) -> None:
     """Killed (SIGKILL) once the first epoch is done: with --resume the same files come out, and the epoch is not made again."""
     words = ["monitor", *map(str, sorted(scans.glob("*.las"))), "--position", ",".join(STATION.split())]
     words += ["--out", str(tmp_path / "out"), "--quiet"]
-    command = "import sys; from pipeline.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    process = subprocess.Popen([sys.executable, "-c", command, *words])
+    process = subprocess.Popen(command("main", *words), env=ENVIRONMENT)
     first = tmp_path / "out" / ".monitor" / "epoch_001.json"
     until = time.monotonic() + 120
     while not first.is_file() and process.poll() is None and time.monotonic() < until:

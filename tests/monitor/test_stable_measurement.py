@@ -21,6 +21,7 @@ from pipeline.cli import main as cli
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.formats.points.laz import read_laz
 from pipeline.monitoring.repeated_directions import repeated_noise
+from pipeline.monitoring.stable_measurement import build_from_monitoring
 from scene.geometry.mesh import FloatArray
 from sensors.models.sensor_model import TlsModel, TlsNoise
 
@@ -64,21 +65,26 @@ def diagnosed(folder: Path, model: Path, seed: int, **how: Any) -> dict[str, Any
     return dict(json.loads((folder / "gap" / "gap.json").read_text()))
 
 
-def test_what_fell_is_left_out_and_nothing_is_named(model: Path, tmp_path: Path) -> None:
+def test_nothing_is_named_where_rock_fell(model: Path, tmp_path: Path) -> None:
     found = diagnosed(tmp_path, model, 10, block=FALL)
     assert (found["verdict"], found["effects"], found["scene_changes"]) == ("no_gap", [], [])
-    told = yaml.safe_load((tmp_path / "gap" / "measurement" / "measurement.yaml").read_text())
+    assert "are on stable rock" in (tmp_path / "gap" / "report.html").read_text()
+
+
+def test_what_fell_is_left_out(model: Path, tmp_path: Path) -> None:
+    assert run("monitor", *scans(tmp_path / "scans", 10, 2, block=FALL), "--model", model, "--out", tmp_path / "found") == 0
+    build_from_monitoring(tmp_path / "found", tmp_path / "measurement")
+    told = yaml.safe_load((tmp_path / "measurement" / "measurement.yaml").read_text())
     assert told["points"] == ["scan_0.laz", "scan_1.laz"]
     assert told["reference_error_m"] == pytest.approx(NOISE_M, rel=0.2)
     np.testing.assert_allclose(told["scanner"]["position_m"], POSITION, atol=0.02)
     assert "are on stable rock" in told["notes"][0]
-    assert "are on stable rock" in (tmp_path / "gap" / "report.html").read_text()
     events = read_laz(tmp_path / "found" / "epoch_001.laz")
-    used = read_laz(tmp_path / "gap" / "measurement" / "scan_0.laz").points
+    used = read_laz(tmp_path / "measurement" / "scan_0.laz").points
     fallen = events.points[events.extra["event"] > 0]
     assert len(fallen) > 10
     assert np.linalg.norm(used[:, None] - fallen[None, ::10], axis=2).min() > 1e-3
-    measurement = read_measurement(tmp_path / "gap" / "measurement")
+    measurement = read_measurement(tmp_path / "measurement")
     right = SingleRanges.of(measurement, measurement.model)
     noisy = TlsNoise(range_sigma_m=3 * NOISE_M, angle_sigma_rad=ANGLE_NOISE_RAD)
     wrong = SingleRanges.of(measurement, TlsModel(noise=noisy))

@@ -149,6 +149,7 @@ def test_a_rough_face_is_whole_from_a_place_nearly_in_its_plane() -> None:
     assert (facing > 0.5).mean() > 0.97
 
 
+@pytest.mark.usefixtures("undrawn_here")
 def test_the_number_of_views_can_be_given(tmp_path: Path) -> None:
     files = [las(tmp_path / "a.las", corner(1)), las(tmp_path / "b.las", corner(2))]
     one = monitor_paths(files, tmp_path / "one", MonitorOptions(position=STATION, views=1))
@@ -157,6 +158,7 @@ def test_the_number_of_views_can_be_given(tmp_path: Path) -> None:
         monitor_paths(files, tmp_path / "none", MonitorOptions(position=STATION, views=7))
 
 
+@pytest.mark.usefixtures("undrawn_here")
 def test_stable_areas_in_survey_coordinates_hold_for_every_view(tmp_path: Path) -> None:
     """A box on one face and a polygon on the other, x, y and z: only pixels in them are stable, and both faces have some."""
     files = [las(tmp_path / "2026-03-01.las", corner(1)), las(tmp_path / "2026-04-01.las", corner(2, fallen=True))]

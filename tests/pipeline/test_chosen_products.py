@@ -14,6 +14,8 @@ from pipeline.formats.points.e57 import read_e57
 from pipeline.formats.points.points import read_points
 from scene import InputError
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 SMALL: dict[str, Any] = {
     "station__distance_m": 20.0, "scanner__azimuth_step_rad": 0.004, "scanner__zenith_step_rad": 0.004,
     "difference__gsd_m": 0.1, "rockfall__count": 1, "rockfall__safe_zone_offset_m": 0.2,

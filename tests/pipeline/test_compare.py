@@ -28,6 +28,8 @@ from scene.common.keyed_random import KeyedRandom
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import WALL
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 SMALL: dict[str, Any] = {
     "seed": 3,
     "wall": {"style": "glendale", "width_m": 5.0, "height_m": 4.0, "resolution_m": 0.06, "seed": 1},

@@ -8,16 +8,19 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import rasterio
 from pycocotools.coco import COCO
+from shared_outputs import made_once
 from tiny_dataset import EPOCHS, ROOT, TINY, digests, tiny, tiny_set
 
 from pipeline.change.tiles import TileConfig
@@ -41,7 +44,7 @@ def entries(folder: Path, split: str, kind: str) -> list[dict[str, Any]]:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tiny_set(tmp_path_factory.mktemp("dataset") / "set")
+    return made_once(tmp_path_factory, "tiny_set", tiny_set)
 
 
 def test_every_split_loads_in_pycocotools_with_ids_of_its_own(made: Path) -> None:
@@ -179,6 +182,7 @@ def test_a_stage_is_set_up_once_and_shared(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_damage_is_found_and_made_again(made: Path, tmp_path: Path) -> None:
     before = digests(made)
+    made = Path(shutil.copytree(made, tmp_path / "set"))
     tiles = sorted((made / "train").glob("*.tif"))
     tiles[0].write_bytes(tiles[0].read_bytes()[:1000])
     flipped = bytearray(tiles[1].read_bytes())
@@ -253,6 +257,31 @@ def test_the_loaders_leave_the_simulation_alone() -> None:
         "import sys, pipeline.dataset.loaders; raise SystemExit(bool({'mitsuba', 'cv2', 'open3d', 'scipy'} & set(sys.modules)))"
     )
     subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)
+
+
+def test_tensorflow_gets_the_tiles_as_their_signature_says(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In place of TensorFlow, which takes seconds to load, stands what notes the generator and its signature."""
+    given: dict[str, Any] = {}
+
+    def from_generator(generate: Any, output_signature: dict[str, tuple[Any, ...]]) -> SimpleNamespace:
+        given.update(samples=list(generate()), signature=output_signature)
+        return SimpleNamespace(apply=lambda count: count)
+
+    data = SimpleNamespace(
+        Dataset=SimpleNamespace(from_generator=from_generator), experimental=SimpleNamespace(assert_cardinality=int)
+    )
+    types = {"float32": np.float32, "bool": np.bool_, "int64": np.int64}
+    stand_in = SimpleNamespace(TensorSpec=lambda shape, kind: (shape, kind), data=data, **types)
+    monkeypatch.setitem(sys.modules, "tensorflow", stand_in)  # type: ignore[arg-type]
+    tiles = Tiles(made / "train")
+    assert cast("int", tiles.tf_dataset()) == len(tiles) == len(given["samples"])
+    for tile, sample in zip(tiles, given["samples"], strict=True):
+        assert sample.keys() == given["signature"].keys()
+        for name, (shape, kind) in given["signature"].items():
+            assert sample[name].dtype == kind
+            assert all(known in (None, found) for known, found in zip(shape, sample[name].shape, strict=True))
+        np.testing.assert_array_equal(sample["image"][..., 0], tile.image)
+        assert sample["image_id"] == tile.record["id"]
 
 
 def test_tf_data(made: Path) -> None:

@@ -174,9 +174,9 @@ def test_a_deadlocked_worker_ends_the_job(monkeypatch: pytest.MonkeyPatch, capfd
 
 @pytest.fixture
 def no_workers(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """Return the address of a scheduler without workers, which is given up after a second."""
-    monkeypatch.setattr(cluster, "_LOOK_S", 0.2)
-    monkeypatch.setattr(cluster, "_EMPTY_S", 1.0)
+    """Return the address of a scheduler without workers, which is given up after 0.2 s."""
+    monkeypatch.setattr(cluster, "_LOOK_S", 0.05)
+    monkeypatch.setattr(cluster, "_EMPTY_S", 0.2)
     with distributed.LocalCluster(n_workers=0, processes=False, protocol="tcp", dashboard_address=None) as empty:
         yield empty.scheduler_address
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from pycocotools.coco import COCO
+from shared_outputs import made_once
 from tiny_dataset import COMMAND, EPOCHS, ROOT, TINY, digests, tiny, tiny_set
 
 from pipeline.config.bundled import bundled_config
@@ -27,7 +28,7 @@ from scene.common.errors import InputError
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tiny_set(tmp_path_factory.mktemp("dataset") / "set")
+    return made_once(tmp_path_factory, "tiny_set", tiny_set)
 
 
 def test_two_jobs_on_one_folder_refuse_each_other(tmp_path: Path) -> None:
@@ -71,20 +72,26 @@ def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str], seco
         time.sleep(0.002)
 
 
-def test_a_killed_job_is_finished_by_the_next_with_the_same_checksums(made: Path, tmp_path: Path) -> None:
+KILLS: list[tuple[Callable[[Path], bool], int]] = [
+    (lambda out: any((out / ".staging").glob("*/*/*.tif")) and any((out / "shards").glob("*.json")), 0),
+    (lambda out: len(list((out / "shards").glob("*.json"))) >= 2, 2),
+]
+"""Moment of the kill, by the set's folder, and number of workers."""
+
+
+@pytest.mark.parametrize("kills", [KILLS[:1], KILLS], ids=["alone", "then with workers"])
+def test_a_killed_job_is_finished_by_the_next_with_the_same_checksums(
+    kills: list[tuple[Callable[[Path], bool], int]], made: Path, tmp_path: Path
+) -> None:
     """Kill a job while it writes an epoch's tiles, before its shard; then one whose workers outlive it for a while."""
     out = tmp_path / "set"
-    for moment, workers in (
-        (lambda: any((out / ".staging").glob("*/*/*.tif")), 0),
-        (lambda: len(list((out / "shards").glob("*.json"))) >= 2, 2),
-    ):
+    for moment, workers in kills:
         process = job(tmp_path, out, workers)
-        wait_for(moment, process)
+        wait_for(lambda moment=moment: moment(out), process)
         process.send_signal(signal.SIGKILL)
         process.wait()
         assert not (out / "train/annotations.json").exists()
-    process = job(tmp_path, out)
-    assert 0 < int(process.communicate(timeout=300)[0]) < EPOCHS
+    assert 0 < len(make_dataset(tiny(), out, command=COMMAND).made) < EPOCHS
     assert digests(out) == digests(made)
     assert not list(out.rglob(".*.part*"))
     assert not (out / ".staging").exists()

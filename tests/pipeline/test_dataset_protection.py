@@ -31,6 +31,8 @@ from pipeline.formats.files.inside import inside
 from scene.common.errors import InputError
 from sensors.cameras.camera import Camera
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -21,6 +21,8 @@ from pipeline.detection.network.data import CocoFolder
 from pipeline.report.progress import Progress
 from scene.common.errors import InputError
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 SERIES: dict[str, Any] = {
     "times": {"start": "2026-03-01T00:00:00Z", "every_h": 6, "count": 4},
     "events": [

@@ -33,6 +33,8 @@ from scene.common.config import parse
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import TriangleMesh
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 SMALL: dict[str, Any] = {
     "seed": 3,
     "epochs": 2,
@@ -76,9 +78,10 @@ def test_a_place_is_drawn_where_it_projects() -> None:
     assert (pixels[0, 0] == 255).all()
 
 
+@pytest.mark.usefixtures("drawn")
 def test_a_run_as_picture_and_animations(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pictures, "_ANIMATED_PX", 320)
-    monkeypatch.setattr(pictures, "_SCAN_FRAMES", 5)
+    monkeypatch.setattr(pictures, "_SCAN_FRAMES", 3)
     assert export(run, "picture", "--epoch", 2, "--width", 400, "--out", tmp_path / "a.png") == 0
     with Image.open(tmp_path / "a.png") as picture:
         assert picture.width == 400

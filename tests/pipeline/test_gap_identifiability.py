@@ -117,7 +117,7 @@ def test_a_config_gives_json_page_and_matrix_for_both_sensors(tmp_path: Path, ca
 
 
 def test_a_measurement_gives_its_own_geometry_and_refuses_overrides(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_scan(tmp_path, 1)
+    write_scan(tmp_path, 1, step_rad=0.008)
     assert main(["gap", "--identifiability", str(tmp_path), "--out", str(tmp_path / "out")]) == 0
     assert json.loads((tmp_path / "out/identifiability.json").read_text())["surveys"][0]["points"] > 10_000
     assert main(["gap", "--identifiability", str(tmp_path), "--set", "seed=2"]) == 2

@@ -15,6 +15,7 @@ from pipeline.gap.residuals.ray_hits import RayGeometry
 from pipeline.gap.residuals.scan_simulation import predict_ranges
 from pipeline.gap.residuals.tls_residuals import tls_residuals
 from pipeline.measurement.build import Request, build
+from pipeline.measurement.folder import Interpretation
 from scene.common.config import parse
 from scene.common.errors import InputError
 from scene.geometry.point_planes import PointPlanes
@@ -48,11 +49,15 @@ def scan(path: Path, bias_m: float = 0.0, swell_m: float = 0.0) -> Path:
 
 
 @pytest.fixture(scope="module")
-def level(tmp_path_factory: pytest.TempPathFactory) -> TlsMeasurement:
-    """Level ground, one half of the points compared with the other."""
+def built(tmp_path_factory: pytest.TempPathFactory) -> Interpretation:
+    """The folder of level ground, one half of the points compared with the other."""
     folder = tmp_path_factory.mktemp("level")
-    build(Request([scan(folder / "ground.xyz")], "half", "riegl_vz400i", position=(0.0, 0.0, 0.0)), folder / "out")
-    measurement = read_measurement(folder / "out")
+    return build(Request([scan(folder / "ground.xyz")], "half", "riegl_vz400i", position=(0.0, 0.0, 0.0)), folder / "out")
+
+
+@pytest.fixture(scope="module")
+def level(built: Interpretation) -> TlsMeasurement:
+    measurement = read_measurement(built.folder)
     assert isinstance(measurement, TlsMeasurement)
     return measurement
 
@@ -92,12 +97,9 @@ def test_a_bias_of_the_incidence_is_named_on_half_of_a_scan(tmp_path: Path) -> N
     assert abs(effect.entry["coefficient_m"] - 0.006) < 2 * effect.std["coefficient_m"]
 
 
-def test_references_of_points_ask_for_planes(tmp_path: Path) -> None:
-    path = scan(tmp_path / "ground.xyz")
-    request = Request([path], "half", "riegl_vz400i", position=(0.0, 0.0, 0.0))
-    found = build(request, tmp_path / "out")
-    assert "planes through 24 of its points" in found.about["reference"][-1]
-    assert yaml.safe_load((tmp_path / "out/measurement.yaml").read_text())["incidence"] == "planes"
+def test_references_of_points_ask_for_planes(built: Interpretation) -> None:
+    assert "planes through 24 of its points" in built.about["reference"][-1]
+    assert yaml.safe_load((built.folder / "measurement.yaml").read_text())["incidence"] == "planes"
 
 
 def test_planes_are_not_asked_for_where_nothing_looks_at_them() -> None:

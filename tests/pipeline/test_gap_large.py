@@ -57,7 +57,7 @@ def test_a_large_turn_of_a_camera_is_one_effect(tmp_path: Path, monkeypatch: pyt
     The linearised model gives half of the angle, and adds other effects for the rest.
     """
     monkeypatch.setattr(stereo_cases, "Target", _Strong)
-    make(Case(0, (3, 1), "one", "stereo", (kind,), 4_000, 4_000), tmp_path / "case", tmp_path / "truth.json")
+    make(Case(0, (3, 1), "one", "stereo", (kind,), 4_000, 4_000), tmp_path / "case", tmp_path / "truth.json", baselines=False)
     (truth,) = json.loads((tmp_path / "truth.json").read_text())["effects"]
     found = diagnose(read_measurement(tmp_path / "case"))
     (effect,) = found.effects
@@ -76,7 +76,12 @@ def test_whose_principal_point_is_off_shows_with_it_in_the_model(tmp_path: Path,
     length for the rest.
     """
     monkeypatch.setattr(stereo_cases, "Target", _Strong)
-    make(Case(0, (77, 1), "one", "stereo", ("principal_point_x",), 4_000, 4_000), tmp_path / "case", tmp_path / "truth.json")
+    make(
+        Case(0, (77, 1), "one", "stereo", ("principal_point_x",), 4_000, 4_000),
+        tmp_path / "case",
+        tmp_path / "truth.json",
+        baselines=False,
+    )
     (truth,) = json.loads((tmp_path / "truth.json").read_text())["effects"]
     (effect,) = diagnose(read_measurement(tmp_path / "case")).effects
     assert effect.name == "stereo.principal_point_x"
@@ -94,7 +99,7 @@ def turned_and_zoomed(tmp_path_factory: pytest.TempPathFactory) -> tuple[SearchI
     kinds = ("camera_kappa", "focal_length")
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(stereo_cases, "Target", _Strong)
-        make(Case(0, (9241, 310), "two", "stereo", kinds, 3_000, 3_000), folder / "case", folder / "truth.json")
+        make(Case(0, (9241, 310), "two", "stereo", kinds, 3_000, 3_000), folder / "case", folder / "truth.json", baselines=False)
     truth = {each["name"]: each["parameters"] for each in json.loads((folder / "truth.json").read_text())["effects"]}
     there, residuals, _ = align(read_measurement(folder / "case"))
     part = residuals.part(residuals.usable)

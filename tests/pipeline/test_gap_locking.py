@@ -41,13 +41,15 @@ def test_disparities_of_a_rough_wall_show_none() -> None:
         assert find_locking(measured.ravel(), facets.ravel()) is None
 
 
-def test_a_small_amplitude_is_told_from_noise_by_how_much_of_it_there_may_be() -> None:
+@pytest.mark.parametrize(("draws", "least"), [(5, 4), (20, 18)])
+def test_a_small_amplitude_is_told_from_noise_by_how_much_of_it_there_may_be(draws: int, least: int) -> None:
     """Of 0.115 px beside noise of 0.22 px only the first harmonic shows.
 
-    In twenty draws the mean is within 8 %, and 18 or more intervals of 1.645 standard deviations contain the truth.
+    The mean is within 8 %, and most intervals of 1.645 standard deviations contain the truth: of five draws, fewer than four do
+    with a chance of 8 %; the seeds are fixed.
     """
     found = []
-    for seed in range(20):
+    for seed in range(draws):
         random = np.random.default_rng(seed)
         surface = random.uniform(100, 160, 6000)
         measured = surface + 0.115 * np.sin(2 * np.pi * surface) + 0.22 * random.standard_normal(6000)
@@ -56,7 +58,7 @@ def test_a_small_amplitude_is_told_from_noise_by_how_much_of_it_there_may_be() -
         found.append((locking.amplitude_px, locking.std_px))
     amplitude, std = np.transpose(found)
     assert amplitude.mean() == pytest.approx(0.115, rel=0.08)
-    assert np.sum(np.abs(amplitude - 0.115) < 1.645 * std) >= 18
+    assert np.sum(np.abs(amplitude - 0.115) < 1.645 * std) >= least
 
 
 def test_an_amplitude_that_folds_disparities_over_is_not_taken_for_a_small_one() -> None:

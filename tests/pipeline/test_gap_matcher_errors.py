@@ -30,7 +30,12 @@ def measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, error: 
     """Return a stereo pair of the closed-form generator to whose raster of disparities `error` is applied."""
     monkeypatch.setattr(stereo_cases, "_drawn", lambda *_: [("edge_fattening", {}, Strength(0.0, "", 0.0))])
     monkeypatch.setattr(stereo_effects, "raster_effect", lambda _name, _p, disparity, step: error(disparity, step))
-    make(Case(0, (seed, 5), "one", "stereo", ("edge_fattening",), 12_000, 12_000), tmp_path / "case", tmp_path / "truth.json")
+    make(
+        Case(0, (seed, 5), "one", "stereo", ("edge_fattening",), 12_000, 12_000),
+        tmp_path / "case",
+        tmp_path / "truth.json",
+        baselines=False,
+    )
     found = read_measurement(tmp_path / "case")
     assert isinstance(found, StereoMeasurement)
     return found

@@ -124,8 +124,9 @@ def of_nodes(count: int, sigma_px: float) -> list[float]:
     return found
 
 
-def test_of_noise_on_nodes() -> None:
-    found = of_nodes(60, 0.0)
+@pytest.mark.parametrize("count", [12, 60])
+def test_of_noise_on_nodes(count: int) -> None:
+    found = of_nodes(count, 0.0)
     assert kstest(found, "uniform").pvalue > 0.001, sorted(found)
 
 

@@ -52,6 +52,13 @@ def few(tmp_path_factory: pytest.TempPathFactory) -> tuple[GapDiagnosis, Measure
     return diagnose(measurement), measurement
 
 
+@pytest.fixture(scope="module")
+def drawn(few: tuple[GapDiagnosis, Measurement]) -> dict[bool, dict[str, bytes]]:
+    """The figures with and without scores and a table of similarities; they are the same for every verdict."""
+    whole = replace(few[0], gap=GAP, identifiability=MATRIX)
+    return {True: report._pictures(whole), False: report._pictures(replace(few[0], gap=None))}
+
+
 @pytest.mark.parametrize(
     ("name", "alike", "expected"),
     [
@@ -72,7 +79,12 @@ def test_noises_are_split_by_what_they_depend_on(name: str, alike: str, expected
 @pytest.mark.parametrize("pictures", [True, False])
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_every_verdict_has_a_report(
-    few: tuple[GapDiagnosis, Measurement], verdict: str, pictures: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    few: tuple[GapDiagnosis, Measurement],
+    drawn: dict[bool, dict[str, bytes]],
+    verdict: str,
+    pictures: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     found, measurement = few
     told = verdict != "insufficient_data"
@@ -84,8 +96,7 @@ def test_every_verdict_has_a_report(
         identifiability=MATRIX if told and pictures else found.identifiability,
         remaining={**found.remaining, "p_value": 0.3 if told else None, "note": ""},
     )
-    if not pictures:
-        monkeypatch.setattr(report, "_pictures", lambda _: {})
+    monkeypatch.setattr(report, "_pictures", lambda case: drawn[case.gap is not None] if pictures else {})
     page = report.write_report(tmp_path, case, measurement).read_text()
     assert {path.name for path in tmp_path.iterdir()} >= FILES
     assert VERDICTS[verdict] in page
@@ -96,6 +107,8 @@ def test_every_verdict_has_a_report(
     places = [page.index(title) for title in order if title in page]
     assert places == sorted(places)
     assert "On validation blocks, which no fit has used" not in page[: page.index("</p>")]  # the scores are evidence, no headline
+    if verdict == "unknown":
+        assert "_empirical (covariate" in report.summarise(case)
     assert ("± &lt; 0.001 mm" in page) == (verdict in ("named", "several", "ambiguous"))
 
 
@@ -126,6 +139,7 @@ def test_nothing_is_written_where_the_report_cannot_be_made(
     def broken(*_: Any) -> str:
         raise RuntimeError("a fault in the page")
 
+    monkeypatch.setattr(report, "_pictures", lambda _: {})
     monkeypatch.setattr(report, "_render_page", broken)
     with pytest.raises(RuntimeError, match="a fault"):
         report.write_report(tmp_path / "out", *few)
@@ -159,11 +173,14 @@ def _keep(path: Path, count: int) -> None:
 
 
 @pytest.mark.parametrize("sensor", ["tls", "stereo"])
-def test_missing_rock_is_positive_of_both_sensors(few: tuple[GapDiagnosis, Measurement], sensor: str, tmp_path: Path) -> None:
+def test_missing_rock_is_positive_of_both_sensors(
+    few: tuple[GapDiagnosis, Measurement], sensor: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A surface 20 mm behind the reference has positive residuals in both sensors.
 
     The ranges are 20 mm longer, the disparities smaller by 20 mm over the depth of a pixel.
     """
+    monkeypatch.setattr(report, "_pictures", lambda _: {})
     found, measurement = few
     unit = 1.0 if sensor == "tls" else 0.25
     deeper = np.full(len(found.residuals), 0.02 / unit if sensor == "tls" else -0.02 / unit)

@@ -39,7 +39,7 @@ from sensors.stereo.stereo_pair import REDUCTION
 
 def test_an_effect_that_turns_all_rays_off_the_wall_leaves_no_residuals(tmp_path: Path) -> None:
     """The principal point is wrong by 10,000 px, beside an effect that uses the raster of what is seen."""
-    make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
+    make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json", baselines=False)
     measurement = read_measurement(tmp_path / "case")
     assert isinstance(measurement, StereoMeasurement)
     away = [{"name": "principal_point_x", "camera": "left", "delta_px": 1e4}, {"name": "smoothing", "sigma_px": 2.0}]
@@ -101,7 +101,7 @@ def test_a_simulation_without_noise_departs_nowhere_from_the_surface(tmp_path: P
 
     What the surface does between them must not count as an error of the sensor.
     """
-    make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
+    make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json", baselines=False)
     there, residuals, _ = align(read_measurement(tmp_path / "case"))
     assert isinstance(there, StereoMeasurement)
     noise = StereoNoise(parallax_sigma_px=1e-6, regularization_sigma_px=0.0)
@@ -116,7 +116,12 @@ def test_a_simulation_without_noise_departs_nowhere_from_the_surface(tmp_path: P
 
 def test_outlines_grow_among_the_measurement_s_own_pixels_when_it_is_simulated(tmp_path: Path) -> None:
     """On a depth map with finer cells the same radius would have another reach and start at other steps."""
-    make(Case(0, (4, 1), "one", "stereo", ("edge_fattening",), 6_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
+    make(
+        Case(0, (4, 1), "one", "stereo", ("edge_fattening",), 6_000, 15_000),
+        tmp_path / "case",
+        tmp_path / "truth.json",
+        baselines=False,
+    )
     read = read_measurement(tmp_path / "case")
     plain = compute_residuals(read)
     raster = DisparityRaster.of(read, plain.geometry)
@@ -141,6 +146,7 @@ def test_outlines_grow_where_a_turned_camera_sees_them_when_they_are_simulated(t
         Case(0, (6, 1), "two", "stereo", ("edge_fattening", "camera_omega"), 5000, 5000),
         tmp_path / "case",
         tmp_path / "truth.json",
+        baselines=False,
     )
     there = read_measurement(tmp_path / "case")
     assert isinstance(there, StereoMeasurement)
@@ -241,7 +247,7 @@ def test_what_shapes_do_is_found_once_for_a_search(tmp_path: Path) -> None:
 
     It takes it from the whole raster, including points that miss the reference.
     """
-    make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
+    make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json", baselines=False)
     read = read_measurement(tmp_path / "case")
     there = read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 40.0}]))
     plain, nowhere = compute_residuals(there), np.zeros(len(there.cloud.points), dtype=bool)

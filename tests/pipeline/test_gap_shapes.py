@@ -6,7 +6,9 @@ Edge effects are smoothing, grown outlines, filled strips and beam footprints.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,12 @@ from scipy.interpolate import RectBivariateSpline
 from benchmarks.gap_closed_form import stereo_effects
 from benchmarks.gap_closed_form.cases import Case, make
 from benchmarks.gap_second_generator.cases import build, schedule
-from pipeline.formats.measurements.measurement import Measurement, TlsMeasurement, read_measurement
+from pipeline.formats.measurements.measurement import (
+    Measurement,
+    StereoMeasurement,
+    TlsMeasurement,
+    read_measurement,
+)
 from pipeline.gap.mean.candidates import Candidate, SineGrid
 from pipeline.gap.naming import effect_selection as steps
 from pipeline.gap.naming.candidate_families import candidate_families
@@ -44,13 +51,29 @@ from sensors.models.sensor_model import StereoModel
 Made = tuple[Measurement, Residuals, dict[str, Any]]
 
 
-def made(tmp_path: Path, sensor: str, kinds: tuple[str, ...], seed: int) -> Made:
+def made_in(folder: Path, sensor: str, kinds: tuple[str, ...], seed: int) -> Made:
     """Return a measurement with the effects `kinds`, its residuals, and the true parameters of the first effect."""
     stratum = "one" if kinds else "none"
-    make(Case(0, (seed, 1), stratum, sensor, kinds, 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
-    effects = json.loads((tmp_path / "truth.json").read_text())["effects"]
-    there, residuals, _ = align(read_measurement(tmp_path / "case"))
+    make(Case(0, (seed, 1), stratum, sensor, kinds, 15_000, 15_000), folder / "case", folder / "truth.json", baselines=False)
+    effects = json.loads((folder / "truth.json").read_text())["effects"]
+    there, residuals, _ = align(read_measurement(folder / "case"))
     return there, residuals, effects[0]["parameters"] if effects else {}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Made]:
+    """`made_in` a folder of its own, once for all tests that ask for the same sensor, effects and seed."""
+    return cache(lambda *case: made_in(tmp_path_factory.mktemp("made"), *case))
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> StereoMeasurement:
+    """A stereo pair without effects, of a wall with ledges and relief."""
+    folder = tmp_path_factory.mktemp("plain")
+    make(Case(0, (5, 1), "none", "stereo", (), 15_000, 15_000), folder / "case", folder / "truth.json", baselines=False)
+    found = read_measurement(folder / "case")
+    assert isinstance(found, StereoMeasurement)
+    return found
 
 
 def shapes_of(case: Made) -> dict[str, Any]:
@@ -65,16 +88,16 @@ def shapes_of(case: Made) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_low_pass_is_found_with_its_width(tmp_path: Path, seed: int) -> None:
-    case = made(tmp_path, "stereo", ("smoothing",), seed)
+def test_a_low_pass_is_found_with_its_width(made: Callable[..., Made], seed: int) -> None:
+    case = made("stereo", ("smoothing",), seed)
     found = shapes_of(case)
     assert set(found) == {"smoothing"}
     # the generator filters its own cells, the diagnosis those of the reference, whose error is some millimetres
     assert found["smoothing"].effect.sigma_px == pytest.approx(case[2]["sigma_px"], rel=0.1)
 
 
-def test_outlines_that_grow_are_found_with_their_reach(tmp_path: Path) -> None:
-    case = made(tmp_path, "stereo", ("edge_fattening",), 1)
+def test_outlines_that_grow_are_found_with_their_reach(made: Callable[..., Made]) -> None:
+    case = made("stereo", ("edge_fattening",), 1)
     found = shapes_of(case)["edge_fattening"]
     assert found.effect.radius_px == pytest.approx(case[2]["radius_px"], abs=2 * np.sqrt(3) * found.std["radius_px"])
 
@@ -82,7 +105,7 @@ def test_outlines_that_grow_are_found_with_their_reach(tmp_path: Path) -> None:
 def test_outlines_that_grow_at_high_steps_alone_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The matcher follows low steps like slopes; the measurement does not say which height it takes for a step."""
     monkeypatch.setattr(stereo_effects, "_STEP_PX", 4.0)
-    there, residuals, truth = case = made(tmp_path, "stereo", ("edge_fattening",), 4)
+    there, residuals, truth = case = made_in(tmp_path, "stereo", ("edge_fattening",), 4)
     raster = DisparityRaster.of(there, residuals.geometry)
     assert raster is not None
     assert raster.depth_step_px < 2
@@ -92,34 +115,30 @@ def test_outlines_that_grow_at_high_steps_alone_are_found(tmp_path: Path, monkey
     assert found.effect.radius_px == pytest.approx(truth["radius_px"], abs=2 * np.sqrt(3) * found.std["radius_px"])
 
 
-def test_a_low_pass_takes_the_relief_off_what_a_move_changes(tmp_path: Path) -> None:
+def test_a_low_pass_takes_the_relief_off_what_a_move_changes(plain: StereoMeasurement) -> None:
     """The Jacobian of the pose, of low-passed disparities, predicts what a small move of the cameras changes.
 
     It is compared with moving the cameras and filtering the reference anew, on a wall with ledges and relief. The move has mm and
     tens of microradians, where the change is linear. Points beside pixels without a hit are left out, because the low-pass does
     not know what is there.
     """
-    make(Case(0, (5, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
-    read = read_measurement(tmp_path / "case")
-    there = read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 40.0}]))
-    plain, found = compute_residuals(read), compute_residuals(there)
+    there = plain.changed(model=with_effects(plain.model, [{"name": "smoothing", "sigma_px": 40.0}]))
+    sharp, found = compute_residuals(plain), compute_residuals(there)
     step = np.array([2e-3, 0, 1e-3, 0, 2e-5, 0])
     moved = compute_residuals(there.moved(step))
-    inner = ~DisparityRaster.of(read, plain.geometry).near_border(60.0)[np.searchsorted(plain.index, found.index)]
+    inner = ~DisparityRaster.of(plain, sharp.geometry).near_border(60.0)[np.searchsorted(sharp.index, found.index)]
     both, ours, theirs = np.intersect1d(found.index[found.usable & inner], moved.index, return_indices=True)
     rows = np.flatnonzero(found.usable & inner)[ours]
     assert len(both) > 3000
     change = found.value[rows] - moved.value[theirs]
-    low_passed, raw = (float(np.std(change - each.pose_jacobian[rows] @ step)) for each in (found, plain))
+    low_passed, raw = (float(np.std(change - each.pose_jacobian[rows] @ step)) for each in (found, sharp))
     assert low_passed < 0.1 * np.std(change)
     assert low_passed < 0.3 * raw
 
 
-def test_a_cut_cloud_has_the_low_pass_of_the_whole_picture(tmp_path: Path) -> None:
+def test_a_cut_cloud_has_the_low_pass_of_the_whole_picture(plain: StereoMeasurement) -> None:
     """Clouds are matched first and cut then: at a cut, the smoothing has seen what was cut off."""
-    make(Case(0, (5, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json")
-    read = read_measurement(tmp_path / "case")
-    there = read.changed(model=with_effects(read.model, [{"name": "smoothing", "sigma_px": 30.0}]))
+    there = plain.changed(model=with_effects(plain.model, [{"name": "smoothing", "sigma_px": 30.0}]))
     whole = compute_residuals(there)
     u = whole.geometry.u
     kept = whole.index[(u > np.quantile(u, 0.3)) & (u < np.quantile(u, 0.7))]
@@ -130,17 +149,15 @@ def test_a_cut_cloud_has_the_low_pass_of_the_whole_picture(tmp_path: Path) -> No
     assert np.std(whole.geometry.shaped[theirs]) > 0.05, "px that the low-pass does"
 
 
-def test_nothing_is_matched_outside_of_the_right_picture(tmp_path: Path) -> None:
-    make(Case(0, (5, 1), "none", "stereo", (), 8_000, 8_000), tmp_path / "case", tmp_path / "truth.json")
-    there = read_measurement(tmp_path / "case")
-    geometry = compute_residuals(there).geometry
-    right = there.cameras.right
+def test_nothing_is_matched_outside_of_the_right_picture(plain: StereoMeasurement) -> None:
+    geometry = compute_residuals(plain).geometry
+    right = plain.cameras.right
     column = right.width // 2
-    narrow = there.changed(cameras=replace(there.cameras, right=replace(right, width=column, cx_px=right.cx_px + column / 2)))
-    raster, cut = DisparityRaster.of(there, geometry), DisparityRaster.of(narrow, geometry)
+    narrow = plain.changed(cameras=replace(plain.cameras, right=replace(right, width=column, cx_px=right.cx_px + column / 2)))
+    raster, cut = DisparityRaster.of(plain, geometry), DisparityRaster.of(narrow, geometry)
     assert raster is not None
     assert cut is not None
-    seen_at = project(NominalPair.of(there).pair.right, geometry.point)[0]
+    seen_at = project(NominalPair.of(plain).pair.right, geometry.point)[0]
     held = ~np.isnan(cut.at_points(cut.disparity))
     sure, matched = np.abs(seen_at - column) > 2, ~np.isnan(raster.at_points(raster.disparity))
     np.testing.assert_array_equal(held[sure & matched], (seen_at < column)[sure & matched])
@@ -157,12 +174,10 @@ def test_a_low_pass_sees_over_a_straight_border_from_so_many_sigmas(sigma_px: fl
     np.testing.assert_array_equal(found[middle], away[middle] < 2.326 * sigma_px)
 
 
-def test_a_raster_too_large_for_shapes_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_raster_too_large_for_shapes_is_told(plain: StereoMeasurement, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not any("cells" in note for note in align(plain).residuals.notes)
     monkeypatch.setattr(stereo_residuals, "MOST_CELLS", 1000)
-    there, residuals, _ = made(tmp_path, "stereo", (), 1)
-    assert any("more than 1,000 cells" in note for note in residuals.notes)
-    monkeypatch.undo()
-    assert not any("cells" in note for note in compute_residuals(there).notes)
+    assert any("more than 1,000 cells" in note for note in align(plain).residuals.notes)
 
 
 def banded(monkeypatch: pytest.MonkeyPatch, cells: int, rows: int) -> None:
@@ -231,10 +246,10 @@ def test_outlines_in_few_places_agree_by_signs() -> None:
 
 @pytest.mark.parametrize(("kind", "seed"), [("smoothing", 1), ("edge_fattening", 1), ("occlusion_fill", 6)])
 def test_shapes_are_found_in_bands_of_a_large_raster(
-    tmp_path: Path, kind: str, seed: int, monkeypatch: pytest.MonkeyPatch
+    made: Callable[..., Made], kind: str, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The values agree with those of the whole raster, and the touched points are found in all of it."""
-    case = made(tmp_path, "stereo", (kind,), seed)
+    case = made("stereo", (kind,), seed)
     whole = shapes_of(case)[kind]
     banded(monkeypatch, 8_000, 16)
     there, residuals, _ = case
@@ -248,24 +263,24 @@ def test_shapes_are_found_in_bands_of_a_large_raster(
     assert np.count_nonzero(found.touched & whole.touched) > 0.8 * np.count_nonzero(whole.touched)
 
 
-def test_strips_that_are_filled_are_found(tmp_path: Path) -> None:
-    found = shapes_of(made(tmp_path, "stereo", ("occlusion_fill",), 6))
+def test_strips_that_are_filled_are_found(made: Callable[..., Made]) -> None:
+    found = shapes_of(made("stereo", ("occlusion_fill",), 6))
     assert set(found) == {"occlusion_fill"}
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_wall_without_effects_shows_no_shape(tmp_path: Path, seed: int) -> None:
-    assert not shapes_of(made(tmp_path, "stereo", (), seed))
+def test_a_wall_without_effects_shows_no_shape(made: Callable[..., Made], seed: int) -> None:
+    assert not shapes_of(made("stereo", (), seed))
 
 
-def test_points_that_are_held_out_have_no_say(tmp_path: Path) -> None:
-    there, residuals, _ = made(tmp_path, "stereo", ("smoothing",), 1)
+def test_points_that_are_held_out_have_no_say(made: Callable[..., Made]) -> None:
+    there, residuals, _ = made("stereo", ("smoothing",), 1)
     assert not find_disparity_edge_effects(there, residuals, fit_pose_robustly(residuals)[0], np.ones(len(residuals), dtype=bool))
 
 
 @pytest.mark.parametrize("seed", [2, 3])
-def test_a_footprint_is_found_with_divergence_and_mode(tmp_path: Path, seed: int) -> None:
-    there, residuals, truth = made(tmp_path, "tls", ("beam_divergence",), seed)
+def test_a_footprint_is_found_with_divergence_and_mode(made: Callable[..., Made], seed: int) -> None:
+    there, residuals, truth = made("tls", ("beam_divergence",), seed)
     rough, _, scale = fit_pose_robustly(residuals)
     (found,) = find_footprint(there, residuals, rough, scale, np.zeros(len(residuals), dtype=bool))
     assert isinstance(found.effect, BeamDivergence)
@@ -274,8 +289,8 @@ def test_a_footprint_is_found_with_divergence_and_mode(tmp_path: Path, seed: int
     assert found.effect.mode == truth["mode"]
 
 
-def test_modes_that_share_their_sub_rays_record_what_each_would_alone(tmp_path: Path) -> None:
-    there, residuals, _ = made(tmp_path, "tls", ("beam_divergence",), 2)
+def test_modes_that_share_their_sub_rays_record_what_each_would_alone(made: Callable[..., Made]) -> None:
+    there, residuals, _ = made("tls", ("beam_divergence",), 2)
     random, modes, plain = KeyedRandom(0), ("strongest", "mean", "first"), systematic_part(there.model)
     beams = {
         mode: plain.model_copy(update={"effects": (*plain.effects, BeamDivergence(divergence_rad=2e-3, mode=mode))})
@@ -288,8 +303,8 @@ def test_modes_that_share_their_sub_rays_record_what_each_would_alone(tmp_path: 
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_thin_beam_shows_no_footprint(tmp_path: Path, seed: int) -> None:
-    there, residuals, _ = made(tmp_path, "tls", (), seed)
+def test_a_thin_beam_shows_no_footprint(made: Callable[..., Made], seed: int) -> None:
+    there, residuals, _ = made("tls", (), seed)
     rough, _, scale = fit_pose_robustly(residuals)
     assert not find_footprint(there, residuals, rough, scale, np.zeros(len(residuals), dtype=bool))
 
@@ -313,9 +328,9 @@ def test_the_noise_of_angles_is_no_footprint(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("every", [1, 2])
 @pytest.mark.parametrize(("kind", "seed"), [("parallax_noise", 2), ("regularization_noise", 9)])
-def test_white_noise_and_noise_on_a_grid_are_told_apart(tmp_path: Path, kind: str, seed: int, every: int) -> None:
+def test_white_noise_and_noise_on_a_grid_are_told_apart(made: Callable[..., Made], kind: str, seed: int, every: int) -> None:
     """Also where rows lie twice as far apart as columns, because every second row of a map is compared."""
-    there, residuals, truth = made(tmp_path, "stereo", (kind,), seed)
+    there, residuals, truth = made("stereo", (kind,), seed)
     row = residuals.geometry.sensor_coordinates[:, 1]
     step = raster_spacing_px(row)
     assert step is not None
@@ -330,12 +345,12 @@ def test_white_noise_and_noise_on_a_grid_are_told_apart(tmp_path: Path, kind: st
 
 
 @pytest.mark.parametrize(("kind", "seed", "empirical"), [("parallax_noise", 2, True), ("regularization_noise", 9, False)])
-def test_noise_on_a_grid_goes_before_an_empirical_term(tmp_path: Path, kind: str, seed: int, empirical: bool) -> None:
+def test_noise_on_a_grid_goes_before_an_empirical_term(made: Callable[..., Made], kind: str, seed: int, empirical: bool) -> None:
     """Grid noise replaces an empirical variance term; white noise keeps it.
 
     Some of few nodes are noisier by chance, whichever covariate sorts them.
     """
-    there, residuals, _ = made(tmp_path, "stereo", (kind,), seed)
+    there, residuals, _ = made("stereo", (kind,), seed)
     part = residuals.part(residuals.usable)
     value = fit_pose_robustly(part)[0]
     spread, _, _ = fit_variance_model(part, WallCells.over(part.wall_xy), value, KeyedRandom(1))
@@ -346,9 +361,9 @@ def test_noise_on_a_grid_goes_before_an_empirical_term(tmp_path: Path, kind: str
     assert found.name == ("variance by disparity" if empirical else kind)
 
 
-def test_noise_on_a_coarse_grid_is_found_where_no_point_is_noisier_than_it_should_be(tmp_path: Path) -> None:
+def test_noise_on_a_coarse_grid_is_found_where_no_point_is_noisier_than_it_should_be(made: Callable[..., Made]) -> None:
     """Nodes are 64 px apart, with 0.23 px: within a cell of the search all points have the same error."""
-    there, residuals, truth = made(tmp_path, "stereo", ("regularization_noise",), 8)
+    there, residuals, truth = made("stereo", ("regularization_noise",), 8)
     part = residuals.part(residuals.usable)
     assert isinstance(there.model, StereoModel)
     found, _ = find_grid_noise(part, fit_pose_robustly(part)[0], there.model, KeyedRandom(1))
@@ -368,7 +383,7 @@ def test_noise_on_a_coarse_grid_counts_as_no_error_of_the_reference(tmp_path: Pa
     Otherwise the noise passes for an equal error of the reference; then, with the noise named, the model predicts too wide a
     scatter of patches, and the right name is lost.
     """
-    there, residuals, _ = made(tmp_path, "stereo", (), 1)
+    there, residuals, _ = made_in(tmp_path, "stereo", (), 1)
     left = residuals.covariates["image_x"]
     part = residuals.part(residuals.usable & (left < np.median(left)))
     x, y = (part.covariates[name] for name in ("image_x", "image_y"))
@@ -389,9 +404,9 @@ def test_noise_on_a_coarse_grid_counts_as_no_error_of_the_reference(tmp_path: Pa
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
-def test_the_reference_error_is_not_taken_for_noise_on_a_grid(tmp_path: Path, seed: int) -> None:
+def test_the_reference_error_is_not_taken_for_noise_on_a_grid(made: Callable[..., Made], seed: int) -> None:
     """The reference's error is a few millimetres, correlated over metres."""
-    there, residuals, _ = made(tmp_path, "stereo", (), seed)
+    there, residuals, _ = made("stereo", (), seed)
     part = residuals.part(residuals.usable)
     assert isinstance(there.model, StereoModel)
     assert find_grid_noise(part, fit_pose_robustly(part)[0], there.model, KeyedRandom(1))[0] is None
@@ -399,13 +414,13 @@ def test_the_reference_error_is_not_taken_for_noise_on_a_grid(tmp_path: Path, se
 
 @pytest.mark.parametrize(("off_m", "length_m", "found"), [(0.012, 0.8, False), (0.015, 0.3, True), (0.0, 0.3, False)])
 def test_noise_that_neighbours_share_is_the_reference_s_error_only_where_that_may_be_so(
-    tmp_path: Path, off_m: float, length_m: float, found: bool
+    made: Callable[..., Made], off_m: float, length_m: float, found: bool
 ) -> None:
     """A reference may be wrong by centimetres over metres, but not over decimetres.
 
     If an error is attributed to it, the note says so.
     """
-    there, residuals, _ = made(tmp_path, "stereo", (), 1)
+    there, residuals, _ = made("stereo", (), 1)
     part = residuals.part(residuals.usable)
     random = np.random.default_rng(3)
     k = random.normal(scale=1 / length_m, size=(400, 2))  # spectrum of a Gaussian correlation exp(-h^2 / 2 l^2)

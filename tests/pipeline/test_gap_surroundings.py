@@ -15,7 +15,7 @@ from scene.ray_casting.raycast import RayCaster
 @pytest.fixture(scope="module")
 def measurement(tmp_path_factory: pytest.TempPathFactory) -> StereoMeasurement:
     folder = tmp_path_factory.mktemp("surroundings")
-    make(Case(0, (8, 1), "none", "stereo", (), 8_000, 8_000), folder / "case", folder / "truth.json")
+    make(Case(0, (8, 1), "none", "stereo", (), 8_000, 8_000), folder / "case", folder / "truth.json", baselines=False)
     read = read_measurement(folder / "case")
     assert isinstance(read, StereoMeasurement)
     return read

@@ -18,6 +18,8 @@ from pipeline.registration.rigid import RigidTransform
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import TriangleMesh
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 SIGMA = 0.003
 
 

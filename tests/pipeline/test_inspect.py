@@ -38,6 +38,8 @@ from sensors.models.placement import RigConfig, Target
 from sensors.models.sensor_model import StereoModel, TlsModel
 from sensors.stereo.stereo_pair import StereoPair
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 SIGNIFICANCE = 1e-5
 """False-failure rate of each statistical test here; seeds are fixed."""
 FRAME = WallFrame(np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]), np.zeros(3))
@@ -391,6 +393,7 @@ def _colours(png: bytes) -> list[tuple[int, ...]]:
     return [colour for colour in ordered if colour != (255, 255, 255)]
 
 
+@pytest.mark.usefixtures("drawn")
 def test_a_map_of_counts_has_whole_steps_and_a_constant_is_told_in_words() -> None:
     grid = Grid(0.0, 3.0, 0.1, 40, 30)
     counts = np.ones((30, 40))

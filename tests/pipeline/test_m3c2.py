@@ -20,6 +20,8 @@ from scene.common.keyed_random import KeyedRandom
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray, IntArray
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 GRID = Grid(0.0, 4.0, 0.1, 60, 40)
 SIGMA = 0.004
 

@@ -38,11 +38,13 @@ from scene.common.errors import InputError
 from scene.geometry.grid import Grid
 from sensors.cameras.camera import Camera, CameraPair
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 FOREST = SHARED / "tls_forest_vz400i" / "TLS_scan.npz"
 ROCKS = SHARED / "tls_rock_blocks" / "Blocs_EGU_avant.txt"
 POSITION = np.array([42.0 * 0.42, -34.0, 2.5])
-STEP = 0.012
+STEP = 0.018
 UTM = np.array([547_000.0, 5_149_000.0, 700.0])
 Case = tuple[Path, PointCloud, np.ndarray]
 
@@ -125,7 +127,6 @@ def test_every_format_gives_the_same_measurement(name: str, case: Case, tmp_path
     assert stated["pattern"]["azimuth_rad"][2] == pytest.approx(STEP, rel=1e-4)
     assert stated["pattern"]["zenith_rad"][2] == pytest.approx(STEP, rel=1e-4)
     assert measurement.fit.near > 0.99
-    assert (tmp_path / "out" / "understood.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "out" / "understood.json").read_text())["next"] == found.next_command
     assert any("taken as exact" in line for line in found.about["reference"])
 
@@ -179,11 +180,13 @@ def test_large_coordinates_keep_their_millimetres(case: Case, tmp_path: Path) ->
     np.testing.assert_allclose(stated["scanner"]["position_m"], POSITION + UTM, atol=0.01)
 
 
+@pytest.mark.usefixtures("drawn")
 def test_half_of_a_scan_is_compared_with_the_other(case: Case, tmp_path: Path) -> None:
     """Every second line becomes the surface; the measurement itself says what this comparison cannot show."""
     found = build(Request([as_e57(case, tmp_path)], "half", "riegl_vz400i"), tmp_path / "out")
     measurement = read_measurement(tmp_path / "out")
     assert len(measurement.cloud.points) == pytest.approx(len(case[1].points) / 2, rel=0.02)
+    assert (tmp_path / "out" / "understood.png").stat().st_size > 10_000
     lines = np.unique(measurement.cloud.extra["line"])
     assert set(lines % 2) == {1}
     assert "every second line" in found.about["reference"][0]
@@ -393,7 +396,7 @@ BAD: dict[str, tuple[Callable[[Case, Path], list[str]], str]] = {
     "no such reference": (asked(reference="no.ply"), "no.ply: there is no such file"),
     "no such scanner": (asked(scanner="riegl_vz400j"), "riegl_vz400i"),
     "millimetres": (move(lambda points: 1000 * points), "add --unit mm"),
-    "few in millimetres": (move(lambda points: 1000 * points[::50]), "add --unit mm"),
+    "few in millimetres": (move(lambda points: 1000 * points[::20]), "add --unit mm"),
     "one point": (move(lambda points: points[:1]), "has only 1 points"),
     "identical points": (move(lambda points: np.repeat(points[:1], 500, axis=0)), "at the same place"),
     "NaN": (move(lambda points: points * np.nan), "no point with finite values"),
@@ -439,10 +442,10 @@ def test_gap_takes_raw_scans(case: Case, tmp_path: Path, capsys: pytest.CaptureF
 
 @pytest.mark.skipif(not FOREST.exists(), reason=f"the real scan is not there: {FOREST}")
 def test_a_real_scan_in_its_own_frame(tmp_path: Path) -> None:
-    """A quarter of a RIEGL VZ-400i scan in a forest: scanner at the origin, steps as documented, second echoes left out."""
+    """A seventh of a RIEGL VZ-400i scan in a forest: scanner at the origin, steps as documented, second echoes left out."""
     data: Any = np.load(FOREST)
     points = np.stack([data[axis] for axis in "XYZ"], axis=1)
-    rows = points[:, 1] > np.abs(points[:, 0] + 0.5)
+    rows = points[:, 1] > 2 * np.abs(points[:, 0] + 0.5)
     echo = {
         "return_number": data["Target_index"][rows].astype(np.uint8),
         "number_of_returns": data["Target_count"][rows].astype(np.uint8),

@@ -17,8 +17,10 @@ from pipeline.surface.mesh import SurfaceConfig
 from pipeline.surface.reconstruct import FusionConfig, colmap_surface, write_workspace
 from scene.common.config import parse
 from scene.common.errors import InputError
-from scene.geometry.mesh import FloatArray
+from scene.geometry.mesh import FloatArray, TriangleMesh
 from sensors.cameras.camera import Camera
+
+pytestmark = pytest.mark.usefixtures("undrawn")
 
 LENS = {"b1": 1.0, "b2": -0.5, "k1": -0.05, "k2": 0.03, "k3": 0.0, "k4": 0.01, "p1": 1e-3, "p2": -7e-4}
 NORMAL = np.array([0.2, -0.15, 1.0]) / np.linalg.norm([0.2, -0.15, 1.0])
@@ -121,14 +123,24 @@ def test_colmap_reads_the_workspace(pycolmap: Any, tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.squeeze(theirs.to_array()), read_map(path))
 
 
+def fused(lens: dict[str, float] | None = None) -> TriangleMesh:
+    left, right = maps(lens)
+    return colmap_surface(left, right, *labels(left), SurfaceConfig(), FusionConfig())
+
+
+@pytest.fixture(scope="module")
+def plain(pycolmap: Any) -> TriangleMesh:
+    """COLMAP's surface of the plane, of cameras without distortion."""
+    return fused()
+
+
 @pytest.mark.parametrize("lens", [None, LENS])
-def test_colmap_gives_a_plane_back(pycolmap: Any, lens: dict[str, float] | None) -> None:
+def test_colmap_gives_a_plane_back(plain: TriangleMesh, lens: dict[str, float] | None) -> None:
     """A cell is 0.25 m wide; an error of half a pixel would move the plane by 25 mm.
 
     The border, where Poisson ends, is excluded.
     """
-    left, right = maps(lens)
-    mesh = colmap_surface(left, right, *labels(left), SurfaceConfig(), FusionConfig())
+    mesh = plain if lens is None else fused(lens)
     inside = (np.abs(mesh.vertices[:, 0]) < 12) & (np.abs(mesh.vertices[:, 1]) < 10)
     assert inside.sum() > 5000
     error = mesh.vertices[inside] @ NORMAL
@@ -142,11 +154,10 @@ def test_colmap_gives_a_plane_back(pycolmap: Any, lens: dict[str, float] | None)
     assert (area @ NORMAL > 0).mean() > 0.99  # counter-clockwise seen from the sensors
 
 
-def test_equal_maps_give_equal_surfaces(pycolmap: Any) -> None:
-    left, right = maps()
-    one, other = (colmap_surface(left, right, *labels(left), SurfaceConfig(), FusionConfig()) for _ in range(2))
-    np.testing.assert_array_equal(one.vertices, other.vertices)
-    np.testing.assert_array_equal(one.faces, other.faces)
+def test_equal_maps_give_equal_surfaces(plain: TriangleMesh) -> None:
+    again = fused()
+    np.testing.assert_array_equal(plain.vertices, again.vertices)
+    np.testing.assert_array_equal(plain.faces, again.faces)
 
 
 def test_maps_that_disagree_are_an_error(pycolmap: Any) -> None:

@@ -6,15 +6,13 @@ Tested are also the uncertainty and each parameter's effect.
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, norm
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from pipeline.registration.closest_points import ReferenceSurface, scan_order
 from pipeline.registration.register import IcpConfig, Registration, _point_step, measure_fit, register, register_to
@@ -350,20 +348,15 @@ def test_threads_do_not_change_a_bit(reference: ReferenceSurface) -> None:
 
 
 def test_blas_threads_do_not_change_a_bit() -> None:
-    code = (
-        "import json, numpy as np; from pipeline.registration.register import *; g = np.random.default_rng(3); "
-        "p = np.stack([*g.uniform(0, 9, (2, 40000)), np.zeros(40000)], 1); p[:, 2] = np.sin(p[:, 0]) * np.cos(p[:, 1]); "
-        "c = IcpConfig(method='point_to_point', max_iteration=6, outlier_distance_threshold=0.5); "
-        "print(json.dumps(register(p[::2] + 0.02, p, None, c, KeyedRandom(1)).to_dict()))"
-    )
-    outputs = [
-        subprocess.run(
-            [sys.executable, "-c", code], env=os.environ | {"OMP_NUM_THREADS": n, "OPENBLAS_NUM_THREADS": n}, capture_output=True
-        )
-        for n in ("1", "2")
-    ]
-    assert outputs[0].returncode == 0, outputs[0].stderr
-    assert outputs[0].stdout == outputs[1].stdout
+    points = np.stack([*np.random.default_rng(3).uniform(0, 9, (2, 40_000)), np.zeros(40_000)], axis=1)
+    points[:, 2] = np.sin(points[:, 0]) * np.cos(points[:, 1])
+    config = IcpConfig(method="point_to_point", max_iteration=6, outlier_distance_threshold=0.5)
+    found = []
+    for threads in (1, 2):
+        with threadpool_limits(threads, user_api="blas"):
+            assert {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"} == {threads}
+            found.append(register(points[::2] + 0.02, points, None, config, KeyedRandom(1)).to_dict())
+    assert found[0] == found[1]
 
 
 def test_scan_order_sorts_only_what_is_scattered() -> None:

@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pictures import ENVIRONMENT
+from pictures import command as started
 from test_run import config, digests
 
 from pipeline.cli.main import simulate as command
@@ -22,6 +24,8 @@ from pipeline.run import simulation as pipeline_run
 from pipeline.run.products import is_whole
 from pipeline.run.simulation import simulate
 from scene.common.errors import InputError
+
+pytestmark = pytest.mark.usefixtures("undrawn")
 
 ROOT = Path(__file__).parents[2]
 COARSE: dict[str, Any] = {
@@ -95,17 +99,17 @@ def test_the_lock_goes_with_its_process(tmp_path: Path) -> None:
     assert list((tmp_path / "run").iterdir()) == []
 
 
-@pytest.mark.slow
-def test_a_run_that_is_killed_goes_on_to_the_same_bytes(finished: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "moments", [(".epoch_000/points.laz",), (".epoch_000/points.laz", "difference_001.tif")], ids=["once", "twice"]
+)
+def test_a_run_that_is_killed_goes_on_to_the_same_bytes(moments: tuple[str, ...], finished: Path, tmp_path: Path) -> None:
     """The command gets kill -9 in the middle of the reference epoch, and its successor among the maps."""
     out, coarse = tmp_path / "run", tmp_path / "coarse.yaml"
     coarse.write_text(json.dumps(config(**COARSE).model_dump(mode="json")))
-    program = "from pipeline.cli.main import simulate; raise SystemExit(simulate())"
     words = ["--sensor", "tls", "--config", str(coarse), "--out", str(out), "--quiet"]
-    for moment in (".epoch_000/points.laz", "difference_001.tif"):
+    for moment in moments:
         process = subprocess.Popen(
-            [sys.executable, "-c", program, *words, *(["--resume"] if (out / "run.json").exists() else [])],
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            started("simulate", *words, *(["--resume"] if (out / "run.json").exists() else [])), env=ENVIRONMENT
         )
         while not (out / moment).exists():
             assert process.poll() is None

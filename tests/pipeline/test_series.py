@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 from pipeline.config.simulation import SimulationConfig, load_config
+from pipeline.export import pictures
 from pipeline.export.exported_run import ExportedRun
 from pipeline.export.pictures import save_epochs
 from pipeline.formats.meshes.ply import read_ply, write_ply
@@ -31,6 +32,8 @@ from scene.geometry.mesh import TriangleMesh
 from sensors.effects.range_scale import RangeScale
 from sensors.models.conditions import with_effects
 from sensors.models.sensor_model import TlsModel
+
+pytestmark = pytest.mark.usefixtures("undrawn")
 
 SMALL: dict[str, Any] = {
     "seed": 3,
@@ -214,7 +217,9 @@ def test_mistakes_are_named(series: dict[str, Any], message: str) -> None:
         config(series)
 
 
-def test_view_and_export_name_the_times(finished: Path, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("drawn")
+def test_view_and_export_name_the_times(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pictures, "_ANIMATED_PX", 320)
     results = RunResults(finished)
     assert results.steps["2"] == "epoch 2, 2026-03-01 12:00"
     assert [layer.key for layer in results.layers("2")][:2] == ["difference", "change"]

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from pictures import ENVIRONMENT, command
 from test_series import EVENTS, SMALL, TIMES, config, digests
 
 from pipeline.config.simulation import SimulationConfig
@@ -20,6 +19,8 @@ from scene.common.config import parse
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import TriangleMesh
 from scene.series.cover import Cover
+
+pytestmark = pytest.mark.usefixtures("undrawn")
 
 CAMERAS = {"cameras": {"distance_m": 15.0, "width": 368, "height": 246}}
 UP = np.array([0.0, 1.0, 0.0])
@@ -49,15 +50,18 @@ def test_the_stereo_pair_sees_what_fell_in_every_later_epoch(tmp_path: Path) -> 
 
 
 def test_one_thread_makes_the_same_bytes(tmp_path: Path) -> None:
-    series = {"events": EVENTS, "deposits": {"fragments": 3}, "conditions": {"pose": {"position_m": {"random_walk": 0.002}}}}
+    """Epochs with what fell, its deposit, a precursor and a pose of its own."""
+    times = {**TIMES, "count": 2}
+    series = {
+        "times": times,
+        "events": EVENTS,
+        "deposits": {"fragments": 3},
+        "conditions": {"pose": {"position_m": {"random_walk": 0.002}}},
+    }
     simulate(config(series), "tls", tmp_path / "all")
-    (tmp_path / "config.yaml").write_text(json.dumps({**SMALL, "series": {"times": TIMES, **series}}))  # JSON is YAML
-    program = "from pipeline.cli.main import simulate; raise SystemExit(simulate())"
+    (tmp_path / "config.yaml").write_text(json.dumps({**SMALL, "series": series}))  # JSON is YAML
     words = ["--sensor", "tls", "--config", str(tmp_path / "config.yaml"), "--out", str(tmp_path / "one"), "--threads", "1"]
-    root = str(Path(__file__).parents[2])
-    subprocess.run(
-        [sys.executable, "-c", program, *words, "--quiet"], check=True, env={**os.environ, "PYTHONPATH": root}, timeout=300
-    )
+    subprocess.run(command("simulate", *words, "--quiet"), check=True, env=ENVIRONMENT, timeout=300)
     assert digests(tmp_path / "one") == digests(tmp_path / "all")
 
 

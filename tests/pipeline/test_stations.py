@@ -28,6 +28,8 @@ from sensors.laser.tls import LaserScanner, ScannerConfig
 from sensors.models.placement import EXACT_POSE, PoseSigma
 from sensors.models.sensor_model import TlsModel
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 WALL = heightfield(16.0, 10.0, 0.1, roughness=0.15)
 CASTER = RayCaster(WALL)
 SIGMA_M = 0.002
@@ -150,7 +152,8 @@ TWO: list[dict[str, Any]] = [
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("stations") / "run"
     beam = {"name": "beam_divergence", "divergence_rad": 0.003, "mode": "multiple", "sub_rays": 7, "pulse_width_s": 3e-10}
-    simulate(config(station=TWO, sensor=[{"sensor": "tls", "effects": [beam]}]), "tls", out)
+    scanner = {"azimuth_step_rad": 0.003, "zenith_step_rad": 0.003}
+    simulate(config(station=TWO, scanner=scanner, sensor=[{"sensor": "tls", "effects": [beam]}]), "tls", out)
     return out
 
 

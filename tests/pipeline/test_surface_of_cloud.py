@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from surfaces import heightfield
 
 from pipeline import mesh_points
@@ -44,7 +45,7 @@ def test_points_become_a_wall_where_they_are(cloud: Path, method: str, capsys: p
     local = (mesh.vertices - ORIGIN) @ TURN
     inside = (local[:, :2] > 0.3).all(axis=1) & (local[:, 0] < 5.7) & (local[:, 1] < 3.7)
     truth = heightfield(6.0, 4.0, 0.08, roughness=0.05).vertices
-    nearest = np.linalg.norm(local[inside][:, None, :2] - truth[None, ::1, :2], axis=2).argmin(axis=1)
+    nearest = cKDTree(truth[:, :2]).query(local[inside][:, :2])[1]
     assert np.median(np.abs(local[inside, 2] - truth[nearest, 2])) < 0.01
     towards = STATION - mesh.vertices[mesh.faces].mean(axis=1)
     assert np.mean(np.einsum("fi,fi->f", mesh.face_normals(), towards) > 0) > 0.99

@@ -113,12 +113,16 @@ def rough_blocks(rough: TriangleMesh) -> Blocks:
     return blocks_on(rough, count=300)
 
 
-def test_three_hundred_blocks_in_a_rough_wall(rough: TriangleMesh, rough_blocks: Blocks) -> None:
-    carved = carve(rough, rough_blocks)
-    assert_sound(carved, rough, rough_blocks)
+@pytest.fixture(scope="module")
+def rough_carved(rough: TriangleMesh, rough_blocks: Blocks) -> Carved:
+    return carve(rough, rough_blocks)
+
+
+def test_three_hundred_blocks_in_a_rough_wall(rough: TriangleMesh, rough_blocks: Blocks, rough_carved: Carved) -> None:
+    assert_sound(rough_carved, rough, rough_blocks)
     base = rough.vertices[:, 2].min()
-    assert carved.wall_volume_m3 == pytest.approx(prisms(rough, base), rel=1e-12)
-    assert prisms(rough, base) - prisms(carved.mesh, base) == pytest.approx(carved.removed_volume_m3.sum(), rel=1e-6)
+    assert rough_carved.wall_volume_m3 == pytest.approx(prisms(rough, base), rel=1e-12)
+    assert prisms(rough, base) - prisms(rough_carved.mesh, base) == pytest.approx(rough_carved.removed_volume_m3.sum(), rel=1e-6)
 
 
 def prisms(mesh: TriangleMesh, base: float) -> float:
@@ -220,8 +224,8 @@ def test_the_mending_has_something_to_mend(rough: TriangleMesh, rough_blocks: Bl
     assert (smallest_height(mesh.vertices[mesh.faces[at_rim]]) < SLIVER_M).sum() > 20
 
 
-def test_far_from_the_blocks_nothing_changes(rough: TriangleMesh, rough_blocks: Blocks) -> None:
-    mesh = carve(rough, rough_blocks).mesh
+def test_far_from_the_blocks_nothing_changes(rough: TriangleMesh, rough_blocks: Blocks, rough_carved: Carved) -> None:
+    mesh = rough_carved.mesh
     kept = {tuple(v) for v in mesh.vertices[mesh.vertex_block == 0].tolist()}
     far = ~np.any(
         [np.all((rough.vertices >= low - 0.01) & (rough.vertices <= high + 0.01), axis=1) for low, high in rough_blocks.bbox],
@@ -243,8 +247,7 @@ def test_the_albedo_is_carried_over() -> None:
     assert carve(wall, blocks).mesh.vertex_albedo is None
 
 
-def test_the_four_meshes_of_a_block_fit_together(rough: TriangleMesh, rough_blocks: Blocks) -> None:
-    carved = carve(rough, rough_blocks)
+def test_the_four_meshes_of_a_block_fit_together(rough: TriangleMesh, rough_blocks: Blocks, rough_carved: Carved) -> None:
     for index in (0, 17):
         meshes = block_meshes(rough, rough_blocks, index)
         removed, rest, block = (
@@ -253,7 +256,7 @@ def test_the_four_meshes_of_a_block_fit_together(rough: TriangleMesh, rough_bloc
         )
         assert removed.is_watertight
         assert rest.is_watertight
-        assert removed.volume == pytest.approx(carved.removed_volume_m3[index], rel=1e-9)
+        assert removed.volume == pytest.approx(rough_carved.removed_volume_m3[index], rel=1e-9)
         assert removed.volume + rest.volume == pytest.approx(block.volume, rel=1e-9)
         skin = removed.area_faces[meshes.intersection.face_block == 0].sum()
         inner = removed.area_faces[meshes.intersection.face_block == index + 1].sum()
@@ -268,8 +271,8 @@ def test_the_four_meshes_of_a_block_fit_together(rough: TriangleMesh, rough_bloc
         assert skin > 0
 
 
-def test_the_same_blocks_give_the_same_bytes(rough: TriangleMesh, rough_blocks: Blocks) -> None:
-    first, second = (carve(rough, rough_blocks).mesh for _ in range(2))
+def test_the_same_blocks_give_the_same_bytes(rough: TriangleMesh, rough_blocks: Blocks, rough_carved: Carved) -> None:
+    first, second = rough_carved.mesh, carve(rough, rough_blocks).mesh
     assert first.vertices.tobytes() == second.vertices.tobytes()
     assert first.faces.tobytes() == second.faces.tobytes()
 

@@ -1,5 +1,6 @@
 """Procedural walls: size, slope, the same rock at every resolution, determinism, albedo, manifoldness."""
 
+from functools import cache
 from typing import get_args
 
 import cv2
@@ -38,6 +39,12 @@ def normal_relief(mesh):
     return frame.to_wall(mesh.vertices), np.arccos(frame.rotation[2, 2])
 
 
+@cache
+def site_wall(style):
+    """Return a wall in the size of its site, which tests only read."""
+    return ProceduralWall(style=style, resolution_m=0.1).mesh(KeyedRandom(2))
+
+
 def test_every_style_of_the_config_has_a_site():
     assert set(STYLES) == set(SITES)
 
@@ -45,7 +52,7 @@ def test_every_style_of_the_config_has_a_site():
 @pytest.mark.parametrize("style", STYLES)
 def test_size_slope_and_relief_are_the_sites(style):
     config = ProceduralWall(style=style, resolution_m=0.1)
-    points, slope = normal_relief(config.mesh(KeyedRandom(3)))
+    points, slope = normal_relief(site_wall(style))
     extent = points.max(axis=0) - points.min(axis=0)
     # 0.3 degrees: the relief's plane is taken off on a 0.5 m lattice, blocks between its points remain
     assert slope == pytest.approx(SITES[style].slope_rad, abs=np.radians(0.3))
@@ -89,7 +96,7 @@ def test_nothing_to_mend_in_a_procedural_wall(style):
 
 @pytest.mark.parametrize("style", STYLES)
 def test_albedo_has_bounds_and_texture(style):
-    albedo = ProceduralWall(style=style, resolution_m=0.1).mesh(KeyedRandom(2)).vertex_albedo
+    albedo = site_wall(style).vertex_albedo
     assert albedo.dtype == np.float32
     assert albedo.min() >= np.float32(0.05)
     assert albedo.max() <= np.float32(0.9)
@@ -98,8 +105,7 @@ def test_albedo_has_bounds_and_texture(style):
 
 
 def test_the_coal_of_glendale_is_dark_and_of_its_thickness():
-    config = ProceduralWall(style="glendale", resolution_m=0.1)
-    albedo = config.mesh(KeyedRandom(2)).vertex_albedo.reshape(451, 701)
+    albedo = site_wall("glendale").vertex_albedo.reshape(451, 701)
     dark = albedo < 0.2
     assert np.median(0.1 * dark.sum(axis=0)) == pytest.approx(2.3, abs=0.3)
     rows = np.nonzero(dark)[0]
