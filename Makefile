@@ -1,6 +1,9 @@
 # `make demo` and `make test` work from an empty clone on a bare Debian or Ubuntu with Python 3.11 to 3.13; see tools/setup.sh.
 BIN := .venv/bin
 
+# Many tests start processes, which would compile the program anew each time.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: help setup setup-all demo test types short-tests validate docs format benchmarks nightly
 
 help:

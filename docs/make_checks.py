@@ -152,6 +152,8 @@ ANY: dict[str, Make] = {
     "It contains random bytes": lambda path: path.write_bytes(bytes(range(256)) * 40),
 }
 GOOD_POINTS = _cloud(_grid_points())
+FEW_POINTS = _cloud(_grid_points(0.4))
+"""Points whose scan pattern is sought in a moment, for readers of another file that is faulty."""
 KINDS = (
     Kind(
         "Points",
@@ -286,7 +288,7 @@ KINDS = (
 def prepare(folder: Path) -> None:
     """Write the good files that the readers need beside the bad one."""
     write_ply(folder / "wall.ply", _sheet())
-    GOOD_POINTS(folder / "scan.ply")
+    FEW_POINTS(folder / "scan.ply")
     _raster(folder / "map.tif")
     (folder / "site.yaml").write_text(SITE)
     (folder / "truth.json").write_text(json.dumps({**COCO, "annotations": [{**BOX, "iscrowd": 0}]}))

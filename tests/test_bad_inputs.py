@@ -36,6 +36,11 @@ LONG = (
     "ev: 2000 of one place",
     "ev: 20000 of one place",
     "ev: 20000 images",
+    "ev: 300 images of 15000",
+    "ev: truth of 400 MB",
+    "ev: polygon of a million",
+    "ev: truth polygon of 100000",
+    "ev: RLE of a million",
     "view: run products of a million",
 )
 """With these a calibration runs, as it does not look at what is wrong, or seconds of work precede the answer: the benchmark's."""

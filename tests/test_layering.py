@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -20,16 +22,29 @@ HEAVY = ("numpy", "scipy", "mitsuba", "drjit", "pydantic", "matplotlib", "open3d
 Imports = set[tuple[str, ...]]
 
 
-def imports_of(source: str) -> Imports:
+@functools.cache
+def nodes_of(source: str) -> tuple[ast.AST, ...]:
+    """Return all nodes of the syntax tree of `source`; each file is read by several rules and parsed once."""
+    return tuple(ast.walk(ast.parse(source)))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _forget_syntax_trees() -> Iterator[None]:
+    yield
+    nodes_of.cache_clear()
+
+
+@functools.cache
+def imports_of(source: str) -> frozenset[tuple[str, ...]]:
     """Return every absolute module path imported anywhere in `source`; `from a import b` counts as a.b."""
     found: Imports = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes_of(source):
         if isinstance(node, ast.Import):
             found |= {tuple(alias.name.split(".")) for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "relative imports hide the layer"
             found |= {(*str(node.module).split("."), alias.name) for alias in node.names}
-    return found
+    return frozenset(found)
 
 
 def violations(folder: str, imports: Imports) -> Imports:
@@ -78,7 +93,7 @@ def test_mitsuba_comes_through_the_backend_only(folder: str) -> None:
 @pytest.mark.parametrize("folder", ["scene", "sensors", "pipeline"])
 def test_what_cannot_be_is_said_by_types_and_not_by_asserts(folder: str) -> None:
     """`python -O` removes asserts; types that exclude the case need none."""
-    trees = {str(file.relative_to(ROOT)): ast.walk(ast.parse(file.read_text())) for file in sources(folder)}
+    trees = {str(file.relative_to(ROOT)): nodes_of(file.read_text()) for file in sources(folder)}
     assert [name for name, nodes in trees.items() if any(isinstance(node, ast.Assert) for node in nodes)] == []
 
 
@@ -171,7 +186,7 @@ def test_nothing_in_the_pipeline_is_decided_by_the_name_of_an_effect(file: Path)
     """Knowledge of an effect belongs to its class; an algorithm that is made for one effect refers to the class."""
     names = {path.stem for path in (ROOT / "sensors" / "effects").glob("*.py")}
     names |= {f"{sensor}.{name}" for sensor in ("tls", "stereo") for name in names}
-    written = {node.value for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.Constant)}
+    written = {node.value for node in nodes_of(file.read_text()) if isinstance(node, ast.Constant)}
     assert written & names == set()
 
 
@@ -181,8 +196,7 @@ OF_OTHERS = {"_exit", "_actions", "_repr_html_"}
 
 def private_of_others(source: str) -> set[str]:
     """Return names with a leading underscore that a module imports from another one, or uses of an object of another class."""
-    tree = ast.parse(source)
-    nodes = list(ast.walk(tree))
+    nodes = nodes_of(source)
     own = {node.name for node in nodes if isinstance(node, ast.FunctionDef | ast.ClassDef)}
     own |= {node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
     own |= {node.attr for node in nodes if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)}
@@ -208,7 +222,7 @@ def test_no_two_classes_have_one_name() -> None:
     places: dict[str, list[str]] = {}
     for folder in ("scene", "sensors", "pipeline"):
         for file in sources(folder):
-            for node in ast.walk(ast.parse(file.read_text())):
+            for node in nodes_of(file.read_text()):
                 if isinstance(node, ast.ClassDef):
                     places.setdefault(node.name, []).append(str(file.relative_to(ROOT)))
     assert {name: files for name, files in places.items() if len(files) > 1} == {}

@@ -93,18 +93,19 @@ def test_gap_schema_and_plans_know_an_effect_of_another_package(package: dict[st
 
 
 def test_a_run_records_ranges_with_an_effect_of_another_package(package: dict[str, str], tmp_path: Path) -> None:
-    def run(name: str, *words: str) -> subprocess.CompletedProcess[str]:
-        program = "import sys; from pipeline.cli.main import simulate; sys.exit(simulate(sys.argv[1:]))"
-        small = ["--set", "wall.width_m=4", "--set", "wall.height_m=3", "--set", "epochs=1", "--set", "rockfall.count=2"]
-        return subprocess.run(
-            [sys.executable, "-c", program, "--sensor", "tls", "--out", str(tmp_path / name), *small, *words],
-            capture_output=True, text=True, env=package,
-        )  # fmt: skip
-
-    wrong = run("wrong", "--set", "sensor={sensor: tls, effects: [{name: range_warm_upp, amplitude_m: 0.02}]}")
-    assert wrong.returncode == 2
-    assert "did you mean 'range_warm_up'" in wrong.stderr
-    right = run("right", "--set", "sensor={sensor: tls, effects: [{name: range_warm_up, amplitude_m: 0.02}]}")
-    assert right.returncode == 0, right.stderr
+    program = "import sys; from pipeline.cli.main import simulate\nfor words in {}: print(simulate(words), file=sys.stderr)"
+    small = ["wall.width_m=4", "wall.height_m=3", "epochs=1", "rockfall.count=2"]
+    small += ["scanner.azimuth_step_rad=0.002", "scanner.zenith_step_rad=0.002"]
+    runs = []
+    for out, name in (("wrong", "range_warm_upp"), ("right", "range_warm_up")):
+        sets = [*small, f"sensor={{sensor: tls, effects: [{{name: {name}, amplitude_m: 0.02}}]}}"]
+        options = [word for each in sets for word in ("--set", each)]
+        runs.append(["--sensor", "tls", "--out", str(tmp_path / out), "--quiet", *options])
+    done = subprocess.run([sys.executable, "-c", program.format(runs)], capture_output=True, text=True, env=package)
+    assert done.returncode == 0, done.stderr
+    error, *codes = [line for line in done.stderr.splitlines() if line.strip()]
+    assert "did you mean 'range_warm_up'" in error
+    assert codes == ["2", "0"]
+    assert not (tmp_path / "wrong").exists()
     (model,) = json.loads((tmp_path / "right" / "run.json").read_text())["config"]["sensor"]
     assert model["effects"] == [{"name": "range_warm_up", "amplitude_m": 0.02}]

@@ -38,7 +38,6 @@ def _shape(value: Any, file: str = TRUTH) -> Change:
     return put(file, annotations__0__segmentation=value)
 
 
-_MANY = [[4 + k / 100, 6, 14, 6, 14, 14] for k in range(100_000)]
 _EVALUATE: dict[str, Change] = {
     "truth no annotations key": put(TRUTH, annotations=GONE),
     "truth no images key": put(TRUTH, images=GONE),
@@ -86,7 +85,7 @@ _EVALUATE: dict[str, Change] = {
     "truth polygon odd": _shape([[4, 6, 14, 6, 14, 14, 4]]),
     "truth polygon 2 points": _shape([[4, 6, 14, 6]]),
     "truth polygon good": _shape(_SQUARE),
-    "truth polygon of 100000 parts": _shape(_MANY),
+    "truth polygon of 100000 parts": _shape(lambda: [[4 + k / 100, 6, 14, 6, 14, 14] for k in range(100_000)]),
     "truth polygon outside": _shape([[400, 600, 1400, 600, 1400, 1400]]),
     "truth polygon 1e300": _shape([[1e300, 6, 14, 6, 14, 14]]),
     "truth polygon words": _shape([["a", "b", "c", "d", "e", "f"]]),

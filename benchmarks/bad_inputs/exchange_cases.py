@@ -120,7 +120,7 @@ _MESHES: dict[str, tuple[str, Change]] = {
     "obj of 2 coordinates": ("obj", text("a.obj", "v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n")),
     "obj of lines": ("obj", text("a.obj", "v 0 0 0\nv 1 0 0\nl 1 2\n")),
     "obj of 1e400": ("obj", text("a.obj", "v 1e400 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")),
-    "obj one 100 MB line": ("obj", text("a.obj", b"v " + b"1" * 100_000_000)),
+    "obj one 100 MB line": ("obj", text("a.obj", lambda: b"v " + b"1" * 100_000_000)),
     "obj of 60 GB": ("obj", sparse("a.obj")),
     "stl of 60 GB": ("stl", sparse("a.stl")),
     "stl of 3 GB": ("stl", sparse("a.stl", 3)),

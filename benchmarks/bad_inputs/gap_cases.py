@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from benchmarks.bad_inputs.case import Case
@@ -53,7 +55,7 @@ def _one(value: float) -> Change:
     return points(lambda found: np.concatenate([found, [[value, 0.0, 0.0]]]))
 
 
-def _xyz(content: str | bytes) -> Change:
+def _xyz(content: str | bytes | Callable[[], bytes]) -> Change:
     return both(text("measurement/scan.xyz", content), put(YAML, points="scan.xyz"))
 
 
@@ -92,7 +94,7 @@ _TLS: dict[str, Change] = {
     "xyz of one column": _xyz("1\n2\n3\n"),
     "xyz of words": _xyz("a b c\nd e f\n"),
     "xyz of changing columns": _xyz("1 2 3\n1 2\n1 2 3 4\n"),
-    "xyz one 50 MB line": _xyz(b"1.0 2.0 3.0 " * 4_200_000),
+    "xyz one 50 MB line": _xyz(lambda: b"1.0 2.0 3.0 " * 4_200_000),
     "xyz in UTF-16": _xyz("1 2 3\n4 5 6\n".encode("utf-16")),
     "xyz with null characters": _xyz(b"\0" * 1000),
     "pattern step 1e-12": put(YAML, pattern__azimuth_rad=[0.3, 1.5, 1e-12]),

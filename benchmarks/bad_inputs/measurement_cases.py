@@ -86,7 +86,8 @@ def _pieces(folder: Path) -> None:
     write_mesh(folder / WALL, found.vertices[found.faces].reshape(-1, 3), np.arange(3 * len(found.faces)).reshape(-1, 3))
 
 
-_RING = [[float(np.cos(k)), float(np.sin(k))] for k in np.linspace(0, 6.28, 20_000)]
+_RING = np.linspace(0, 6.28, 20_000)
+"""Directions of the corners of a stable area, rad."""
 _GAP: dict[str, Change] = {
     "epochs: one in mm": _epochs(_same, lambda found: 1000 * found),
     "epochs: one NaN": _epochs(_same, lambda found: found * NAN),
@@ -141,7 +142,7 @@ _GAP: dict[str, Change] = {
     "scanner rotation turned": put(YAML, scanner__rotation=[[0.94686, -0.3216, 0], [0.3216, 0.94686, 0], [0, 0, 1]]),
     "scanner rotation of words": put(YAML, scanner__rotation=[["a", "b", "c"]] * 3),
     "scanner rotation 1e300": put(YAML, scanner__rotation=[[1e300] * 3] * 3),
-    "stable_areas a ring": put(YAML, stable_areas=[_RING]),
+    "stable_areas a ring": put(YAML, stable_areas=lambda: [np.column_stack([np.cos(_RING), np.sin(_RING)]).tolist()]),
     "stable_areas crossed": put(YAML, stable_areas=[[[0, 0], [9, 9], [9, 0], [0, 9]]]),
     "stable_areas 20000": put(YAML, stable_areas=[[0, 0, 50, 50]] * 20_000),
     "stable_areas one number": put(YAML, stable_areas=[[1]]),

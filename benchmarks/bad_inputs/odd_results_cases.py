@@ -115,7 +115,7 @@ _DIAGNOSES: dict[str, Change] = {
     "verdict of markup": put(GAP, verdict="<script>alert(1)</script>"),
     "verdict of half a character": put(GAP, verdict=_SURROGATE),
     "verdict of 1 MB": put(GAP, verdict="a" * 1_000_000),
-    "a million changes": put(GAP, scene_changes=[{"bbox_m": [0.0] * 6, "volume_m3": 1.0}] * 1_000_000),
+    "a million changes": put(GAP, scene_changes=lambda: [{"bbox_m": [0.0] * 6, "volume_m3": 1.0}] * 1_000_000),
     "a change backwards": put(GAP, scene_changes=[{"bbox_m": [1.0, 1.0, 1.0, 0.0, 0.0, 0.0], "volume_m3": 1.0}]),
     "a change 1e300": put(GAP, scene_changes=[{"bbox_m": [1e300] * 6, "volume_m3": 1e300}]),
     "sensor of the other": put(GAP, sensor="stereo"),
@@ -217,7 +217,7 @@ _EVALUATE: dict[str, Change] = {
     "truth with comments": lambda folder: (folder / TRUTH).write_text("// mine\n" + (folder / TRUTH).read_text()),
     "truth with a comma too many": text(TRUTH, '{"images": [],}'),
     "truth and found exchanged": lambda folder: _exchanged(folder),
-    "truth of 400 MB": text(TRUTH, b"[" + b"0," * 200_000_000 + b"0]"),
+    "truth of 400 MB": text(TRUTH, lambda: b"[" + b"0," * 200_000_000 + b"0]"),
 }  # fmt: skip
 _EPOCH = "run/epoch_001/surface.ply"
 _RUNS: dict[str, Change] = {
@@ -263,7 +263,7 @@ _RUNS: dict[str, Change] = {
     "lock a folder": lambda folder: (folder / "run/.lock").mkdir(),
     "lock a pipe": lambda folder: instead("run/.lock", pipe)(folder),
     "products null": put(RUN, products=None),
-    "products of a million": put(RUN, products={f"epoch_{k:03d}": {} for k in range(1_000_000)}),
+    "products of a million": put(RUN, products=lambda: {f"epoch_{k:03d}": {} for k in range(1_000_000)}),
 }  # fmt: skip
 
 

@@ -37,18 +37,19 @@ def both(*changes: Change) -> Change:
     return change
 
 
-def text(name: str, content: str | bytes) -> Change:
-    """Replace the content of a file."""
+def text(name: str, content: str | bytes | Callable[[], str | bytes]) -> Change:
+    """Replace the content of a file; content: a function where it is large, so that importing the cases does not make it."""
 
     def change(folder: Path) -> None:
+        made = content() if callable(content) else content
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+        (folder / name).write_bytes(made.encode() if isinstance(made, str) else made)
 
     return change
 
 
 def put(name: str, /, **values: Any) -> Change:
-    """Set values of a YAML or JSON file at places such as `a__b__0`; GONE removes a key."""
+    """Set values of a YAML or JSON file at places such as `a__b__0`; GONE removes a key, a function makes a large value."""
 
     def change(folder: Path) -> None:
         path = folder / name
@@ -68,7 +69,7 @@ def _place(content: Any, keys: list[str], value: Any) -> None:
     if value is GONE:
         del content[last]
     else:
-        content[last] = copy.deepcopy(value)
+        content[last] = value() if callable(value) else copy.deepcopy(value)
 
 
 def whole(name: str, value: Any) -> Change:

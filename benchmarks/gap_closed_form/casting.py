@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,15 @@ class Surface:
     """A mesh for ray casting. vertices: (v, 3) m, within a few hundred metres of the origin; faces: (f, 3)."""
 
     def __init__(self, vertices: Array, faces: Any) -> None:
+        self.vertices, self.faces = vertices, faces
+
+    @cached_property
+    def _scene(self) -> Any:
         import open3d as o3d
 
-        self.vertices, self.faces = vertices, faces
-        self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(
-            o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(np.ascontiguousarray(faces, dtype=np.uint32))
-        )
+        scene, faces = o3d.t.geometry.RaycastingScene(), np.ascontiguousarray(self.faces, dtype=np.uint32)
+        scene.add_triangles(o3d.core.Tensor(self.vertices.astype(np.float32)), o3d.core.Tensor(faces))
+        return scene
 
     def cast(self, origin: Array, ray: Array) -> tuple[Array, Array]:
         """Cast rays (n, 3) from `origin`, (3,) or (n, 3), onto the surface.

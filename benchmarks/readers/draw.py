@@ -10,6 +10,7 @@ A reader says of each item what it does, what its arguments are and why it exist
 from __future__ import annotations
 
 import ast
+import functools
 import json
 import random
 import statistics
@@ -159,6 +160,7 @@ class _WithTexts(ast.NodeTransformer):
 
 
 @cache
+@functools.cache
 def everything() -> dict[str, list[dict[str, str]]]:
     """Return all that can be drawn, by kind."""
     return {"definition": list(definitions()), "page": list(pages()), "message": list(messages())}

@@ -82,14 +82,21 @@ def parsed_time(text: str, where: str) -> datetime:
 
 
 def check_order(times: Sequence[EpochTime], names: Sequence[str]) -> None:
-    """Raise InputError if an epoch is earlier than the one that is listed before it. names: the epochs' names, for errors."""
+    """Raise InputError if an epoch is earlier than the one that is listed before it, the reference first.
+
+    names: the epochs' names, for errors.
+    """
     known = [(time.when, name) for time, name in zip(times, names, strict=True) if time.when is not None]
     for (before, first), (after, second) in itertools.pairwise(known):
         if after < before:
+            is_reference = first == names[0]
             raise InputError(
-                f"{second} ({after:%Y-%m-%d %H:%M}) is earlier than {first} ({before:%Y-%m-%d %H:%M}), which comes before it",
+                f"{second} ({after:%Y-%m-%d %H:%M}) is earlier than {first} ({before:%Y-%m-%d %H:%M}), "
+                + ("which is the reference" if is_reference else "which comes before it"),
                 where="EPOCH",
-                remedy="give the epochs in the order of their times, the reference first, or state the times with --times",
+                remedy="make the earliest epoch the reference (--reference, or the first one), or state the times with --times"
+                if is_reference
+                else "give the epochs in the order of their times, or state the times with --times",
             )
 
 

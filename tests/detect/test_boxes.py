@@ -6,19 +6,24 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.detection.network.boxes import (
-    anchors,
-    clip,
-    decode,
-    doublings,
-    encode,
-    intersection_over_union,
-    non_maximum_suppression,
-    widened,
-)
-from pipeline.detection.network.roi_align import roi_align
-
 STRIDES = (4, 8, 16, 32, 64)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _network() -> None:
+    """Import what needs Keras only where a test runs, as TensorFlow takes seconds to import."""
+    global anchors, clip, decode, doublings, encode, intersection_over_union, non_maximum_suppression, roi_align, widened
+    from pipeline.detection.network.boxes import (
+        anchors,
+        clip,
+        decode,
+        doublings,
+        encode,
+        intersection_over_union,
+        non_maximum_suppression,
+        widened,
+    )
+    from pipeline.detection.network.roi_align import roi_align
 
 
 def _random_boxes(count: int, seed: int, side: float = 200.0) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import itertools
 import json
 import shutil
@@ -11,15 +12,12 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-
-pytest.importorskip("keras")
-
 from test_model import SMALL, make_set
 
 from pipeline.detection.inference import weights
 from pipeline.detection.network.config import TrainConfig, TrainingConfig
-from pipeline.detection.network.model import MaskRCNN
 
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("keras") is None, reason="Keras is not installed")
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 SIDE = 64
 NETWORK = SMALL.model_copy(update={"image_px": SIDE, "pyramid_channels": 8})
@@ -58,6 +56,8 @@ def data_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def detector(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from pipeline.detection.network.model import MaskRCNN  # takes seconds
+
     folder = tmp_path_factory.mktemp("network")
     weights.save(MaskRCNN(NETWORK, seed=3), folder)
     return folder

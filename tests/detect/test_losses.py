@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
-import keras
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.detection.network.boxes import anchors, encode, share_inside
 from pipeline.detection.network.config import HeadConfig, ProposalConfig
-from pipeline.detection.network.losses import binary_cross_entropy, cross_entropy, smooth_l1
-from pipeline.detection.network.targets import anchor_targets, box_targets, mask_targets
 
 STRIDES = (4, 8, 16, 32, 64)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _network() -> None:
+    """Import what needs Keras only where a test runs, as TensorFlow takes seconds to import."""
+    global anchor_targets, anchors, binary_cross_entropy, box_targets, cross_entropy, encode, keras, mask_targets
+    global share_inside, smooth_l1
+    import keras
+
+    from pipeline.detection.network.boxes import anchors, encode, share_inside
+    from pipeline.detection.network.losses import binary_cross_entropy, cross_entropy, smooth_l1
+    from pipeline.detection.network.targets import anchor_targets, box_targets, mask_targets
 
 
 def test_binary_cross_entropy_by_hand():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -10,9 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.cli.main import main
 from pipeline.detection.inference import operating_point, weights
-from pipeline.detection.inference.mirrored import VIEWS, MirroredMaskRCNN, build_network
 from pipeline.detection.network.config import DetectorConfig, HeadConfig, ProposalConfig
-from pipeline.detection.network.model import MaskRCNN
 from pipeline.detection.products import run
 from scene.common.errors import InputError
 
@@ -24,7 +23,16 @@ SMALL = DetectorConfig(
     proposal=ProposalConfig(candidates=100, proposals=20),
     head=HeadConfig(mask_size_px=28, hidden_units=16, detections=10),
 )
-TURNS = VIEWS["both"]
+WAYS = get_args(HeadConfig.model_fields["mirrored"].annotation)
+"""What a config may say of mirrored views."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _network() -> None:
+    """Import what needs Keras only where a test runs, as TensorFlow takes seconds to import."""
+    global VIEWS, MaskRCNN, MirroredMaskRCNN, build_network
+    from pipeline.detection.inference.mirrored import VIEWS, MirroredMaskRCNN, build_network
+    from pipeline.detection.network.model import MaskRCNN
 
 
 @pytest.fixture(scope="module")
@@ -39,9 +47,9 @@ def model() -> MirroredMaskRCNN:
 
 @pytest.fixture(scope="module")
 def images() -> np.ndarray:
-    """Noise (4, h, w, 2) without gaps: one map, mirrored in each way of TURNS."""
+    """Noise (4, h, w, 2) without gaps: one map, mirrored in each way of VIEWS["both"]."""
     noise = np.random.default_rng(5).normal(0, 1, (SIDE, SIDE)).astype(np.float32)
-    return np.stack([np.stack([np.flip(noise, axes), np.ones_like(noise)], axis=-1) for axes in TURNS])
+    return np.stack([np.stack([np.flip(noise, axes), np.ones_like(noise)], axis=-1) for axes in VIEWS["both"]])
 
 
 def _turned(answer: dict[str, np.ndarray], axes: tuple[int, ...]) -> dict[str, np.ndarray]:
@@ -55,7 +63,11 @@ def _turned(answer: dict[str, np.ndarray], axes: tuple[int, ...]) -> dict[str, n
     return result | {"masks": np.flip(answer["masks"], [axis + 1 for axis in axes])}
 
 
-@pytest.mark.parametrize("mirrored", VIEWS)
+def test_every_way_of_looking_has_its_views():
+    assert tuple(VIEWS) == WAYS
+
+
+@pytest.mark.parametrize("mirrored", WAYS)
 def test_a_mirrored_map_has_mirrored_answers_where_its_mirror_images_are_looked_at(mirrored, model, images):
     """The mean over a group of views is mirrored with the map.
 
@@ -63,7 +75,7 @@ def test_a_mirrored_map_has_mirrored_answers_where_its_mirror_images_are_looked_
     """
     model.config = weights.with_head(SMALL, mirrored=mirrored)
     answers = {name: np.asarray(values) for name, values in model({"image": images}).items()}
-    for number, axes in enumerate(TURNS):
+    for number, axes in enumerate(VIEWS["both"]):
         other = _turned({name: values[number] for name, values in answers.items()}, axes)
         if axes in VIEWS[mirrored]:
             for name, values in answers.items():

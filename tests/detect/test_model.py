@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import keras
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -15,7 +14,6 @@ from pipeline.detection.evaluation.evaluate import evaluate
 from pipeline.detection.inference import weights
 from pipeline.detection.inference.inference import detect
 from pipeline.detection.inference.operating_point import CONFIDENCE, best_shifts, set_operating_point
-from pipeline.detection.network.backbone import feature_pyramid
 from pipeline.detection.network.config import (
     DetectorConfig,
     HeadConfig,
@@ -25,9 +23,7 @@ from pipeline.detection.network.config import (
     load_train_config,
 )
 from pipeline.detection.network.data import CocoFolder, cut_window, network_input
-from pipeline.detection.network.model import LOSSES, MaskRCNN
 from pipeline.detection.products.run import detect as run_detect
-from pipeline.detection.training.training import train
 from pipeline.formats.rasters.geotiff import write_geotiff
 from scene.common.errors import InputError
 from scene.geometry.grid import Grid
@@ -40,6 +36,17 @@ SMALL = DetectorConfig(
     proposal=ProposalConfig(candidates=200, proposals=64, sampled_anchors=64),
     head=HeadConfig(mask_size_px=28, hidden_units=64, sampled_proposals=24, detections=32),
 )
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _network() -> None:
+    """Import what needs Keras only where a test runs, as TensorFlow takes seconds to import."""
+    global LOSSES, MaskRCNN, feature_pyramid, keras, train
+    import keras
+
+    from pipeline.detection.network.backbone import feature_pyramid
+    from pipeline.detection.network.model import LOSSES, MaskRCNN
+    from pipeline.detection.training.training import train
 
 
 def make_set(folder: Path, count: int, seed: int, side: int = SIDE, blocks: int = 3) -> Path:
@@ -219,33 +226,32 @@ def test_masks_have_the_size_of_the_config(size):
     assert answer["boxes"].shape == (1, 5, 4)
 
 
-class _SeesADisc(MaskRCNN):
-    """A fake network whose one box is smaller than the disc it sees.
+CENTRE, RADIUS, BOX = (40.3, 60.8), 6.0, (35.0, 56.0, 45.0, 66.0)
+"""A disc, and a box that is smaller than it: a small block's box is wrong like this, by a fraction of a pixel."""
 
-    A small block's box is wrong like this, by a fraction of a pixel.
-    """
 
-    centre, radius, box = (40.3, 60.8), 6.0, (35.0, 56.0, 45.0, 66.0)
+def _inside(y, x):
+    """Return how far inside the disc the points lie, px (len(y), len(x))."""
+    return RADIUS - np.hypot(y[:, None] - CENTRE[0], x - CENTRE[1])
 
-    def __init__(self, margin: float) -> None:
-        super().__init__(
-            SMALL.model_copy(update={"head": SMALL.head.model_copy(update={"mask_margin_px": margin, "detections": 1})})
-        )
 
-    def _proposals(self, logits, codes):
-        return np.array([[self.box]], np.float32)
+def _seeing_a_disc(margin: float):
+    """Return a fake network that sees the disc and answers with its one box. margin: of the masks, px."""
 
-    def _on_boxes(self, levels, boxes, training):
-        return np.array([[[0, 5]]], np.float32), np.zeros((1, 1, 4), np.float32)
+    class SeesADisc(MaskRCNN):
+        def _proposals(self, logits, codes):
+            return np.array([[BOX]], np.float32)
 
-    def _masks(self, levels, boxes, training):
-        y0, x0, y1, x1 = np.asarray(boxes)[0, 0]
-        parts = (np.arange(28) + 0.5) / 28
-        return self.inside(y0 + parts * (y1 - y0), x0 + parts * (x1 - x0))[None, None].astype(np.float32)
+        def _on_boxes(self, levels, boxes, training):
+            return np.array([[[0, 5]]], np.float32), np.zeros((1, 1, 4), np.float32)
 
-    def inside(self, y, x):
-        """Return how far inside the disc the points lie, px (len(y), len(x))."""
-        return self.radius - np.hypot(y[:, None] - self.centre[0], x - self.centre[1])
+        def _masks(self, levels, boxes, training):
+            y0, x0, y1, x1 = np.asarray(boxes)[0, 0]
+            parts = (np.arange(28) + 0.5) / 28
+            return _inside(y0 + parts * (y1 - y0), x0 + parts * (x1 - x0))[None, None].astype(np.float32)
+
+    head = SMALL.head.model_copy(update={"mask_margin_px": margin, "detections": 1})
+    return SeesADisc(SMALL.model_copy(update={"head": head}))
 
 
 @pytest.mark.parametrize("margin", [0, 2])
@@ -254,13 +260,13 @@ def test_a_mask_is_cut_at_the_margin_around_its_box(margin, eager):
 
     Pixels whose centres lie within a tenth of a pixel of the disc's edge may be in or out.
     """
-    model = _SeesADisc(margin)
+    model = _seeing_a_disc(margin)
     (found,) = detect(model, np.random.default_rng(1).normal(0, 0.01, (SIDE, SIDE)).astype(np.float32))
     mask = np.zeros((SIDE, SIDE), bool)
     top, bottom, left, right = found.bounds
     mask[top:bottom, left:right] = found.mask
     at = np.arange(SIDE) + 0.5
-    inside, held = model.inside(at, at), np.zeros_like(mask)
+    inside, held = _inside(at, at), np.zeros_like(mask)
     held[35 - margin : 45 + margin, 56 - margin : 66 + margin] = True
     sure = np.abs(inside) > 0.1
     assert_array_equal(mask[sure], ((inside > 0) & held)[sure])
@@ -269,7 +275,7 @@ def test_a_mask_is_cut_at_the_margin_around_its_box(margin, eager):
 
 def test_scores_are_shifted_by_the_size_of_the_box(eager):
     """The log odds are 5 for a box of 10 px, less 0.5 for each doubling of the size."""
-    model = _SeesADisc(1.0)
+    model = _seeing_a_disc(1.0)
     model.config = model.config.model_copy(update={"head": model.config.head.model_copy(update={"score_per_doubling": -0.5})})
     answer = model.predict_on_batch({"image": np.zeros((1, SIDE, SIDE, 2), np.float32)})
     assert answer["scores"][0, 0] == pytest.approx(1 / (1 + np.exp(-5 + 0.5 * np.log2(10 / 16))), rel=1e-6)
@@ -301,9 +307,9 @@ def _square(number: int, side: int, score: float) -> dict:
 
 
 def test_boxes_stay_as_found_where_masks_have_a_margin(eager):
-    model = _SeesADisc(1.5)
+    model = _seeing_a_disc(1.5)
     answer = model.predict_on_batch({"image": np.zeros((1, SIDE, SIDE, 2), np.float32)})
-    assert_allclose(answer["boxes"][0, 0], model.box, rtol=1e-5)
+    assert_allclose(answer["boxes"][0, 0], BOX, rtol=1e-5)
     assert_allclose(answer["mask_boxes"][0, 0], (33.5, 54.5, 46.5, 67.5), rtol=1e-5)
 
 
@@ -313,8 +319,6 @@ def test_the_backbones_are_the_papers(name, millions):
 
     The first layer has one channel instead of three.
     """
-    from pipeline.detection.network.backbone import feature_pyramid
-
     model = feature_pyramid(name, 64, 1, 256)
     backbone = sum(
         int(np.prod(weight.shape)) for weight in model.weights if "lateral" not in weight.path and "pyramid_" not in weight.path

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import keras
 import numpy as np
 import pytest
-import tensorflow as tf
 from test_model import SMALL, make_set
 
 from pipeline.detection.inference import weights
 from pipeline.detection.network.config import TrainConfig, TrainingConfig
 from pipeline.detection.network.keras_backend import computing_precision
-from pipeline.detection.training.training import train
 from scene.common.errors import InputError
 
 _FLAGS = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""
@@ -22,6 +19,8 @@ bfloat16_processor = pytest.mark.skipif("avx512_bf16" not in _FLAGS, reason="thi
 
 def _error_of_a_product() -> float:
     """Return the largest relative error of a compiled convolution of positive numbers."""
+    import tensorflow as tf
+
     random = np.random.default_rng(1)
     image, kernel = random.uniform(1, 2, (2, 32, 32, 16)), random.uniform(1, 2, (3, 3, 16, 16))
     convolved = tf.function(lambda x, k: tf.nn.relu(tf.nn.conv2d(x, k, 1, "VALID")))
@@ -40,6 +39,8 @@ def test_products_have_eight_bits_inside_and_all_of_them_outside():
 
 
 def test_another_backend_is_refused(monkeypatch):
+    import keras
+
     monkeypatch.setattr(keras.backend, "backend", lambda: "jax")
     with pytest.raises(InputError, match=r"training\.precision.*tensorflow"), computing_precision("bfloat16"):
         pass
@@ -51,6 +52,8 @@ def test_another_backend_is_refused(monkeypatch):
 @pytest.mark.slow
 def test_a_training_in_bfloat16_has_the_losses_of_one_in_float32(tmp_path):
     """They agree to a hundredth of the initial losses; weights are saved in float32."""
+    from pipeline.detection.training.training import train
+
     make_set(tmp_path / "set" / "train", 4, 1)
     make_set(tmp_path / "set" / "val", 2, 2)
     short = {"batch": 2, "warm_up_steps": 2, "epochs": 2, "learning_rate": 1e-3}

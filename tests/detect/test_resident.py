@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -15,11 +14,19 @@ from test_model import make_set
 
 from pipeline.detection.network.config import DetectorConfig, NormalisationConfig, TrainConfig, TrainingConfig
 from pipeline.detection.network.data import CocoFolder, cut_window, mirrored, network_input
-from pipeline.detection.training.resident import cut_on_device, load_resident_set, mirrored_window
-from pipeline.detection.training.training import train
 from scene.common.errors import InputError
 
 FIXED = DetectorConfig(image_px=128, most_blocks=8, normalisation=NormalisationConfig(method="fixed"))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _network() -> None:
+    """Import what needs Keras only where a test runs, as TensorFlow takes seconds to import."""
+    global cut_on_device, jnp, load_resident_set, mirrored_window, train
+    import jax.numpy as jnp
+
+    from pipeline.detection.training.resident import cut_on_device, load_resident_set, mirrored_window
+    from pipeline.detection.training.training import train
 
 
 class _At:

@@ -57,4 +57,8 @@ def test_times_that_run_backwards() -> None:
     times = [EpochTime(parsed_time(text, ""), "") for text in ("2026-03-01", "2026-02-01")]
     with pytest.raises(InputError, match=r"b \(2026-02-01 00:00\) is earlier than a"):
         check_order(times, ["a", "b"])
+    with pytest.raises(InputError, match="which is the reference; make the earliest epoch the reference"):
+        check_order(times, ["a", "b"])
+    with pytest.raises(InputError, match="which comes before it; give the epochs in the order"):
+        check_order([times[1], *times], ["0", "a", "b"])
     check_order([times[0], EpochTime(None, ""), times[0]], ["a", "b", "c"])

@@ -101,18 +101,15 @@ def test_each_key_is_explained() -> None:
     assert found["length_m"] == "its length [m]", "the unit twice"
 
 
-def inits() -> dict[str, str]:
-    """Return the configs that `scarpsim init` writes."""
-    sites = sorted(path.stem for path in (configs_folder() / "sites").glob("*.yaml"))
-    return {site or "demo": simulation_text(site, None) for site in (None, *sites)} | {
-        f"{site}, {scanner}": simulation_text(site, scanner)
-        for site, scanner in ((None, "zf_5016"), ("glendale", "riegl_vz400i"))
-    }
+SITES = sorted(path.stem for path in (configs_folder() / "sites").glob("*.yaml"))
+INITS = [*((site, None) for site in (None, *SITES)), (None, "zf_5016"), ("glendale", "riegl_vz400i")]
+"""Sites and scanners for which `scarpsim init` writes a config; None: those of the demo."""
 
 
-@pytest.mark.parametrize(("name", "text"), inits().items(), ids=inits().keys())
-def test_all_comments_of_init_can_become_keys(name: str, text: str) -> None:
+@pytest.mark.parametrize(("site", "scanner"), INITS, ids=[f"{site or 'demo'}, {scanner}" for site, scanner in INITS])
+def test_all_comments_of_init_can_become_keys(site: str | None, scanner: str | None) -> None:
     """All at once, without changing the config; then every key of the model is present."""
+    text, name = simulation_text(site, scanner), f"{site}, {scanner}"
     short, whole = parse_yaml(text), parse_yaml(COMMENTED.sub(r"\1", text))
     assert parse(SimulationConfig, whole, name) == parse(SimulationConfig, short, name)
     assert set(whole) == set(SimulationConfig.model_fields)

@@ -78,7 +78,7 @@ def test_noise_that_falls_with_intensity_is_named(tmp_path: Path) -> None:
 
 
 def test_a_jump_in_azimuth_is_unknown(tmp_path: Path) -> None:
-    found = found_in(tmp_path, 18, ranges=lambda scan: scan.R + 0.002 * np.where(scan.az > 1.6, 1.0, -1.0))
+    found = found_in(tmp_path, 18, step_rad=0.013, ranges=lambda scan: scan.R + 0.003 * np.where(scan.az > 1.6, 1.0, -1.0))
     assert found.verdict == "unknown"
     assert found.effects[0].kind == "empirical"
     assert "depends on" in paragraph(found, rank_disagreements(found))
@@ -122,13 +122,26 @@ def test_too_few_points_are_no_data(tmp_path: Path) -> None:
 
 
 def test_the_corrected_model_leaves_no_gap_and_files_are_as_promised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A bias by the incidence is named beside a rockfall, which is no effect of the sensor."""
     case, out = tmp_path / "case", tmp_path / "out"
     case.mkdir()
-    write_scan(case, 8, ranges=lambda scan: scan.R + 0.008 * (1 / scan.cos_i - 1), intensity=False, step_rad=0.011)
+    write_scan(
+        case,
+        8,
+        ranges=lambda scan: scan.R + 0.008 * (1 / scan.cos_i - 1),
+        fall=(20.0, 12.0, 0.4),
+        intensity=False,
+        step_rad=0.011,
+    )
     assert main(["gap", str(case), "--out", str(out)]) == 0
     result = json.loads((out / "gap.json").read_text())
     assert result["verdict"] == "named"
     assert result["effects"][0]["name"] == "tls.range_incidence_bias"
+    (change,) = result["scene_changes"]
+    x0, _, z0, x1, _, z1 = change["bbox_m"]
+    assert x0 - 0.5 < 20.0 < x1 + 0.5
+    assert z0 - 0.5 < 12.0 < z1 + 0.5
+    assert 0.2 < change["volume_m3"] < 1.2  # 1.2 x 1.2 x 0.4 m
     assert "intensity" in result["remaining"]["note"]
     hidden = {each["name"]: each for each in result["detectable"]}
     assert "tls.range_incidence_bias" not in hidden

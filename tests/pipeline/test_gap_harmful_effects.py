@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -42,14 +43,20 @@ def _validation(folder: Path, ranges: Callable[[Scan], Array]) -> Validation:
     )
 
 
+@pytest.fixture(scope="module")
+def validation_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[float], Validation]:
+    """`_validation` of a bias by the incidence, once for each coefficient."""
+    return cache(lambda coefficient_m: _validation(tmp_path_factory.mktemp("biased"), _biased(coefficient_m)))
+
+
 def _named(name: str, key: str, value: float) -> NamedEffect:
     return NamedEffect(f"tls.{name}", "physical", {"name": name, key: value}, {}, (), 0.001, 10.0)
 
 
-def test_a_harmful_effect_is_taken_out_and_a_true_one_stays(tmp_path: Path) -> None:
+def test_a_harmful_effect_is_taken_out_and_a_true_one_stays(validation_of: Callable[[float], Validation]) -> None:
     """Beside a true effect a noise of ten times the true one is named that is not there."""
     true, wrong = _named("range_incidence_bias", "coefficient_m", 0.01), _named("range_noise", "sigma_m", 0.03)
-    result, words = _validation(tmp_path, _biased(0.01)).validate([wrong, true])
+    result, words = validation_of(0.01).validate([wrong, true])
     assert result.named == [true]
     assert words == ["tls.range_noise dropped: the model predicts worse with it"]
     assert result.gap is not None
@@ -66,18 +73,18 @@ def test_a_harmful_effect_is_taken_out_and_a_true_one_stays(tmp_path: Path) -> N
     ],
 )
 def test_an_effect_that_does_little_harm_is_taken_out_too(
-    tmp_path: Path, name: str, key: str, value: float, kind: str, kept: int
+    validation_of: Callable[[float], Validation], name: str, key: str, value: float, kind: str, kept: int
 ) -> None:
     """An effect that does slight harm is dropped, and so is an empirical term that does clear harm.
 
     Noise that is half as large again does no more harm than chance would, and is dropped whether it has a name or not. An effect
     of that size that is real stays.
     """
-    result, _ = _validation(tmp_path, _biased(0.003)).validate([replace(_named(name, key, value), kind=kind)])
+    result, _ = validation_of(0.003).validate([replace(_named(name, key, value), kind=kind)])
     assert len(result.named) == kept
 
 
-def test_drops_are_no_harm_to_ranges_on_the_wall(tmp_path: Path) -> None:
+def test_drops_are_no_harm_to_ranges_on_the_wall(validation_of: Callable[[float], Validation]) -> None:
     """Early returns from rain do no harm to the score of ranges on the wall.
 
     A fifth of what rain removes comes back from drops before the wall, which say nothing about ranges on the wall.
@@ -85,7 +92,7 @@ def test_drops_are_no_harm_to_ranges_on_the_wall(tmp_path: Path) -> None:
     true = _named("range_incidence_bias", "coefficient_m", 0.01)
     rain = {"name": "precipitation", "rate_per_m": 2e-3, "early_share": 0.2}
     drops = replace(_named("precipitation", "rate_per_m", 2e-3), entry=rain)
-    validation = _validation(tmp_path, _biased(0.01))
+    validation = validation_of(0.01)
     alone, _ = validation.validate([true])
     result, words = validation.validate([true, drops])
     assert (result.named, words) == ([true, drops], [])
@@ -93,12 +100,12 @@ def test_drops_are_no_harm_to_ranges_on_the_wall(tmp_path: Path) -> None:
     assert [effect.name for effect in result.model.effects] == ["range_incidence_bias", "precipitation"]
 
 
-def test_harm_is_that_of_the_same_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_harm_is_that_of_the_same_points(validation_of: Callable[[float], Validation], monkeypatch: pytest.MonkeyPatch) -> None:
     """An effect brings points near that were too far off to count: without it all of these score 7 mm, with it 3.
 
     That the others score 1 mm alone, and a few validation edges score worse, does not count against it.
     """
-    validation = _validation(tmp_path, _biased(0.003))
+    validation = validation_of(0.003)
     with_it, alone = {True: (0.009, 0.011), False: (0.007, 0.003)}, {True: (0.001, 0.001), False: (0.001, 0.001)}
 
     def scored(self: Validation, named: list[NamedEffect], versions: object, rows: np.ndarray) -> Gap:

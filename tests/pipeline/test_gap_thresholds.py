@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import json
 import re
 from pathlib import Path
@@ -18,6 +19,7 @@ from pipeline.gap.thresholds import Thresholds, read_thresholds, thresholds, use
 GAP = Path(__file__).parents[2] / "pipeline" / "gap"
 
 
+@functools.cache
 def _read() -> set[tuple[str, str]]:
     """Return the thresholds that code reads, from its syntax tree.
 
@@ -36,7 +38,6 @@ def _read() -> set[tuple[str, str]]:
     return found
 
 
-READ = _read()
 EVERY = [(group, key) for group, found in Thresholds().model_dump().items() for key in found]
 
 
@@ -54,7 +55,7 @@ def test_each_says_its_unit_what_it_decides_and_where_it_comes_from(group: str, 
 @pytest.mark.parametrize(("group", "key"), EVERY)
 def test_each_is_used_by_the_diagnosis(group: str, key: str) -> None:
     """A threshold that nothing reads would decide nothing."""
-    assert (group, key) in READ
+    assert (group, key) in _read()
 
 
 def test_thresholds_hold_within_the_block_that_sets_them() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import open3d
 import pytest
 import trimesh
 from format_cases import UTM, a_cloud, a_mesh
@@ -40,6 +39,8 @@ def test_ply_mesh_round_trip_is_exact(tmp_path: Path, mesh: TriangleMesh) -> Non
 
 
 def test_ply_mesh_in_trimesh_and_open3d(tmp_path: Path, mesh: TriangleMesh) -> None:
+    import open3d  # takes a second
+
     path = tmp_path / "a.ply"
     write_ply(path, mesh)
     theirs = trimesh.load(path, process=False)
@@ -52,6 +53,8 @@ def test_ply_mesh_in_trimesh_and_open3d(tmp_path: Path, mesh: TriangleMesh) -> N
 
 def test_ply_of_trimesh_and_open3d(tmp_path: Path, mesh: TriangleMesh) -> None:
     """Their float32 resolves UTM coordinates only to 0.25 m, so local coordinates are compared."""
+    import open3d
+
     local = mesh.vertices - UTM
     for encoding in ("ascii", "binary_little_endian"):
         data = trimesh.Trimesh(local, mesh.faces, process=False).export(file_type="ply", encoding=encoding.split("_")[0])

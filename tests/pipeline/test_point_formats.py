@@ -9,7 +9,6 @@ from typing import Any
 
 import laspy
 import numpy as np
-import open3d as o3d
 import pye57
 import pytest
 from scipy.spatial.transform import Rotation
@@ -203,6 +202,8 @@ def test_xyz_gives_back_every_channel(tmp_path: Path, cloud: PointCloud) -> None
 
 
 def test_xyz_is_read_by_open3d(tmp_path: Path, cloud: PointCloud) -> None:
+    import open3d as o3d
+
     write_xyz(tmp_path / "a.xyz", PointCloud(cloud.points))
     path = tmp_path / "bare.xyz"
     path.write_text((tmp_path / "a.xyz").read_text().split("\n", 1)[1])

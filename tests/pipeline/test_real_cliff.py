@@ -8,7 +8,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import open3d
 import pytest
 import trimesh
 
@@ -44,6 +43,8 @@ def seen() -> dict[str, Observation]:
 
 
 def _true_ranges(state: str, origin: FloatArray, rays: FloatArray) -> FloatArray:
+    import open3d
+
     mesh = trimesh.load(DATA / f"{state}.ply", process=False)
     scene = open3d.t.geometry.RaycastingScene()
     vertices = (np.asarray(mesh.vertices) - origin).astype(np.float32)

@@ -322,10 +322,10 @@ def test_heavy_tailed_noise_has_its_standard_deviation_kurtosis_and_grain() -> N
 
 
 def random_relief(seed: int) -> FloatArray:
-    """Return disparities (30, 40) with smooth parts, steps and unmatched cells."""
+    """Return disparities (20, 30) with smooth parts, steps and unmatched cells."""
     random = np.random.default_rng(seed)
-    relief = np.cumsum(random.uniform(-0.5, 0.5, (30, 40)), axis=1) + 8.0 * (
-        cv2.blur(random.uniform(0, 1, (30, 40)), (7, 7)) > 0.5
+    relief = np.cumsum(random.uniform(-0.5, 0.5, (20, 30)), axis=1) + 8.0 * (
+        cv2.blur(random.uniform(0, 1, (20, 30)), (7, 7)) > 0.5
     )
     relief[random.uniform(0, 1, relief.shape) < 0.15] = np.nan
     relief[5, :12], relief[9, :] = np.nan, np.nan
