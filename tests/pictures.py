@@ -27,9 +27,14 @@ def command(name: str, *words: str) -> list[str]:
     return [sys.executable, "-c", program, *words]
 
 
-def write_blank(_: object, file: Any, **__: Any) -> None:
+def write_blank(canvas: Any, file: Any, **_: Any) -> None:
     """Write a blank picture in place of a figure, like Matplotlib's `FigureCanvasAgg.print_png`."""
-    file.write(BLANK)
+    from matplotlib.cbook import open_file_cm
+
+    if "draw" in vars(canvas.figure):  # Matplotlib replaces it where it only asks for a renderer
+        canvas.figure.draw(canvas.get_renderer())
+    with open_file_cm(file, "wb") as opened:
+        opened.write(BLANK)
 
 
 def leave_blank() -> None:

@@ -14,6 +14,8 @@ from benchmarks.bad_inputs.case import Case, tried
 from benchmarks.bad_inputs.materials import make_materials
 from benchmarks.bad_inputs.run import all_cases, listed_cases, said
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 AT_THE_DOOR = (
     "ev: ",
     "det: tiff",

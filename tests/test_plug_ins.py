@@ -13,6 +13,8 @@ import pytest
 from scene.common.errors import InputError
 from scene.common.plug_ins import load_plug_ins
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 ROOT = Path(__file__).parents[1]
 MODULE = """
 from dataclasses import replace

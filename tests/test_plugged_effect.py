@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 EFFECT = '''
 """Range error of a scanner that warms up."""
 

@@ -25,6 +25,8 @@ from pipeline.monitoring.stable_measurement import build_from_monitoring
 from scene.geometry.mesh import FloatArray
 from sensors.models.sensor_model import TlsModel, TlsNoise
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 POSITION = np.array([float(each) for each in STATION.split()])
 STEP_RAD = 0.0022
 COEFFICIENT_M = 0.008

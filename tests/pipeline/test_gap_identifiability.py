@@ -15,6 +15,8 @@ from pipeline.config.simulation import load_config
 from pipeline.gap.survey.identifiability import Identifiability, format_table, identifiability
 from pipeline.gap.survey.survey_views import planned_survey
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 POSITION = np.array([WIDTH * 0.42, -34.0, 2.5])
 SIGMA = 0.003
 
