@@ -87,7 +87,7 @@ def _pieces(folder: Path) -> None:
 
 
 _RING = np.linspace(0, 6.28, 20_000)
-"""Directions of the corners of a stable area, rad."""
+"""Angles at which the corners of a round stable area lie about its centre, rad."""
 _GAP: dict[str, Change] = {
     "epochs: one in mm": _epochs(_same, lambda found: 1000 * found),
     "epochs: one NaN": _epochs(_same, lambda found: found * NAN),

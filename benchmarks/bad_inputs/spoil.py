@@ -38,7 +38,7 @@ def both(*changes: Change) -> Change:
 
 
 def text(name: str, content: str | bytes | Callable[[], str | bytes]) -> Change:
-    """Replace the content of a file; content: a function where it is large, so that importing the cases does not make it."""
+    """Replace the content of a file. content: the new content, or a function that makes it if it is large."""
 
     def change(folder: Path) -> None:
         made = content() if callable(content) else content
@@ -49,7 +49,10 @@ def text(name: str, content: str | bytes | Callable[[], str | bytes]) -> Change:
 
 
 def put(name: str, /, **values: Any) -> Change:
-    """Set values of a YAML or JSON file at places such as `a__b__0`; GONE removes a key, a function makes a large value."""
+    """Set values of a YAML or JSON file: `a__b__0` is item 0 of list b in mapping a.
+
+    The value GONE removes a key. A large value is given as a function that makes it.
+    """
 
     def change(folder: Path) -> None:
         path = folder / name

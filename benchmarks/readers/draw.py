@@ -16,7 +16,6 @@ import random
 import statistics
 import sys
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -159,10 +158,9 @@ class _WithTexts(ast.NodeTransformer):
         return self._texts.get(node.id, node)
 
 
-@cache
 @functools.cache
 def everything() -> dict[str, list[dict[str, str]]]:
-    """Return all that can be drawn, by kind."""
+    """Return the definitions, pages and messages of the repository from which the readers' samples are drawn, by kind."""
     return {"definition": list(definitions()), "page": list(pages()), "message": list(messages())}
 
 

@@ -236,7 +236,7 @@ def _inside(y, x):
 
 
 def _seeing_a_disc(margin: float):
-    """Return a fake network that sees the disc and answers with its one box. margin: of the masks, px."""
+    """Return a stand-in for the network, which finds one box around the disc. margin: width added around masks, px."""
 
     class SeesADisc(MaskRCNN):
         def _proposals(self, logits, codes):

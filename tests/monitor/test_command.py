@@ -158,7 +158,7 @@ def test_an_error_in_a_worker_is_one_line(scans: Path, tmp_path: Path, capsys: p
 def test_an_error_of_map_on_workers_is_one_line(
     scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An epoch's error travels from its worker as bytes; here the worker is this process."""
+    """A worker sends its error to the main process as pickled bytes. Here this process plays the worker."""
 
     def here(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], count: int) -> Iterator[Any]:
         assert count == 2

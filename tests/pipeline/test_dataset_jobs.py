@@ -76,7 +76,7 @@ KILLS: list[tuple[Callable[[Path], bool], int]] = [
     (lambda out: any((out / ".staging").glob("*/*/*.tif")) and any((out / "shards").glob("*.json")), 0),
     (lambda out: len(list((out / "shards").glob("*.json"))) >= 2, 2),
 ]
-"""Moment of the kill, by the set's folder, and number of workers."""
+"""Cases: a condition on the folder of the data set, at which the job is killed, and the number of workers."""
 
 
 @pytest.mark.parametrize("kills", [KILLS[:1], KILLS], ids=["alone", "then with workers"])
