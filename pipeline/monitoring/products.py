@@ -22,7 +22,7 @@ from pipeline.formats.records.geopackage import write_geopackage
 from pipeline.monitoring.events import ChangedRegion
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.outlines import in_survey
-from pipeline.monitoring.reading import EpochData, EpochSource
+from pipeline.monitoring.reading import EpochData, EpochSource, in_pieces
 from pipeline.monitoring.records import EpochRecord
 from pipeline.monitoring.site import ReferenceSite, WallView
 from pipeline.registration.rigid import RigidTransform
@@ -175,8 +175,8 @@ def write_points(epoch: Followed, data: EpochData, site: ReferenceSite, out: Pat
         return world, {"distance_m": values[:, 0], "lod_m": values[:, 1], "event": event}
 
     header = LazHeader(scale_m=_SCALE_M, wkt=data.crs)
-    pieces = (chunk[start : start + _WRITTEN] for chunk in data.chunks() for start in range(0, len(chunk), _WRITTEN))
-    write_chunks(out / f"epoch_{epoch.number:03d}.laz", data.bounds, map(registered, pieces), header)
+    pieces = map(registered, in_pieces(data.chunks(), _WRITTEN))
+    write_chunks(out / f"epoch_{epoch.number:03d}.laz", data.bounds, pieces, header)
 
 
 @dataclass(frozen=True)

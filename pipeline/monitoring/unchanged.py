@@ -78,7 +78,9 @@ def quieter_scatter(values: NDArray[np.floating]) -> float:
 
 def _changed(means: dict[int, NDArray[np.float32]], unchanged: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(h, w) changed places by the noise of the pixels that are unchanged as far as is known."""
-    scatter = {side: _scatter_on(mean, unchanged) for side, mean in means.items()}
+    places = np.flatnonzero(unchanged)
+    places = places[:: max(len(places) // _SAMPLE, 1)]
+    scatter = {side: _scatter(mean.ravel()[places]) for side, mean in means.items()}
     changed = np.zeros(unchanged.shape, dtype=bool)
     for sign in (1.0, -1.0):
         begun = np.zeros(unchanged.shape, dtype=bool)
@@ -105,11 +107,9 @@ def _dilated(changed: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return ndimage.maximum_filter(changed.view(np.uint8), side, mode="constant").view(bool)
 
 
-def _scatter_on(mean: NDArray[np.float32], unchanged: NDArray[np.bool_]) -> float:
-    """Scatter of means on the pixels that are unchanged, of a subset of evenly spaced ones where they are many."""
-    places = np.flatnonzero(unchanged)
-    values = mean.ravel()[places[:: max(len(places) // _SAMPLE, 1)]]
-    return quieter_scatter(values[np.isfinite(values)])
+def _scatter(means: NDArray[np.float32]) -> float:
+    """Scatter of means on pixels that are unchanged; NaN is left out."""
+    return quieter_scatter(means[np.isfinite(means)])
 
 
 def _mean_over_squares(standard: NDArray[np.floating], side: int) -> NDArray[np.float32]:
