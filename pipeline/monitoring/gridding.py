@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.monitoring.raster_statistics import quantiles
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray
 
@@ -167,7 +168,7 @@ def _fitted(sums: FloatArray, grid: Grid) -> HeightRaster:
         freedom[band] = around[0] - 3
         height[band], scatter[band], slope_x[band], slope_y[band], leverage[band] = _planes(around)
     known = np.isfinite(height)
-    usual = float(np.median(scatter[known] / freedom[known])) if known.any() else 0.0
+    usual = float(quantiles(scatter[known] / freedom[known], [0.5])[0]) if known.any() else 0.0
     scatter = np.sqrt((scatter + np.float32(_PRIOR_POINTS * usual)) / (freedom + np.float32(_PRIOR_POINTS)))
     slopes = slope_x / np.float32(grid.gsd), slope_y / np.float32(grid.gsd)
     return HeightRaster(grid, height, scatter * np.sqrt(leverage), scatter, *slopes, sums[:, :, 0].astype(np.int32))

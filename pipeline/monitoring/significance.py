@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from pipeline.monitoring.raster_statistics import quantiles
 from scene.geometry.mesh import FloatArray
 
 NORMAL_95 = 1.959964
@@ -105,9 +106,9 @@ def significance(difference: NDArray[np.float32], predicted: NDArray[np.float32]
 
 def _sigma_with_tails(means: NDArray[np.float64]) -> float:
     """Largest of the standard deviations that quantiles tell, from the median on outwards: noise has long tails at edges."""
-    apart = np.abs(means - np.median(means))
+    apart = np.abs(means - quantiles(means, [0.5]))
     known = [quantile for quantile in _QUANTILES if (1 - quantile) * len(apart) >= 1]
-    found = np.quantile(apart, known) / ndtri((1 + np.array(known)) / 2)
+    found = quantiles(apart, known) / ndtri((1 + np.array(known)) / 2)
     return float(max(min(found.max(), _LONGEST_TAIL * found[0]), 1e-3))
 
 
@@ -117,13 +118,13 @@ def _factor(difference: NDArray[np.float32], predicted: NDArray[np.float32], sta
     order = np.argsort(of)
     of, ratio = of[order], (np.abs(difference[stable]) / of)[order]
     classes = int(np.clip(len(ratio) // _FEWEST_IN_CLASS, 1, _CLASSES))
-    edges = np.quantile(of, np.linspace(0, 1, classes + 1))
+    edges = quantiles(of, np.linspace(0, 1, classes + 1), ordered=True)
     begins, ends = np.searchsorted(of, edges[:-1], "left"), np.searchsorted(of, edges[1:], "right")
     middle, quantile = [], []
     for begin, end in zip(begins, ends, strict=True):
         if end > begin:
-            middle.append(float(np.median(of[begin:end])))
-            half, most = np.quantile(ratio[begin:end], [0.5, 0.95])
+            middle.append(float(quantiles(of[begin:end], [0.5], ordered=True)[0]))
+            half, most = quantiles(ratio[begin:end], [0.5, 0.95])
             quantile.append(float(max(min(most, _LONGEST_TAIL * NORMAL_95 * half / MEDIAN), _LEAST_FACTOR)))
     return np.interp(predicted, middle, quantile).astype(np.float32)
 

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.special import ndtri
 
+from pipeline.monitoring.raster_statistics import dilated, mean_over_squares, quantiles
+
 _SQUARES_PX = (3, 5, 9)
 """Sides of the squares over which means are taken: more than the 3 pixels that share points."""
 _CHANGED = 4.0
@@ -53,7 +55,7 @@ def unchanged_pixels(standard: NDArray[np.floating], candidates: NDArray[np.bool
     means = {side: _mean_over_squares(standard, side) for side in _SQUARES_PX}
     for _ in range(_ROUNDS):
         before = unchanged
-        unchanged = candidates & ~_dilated(_changed(means, unchanged))
+        unchanged = candidates & ~dilated(_changed(means, unchanged), _MARGIN_PX)
         if np.count_nonzero(unchanged) < _FEWEST:
             return before
         if np.count_nonzero(before != unchanged) <= _SETTLED * before.size:
@@ -72,7 +74,7 @@ def quieter_scatter(values: NDArray[np.floating]) -> float:
     if not sides:
         return float(np.sqrt(np.mean(values**2))) if len(values) else np.inf
     normal = ndtri((1 + np.array(_QUANTILES)) / 2)
-    found = [np.quantile(side, _QUANTILES) / normal for side in sides]
+    found = [quantiles(side, _QUANTILES) / normal for side in sides]
     return float(min(min(each.max(), _LONGEST_TAIL * each[0]) for each in found))
 
 
@@ -101,12 +103,6 @@ def _connected_with(begun: NDArray[np.bool_], reached: NDArray[np.bool_]) -> NDA
     return np.asarray(wanted[labels])
 
 
-def _dilated(changed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(h, w) changed places with a margin of `_MARGIN_PX`, as a binary dilation gives them more slowly."""
-    side = 2 * _MARGIN_PX + 1
-    return ndimage.maximum_filter(changed.view(np.uint8), side, mode="constant").view(bool)
-
-
 def _scatter(means: NDArray[np.float32]) -> float:
     """Scatter of means on pixels that are unchanged; NaN is left out."""
     return quieter_scatter(means[np.isfinite(means)])
@@ -115,6 +111,6 @@ def _scatter(means: NDArray[np.float32]) -> float:
 def _mean_over_squares(standard: NDArray[np.floating], side: int) -> NDArray[np.float32]:
     """(h, w) means over squares about each pixel; NaN where less than half of the square has data."""
     known = np.isfinite(standard)
-    share = ndimage.uniform_filter(known.astype(np.float32), side)
-    total = ndimage.uniform_filter(np.where(known, standard, 0.0).astype(np.float32), side)
+    share = mean_over_squares(known.astype(np.float32), side)
+    total = mean_over_squares(np.where(known, standard, 0.0).astype(np.float32), side)
     return np.where(known & (share > _FILLED), total / np.maximum(share, 1e-9), np.nan)
