@@ -323,14 +323,9 @@ def _select_and_validate(
         if again.named:
             return replace(again, words=[*words, *(each for each in again.words if each not in words)])
     words += [f"{item.name} mentioned but not named: beside the other effects {describe_weakness(item)}" for item in scored.weak]
-    described = [item.gain for item in scored.named if item.name.endswith("_empirical")]
-    least = thresholds().validation.leftover_share * max(described, default=0.0)
-    left = [item for item in scored.named if item.adds_variance and item.gain < least]
-    words += [f"{item.name} dropped: it only describes the misfit of the empirical term" for item in left]
     rows_of_tails = subsample_rows(np.flatnonzero(given.stable & ~given.held_out))
-    kept = [item for item in scored.named if item not in left]
     fewer, _ = subsample(aligned, given.residuals, rows_of_tails)
-    found, tails = _with_heavy_tails(fewer, kept, given.cells.side_m)
+    found, tails = _with_heavy_tails(fewer, scored.named, given.cells.side_m)
     words += [tails.note] if tails else []
     return _ValidatedSelection(given, selection, losses, with_separating_measurements(aligned, found), tails, words)
 
