@@ -158,9 +158,6 @@ class LockingThresholds(ThresholdGroup):
         "make them crowd too.",
         DEVELOPMENT,
     )
-    most_noise: PositiveFloat = threshold_field(
-        0.35, "px", "Largest standard deviation of matching noise that is fitted; more noise hides any crowding.", JUDGEMENT
-    )
     significance: PositiveFloat = threshold_field(
         1e-4, "probability", "Significance level: crowding that chance makes more often is not reported.", JUDGEMENT, lt=1
     )
@@ -281,12 +278,6 @@ class MissingReturnsThresholds(ThresholdGroup):
         "cases without losses by direction is 0.73, the lowest of 3 sectors 0.96.",
         DEVELOPMENT,
     )
-    early_sigmas: PositiveFloat = threshold_field(
-        8.0,
-        "standard deviations",
-        "A return counts as early, possibly from a drop, if it lies this far before the surface.",
-        JUDGEMENT,
-    )
     early_m: PositiveFloat = threshold_field(
-        0.5, "m", "A return counts as early if it also lies this far before the surface.", JUDGEMENT
+        0.5, "m", "A return counts as early, possibly from a drop, if it lies this far before the surface.", JUDGEMENT
     )

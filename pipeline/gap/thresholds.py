@@ -164,13 +164,6 @@ class MeanThresholds(ThresholdGroup):
         "A wave that is no effect of the catalogue must be at least this large, or it is attributed to the reference.",
         JUDGEMENT,
     )
-    same_covariate: PositiveFloat = threshold_field(
-        0.95,
-        "absolute correlation",
-        "Covariates with a higher correlation count as one covariate for non-parametric terms.",
-        JUDGEMENT,
-        lt=1,
-    )
     refit_share: PositiveFloat = threshold_field(
         0.5,
         "share of the largest log-likelihood ratio",

@@ -437,14 +437,7 @@ def _explain_losses(measurement: Measurement, given: PassInput) -> tuple[LossExp
     if missing is None or any(model_has(measurement, name) for name in LOSS_EFFECTS):
         return None
     held_out = in_validation_blocks(missing.wall_xy, given.cells.side_m)
-    early = (
-        residuals.usable
-        & ~given.changed
-        & (
-            given.registered_residuals
-            < -np.maximum(thresholds().missing_returns.early_sigmas * residuals.sigma, thresholds().missing_returns.early_m)
-        )
-    )
+    early = residuals.usable & ~given.changed & (given.registered_residuals < -thresholds().missing_returns.early_m)
     drops = count_isolated_returns(residuals.wall_xy, early)
     found = explain_missing_returns(missing, ~held_out, drops, len(residuals), measurement.cloud.intensity)
     return None if found is None else (found, held_out)
