@@ -211,7 +211,7 @@ def coarse(surface: ReferenceSurface, points: FloatArray, gsd_m: float, seed: in
     try:
         return register_to(surface, moving, config, KeyedRandom(seed)).transform
     except InputError:
-        away = float(np.median(surface.tree.query(moving - surface.origin)[0]))
+        away = float(np.median(surface.tree.query(moving - surface.origin, 1)[0]))
         raise InputError(
             f"the epoch cannot be registered on the reference: half of its points are more than {away:.3g} m from it",
             where="registration",
