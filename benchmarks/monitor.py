@@ -35,6 +35,7 @@ from pipeline.change.difference import SurfaceRaster, cast_raster  # noqa: E402
 from pipeline.change.m3c2 import M3c2Config, M3c2Map, m3c2  # noqa: E402
 from pipeline.formats.point_cloud import PointCloud  # noqa: E402
 from pipeline.formats.points.laz import read_laz, write_laz  # noqa: E402
+from pipeline.monitoring.alignment import SAME  # noqa: E402
 from pipeline.monitoring.comparison import EpochChange, compare_epoch  # noqa: E402
 from pipeline.monitoring.events import LEAST_PIXELS, SIGNIFICANT, Change, ChangedRegion, region_of_mask  # noqa: E402
 from pipeline.monitoring.options import MonitorOptions  # noqa: E402
@@ -251,7 +252,7 @@ class BothWays:
         change = compare_epoch(site.reference, points[1], None, options.seed)
         surface = SurfaceRaster(grid, raster.height, np.zeros(grid.shape, dtype=np.int32))
         config = M3c2Config(core_step_px=1, cylinder_radius_m=3 * grid.gsd, normal_radius_m=6 * grid.gsd, direction="wall")
-        clouds = [np.concatenate(list(each.chunks())) for each in points]
+        clouds = [np.concatenate(list(each.moved(SAME))) for each in points]
         other = m3c2(clouds[0], change.transform.apply(clouds[1]), surface, surface.block, config)
         return cls(change, other)
 
