@@ -23,7 +23,7 @@ from pydantic import ValidationError
 
 from benchmarks.gap_closed_form.cases import Case, make, plan
 from benchmarks.gap_closed_form.score import score
-from benchmarks.varied import Setting, Varied
+from benchmarks.varied import Setting, WatchedThresholds
 from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.gap.naming.workflow import diagnose
 from pipeline.gap.report.report import to_dict
@@ -32,23 +32,6 @@ from pipeline.gap.thresholds import Thresholds
 Json = dict[str, Any]
 FACTORS = (0.7, 1.4)
 WRONGS = ("false alarm", "wrong name", "missed", "not answered unknown", "called unknown", "no answer")
-
-
-class _Watched:
-    """Thresholds whose values are `Varied`: records which were used, and which would have changed a decision."""
-
-    def __init__(self, values: Any, prefix: str, asked: set[str], matters: set[Setting]) -> None:
-        self._values, self._prefix, self._asked, self._matters = values, prefix, asked, matters
-
-    def __getattr__(self, name: str) -> Any:
-        found = getattr(self._values, name)
-        if name.startswith("model_"):
-            return found
-        if not self._prefix:
-            return _Watched(found, f"{name}.", self._asked, self._matters)
-        key = f"{self._prefix}{name}"
-        self._asked.add(key)
-        return Varied(found, _others(key), self._matters)
 
 
 @functools.cache
@@ -127,7 +110,7 @@ def _usual(folder: Path) -> Json:
     asked: set[str] = set()
     matters: set[Setting] = set()
     measurement = read_measurement(folder / "case")
-    watched: Any = _Watched(Thresholds(), "", asked, matters)
+    watched: Any = WatchedThresholds(Thresholds(), _others, asked, matters)
     found = to_dict(diagnose(measurement, thresholds=watched), measurement)
     (folder / "asked.json").write_text(json.dumps({"asked": sorted(asked), "matters": sorted(matters)}))
     return found

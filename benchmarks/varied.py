@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-Setting = tuple[str, float]
+Setting = tuple[str, Any]
 
 
 class Varied:
@@ -106,3 +106,32 @@ for _name in (*_COMPARISONS, "add", "sub", "mul", "truediv", "floordiv", "mod", 
     _infix(_name)
 for _name in ("neg", "pos", "abs"):
     _prefix(_name)
+
+
+class WatchedThresholds:
+    """Thresholds of `gap` whose values are `Varied`: records which were used, and which settings would change a decision.
+
+    values: the thresholds, or one group of them (with its name and a dot as prefix); others: function from a threshold's
+    group.key to its values under other settings; asked, matters: sets to which used keys and deciding settings are added.
+    """
+
+    def __init__(
+        self,
+        values: Any,
+        others: Callable[[str], dict[Setting, Any]],
+        asked: set[str],
+        matters: set[Setting],
+        prefix: str = "",
+    ) -> None:
+        self._values, self._others, self._asked, self._matters, self._prefix = values, others, asked, matters, prefix
+
+    def __getattr__(self, name: str) -> Any:
+        """Return a group, or the value of a threshold, which is recorded as used."""
+        found = getattr(self._values, name)
+        if name.startswith("model_"):
+            return found
+        if not self._prefix:
+            return WatchedThresholds(found, self._others, self._asked, self._matters, f"{name}.")
+        key = f"{self._prefix}{name}"
+        self._asked.add(key)
+        return Varied(found, self._others(key), self._matters)

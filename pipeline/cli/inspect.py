@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from pipeline.cli.command_output import CommandOutput, record_document
+from pipeline.cli.imports import fast_imports
 from pipeline.cli.parser import add_output_options, at_least, one_of
 
 SUMMARY = "map what a planned set-up achieves: precision, spacing, blind spots, smallest block"
@@ -40,14 +41,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
     """Predict what a set-up of sensors can see (precision, point spacing, smallest block) as maps, and write the report."""
-    from pipeline.config.bundled import config_path
-    from pipeline.config.simulation import load_config
-    from pipeline.formats.files.atomic import empty_folder, new_folder
-    from pipeline.planning.inspect import PLAN_FILE, inspect, write_plans
-    from pipeline.planning.report import summary
-    from pipeline.planning.series import plan_series
-    from pipeline.planning.series_report import series_summary
-    from pipeline.report.progress import shown_progress
+    with fast_imports():
+        from pipeline.config.bundled import config_path
+        from pipeline.config.simulation import load_config
+        from pipeline.formats.files.atomic import empty_folder, new_folder
+        from pipeline.planning.inspect import PLAN_FILE, inspect, write_plans
+        from pipeline.planning.report import summary
+        from pipeline.planning.series import plan_series
+        from pipeline.planning.series_report import series_summary
+        from pipeline.report.progress import shown_progress
 
     config = load_config(config_path("sites", arguments.config), arguments.overrides, arguments.sensor, arguments.seed)
     sensors = [arguments.sensor] if arguments.sensor else config.sensor_names()

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.cli.command_output import CommandOutput, record_document
+from pipeline.cli.imports import fast_imports
 from pipeline.cli.measurement import comma_separated_numbers, comma_separated_words
 from pipeline.cli.parser import add_output_options, at_least, between, one_of
 from scene.common.errors import InputError
@@ -91,12 +92,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> CommandOutput:
     """Compare the measured epochs of a wall with the first one, and write difference maps, events and report."""
-    from pipeline.monitoring.follow import follow
-    from pipeline.monitoring.reading import with_reference
-    from pipeline.monitoring.report import headline
-    from pipeline.monitoring.run import monitor_paths
-    from pipeline.monitoring.write_site import write_site
-    from pipeline.report.progress import shown_progress
+    with fast_imports():
+        from pipeline.monitoring.follow import follow
+        from pipeline.monitoring.reading import with_reference
+        from pipeline.monitoring.report import headline
+        from pipeline.monitoring.run import monitor_paths
+        from pipeline.monitoring.write_site import write_site
+        from pipeline.report.progress import shown_progress
 
     options = _options(arguments)
     paths = with_reference(arguments.reference, arguments.epochs) if arguments.reference else arguments.epochs

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 from pipeline.cli.command_output import CommandOutput, record_document
+from pipeline.cli.imports import fast_imports
 from pipeline.cli.parser import add_output_options, at_least, one_of
 from scene.common.errors import InputError
 
@@ -46,11 +47,12 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
         raise InputError("the option needs the folder of the run to continue", where="--resume", remedy="add --out DIR")
     if arguments.threads:
         _use_threads(arguments.threads)
-    from pipeline.config.bundled import bundled_config, config_path
-    from pipeline.config.simulation import load_config
-    from pipeline.formats.files.atomic import new_folder
-    from pipeline.report.progress import shown_progress
-    from pipeline.run import simulation as pipeline_run
+    with fast_imports():
+        from pipeline.config.bundled import bundled_config, config_path
+        from pipeline.config.simulation import load_config
+        from pipeline.formats.files.atomic import new_folder
+        from pipeline.report.progress import shown_progress
+        from pipeline.run import simulation as pipeline_run
 
     out = arguments.out or new_folder(Path("runs"), arguments.sensor)
     path = config_path("sites", arguments.config) if arguments.config else bundled_config("", "demo")

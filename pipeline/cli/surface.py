@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from pipeline.cli.command_output import CommandOutput
+from pipeline.cli.imports import fast_imports
 from pipeline.cli.parser import add_output_options, between, one_of
 from scene.common.errors import InputError
 from scene.common.lengths import METRES
@@ -67,11 +68,12 @@ def run(arguments: argparse.Namespace) -> CommandOutput:
         )
     if out.exists():
         raise InputError("the file exists already", where=str(out), remedy="choose another name with --out")
-    import numpy as np
+    with fast_imports():
+        import numpy as np
 
-    from pipeline.formats.meshes.ply import write_ply
-    from pipeline.formats.points.points import joined, read_placed_scans
-    from pipeline.surface.from_cloud import CloudConfig, surface_of_cloud
+        from pipeline.formats.meshes.ply import write_ply
+        from pipeline.formats.points.points import joined, read_placed_scans
+        from pipeline.surface.from_cloud import CloudConfig, surface_of_cloud
 
     config = CloudConfig(method=arguments.method, poisson_depth=arguments.depth, poisson_trim_spacings=arguments.trim)
     cloud = joined([scan.cloud for scan in read_placed_scans(arguments.cloud, arguments.unit)])

@@ -17,14 +17,6 @@ class VarianceThresholds(ThresholdGroup):
     tuning on development cases, or judgement.
     """
 
-    significance: PositiveFloat = threshold_field(
-        0.004,
-        "probability",
-        "Significance level of noise terms. The variance differs from the predicted one if the p-value of the largest "
-        "standardised score, with signs flipped by wall block, is at most this.",
-        "target of 1 % false alarms over all steps",
-        lt=1,
-    )
     least_gain: PositiveFloat = threshold_field(
         6.0, "log-likelihood", "The best noise term needs at least this log-likelihood ratio.", JUDGEMENT
     )
@@ -55,27 +47,9 @@ class VarianceThresholds(ThresholdGroup):
         5.0,
         "log-likelihood",
         "Noise terms whose score is within this of the best one belong to its equivalence class. It is larger than for "
-        "systematic effects, because a few steep wall blocks decide.",
+        "systematic effects, because a few steep wall blocks decide. White and grid-correlated noise belong to one class if the "
+        "chi^2 of their semivariograms differ by less.",
         "in three development scans the true term scored 9 to 15 more than the next",
-    )
-    class_share: PositiveFloat = threshold_field(
-        0.01,
-        "share of the log-likelihood ratio",
-        "Noise terms within this share of the best one's ratio belong to its class too, as no form of a variance is exact.",
-        JUDGEMENT,
-        lt=1,
-    )
-    nonparametric_margin: PositiveFloat = threshold_field(
-        6.0,
-        "log-likelihood",
-        "A variance free in bins of a covariate must score this much more than the catalogue's best noise term.",
-        DEVELOPMENT,
-    )
-    nonparametric_gain: PositiveFloat = threshold_field(
-        15.0,
-        "log-likelihood",
-        "A variance free in bins must gain at least this over the named noise term to be reported.",
-        DEVELOPMENT,
     )
     nonparametric_share: PositiveFloat = threshold_field(
         0.1,
@@ -94,12 +68,6 @@ class VarianceThresholds(ThresholdGroup):
         3.0,
         "log-likelihood",
         "A second noise term must raise the score by this if the first alone does not explain the residuals.",
-        JUDGEMENT,
-    )
-    block_sigmas: PositiveFloat = threshold_field(
-        3.0,
-        "root sums of squares of the wall blocks' gains",
-        "The wall blocks must agree by this much on a second noise term, or on noise that is lower than predicted.",
         JUDGEMENT,
     )
     trial_cost: PositiveFloat = threshold_field(
@@ -134,28 +102,15 @@ class GridNoiseThresholds(ThresholdGroup):
 
     White noise is independent from point to point. Grid-correlated noise is interpolated by a stereo matcher between widely
     spaced pixels (nodes of a grid). The semivariogram of the residuals is fitted with each kind. The kind that fits better by
-    `margin` is named; otherwise both are reported as indistinguishable. An error of the reference also correlates residuals. A
-    component of the semivariogram is attributed to it if it is not larger than the `reference_error` limits allow. The last
-    text of each field states where its value comes from: tuning on development cases, or judgement.
+    `variance.class_margin` is named; otherwise both are reported as indistinguishable. An error of the reference also
+    correlates residuals. A component of the semivariogram is attributed to it if it is not larger than the `reference_error`
+    limits allow. The last text of each field states where its value comes from: tuning on development cases, or judgement.
     """
 
-    margin: PositiveFloat = threshold_field(
-        6.0,
-        "chi^2",
-        "White noise is named alone if its chi^2 against the measured semivariogram is smaller by this than that of "
-        "grid-correlated noise, and the reverse. Otherwise both are named as a class.",
-        JUDGEMENT,
-    )
     least_gain: PositiveFloat = threshold_field(
         12.0,
         "chi^2",
         "Grid-correlated noise must improve the fit of the semivariogram by this where single points show no added variance.",
-        DEVELOPMENT,
-    )
-    least_sigmas: PositiveFloat = threshold_field(
-        4.0,
-        "standard deviations of its variance",
-        "Grid-correlated noise must be this significant where single points show no added variance.",
         DEVELOPMENT,
     )
     finest_grid: PositiveFloat = threshold_field(
@@ -203,9 +158,6 @@ class LockingThresholds(ThresholdGroup):
         "make them crowd too.",
         DEVELOPMENT,
     )
-    most_noise: PositiveFloat = threshold_field(
-        0.35, "px", "Largest standard deviation of matching noise that is fitted; more noise hides any crowding.", JUDGEMENT
-    )
     significance: PositiveFloat = threshold_field(
         1e-4, "probability", "Significance level: crowding that chance makes more often is not reported.", JUDGEMENT, lt=1
     )
@@ -249,12 +201,13 @@ class EdgeThresholds(ThresholdGroup):
     """
 
     least_gain: PositiveFloat = threshold_field(
-        30.0, "log-likelihood", "An edge effect needs at least this log-likelihood ratio.", DEVELOPMENT
+        30.0, "log-likelihood", "An edge effect needs at least this log-likelihood ratio, filled occlusions too.", DEVELOPMENT
     )
     block_sigmas: PositiveFloat = threshold_field(
         3.0,
         "root sums of squares of the wall blocks' gains",
-        "The wall blocks must agree by this much on an edge effect.",
+        "The wall blocks must agree by this much on an edge effect, on a second noise term, or on noise that is lower than "
+        "predicted.",
         JUDGEMENT,
     )
     most_gain_of_a_point: PositiveFloat = threshold_field(
@@ -270,18 +223,6 @@ class EdgeThresholds(ThresholdGroup):
     footprint_fewest: PositiveInt = threshold_field(
         20, "points", "At least this many points must lie at edges that a wide beam would move clearly.", JUDGEMENT
     )
-    clear_sigmas: PositiveFloat = threshold_field(
-        3.0,
-        "standard deviations",
-        "A point at a depth step is used to test edge fattening if the effect moves it by more than this.",
-        JUDGEMENT,
-    )
-    most_relative_noise: PositiveFloat = threshold_field(
-        1.5,
-        "ratio of standard deviations",
-        "A selection pass is rejected if its residuals have more than this times the noise of the best pass.",
-        JUDGEMENT,
-    )
     clear_step: PositiveFloat = threshold_field(
         1.3,
         "ratio of depth steps",
@@ -294,9 +235,6 @@ class EdgeThresholds(ThresholdGroup):
         "cells",
         "Filled occlusions need at least this many cells that hold a point though only one camera sees them.",
         JUDGEMENT,
-    )
-    least_filled_gain: PositiveFloat = threshold_field(
-        10.0, "log-likelihood", "Filled occlusions need at least this log-likelihood ratio.", JUDGEMENT
     )
     least_filled_share: PositiveFloat = threshold_field(
         0.6,
@@ -333,12 +271,6 @@ class MissingReturnsThresholds(ThresholdGroup):
         DEVELOPMENT,
         le=1,
     )
-    nonparametric_margin: PositiveFloat = threshold_field(
-        6.0, "log-likelihood", "Losses free by direction must score this much more than the catalogue's best effect.", JUDGEMENT
-    )
-    nonparametric_ratio: PositiveFloat = threshold_field(
-        1.5, "ratio of scores", "Losses free by direction must score this many times as much as the best effect.", JUDGEMENT
-    )
     strip_agreement: PositiveFloat = threshold_field(
         0.85,
         "ratio; 1: every strip gains equally",
@@ -346,12 +278,6 @@ class MissingReturnsThresholds(ThresholdGroup):
         "cases without losses by direction is 0.73, the lowest of 3 sectors 0.96.",
         DEVELOPMENT,
     )
-    early_sigmas: PositiveFloat = threshold_field(
-        8.0,
-        "standard deviations",
-        "A return counts as early, possibly from a drop, if it lies this far before the surface.",
-        JUDGEMENT,
-    )
     early_m: PositiveFloat = threshold_field(
-        0.5, "m", "A return counts as early if it also lies this far before the surface.", JUDGEMENT
+        0.5, "m", "A return counts as early, possibly from a drop, if it lies this far before the surface.", JUDGEMENT
     )

@@ -47,7 +47,7 @@ class PointThresholds(ThresholdGroup):
     outlier_sigmas: PositiveFloat = threshold_field(
         5.0,
         "predicted standard deviations, times the ratio of observed to predicted noise",
-        "A residual beyond this is an outlier and is not used for fitting.",
+        "A residual beyond this is an outlier and is not used for fitting; in validation blocks it is clipped at this.",
         JUDGEMENT,
     )
     most_reference_scatter: PositiveFloat = threshold_field(
@@ -81,8 +81,8 @@ class MeanThresholds(ThresholdGroup):
     significance: PositiveFloat = threshold_field(
         0.004,
         "probability",
-        "Significance level of systematic effects. An effect is accepted if the p-value of the best candidate, under a null "
-        "distribution simulated without effects and maximised over all candidates, is at most this.",
+        "Significance level of systematic effects and of noise terms. An effect is accepted if the p-value of the best "
+        "candidate, under a null distribution simulated without effects and maximised over all candidates, is at most this.",
         "target of 1 % false alarms over all steps",
         lt=1,
     )
@@ -99,15 +99,16 @@ class MeanThresholds(ThresholdGroup):
     class_share: PositiveFloat = threshold_field(
         0.01,
         "share of the log-likelihood ratio",
-        "Effects whose score is within this share of the best one's log-likelihood ratio belong to its class too. No signature "
-        "is exact, and the error grows with the ratio: 6 degrees between two signatures leave this share.",
+        "Effects whose score is within this share of the best one's log-likelihood ratio belong to its class too, noise terms "
+        "likewise. No signature is exact, and the error grows with the ratio: 6 degrees between two signatures leave this share.",
         "geometry of small angles",
         lt=1,
     )
     nonparametric_margin: PositiveFloat = threshold_field(
         5.0,
         "log-likelihood",
-        "A non-parametric term must score this much more than the best effect of the catalogue to be chosen instead.",
+        "A non-parametric term, a variance free in bins or losses free by direction must score this much more than the best "
+        "effect of the catalogue to be chosen instead.",
         DEVELOPMENT,
     )
     least_nonparametric_score: PositiveFloat = threshold_field(
@@ -162,13 +163,6 @@ class MeanThresholds(ThresholdGroup):
         "standard deviations of the reference error",
         "A wave that is no effect of the catalogue must be at least this large, or it is attributed to the reference.",
         JUDGEMENT,
-    )
-    same_covariate: PositiveFloat = threshold_field(
-        0.95,
-        "absolute correlation",
-        "Covariates with a higher correlation count as one covariate for non-parametric terms.",
-        JUDGEMENT,
-        lt=1,
     )
     refit_share: PositiveFloat = threshold_field(
         0.5,
@@ -227,7 +221,8 @@ class ChangesThresholds(ThresholdGroup):
     faint_sigmas: PositiveFloat = threshold_field(
         3.0,
         "standard deviations of medians of nine points",
-        "Neighbouring medians beyond this are joined to one region, which finds faint but wide changes.",
+        "Neighbouring medians beyond this are joined to one region, which finds faint but wide changes. A point counts as moved "
+        "if the median of it and its neighbours lies this many predicted standard deviations off the reference.",
         JUDGEMENT,
     )
     smallest_departure: PositiveFloat = threshold_field(
@@ -241,12 +236,6 @@ class ChangesThresholds(ThresholdGroup):
     )
     largest_share: PositiveFloat = threshold_field(
         0.25, "share of the wall", "A region that is larger than this is not taken for a compact change.", JUDGEMENT
-    )
-    moved_sigmas: PositiveFloat = threshold_field(
-        3.0,
-        "predicted standard deviations",
-        "A point counts as moved if the median of it and its neighbours lies this far off the reference.",
-        "development cases: 41 to 88 % of walls on which 40 % of the rock moved, at most 18 % beside any effect",
     )
     moved_share: PositiveFloat = threshold_field(
         0.3,
@@ -277,9 +266,6 @@ class ValidationThresholds(ThresholdGroup):
     The gain is a difference of log scores (log-likelihoods): model with the effect minus model without it.
     """
 
-    clip_sigmas: PositiveFloat = threshold_field(
-        5.0, "standard deviations", "Deviations in validation blocks are clipped at this, which limits outliers.", JUDGEMENT
-    )
     shortfall_sigmas: PositiveFloat = threshold_field(
         2.5,
         "standard deviations of the gain",
@@ -299,19 +285,6 @@ class ValidationThresholds(ThresholdGroup):
         "Beside other effects an effect must gain more than this on validation blocks to be named, not only mentioned. At this "
         "value a gain equals its standard error.",
         "the gain of a true effect, half a difference of two chi^2, has twice its expectation as variance",
-    )
-    null_sigmas: PositiveFloat = threshold_field(
-        2.0,
-        "standard deviations of the parameter",
-        "Beside other effects, an effect whose only parameter is within this of zero is only mentioned.",
-        JUDGEMENT,
-    )
-    leftover_share: PositiveFloat = threshold_field(
-        0.02,
-        "share of the gain of the empirical term",
-        "A noise term that gains less than this beside an empirical term is dropped: it is the misfit of that term.",
-        DEVELOPMENT,
-        le=1,
     )
 
 
@@ -344,7 +317,11 @@ class VerdictThresholds(ThresholdGroup):
         gt=1,
     )
     gap_sigmas: PositiveFloat = threshold_field(
-        2.0, "standard errors", "The scores before and after differ if their difference exceeds this.", JUDGEMENT
+        2.0,
+        "standard errors",
+        "The scores before and after differ if their difference exceeds this. Beside others, an effect whose only parameter is "
+        "within this of zero is only mentioned.",
+        JUDGEMENT,
     )
     floor_sigmas: PositiveFloat = threshold_field(
         2.6,

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.formats.measurements.checks import finite
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points.finite import finite
 from pipeline.formats.points.points import read_placed_scans
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray

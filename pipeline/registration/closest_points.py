@@ -1,19 +1,13 @@
-"""Pair points with the nearest points of a reference, and sum up the pairs fast and reproducibly.
-
-Points are visited in an order in which neighbours in memory are neighbours in space. Sums are taken over blocks of fixed size
-in a fixed order, so that the result is the same to the bit for any number of threads.
-"""
+"""Prepare point clouds for a registration: check them, sort them in space, and make the search tree of the reference."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.registration.rigid import RigidTransform
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 
@@ -21,15 +15,12 @@ LEAST_POINTS = 6
 """Fewest points of a cloud that is registered: one per unknown."""
 _SEES = "correct the sensor's position, direction or range, for cameras also their overlap, so that it sees the wall"
 """Advice when there are too few points."""
-_BLOCK = 2**14
-"""Number of points per block of the sums; its arrays fit a core's cache."""
+_SAMPLE = 2**14
+"""Number of points, at least, from which the order and the shape of a cloud are judged."""
 ON_A_LINE = 1e-12
 """Share of the largest variance below which the second one makes a cloud a line."""
 _SCATTERED = 0.05
 """Share of a cloud's extent by which neighbours in memory may differ before sorting pays."""
-
-Map = Callable[[Callable[[FloatArray], FloatArray], Iterable[FloatArray]], Iterable[FloatArray]]
-"""`map`, or the `map` method of an executor."""
 
 
 @dataclass(frozen=True)
@@ -76,71 +67,10 @@ class ReferenceSurface:
         points = checked_cloud(points, "reference points")
         unit = None if normals is None else _unit(normals, len(points))
         order = scan_order(points)
-        origin = points.mean(axis=0)
+        origin = centroid_of(points)
         local = points[order] - origin
         tree = cKDTree(local, leafsize=16, balanced_tree=False)
         return cls(origin, local, None if unit is None else unit[order], tree)
-
-    def moments(
-        self, blocks: list[FloatArray], pose: RigidTransform, gate: float, normals: FloatArray | None, map_blocks: Map
-    ) -> FloatArray:
-        """Pair points with their nearest reference points, and sum up what the normal equations of one ICP iteration need.
-
-        The result is the sum of u u^T over all pairs of a moved point p and a reference point q that are at most `gate`
-        apart. The column vector u of a pair is, with the translation g of the pose and q's normal n:
-
-        - with normals: ((p - g) x n, n, n . (p - q), 1), so that the result is (8, 8)
-        - without normals: (p - g, q - p, 1), so that it is (7, 7)
-
-        Its last element is the number of pairs. All coordinates are the reference's.
-
-        Parameters
-        ----------
-        blocks : list of (k, 3) arrays
-            The moving points, m, divided into parts that are processed separately.
-        pose : RigidTransform
-            Moves these points to the reference's coordinates, whose zero is the centroid of the reference.
-        gate : float
-            Largest distance of a pair, m.
-        normals : (m, 3) array, optional
-            The reference's normals, for point-to-plane distances; None for point-to-point distances.
-        map_blocks : Map
-            Function like the built-in `map`, which may use threads.
-        """
-
-        def block_moments(block: FloatArray) -> FloatArray:
-            moved = pose.apply(block)
-            distance, nearest = self.tree.query(moved, distance_upper_bound=gate)
-            near = np.isfinite(distance)
-            moved, nearest = moved[near], nearest[near]
-            arm, offset = (moved - pose.translation).T, (moved - self.points[nearest]).T
-            columns = _point_columns(arm, offset) if normals is None else _plane_columns(arm, offset, normals[nearest].T)
-            return np.einsum("in,jn->ij", columns, columns)
-
-        return np.sum(list(map_blocks(block_moments, blocks)), axis=0)
-
-
-def _point_columns(arm: FloatArray, offset: FloatArray) -> FloatArray:
-    """Return the columns (7, k) from p - g and p - q, (3, k) each."""
-    return np.concatenate([arm, -offset, np.ones((1, arm.shape[1]))])
-
-
-def _plane_columns(arm: FloatArray, offset: FloatArray, normal: FloatArray) -> FloatArray:
-    """Return the columns (8, k) from p - g, p - q and n, (3, k) each."""
-    columns = np.ones((8, arm.shape[1]))
-    for axis, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
-        columns[axis] = arm[i] * normal[j] - arm[j] * normal[i]
-    columns[3:6] = normal
-    columns[6] = normal[0] * offset[0] + normal[1] * offset[1] + normal[2] * offset[2]
-    return columns
-
-
-def blocks_of(points: FloatArray) -> list[FloatArray]:
-    """Divide points (n, 3) into consecutive parts of 16,384 points (the last may be shorter), to process them in threads.
-
-    The size is fixed, so that sums do not depend on the number of threads.
-    """
-    return [points[start : start + _BLOCK] for start in range(0, len(points), _BLOCK)]
 
 
 def scan_order(points: FloatArray) -> NDArray[np.intp] | slice:
@@ -149,7 +79,7 @@ def scan_order(points: FloatArray) -> NDArray[np.intp] | slice:
     Points that are already in such an order, as from a scanner's lines, keep it. Others are sorted along Morton's space-filling
     curve.
     """
-    stride = max(len(points) // _BLOCK, 1)
+    stride = max(len(points) // _SAMPLE, 1)
     steps = np.abs(points[1::stride] - points[:-1:stride]).max(axis=1)
     if np.median(steps) <= _SCATTERED * np.ptp(points[::stride], axis=0).max():
         return slice(None)
@@ -164,6 +94,11 @@ def _spread_bits(number: NDArray[np.uint32]) -> NDArray[np.uint32]:
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
         number = (number | number << np.uint32(shift)) & np.uint32(mask)
     return number
+
+
+def centroid_of(points: FloatArray) -> FloatArray:
+    """Return the mean (3,) of points (n, 3), by columns, which is faster and more exact than along the first axis."""
+    return np.array([column.mean() for column in points.T])
 
 
 def checked_cloud(points: FloatArray, name: str) -> FloatArray:
@@ -196,7 +131,7 @@ def checked_cloud(points: FloatArray, name: str) -> FloatArray:
             where=name,
             remedy="remove these points before registering",
         )
-    if _on_a_line(points[:: max(len(points) // _BLOCK, 1)]) and _on_a_line(
+    if _on_a_line(points[:: max(len(points) // _SAMPLE, 1)]) and _on_a_line(
         points
     ):  # the sample alone may be one column of a grid
         raise InputError(

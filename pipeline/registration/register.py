@@ -26,14 +26,14 @@ from pydantic import Field
 
 from pipeline.registration.closest_points import (
     LEAST_POINTS,
-    ON_A_LINE,
-    Map,
     ReferenceSurface,
-    blocks_of,
+    centroid_of,
     checked_cloud,
     scan_order,
 )
-from pipeline.registration.rigid import RigidTransform, rotation_matrix
+from pipeline.registration.pairs import Map, NearestPairs, Part, parts_of
+from pipeline.registration.rigid import RigidTransform
+from pipeline.registration.steps import plane_step, point_step
 from scene.common.config import Config
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
@@ -42,10 +42,6 @@ from scene.geometry.mesh import FloatArray
 
 _LEVELS = (2**13, 2**17)
 """Sizes of the random subsamples used before all points; each is used if there are at least four times as many points."""
-_UNDETERMINED = 1e-6
-"""Motions whose mean squared effect on the residuals, per squared metre moved, is below this share of the largest are not
-estimated. A wall whose normals vary by less than 1 mrad is a plane.
-"""
 
 
 class IcpConfig(Config):
@@ -266,7 +262,12 @@ def register(
         If there are fewer than six points, values that are not finite, points on one line, or fewer than six pairs within the
         outlier threshold.
     """
-    return register_to(ReferenceSurface.build(reference, reference_normals), moving, config, random, threads=threads)
+    if threads == 1:
+        return register_to(ReferenceSurface.build(reference, reference_normals), moving, config, random, threads=1)
+    with executor(threads) as pool:
+        surface = pool.submit(ReferenceSurface.build, reference, reference_normals)
+        cloud = _MovingCloud(moving, config, random)
+        return _Alignment(surface.result(), cloud, config, pool.map).run()
 
 
 def register_to(
@@ -289,12 +290,11 @@ def register_to(
     threads : int, optional
         Number of threads, by default one per core. It does not affect the result.
     """
-    normals = _normals(surface, config)
-    moving = checked_cloud(moving, "moving points")
+    cloud = _MovingCloud(moving, config, random)
     if threads == 1:  # a pool would only add overhead
-        return _Alignment(surface, normals, moving, config, map).run(random)
+        return _Alignment(surface, cloud, config, map).run()
     with executor(threads) as pool:
-        return _Alignment(surface, normals, moving, config, pool.map).run(random)
+        return _Alignment(surface, cloud, config, pool.map).run()
 
 
 def measure_fit(surface: ReferenceSurface, points: FloatArray, config: IcpConfig, *, threads: int | None = None) -> FitQuality:
@@ -316,8 +316,8 @@ def measure_fit(surface: ReferenceSurface, points: FloatArray, config: IcpConfig
     local = checked_cloud(points, "points") - surface.origin
     gate = config.outlier_threshold_m(config.outlier_threshold_decay_iteration)
     with executor(threads) as pool:
-        blocks = blocks_of(local[scan_order(local)])
-        moments = surface.moments(blocks, RigidTransform.identity(), gate, normals, pool.map)
+        pairs = NearestPairs(surface, local[scan_order(local)])
+        moments = pairs.moments(parts_of(len(local)), RigidTransform.identity(), gate, 1, normals, pool.map)
     squares = np.trace(moments[3:6, 3:6]) if normals is None else moments[6, 6]
     inliers = int(moments[-1, -1])
     return FitQuality(len(local), inliers, float(np.sqrt(squares / inliers)) if inliers else float("nan"))
@@ -335,53 +335,28 @@ def _normals(surface: ReferenceSurface, config: IcpConfig) -> FloatArray | None:
 
 
 @dataclass(frozen=True)
-class _Step:
-    """One step of the search: rotation (3, 3) about the centroid and shift (3,), m; mean square of the residuals after it, m2.
+class _Level:
+    """A random subsample of the moving points, or all of them: their number, and their indices in parts."""
 
-    residual_change_m: RMS of the change of the residuals, m; undetermined: number of motions that were not estimated.
-    """
-
-    rotation: FloatArray
-    shift: FloatArray
-    mean_squares: float
-    residual_change_m: float
-    undetermined: int = 0
+    points: int
+    parts: list[Part]
 
 
-class _Alignment:
-    """One registration, coarse to fine. Moving points are stored relative to their centroid."""
+class _MovingCloud:
+    """Moving points relative to their centroid, in an order that is fast to search, with nested subsamples."""
 
-    def __init__(
-        self, surface: ReferenceSurface, normals: FloatArray | None, moving: FloatArray, config: IcpConfig, map_blocks: Map
-    ) -> None:
-        self.surface, self.normals, self.config, self.map_blocks = surface, normals, config, map_blocks
-        self.centroid = moving.mean(axis=0)
-        self.local = moving[scan_order(moving)] - self.centroid
-        self.covariance = np.einsum("ni,nj->ij", self.local, self.local) / len(self.local)
+    def __init__(self, moving: FloatArray, config: IcpConfig, random: KeyedRandom) -> None:
+        moving = checked_cloud(moving, "moving points")
+        self.centroid = centroid_of(moving)
+        self.points = moving[scan_order(moving)] - self.centroid
+        self.covariance = np.einsum("ni,nj->ij", self.points, self.points) / len(self.points)
+        self.radius = float(np.sqrt(np.trace(self.covariance)))
+        self.levels = self._levels(config, random)
 
-    def run(self, random: KeyedRandom) -> Registration:
-        """Iterate on each subsample until it converges, and on all points until the end."""
-        levels = self._levels(random)
-        pose = RigidTransform(np.eye(3), self.centroid - self.surface.origin)
-        history: list[IcpIteration] = []
-        level, reason = 0, ""
-        for iteration in range(1, self.config.max_iteration + 1):
-            if iteration == self.config.max_iteration:
-                level = len(levels) - 1
-            pose, record = self._iterate(levels[level], pose, self.config.outlier_threshold_m(iteration))
-            history.append(record)
-            reason = self._stop_reason(history)
-            if reason and level == len(levels) - 1:
-                break
-            level += bool(reason)
-        converged = bool(reason)
-        reason = reason or f"max_iteration = {self.config.max_iteration} reached"
-        return Registration(self._in_full_coordinates(pose), converged, reason, tuple(history))
-
-    def _levels(self, random: KeyedRandom) -> list[list[FloatArray]]:
-        """Return nested random subsamples as blocks; the last one is all points in use."""
-        total = len(self.local)
-        used = round(total * (1 - self.config.subsample_ratio)) if self.config.subsample_points else total
+    def _levels(self, config: IcpConfig, random: KeyedRandom) -> list[_Level]:
+        """Return nested random subsamples; the last one is all points in use."""
+        total = len(self.points)
+        used = round(total * (1 - config.subsample_ratio)) if config.subsample_points else total
         if used < LEAST_POINTS:
             raise InputError(
                 f"the subsample would leave only {used} of {total:,} points",
@@ -391,19 +366,49 @@ class _Alignment:
             )
         draw = random.generator().random(total)
         sizes = [size for size in _LEVELS if 4 * size <= used] + [used]
-        return [blocks_of(self.local if size == total else self.local[_smallest(draw, size)]) for size in sizes]
+        return [_Level(size, parts_of(total if size == total else _smallest(draw, size))) for size in sizes]
 
-    def _iterate(self, blocks: list[FloatArray], pose: RigidTransform, gate: float) -> tuple[RigidTransform, IcpIteration]:
+
+class _Alignment:
+    """One registration of a moving cloud to a reference surface, coarse to fine."""
+
+    def __init__(self, surface: ReferenceSurface, cloud: _MovingCloud, config: IcpConfig, map_blocks: Map) -> None:
+        self.surface, self.normals = surface, _normals(surface, config)
+        self.cloud, self.config, self.map_blocks = cloud, config, map_blocks
+        self.pairs = NearestPairs(surface, cloud.points)
+
+    def run(self) -> Registration:
+        """Iterate on each subsample until it converges, and on all points until the end."""
+        levels = self.cloud.levels
+        pose = RigidTransform(np.eye(3), self.cloud.centroid - self.surface.origin)
+        history: list[IcpIteration] = []
+        level, reason = 0, ""
+        for iteration in range(1, self.config.max_iteration + 1):
+            if iteration == self.config.max_iteration:
+                level = len(levels) - 1
+            first = not history or history[-1].points != levels[level].points
+            neighbours = 1 if first and level == len(levels) - 1 else 2  # one iteration with all points often suffices
+            pose, record = self._iterate(levels[level], pose, self.config.outlier_threshold_m(iteration), neighbours)
+            history.append(record)
+            reason = self._stop_reason(history)
+            if reason and level == len(levels) - 1:
+                break
+            level += bool(reason)
+        converged = bool(reason)
+        reason = reason or f"max_iteration = {self.config.max_iteration} reached"
+        return Registration(self._in_full_coordinates(pose), converged, reason, tuple(history))
+
+    def _iterate(self, level: _Level, pose: RigidTransform, gate: float, neighbours: int) -> tuple[RigidTransform, IcpIteration]:
         """Take one iteration: pair the points, solve for the step, and return the next pose and its record."""
-        moments = self.surface.moments(blocks, pose, gate, self.normals, self.map_blocks)
-        points, inliers = sum(map(len, blocks)), int(moments[-1, -1])
+        moments = self.pairs.moments(level.parts, pose, gate, neighbours, self.normals, self.map_blocks)
+        points, inliers = level.points, int(moments[-1, -1])
         if inliers < LEAST_POINTS:
-            raise self._too_few(blocks, pose, gate, inliers)
-        step = _point_step(moments) if self.normals is None else self._plane_step(moments)
+            raise self._too_few(level, pose, gate, inliers)
+        step = point_step(moments) if self.normals is None else plane_step(moments, self.cloud.radius)
         outliers = points - inliers
         squares = step.mean_squares * inliers + (outliers * gate**2 if outliers else 0.0)
         turn = (step.rotation - np.eye(3)) @ pose.rotation
-        moved = np.trace(turn @ self.covariance @ turn.T) + step.shift @ step.shift
+        moved = np.trace(turn @ self.cloud.covariance @ turn.T) + step.shift @ step.shift
         record = IcpIteration(
             points=points,
             inliers=inliers,
@@ -415,19 +420,6 @@ class _Alignment:
             undetermined=step.undetermined,
         )
         return RigidTransform(step.rotation @ pose.rotation, pose.translation + step.shift), record
-
-    def _plane_step(self, moments: FloatArray) -> _Step:
-        """Solve for (w, t) by Gauss-Newton, with w scaled by the cloud's radius so that all six unknowns are metres moved."""
-        radius = float(np.sqrt(np.trace(self.covariance)))
-        scale = np.repeat([1 / radius, 1.0], 3)
-        count = moments[-1, -1]
-        normal = moments[:6, :6] / count * np.outer(scale, scale)
-        gradient = moments[:6, 6] / count * scale
-        unknowns, undetermined = _least_norm(normal, -gradient)
-        change = float(unknowns @ normal @ unknowns)
-        squares = float(moments[6, 6] / count + 2 * gradient @ unknowns) + change
-        rotation = rotation_matrix(unknowns[:3] / radius)
-        return _Step(rotation, unknowns[3:], max(squares, 0.0), float(np.sqrt(max(change, 0.0))), undetermined)
 
     def _stop_reason(self, history: list[IcpIteration]) -> str:
         """Return why the present subsample has converged, in words; "" if it has not."""
@@ -442,11 +434,11 @@ class _Alignment:
             return f"the RMS error changed by less than threshold = {self.config.threshold:g} m"
         return ""
 
-    def _too_few(self, blocks: list[FloatArray], pose: RigidTransform, gate: float, inliers: int) -> InputError:
+    def _too_few(self, level: _Level, pose: RigidTransform, gate: float, inliers: int) -> InputError:
         """Make the error for too few pairs within the outlier threshold."""
-        median_m = np.median(self.surface.tree.query(pose.apply(blocks[0]))[0])
+        median_m = np.median(self.surface.tree.query(pose.apply(self.cloud.points[level.parts[0]]))[0])
         return InputError(
-            f"only {inliers} of {sum(map(len, blocks)):,} points lie within {gate:g} m of the reference; "
+            f"only {inliers} of {level.points:,} points lie within {gate:g} m of the reference; "
             f"the median distance is {median_m:.3g} m",
             where="icp.outlier_distance_threshold",
             remedy=f"raise this threshold above {median_m:.3g} m, or raise icp.outlier_threshold_decay_iteration to begin wider",
@@ -454,40 +446,7 @@ class _Alignment:
 
     def _in_full_coordinates(self, pose: RigidTransform) -> RigidTransform:
         """Convert a pose between local coordinates to full coordinates."""
-        return RigidTransform(pose.rotation, pose.translation + self.surface.origin - pose.rotation @ self.centroid)
-
-
-def _point_step(moments: FloatArray) -> _Step:
-    """Compute Kabsch's rotation (determinant +1) and the corresponding shift from the pairs' p - g and d = q - p.
-
-    Everything is expressed by M = R - I and d, which are small, so that no precision is lost where points nearly coincide.
-    """
-    count = moments[-1, -1]
-    mean_p, mean_d = moments[:3, 6] / count, moments[3:6, 6] / count
-    spread = moments[:3, :3] / count - np.outer(mean_p, mean_p)
-    cross = moments[:3, 3:6] / count - np.outer(mean_p, mean_d)
-    u, singular, vt = np.linalg.svd(spread + cross)
-    if not singular[1] > ON_A_LINE * singular[0]:
-        raise InputError(
-            "all points within this distance lie on one line", where="icp.outlier_distance_threshold", remedy="raise the limit"
-        )
-    rotation = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
-    turn = rotation - np.eye(3)
-    shift = mean_d - turn @ mean_p
-    moved = float(np.trace(turn @ spread @ turn.T))
-    squares = np.trace(moments[3:6, 3:6]) / count - mean_d @ mean_d + moved - 2 * np.trace(turn @ cross)
-    return _Step(rotation, shift, max(float(squares), 0.0), float(np.sqrt(max(moved + mean_d @ mean_d, 0.0))))
-
-
-def _least_norm(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, int]:
-    """Return the shortest least-squares solution of a symmetric system (6, 6), and how many of its directions are undetermined.
-
-    Eigenvectors with an eigenvalue below `_UNDETERMINED` times the largest are left out (pseudo-inverse).
-    """
-    values, vectors = np.linalg.eigh(matrix)
-    kept = values > _UNDETERMINED * values[-1]
-    inverse = np.divide(1.0, values, out=np.zeros(len(values)), where=kept)
-    return vectors @ (inverse * (vectors.T @ right)), int(np.sum(~kept))
+        return RigidTransform(pose.rotation, pose.translation + self.surface.origin - pose.rotation @ self.cloud.centroid)
 
 
 def _smallest(draw: FloatArray, size: int) -> NDArray[np.intp]:

@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from pipeline.formats.measurements.checks import finite
 from pipeline.formats.point_cloud import PointCloud
+from pipeline.formats.points.finite import finite
 from pipeline.surface.mesh import SurfaceConfig, median_spacing, mesh_cloud
 from pipeline.surface.triangulation import triangulate_seen_points
 from scene.common.config import Config

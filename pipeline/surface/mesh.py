@@ -12,7 +12,7 @@ The first condition prevents noise from tearing a densely sampled surface; the s
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,9 @@ from scene.common.errors import InputError
 from scene.common.extras import how_to_install
 from scene.common.native_output import suppress_stderr
 from scene.geometry.mesh import FloatArray, IntArray, TriangleMesh, area_normals
-from sensors.signal_chain.observation import Observation
+
+if TYPE_CHECKING:  # it would import the ray tracer, which a surface from a point cloud does not need
+    from sensors.signal_chain.observation import Observation
 
 BoolArray = NDArray[np.bool_]
 

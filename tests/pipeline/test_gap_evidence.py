@@ -171,9 +171,6 @@ class _Scripted:
     def joint_score(self, members: EffectSet) -> float:
         return sum(member.score for member in members)
 
-    def correlated_covariates(self, form: FamilyScore) -> set[str]:
-        return {form.name}
-
     def with_harmonics(self, members: Any, form: Any) -> Any:
         return form
 

@@ -5,7 +5,9 @@ Tested are also the uncertainty and each parameter's effect.
 
 from __future__ import annotations
 
+import dataclasses
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +16,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, norm
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from pipeline.registration import pairs as nearest_pairs
 from pipeline.registration.closest_points import ReferenceSurface, scan_order
-from pipeline.registration.register import IcpConfig, Registration, _point_step, measure_fit, register, register_to
+from pipeline.registration.register import IcpConfig, Registration, measure_fit, register, register_to
 from pipeline.registration.rigid import RigidTransform, rotation_matrix
+from pipeline.registration.steps import point_step
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -192,7 +196,7 @@ def test_no_reflection() -> None:
     """Pairs that a mirror image in x would match best still give a proper rotation."""
     p = RANDOM.child("mirror").generator().normal(size=(50, 3))
     columns = np.vstack([p.T, (p * [-1, 1, 1] - p).T, np.ones((1, 50))])
-    assert np.linalg.det(_point_step(columns @ columns.T).rotation) == pytest.approx(1.0)
+    assert np.linalg.det(point_step(columns @ columns.T).rotation) == pytest.approx(1.0)
 
 
 def test_fit_counts_and_measures(reference: ReferenceSurface, cloud: tuple[FloatArray, FloatArray]) -> None:
@@ -345,6 +349,35 @@ def test_threads_do_not_change_a_bit(reference: ReferenceSurface) -> None:
             register_to(reference, moving, IcpConfig(method=method, max_iteration=8), RANDOM, threads=count) for count in (1, 2)
         )
         assert json.dumps(one.to_dict()) == json.dumps(two.to_dict())
+
+
+@pytest.mark.parametrize("method", ["point_to_plane", "point_to_point"])
+@pytest.mark.parametrize("remove_outlier", [True, False])
+def test_kept_pairs_are_those_of_a_full_search(
+    method: str, remove_outlier: bool, reference: ReferenceSurface, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moving = OFFSET.apply(sample(50_000, RANDOM.child("kept"))[0])
+    moving[::50, 2] += 0.09  # some points are outliers only once the outlier threshold has decayed
+    config = IcpConfig(method=method, remove_outlier=remove_outlier, delta_threshold=1e-9, threshold=1e-13, max_iteration=30)
+    kept = register_to(reference, moving, config, RANDOM)
+    monkeypatch.setattr(nearest_pairs, "_ROUNDING_M", np.inf)  # no point may keep its pair
+    assert json.dumps(register_to(reference, moving, config, RANDOM).to_dict()) == json.dumps(kept.to_dict())
+
+
+def test_most_points_keep_their_pairs(reference: ReferenceSurface) -> None:
+    class CountingTree:
+        searched = 0
+
+        def query(self, points: FloatArray, **options: Any) -> Any:
+            self.searched += len(points)
+            return reference.tree.query(points, **options)
+
+    tree = CountingTree()
+    moving = OFFSET.apply(sample(20_000, RANDOM.child("again"))[0])
+    config = IcpConfig(method="point_to_point", delta_threshold=1e-9, threshold=1e-13, max_iteration=30)
+    found = register_to(dataclasses.replace(reference, tree=tree), moving, config, RANDOM, threads=1)
+    assert found.iterations > 10
+    assert tree.searched < 0.5 * found.iterations * len(moving)
 
 
 def test_blas_threads_do_not_change_a_bit() -> None:

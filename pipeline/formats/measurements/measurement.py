@@ -26,7 +26,6 @@ from pipeline.formats.measurements.checks import (
     check_pulses,
     check_seen,
     check_sensor,
-    finite,
 )
 from pipeline.formats.measurements.config import MeasurementConfig, ScanPattern
 from pipeline.formats.measurements.model_file import read_model
@@ -37,6 +36,7 @@ from pipeline.formats.measurements.surface_datum import told_datum
 from pipeline.formats.measurements.surface_fit import SurfaceFit, air_side, check_in_metres
 from pipeline.formats.measurements.surroundings import Surroundings
 from pipeline.formats.point_cloud import SCAN, PointCloud, joined
+from pipeline.formats.points.finite import finite
 from pipeline.formats.points.points import read_points
 from pipeline.registration.rigid import rotation_matrix
 from scene.common.config import load_yaml, parse

@@ -222,23 +222,6 @@ class MeanSearch:
         with_them, without = both
         return float(with_them - without - sum(member.log_likelihood_ratio - member.score for member in members))
 
-    def correlated_covariates(self, form: FamilyScore) -> set[str]:
-        """Return the covariates with which a non-parametric term would explain nearly the same residuals.
-
-        Their absolute correlation with the term's own covariate exceeds the threshold `mean.same_covariate`.
-
-        form: the term (a line, spline or wave along a covariate, or a polynomial of two) with its score.
-
-        Returns
-        -------
-        Names of the covariates, the term's own among them.
-        """
-        found = self.design.residuals.covariates
-        covariates = {name: values for name, values in found.items() if np.ptp(values) > 0}
-        parts = form.name.split(" and ")
-        correlation = np.abs(np.corrcoef([*covariates.values(), *(covariates[part] for part in parts)])[:, -len(parts) :])
-        return {name for name, row in zip(covariates, correlation, strict=False) if row.max() > thresholds().mean.same_covariate}
-
     def with_harmonics(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
         """Replace a non-parametric term that describes a periodic error by its best periodic form, to name the error's shape.
 

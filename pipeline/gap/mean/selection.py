@@ -191,18 +191,6 @@ class CandidateScorer(Protocol):
         members: the errors; the periods of sines among them are refined first.
         """
 
-    def correlated_covariates(self, form: FamilyScore) -> set[str]:
-        """Return the covariates with which a non-parametric term would explain nearly the same residuals.
-
-        They are highly correlated with the term's own covariate.
-
-        form: the term (a line, spline or wave along a covariate, or a polynomial of two) with its score.
-
-        Returns
-        -------
-        Names of the covariates, the term's own among them.
-        """
-
     def with_harmonics(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
         """Replace a non-parametric term that describes a periodic error by its best periodic form, to name the error's shape.
 
@@ -339,16 +327,16 @@ class ForwardSelection:
     def _effects_required(self, state: _Set, score: float, form: FamilyScore) -> bool:
         """Tell whether the data require the effects of a set beside a non-parametric term.
 
-        Such a term is inexact and has no constant. Each effect must therefore add more than a second term of a correlated
+        Such a term is inexact and has no constant. Each effect must therefore add more than a second term of the same
         covariate, a polynomial of two covariates, or a constant would.
         """
         if not self._significant(score):
             return False
-        correlated = self.search.correlated_covariates(form)
+        own = form.name.split(" and ")
         second = [
             item.score
             for item in self.search.score_families((form,))
-            if item.name == RangeOffset.tag() or item.candidate.form == POLYNOMIAL or (item.empirical and item.name in correlated)
+            if item.name == RangeOffset.tag() or item.candidate.form == POLYNOMIAL or (item.empirical and item.name in own)
         ]
         return score > len(state.members) * max([0.0, *second])
 

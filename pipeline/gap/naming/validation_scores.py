@@ -125,7 +125,7 @@ def _is_consistent_with_zero(item: NamedEffect) -> bool:
     if item.effect.shows_in != ShowsIn.MEAN or len(values) != 1:
         return False
     ((value, std),) = values
-    return abs(value) < thresholds().validation.null_sigmas * std
+    return abs(value) < thresholds().verdict.gap_sigmas * std
 
 
 def _gain_needed_by(item: NamedEffect, expected: float) -> float:
@@ -158,7 +158,7 @@ class _RegisteredResiduals:
         nodes, own = field.weights, np.maximum(sigma**2 - field.variance, _LEAST_WHITE_SHARE * sigma**2)
         total = np.bincount(patch, 1 / own)
         mean = np.bincount(patch, value / own) / total
-        limit = thresholds().validation.clip_sigmas * sigma
+        limit = thresholds().points.outlier_sigmas * sigma
         left = np.clip(value - mean[patch], -limit, limit)
         shrinkage = 1 / (1 / reference_sigma**2 + total) if reference_sigma else np.zeros(len(total))
         gathered = csr_array((1 / own, (patch, np.arange(len(rows)))))

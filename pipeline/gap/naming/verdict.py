@@ -269,7 +269,7 @@ def note_moved_wall(evidence: Evidence, stable_areas: bool) -> list[str]:
     by = thresholds().changes
     said = (
         f"{100 * evidence.moved_share:.0f} % of the points lie off the reference together with their neighbours, by more than "
-        f"{by.moved_sigmas:g} predicted standard deviations and {1e3 * by.smallest_departure:g} mm: rock moved, or the reference "
+        f"{by.faint_sigmas:g} predicted standard deviations and {1e3 * by.smallest_departure:g} mm: rock moved, or the reference "
         "shows another place or time"
     )
     remedy = "the given stable_areas are not stable" if stable_areas else "add stable_areas where nothing moved"

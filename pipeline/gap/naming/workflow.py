@@ -323,14 +323,9 @@ def _select_and_validate(
         if again.named:
             return replace(again, words=[*words, *(each for each in again.words if each not in words)])
     words += [f"{item.name} mentioned but not named: beside the other effects {describe_weakness(item)}" for item in scored.weak]
-    described = [item.gain for item in scored.named if item.name.endswith("_empirical")]
-    least = thresholds().validation.leftover_share * max(described, default=0.0)
-    left = [item for item in scored.named if item.adds_variance and item.gain < least]
-    words += [f"{item.name} dropped: it only describes the misfit of the empirical term" for item in left]
     rows_of_tails = subsample_rows(np.flatnonzero(given.stable & ~given.held_out))
-    kept = [item for item in scored.named if item not in left]
     fewer, _ = subsample(aligned, given.residuals, rows_of_tails)
-    found, tails = _with_heavy_tails(fewer, kept, given.cells.side_m)
+    found, tails = _with_heavy_tails(fewer, scored.named, given.cells.side_m)
     words += [tails.note] if tails else []
     return _ValidatedSelection(given, selection, losses, with_separating_measurements(aligned, found), tails, words)
 
@@ -442,14 +437,7 @@ def _explain_losses(measurement: Measurement, given: PassInput) -> tuple[LossExp
     if missing is None or any(model_has(measurement, name) for name in LOSS_EFFECTS):
         return None
     held_out = in_validation_blocks(missing.wall_xy, given.cells.side_m)
-    early = (
-        residuals.usable
-        & ~given.changed
-        & (
-            given.registered_residuals
-            < -np.maximum(thresholds().missing_returns.early_sigmas * residuals.sigma, thresholds().missing_returns.early_m)
-        )
-    )
+    early = residuals.usable & ~given.changed & (given.registered_residuals < -thresholds().missing_returns.early_m)
     drops = count_isolated_returns(residuals.wall_xy, early)
     found = explain_missing_returns(missing, ~held_out, drops, len(residuals), measurement.cloud.intensity)
     return None if found is None else (found, held_out)

@@ -142,8 +142,7 @@ class _EdgeData:
         It is 0 at points that the effect does not move; for a rim, also where it moves them little, because matchers disagree on
         small steps.
         """
-        by = thresholds().edges
-        least = np.maximum(by.clear_sigmas * self.sigma, by.clear_step * self.raster.depth_step_px)
+        least = thresholds().edges.clear_step * self.raster.depth_step_px
         clear = np.abs(self.shift([effect]) - self.shift_without) > (least if effect.window == "rim" else 0.0)
         return (self.registered_density([effect]) - self.registered_density_without) * clear
 
@@ -402,7 +401,7 @@ def _find_filling(data: _EdgeData) -> EdgeEffect | None:
     raster = data.raster
     points = raster.in_filled_occlusions(data.beside)
     gain = float(data.gains(OcclusionFill(reach_px=1e5))[points].sum())
-    if points.sum() < thresholds().edges.fewest_filled or gain < thresholds().edges.least_filled_gain:
+    if points.sum() < thresholds().edges.fewest_filled or gain < thresholds().edges.least_gain:
         return None
     widths, held = _occluded_strips(raster.apply(data.beside), raster)
     reach, std = _estimate_reach(widths, held, raster.step)

@@ -220,7 +220,7 @@ def find_grid_noise(
         return None, ""
     fit, step, near = best
     by = thresholds().grid_noise
-    if fit.chi2 >= variogram.chi2_without_grid - by.least_gain or fit.variance <= by.least_sigmas * fit.error:
+    if fit.chi2 >= variogram.chi2_without_grid - by.least_gain or fit.variance <= 0:
         return None, ""
     without = variogram.chi2_of_reference_error
     if fit.chi2 >= without - by.least_gain:
@@ -254,9 +254,9 @@ def _name_noise(white: VarianceTerm, part: StereoResiduals, value: FloatArray, m
     )  # otherwise a grid may be too fine for this raster
     white = replace(both, indistinguishable=white.indistinguishable) if resolved else both
     best = variogram.best_grid()
-    if best is None or white_fit.chi2 < best[0].chi2 - thresholds().grid_noise.margin:
+    if best is None or white_fit.chi2 < best[0].chi2 - thresholds().variance.class_margin:
         return white
-    if best[0].variance <= 0 or white_fit.chi2 < best[0].chi2 + thresholds().grid_noise.margin:
+    if best[0].variance <= 0 or white_fit.chi2 < best[0].chi2 + thresholds().variance.class_margin:
         return both
     grid = replace(white, name=RegularizationNoise.tag(), effect=RegularizationNoise.tag(), indistinguishable=())
     return _as_grid_noise(grid, *best)

@@ -153,10 +153,8 @@ def explain_missing_returns(
         limit = replace(limit, score=-np.inf)
     best, second = (limit, precipitation) if limit.score >= precipitation.score else (precipitation, limit)
     free = _fit_directional_losses(losses, missing.covariates)
-    by = thresholds().missing_returns
-    if free.score > by.nonparametric_ratio * max(best.score, 0.0) + by.nonparametric_margin and _strips_agree(
-        missing, best, free, fit
-    ):
+    ahead = free.score - max(best.score, 0.0)
+    if ahead > thresholds().mean.nonparametric_margin and _strips_agree(missing, best, free, fit):
         best = free
     confidence = 1 / _overdispersion(lost[fit], best.probability[fit], missing.wall_xy[fit])
     best = replace(best, gain=best.gain * confidence, score=best.score * confidence)

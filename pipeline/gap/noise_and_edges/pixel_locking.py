@@ -38,6 +38,7 @@ that shows in the noise."""
 _NOISE_UNCERTAINTY, _LEAST_NOISE_SHARE = 0.1, 0.01
 """Relative uncertainty of the noise; least share of the measured variance that is noise."""
 _MULTIPLES = np.arange(1, 5)
+_MOST_NOISE_PX = 0.35  # of a grid of trial values; more noise hides any crowding
 _FOLDING, _LARGE_AMPLITUDE, _HARMONIC_MISFIT = 1 / (2 * np.pi), 0.3, 0.02
 """Amplitude from which disparities fold over; amplitude that is large; chi^2 share by which a small amplitude may fit worse,
 because a matcher's error is not exactly a sine."""
@@ -225,7 +226,7 @@ def _amplitude(strength: FloatArray, count: int, noise: NoiseBounds | None) -> t
         beyond = np.maximum(least[:, None] - blur, 0) + np.maximum(blur - most[:, None], 0)
         return np.asarray(found + (beyond / (_NOISE_UNCERTAINTY * noise.predicted)) ** 2)
 
-    largest = thresholds().locking.most_noise
+    largest = _MOST_NOISE_PX
     shares, blurs = np.linspace(0.002, _LARGEST_AMPLITUDE, 400), np.linspace(0.0, largest, 60)
     coarse = chi2(shares, blurs)
     row = _plausible_minimum(shares, coarse.min(axis=1), float(np.sum(strength**2)) * 2 * count)

@@ -40,7 +40,7 @@ def null_critical_score(squares: FloatArray, shapes: list[FloatArray], block: ND
 
     The test asks whether any candidate noise effect explains that residuals vary more than predicted. Its statistic is the
     largest standardised score over the candidates. The null distribution comes from random sign flips of the scores of whole
-    wall blocks (squares of the wall). The critical value is its quantile at the significance level `variance.significance`.
+    wall blocks (squares of the wall). The critical value is its quantile at the significance level `mean.significance`.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def null_critical_score(squares: FloatArray, shapes: list[FloatArray], block: ND
     random : source of random numbers.
     """
     _, largest = _scores_with_flipped_signs(squares, shapes, block, random)
-    return float(np.quantile(largest, 1 - thresholds().variance.significance))
+    return float(np.quantile(largest, 1 - thresholds().mean.significance))
 
 
 def _scores_with_flipped_signs(

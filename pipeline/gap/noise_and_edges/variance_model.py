@@ -238,7 +238,8 @@ def fit_variance_model(
     tried = [VarianceScore(c.name, fit.gain, fit.score) for c, fit in zip(candidates, singles, strict=True)]
     tried = sorted(_best_variants(tried), key=lambda item: -item.score)
     by = thresholds().variance
-    if best.gain < by.least_gain or p_value > by.significance or excess < by.least_excess:
+    class_share = thresholds().mean.class_share
+    if best.gain < by.least_gain or p_value > thresholds().mean.significance or excess < by.least_excess:
         return [], tried, ""
     # for disparities `grid_noise` compares neighbours, because grid-correlated noise moves them alike too
     unshared = _unshared_share(residuals, value, used, best.added(shapes)) if residuals.sensor == "tls" else 1.0
@@ -252,9 +253,9 @@ def fit_variance_model(
     pair = max(pairs, key=lambda fit: fit.score, default=best)
     free_name, free_score, free = _best_binned_variance(squares, {name: v[used] for name, v in residuals.covariates.items()})
     # where one effect leaves a misfit, a second one of the catalogue is preferred to a binned variance
-    ahead = max(by.nonparametric_margin, by.class_share * best.gain)
+    ahead = max(thresholds().mean.nonparametric_margin, class_share * best.gain)
     # no form of a variance is exact, so a second effect must explain more than the inexact part of the first
-    needed = max(by.second_gain if free_score > best.score + ahead else by.least_gain, by.class_share * best.gain)
+    needed = max(by.second_gain if free_score > best.score + ahead else by.least_gain, class_share * best.gain)
     agreed = pair.score > best.score + needed and _blocks_agree(squares, best.added(shapes), pair.added(shapes), block)
     chosen = pair if agreed and all(float(theta.max()) > 0 for theta in pair.theta) else best
     free_fits_better = free_score > chosen.score + ahead and _blocks_prefer_binned(squares, chosen.added(shapes), free, block)
@@ -263,7 +264,7 @@ def fit_variance_model(
     if empirical:
         chosen, note = best, ""
     tried = sorted([*tried, VarianceScore(free_name, free_score + _BINS, free_score, True)], key=lambda item: -item.score)
-    margin = max(by.class_margin, by.class_share * chosen.gain)
+    margin = max(by.class_margin, class_share * chosen.gain)
     found = []
     for place, number in enumerate(chosen.members):
         candidate, theta = candidates[number], chosen.theta[place]
@@ -351,7 +352,7 @@ class NoiseRatio:
         means = np.bincount(
             np.unique(wall_block_numbers(residuals.wall_xy[used], cells.side_m), return_inverse=True)[1], squares - 1
         )
-        below = float(means.sum()) < -thresholds().variance.block_sigmas * float(np.linalg.norm(means))
+        below = float(means.sum()) < -thresholds().edges.block_sigmas * float(np.linalg.norm(means))
         return cls(float(np.sqrt(squares.mean())), below)
 
     @property
@@ -440,13 +441,13 @@ def _replaces_only(fit: _JointFit, chosen: _JointFit, number: int) -> bool:
 def _blocks_agree(squares: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> bool:
     """Whether wall blocks agree that one variance fits better than another, so that the gain is not due to a few blocks."""
     gain, sigmas = _gain_over(squares, first, second, block)
-    return gain > 0 and sigmas > thresholds().variance.block_sigmas
+    return gain > 0 and sigmas > thresholds().edges.block_sigmas
 
 
 def _blocks_prefer_binned(squares: FloatArray, first: FloatArray, free: FloatArray, block: NDArray[np.int64]) -> bool:
     """Whether wall blocks agree that a binned variance fits better, which only has to show that the named one does not fit."""
     gain, sigmas = _gain_over(squares, first, free, block)
-    return gain > thresholds().variance.nonparametric_gain and sigmas > thresholds().variance.nonparametric_block_sigmas
+    return gain > 0 and sigmas > thresholds().variance.nonparametric_block_sigmas
 
 
 def _gain_over(squares: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> tuple[float, float]:

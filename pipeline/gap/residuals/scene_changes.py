@@ -178,7 +178,7 @@ def moved_share(residuals: Residuals, view: SensorView, eligible: BoolArray) -> 
     part = residuals.part(known)
     medians = view.part(known).neighbour_median(part.value / part.sigma)
     far = np.abs(medians) * part.sigma * part.unit_m > thresholds().changes.smallest_departure
-    return float(np.mean(far & (np.abs(medians) > thresholds().changes.moved_sigmas)))
+    return float(np.mean(far & (np.abs(medians) > thresholds().changes.faint_sigmas)))
 
 
 def _components(z: FloatArray, faint: FloatArray, view: SensorView, eligible: BoolArray) -> tuple[NDArray[np.int64], FloatArray]:

@@ -1,0 +1,167 @@
+"""The value of each threshold with which the rule behind it never acts, and why some thresholds have none."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from benchmarks.varied import Setting
+from pipeline.gap.thresholds import Thresholds
+
+LARGE = 1e9
+OFF: dict[str, float] = {
+    "points.fewest": 1,
+    "points.fewest_epochs": 10**9,
+    "points.most_reference_scatter": LARGE,
+    "points.least_share_on_reference": 0.0,
+    "mean.least_score": -LARGE,
+    "mean.class_margin": 0.0,
+    "mean.class_share": 0.0,
+    "mean.nonparametric_margin": 0.0,
+    "mean.least_nonparametric_score": -LARGE,
+    "mean.least_surface_score": -LARGE,
+    "mean.surface_ratio": 0.0,
+    "mean.null_wave_ratio": 1.0,
+    "mean.most_effects": 9,
+    "mean.absorbed_size": LARGE,
+    "mean.absorbed_share": 0.0,
+    "mean.least_relative_gain": 0.0,
+    "mean.least_wave_sigmas": 0.0,
+    "mean.same_covariate": 0.999999,
+    "mean.refit_share": 0.0,
+    "mean.refit_gain": 0.0,
+    "mean.linearisation_error": LARGE,
+    "mean.most_reference_error": LARGE,
+    "mean.largest_size": LARGE,
+    "variance.least_gain": -LARGE,
+    "variance.least_excess": 0.0,
+    "variance.least_unshared_share": -LARGE,
+    "variance.excess_noise_ratio": 1.0,
+    "variance.class_margin": 0.0,
+    "variance.class_share": 0.0,
+    "variance.nonparametric_margin": 0.0,
+    "variance.nonparametric_gain": -LARGE,
+    "variance.nonparametric_share": 0.0,
+    "variance.nonparametric_block_sigmas": -LARGE,
+    "variance.second_gain": -LARGE,
+    "variance.block_sigmas": -LARGE,
+    "variance.trial_cost": 0.0,
+    "variance.most_tail_share": LARGE,
+    "variance.most_tail_unevenness": LARGE,
+    "variance.core_excess": -LARGE,
+    "grid_noise.margin": 0.0,
+    "grid_noise.least_gain": -LARGE,
+    "grid_noise.least_sigmas": -LARGE,
+    "grid_noise.finest_grid": 0.0,
+    "grid_noise.reference_error": LARGE,
+    "grid_noise.short_reference_error": 0.02,
+    "locking.fewest_cycles": 0.0,
+    "locking.crowding_ratio": 1.0,
+    "locking.equal_fit": 0.0,
+    "locking.good_fit": LARGE,
+    "edges.least_gain": -LARGE,
+    "edges.block_sigmas": -LARGE,
+    "edges.footprint_block_sigmas": -LARGE,
+    "edges.footprint_fewest": 1,
+    "edges.clear_sigmas": 0.0,
+    "edges.most_relative_noise": LARGE,
+    "edges.clear_step": 0.0,
+    "edges.fewest_filled": 1,
+    "edges.least_filled_gain": -LARGE,
+    "edges.least_filled_share": 0.0,
+    "missing_returns.least_gain": -LARGE,
+    "missing_returns.cutoff_ratio": LARGE,
+    "missing_returns.least_isolated_share": 0.0,
+    "missing_returns.nonparametric_margin": 0.0,
+    "missing_returns.nonparametric_ratio": 1.0,
+    "missing_returns.strip_agreement": -LARGE,
+    "missing_returns.early_sigmas": 0.0,
+    "missing_returns.early_m": 0.0,
+    "changes.fewest": 1,
+    "changes.median_sigmas": 0.0,
+    "changes.faint_sigmas": LARGE,
+    "changes.smallest_departure": 0.0,
+    "changes.margin": 0.0,
+    "changes.largest_share": LARGE,
+    "changes.moved_sigmas": 0.0,
+    "changes.moved_share": LARGE,
+    "changes.moved_share_beside_noise": 0.0,
+    "changes.stripe_length": LARGE,
+    "validation.shortfall_sigmas": 0.0,
+    "validation.most_loss": LARGE,
+    "validation.least_gain_beside_others": -LARGE,
+    "validation.null_sigmas": 0.0,
+    "validation.leftover_share": 0.0,
+    "verdict.least_closed": -LARGE,
+    "verdict.overdispersion": LARGE,
+}
+"""A minimum is 0 or far below; a maximum is far above; a ratio of two scores is 1."""
+
+_SIGNIFICANCE = "it is a significance level, without which nothing is tested"
+_ROBUST = "it bounds the weight of outliers in every fit, so each case depends on it"
+KEPT_OUT: dict[str, str] = {
+    "points.most": "it bounds the memory",
+    "points.outlier_sigmas": _ROBUST,
+    "points.registration_outlier_sigmas": _ROBUST,
+    "mean.significance": _SIGNIFICANCE,
+    "mean.prior_size": "it is a prior, and no rule",
+    "variance.significance": _SIGNIFICANCE,
+    "variance.clip_sigmas": _ROBUST,
+    "variance.tail_sigmas": "it defines what an outlier is; `most_tail_share` decides",
+    "grid_noise.reference_length": "it says where `short_reference_error` holds, and is off with it",
+    "locking.most_noise": "it ends a grid of trial values",
+    "locking.significance": _SIGNIFICANCE,
+    "quantization.least_resultant": "it is the test itself: every scan would count as rounded",
+    "edges.most_gain_of_a_point": _ROBUST,
+    "changes.false_changes": _SIGNIFICANCE,
+    "validation.clip_sigmas": _ROBUST,
+    "verdict.rejection_p": _SIGNIFICANCE,
+    "verdict.gap_sigmas": _SIGNIFICANCE,
+    "verdict.floor_sigmas": _SIGNIFICANCE,
+}
+"""Thresholds without a value that switches off one rule, with the reason."""
+
+MERGED: dict[str, float] = {
+    "mean.class_margin": 5.0,
+    "variance.class_margin": 3.0,
+    "mean.nonparametric_margin": 6.0,
+    "variance.least_gain": 4.0,
+    "variance.nonparametric_margin": 5.0,
+    "variance.nonparametric_gain": 12.0,
+    "variance.second_gain": 6.0,
+    "variance.nonparametric_block_sigmas": 3.0,
+    "mean.least_relative_gain": 0.01,
+    "mean.least_surface_score": 12.0,
+    "grid_noise.margin": 3.0,
+    "grid_noise.least_sigmas": 3.0,
+    "locking.significance": 0.004,
+    "locking.equal_fit": 3.0,
+    "edges.least_gain": 12.0,
+    "edges.footprint_block_sigmas": 3.0,
+    "edges.least_filled_gain": 30.0,
+    "edges.clear_step": 1.0,
+    "missing_returns.least_gain": 6.0,
+    "missing_returns.nonparametric_margin": 5.0,
+    "changes.median_sigmas": 3.0,
+    "changes.moved_share_beside_noise": 0.3,
+    "validation.leftover_share": 0.01,
+    "validation.shortfall_sigmas": 2.0,
+    "validation.least_gain_beside_others": 4.0,
+    "verdict.floor_sigmas": 2.0,
+}
+"""The value of another threshold of the same kind, which could replace this one."""
+
+
+def others(key: str) -> dict[Setting, Any]:
+    """Return a threshold's other values by (key, "off") and (key, "merged")."""
+    tables = {"off": OFF, "merged": MERGED}
+    return {(key, name): values[key] for name, values in tables.items() if key in values}
+
+
+def changed(settings: list[Setting]) -> Thresholds:
+    """Return the thresholds with some of them changed; values beyond their bounds are allowed."""
+    found = Thresholds()
+    for key, name in settings:
+        group, field = key.split(".")
+        values = getattr(found, group).model_copy(update={field: others(key)[key, name]})
+        found = found.model_copy(update={group: values})
+    return found
