@@ -18,7 +18,10 @@ class VarianceThresholds(ThresholdGroup):
     """
 
     least_gain: PositiveFloat = threshold_field(
-        6.0, "log-likelihood", "The best noise term needs at least this log-likelihood ratio.", JUDGEMENT
+        6.0,
+        "log-likelihood",
+        "The best noise term needs at least this log-likelihood ratio, a second one beside it too.",
+        JUDGEMENT,
     )
     least_excess: PositiveFloat = threshold_field(
         0.04,
@@ -63,12 +66,6 @@ class VarianceThresholds(ThresholdGroup):
         "root sums of squares of the wall blocks' gains",
         "The wall blocks must prefer a variance free in bins by this much.",
         DEVELOPMENT,
-    )
-    second_gain: PositiveFloat = threshold_field(
-        3.0,
-        "log-likelihood",
-        "A second noise term must raise the score by this if the first alone does not explain the residuals.",
-        JUDGEMENT,
     )
     trial_cost: PositiveFloat = threshold_field(
         0.5, "log-likelihood", "Penalty of a parameter for which only a few values are tried.", JUDGEMENT
