@@ -446,7 +446,7 @@ def _blocks_agree(squares: FloatArray, first: FloatArray, second: FloatArray, bl
 def _blocks_prefer_binned(squares: FloatArray, first: FloatArray, free: FloatArray, block: NDArray[np.int64]) -> bool:
     """Whether wall blocks agree that a binned variance fits better, which only has to show that the named one does not fit."""
     gain, sigmas = _gain_over(squares, first, free, block)
-    return gain > 0 and sigmas > thresholds().variance.nonparametric_block_sigmas
+    return gain > 0 and sigmas > thresholds().edges.least_block_sigmas
 
 
 def _gain_over(squares: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> tuple[float, float]:
