@@ -71,14 +71,17 @@ def report(name: str, found: dict[str, float]) -> None:
 def scan(wall: Path, sub_rays: int, rate_only: bool) -> None:
     """One process: mesh file to LAS; or, in another, the rate of the observation and the bias of the beam, as JSON."""
     marks = [("start", psutil.Process().create_time()), ("import", 0.0)]
-    from pipeline.config.simulation import SimulationConfig
-    from pipeline.formats.point_cloud import PointCloud
-    from pipeline.formats.points.laz import PulseChannels, write_laz
-    from pipeline.run.recorded_points import recorded_points
-    from pipeline.run.site import prepare_site
-    from scene.common.backend import dr
-    from scene.common.config import parse
-    from scene.common.keyed_random import KeyedRandom
+    from pipeline.cli.imports import fast_imports
+
+    with fast_imports():  # as the commands do
+        from pipeline.config.simulation import SimulationConfig
+        from pipeline.formats.point_cloud import PointCloud
+        from pipeline.formats.points.laz import PulseChannels, write_laz
+        from pipeline.run.recorded_points import recorded_points
+        from pipeline.run.site import prepare_site
+        from scene.common.backend import dr
+        from scene.common.config import parse
+        from scene.common.keyed_random import KeyedRandom
 
     marks[1] = "import", time.time()
     beam = {"name": "beam_divergence", "divergence_rad": 3e-4, "sub_rays": sub_rays}

@@ -13,9 +13,9 @@ def fast_imports() -> Iterator[None]:
     """Import modules in a `with` block without garbage collection, which would check the many objects that modules keep.
 
     This saves about a tenth of the time. Later collections skip these objects too. Nothing is changed in a process that has
-    imported NumPy before, because other objects exist there.
+    imported modules of scarpsim before, because it may hold garbage.
     """
-    if "numpy" in sys.modules or not gc.isenabled():
+    if "pydantic" in sys.modules or not gc.isenabled():
         yield
         return
     gc.disable()

@@ -12,7 +12,7 @@ from pydantic import Field, field_validator
 from scene.common.config import Config
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
-from scene.geometry.mesh import FloatArray, TriangleMesh, area_normals
+from scene.geometry.mesh import FloatArray, TriangleMesh
 from scene.ray_casting.raycast import RayCaster
 from sensors.cameras.camera import Camera, CameraPair, Matrix3, Vector3, axis_rotation, check_rotation
 
@@ -43,7 +43,7 @@ class Target:
 
         Raises InputError if the mesh faces straight up or down or is closed, so that it has no front.
         """
-        area = area_normals(self.mesh.corners())
+        area = self.mesh.area_normals()
         total, horizontal = np.linalg.norm(area, axis=1).sum(), area.sum(axis=0) * [1.0, 1.0, 0.0]
         if np.linalg.norm(horizontal) < 1e-3 * total:
             raise InputError(

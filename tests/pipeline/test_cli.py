@@ -327,6 +327,30 @@ def test_a_simulation_starts_without_the_libraries_of_its_products() -> None:
     assert loaded & {"matplotlib", "PIL", "laspy", "pyproj", "jinja2", "pye57", "scipy", "trimesh", "open3d"} == set()
 
 
+def test_a_surface_from_points_needs_no_ray_tracer() -> None:
+    program = "import sys, pipeline.formats.points.points, pipeline.surface.from_cloud; print(*sys.modules)"
+    shown = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    loaded = {name.partition(".")[0] for name in shown.stdout.split()}
+    assert "numpy" in loaded
+    assert loaded & {"mitsuba", "drjit", "cv2"} == set()
+
+
+def test_fast_imports_pause_garbage_collection_only_at_the_start_of_a_process() -> None:
+    program = """
+import gc
+from pipeline.cli.imports import fast_imports
+seen = [gc.isenabled()]
+for _ in range(2):
+    with fast_imports():
+        import pydantic.main
+        seen.append(gc.isenabled())
+    seen.append(gc.isenabled())
+print(seen, gc.get_freeze_count() > 1000)
+"""
+    shown = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert shown.stdout.strip() == "[True, False, True, True, True] True"
+
+
 def test_the_page_of_the_command_line_says_what_there_is() -> None:
     page = (CONFIGS.parent / "docs/reference/command_line.md").read_text()
     for code in (cli.DONE, cli.FAILED, cli.WRONG_INPUT, cli.INTERRUPTED):
