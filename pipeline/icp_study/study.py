@@ -389,7 +389,7 @@ def _residual_nmad(target: ReferenceSurface, epoch: StudyEpoch) -> float:
     """Return the NMAD of the residuals along the normals at the true pose, m."""
     step = max(len(epoch.points) // _SAMPLE, 1)
     local = epoch.true.apply(epoch.points[::step]) - target.origin
-    _, nearest = target.tree.query(local)
+    nearest = target.tree.query(local, 1)[1][:, 0]
     normals = target.normals if target.normals is not None else np.zeros_like(target.points)
     along = np.einsum("ni,ni->n", local - target.points[nearest], normals[nearest])
     return float(stats.median_abs_deviation(along, scale="normal"))

@@ -140,8 +140,9 @@ def compare_epoch(
 
 
 def _change(pair: RasterPair, alignment: Alignment, view: int) -> Change:
-    difference = pair.reference.height - applied(alignment, pair)
-    registration = alignment.sigma(pair)
+    design = pair.design(alignment.centre)
+    difference = pair.reference.height - applied(alignment, pair, design)
+    registration = alignment.sigma(design)
     predicted = np.sqrt(pair.reference.sigma**2 + pair.epoch.sigma**2 + registration**2).astype(np.float32)
     noise = significance(difference, predicted, alignment.stable[view])
     return Change(difference, noise, registration, pair.reference, pair.epoch)

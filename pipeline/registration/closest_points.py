@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.registration.search_tree import SearchTree
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 
@@ -37,14 +37,14 @@ class ReferenceSurface:
         Reference points relative to `origin`, m.
     normals : (m, 3) array, optional
         Unit normals of the points; None if they are not known.
-    tree : scipy.spatial.cKDTree
+    tree : SearchTree
         Search tree of `points`.
     """
 
     origin: FloatArray
     points: FloatArray
     normals: FloatArray | None
-    tree: Any
+    tree: SearchTree
 
     @classmethod
     def build(cls, points: FloatArray, normals: FloatArray | None = None) -> ReferenceSurface:
@@ -62,15 +62,12 @@ class ReferenceSurface:
         InputError
             If there are fewer than six points, values that are not finite, normals of length zero, or points on one line.
         """
-        from scipy.spatial import cKDTree
-
         points = checked_cloud(points, "reference points")
         unit = None if normals is None else _unit(normals, len(points))
         order = scan_order(points)
         origin = centroid_of(points)
         local = points[order] - origin
-        tree = cKDTree(local, leafsize=16, balanced_tree=False)
-        return cls(origin, local, None if unit is None else unit[order], tree)
+        return cls(origin, local, None if unit is None else unit[order], SearchTree(local))
 
 
 def scan_order(points: FloatArray) -> NDArray[np.intp] | slice:

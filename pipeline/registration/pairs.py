@@ -115,9 +115,9 @@ class NearestPairs:
             step = moved - self.pose.apply(points)
             lead = lead - 2 * np.sqrt(np.einsum("ni,ni->n", step, step))
         again = np.flatnonzero(~(lead > _ROUNDING_M))
-        distance, found = self.surface.tree.query(moved[again], k=[1, neighbours], distance_upper_bound=gate)
+        distance, found = self.surface.tree.query(moved[again], neighbours, gate)
         nearest[again] = found[:, 0]
-        lead[again] = np.minimum(distance[:, 1], gate) - distance[:, 0]
+        lead[again] = np.minimum(distance[:, -1], gate) - distance[:, 0]
         self.lead_m[part], self.nearest[part] = lead, nearest
         return moved, nearest
 

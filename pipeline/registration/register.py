@@ -436,7 +436,7 @@ class _Alignment:
 
     def _too_few(self, level: _Level, pose: RigidTransform, gate: float, inliers: int) -> InputError:
         """Make the error for too few pairs within the outlier threshold."""
-        median_m = np.median(self.surface.tree.query(pose.apply(self.cloud.points[level.parts[0]]))[0])
+        median_m = np.median(self.surface.tree.query(pose.apply(self.cloud.points[level.parts[0]]), 1)[0])
         return InputError(
             f"only {inliers} of {level.points:,} points lie within {gate:g} m of the reference; "
             f"the median distance is {median_m:.3g} m",

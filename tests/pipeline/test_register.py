@@ -368,11 +368,11 @@ def test_most_points_keep_their_pairs(reference: ReferenceSurface) -> None:
     class CountingTree:
         searched = 0
 
-        def query(self, points: FloatArray, **options: Any) -> Any:
+        def query(self, points: FloatArray, neighbours: int, limit: float) -> Any:
             self.searched += len(points)
-            return reference.tree.query(points, **options)
+            return reference.tree.query(points, neighbours, limit)
 
-    tree = CountingTree()
+    tree: Any = CountingTree()
     moving = OFFSET.apply(sample(20_000, RANDOM.child("again"))[0])
     config = IcpConfig(method="point_to_point", delta_threshold=1e-9, threshold=1e-13, max_iteration=30)
     found = register_to(dataclasses.replace(reference, tree=tree), moving, config, RANDOM, threads=1)
