@@ -124,8 +124,7 @@ def cast_rays(measurement: TlsMeasurement, axes: list[FloatArray]) -> RayHits:
     weight = barycentric(position + distance[:, None] * ray, scene.mesh.vertices[corner])
     found = replace(found, corner=corner, weight=weight)
     if measurement.reference_error_m and not measurement.error_is_relief:
-        normal = _interpolated_normals(scene.mesh, corner, weight)
-        found = replace(found, normal=normal, cos_incidence=np.abs(np.einsum("ni,ni->n", ray, normal)))
+        found = replace(found, normal=_interpolated_normals(scene.mesh, corner, weight))
     if measurement.planes is None:
         return found
     return _smoothed_hits(found, measurement.planes, ray, (corner, weight, scene.mesh.vertices[corner]))
