@@ -32,6 +32,8 @@ ELSEWHERE = {
     "fuzz": "tests/test_fuzz.py, test_fuzz_commands.py and test_fuzz_records.py run what it runs",
     "bad_inputs/run": "tests/test_bad_inputs.py",
     "bad_inputs/preloaded": "benchmarks/bad_inputs/run.py runs it as a process of its own",
+    "gap_ablation/run": "tests/test_gap_ablation.py",
+    "gap_ablation/page": "tests/test_gap_ablation.py",
     "gap_closed_form/run": "tests/test_gap_closed_form.py",
     "gap_injections/run": "tests/test_gap_injections.py",
     "gap_second_generator/run": "tests/test_gap_second_generator.py",

@@ -3,8 +3,8 @@
     python benchmarks/gap_ablation/run.py --runs RUNS --measurements DIR --out OUT --minutes 60
 
 The first diagnosis of a case also carries the value of each threshold with which its rule never acts (benchmarks/varied.py), and
-records which of them would change a decision. Only with those is the case diagnosed again, thresholds with few such cases first.
-An interrupted run continues. `--together KEY=NAME ...` diagnoses all cases with several settings at once instead.
+records which of them would change a decision. Only with those is the case diagnosed again, settings that take the least time
+first. An interrupted run continues. `--together KEY=NAME ...` diagnoses all cases with several settings at once instead.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def watch(case: StoredCase, out: Path) -> None:
 
 
 def jobs(cases: list[StoredCase], out: Path, only: list[str]) -> list[tuple[StoredCase, Setting]]:
-    """Return what to diagnose again: settings with few cases first, each on its cases in turn.
+    """Return what to diagnose again: settings that take the least time first, each on its cases in turn.
 
     only: names of settings (off, merged), or settings as KEY=NAME; empty for all.
     """
@@ -63,8 +63,15 @@ def jobs(cases: list[StoredCase], out: Path, only: list[str]) -> list[tuple[Stor
         for key, name in noted(case, out)["matters"]:
             if not only or name in only or f"{key}={name}" in only:
                 by_setting.setdefault((key, name), []).append(case)
-    ordered = sorted(by_setting.items(), key=lambda item: len(item[1]))
+    seconds = {case: _usual(case, out).get("wall_s", 0.0) for case in cases}
+    ordered = sorted(by_setting.items(), key=lambda item: sum(seconds[case] for case in item[1]))
     return [(case, setting) for setting, some in ordered for case in some]
+
+
+def _usual(case: StoredCase, out: Path) -> Json:
+    """Return the first answer to a case; empty if there is none."""
+    path = out / case.source / case.name / "usual.json"
+    return dict(json.loads(path.read_text())) if path.exists() else {}
 
 
 def noted(case: StoredCase, out: Path) -> Json:
@@ -80,8 +87,7 @@ def again(case: StoredCase, settings: list[Setting], name: str, out: Path) -> No
         return
     found = diagnosed(case.folder, changed(settings))
     path.write_text(json.dumps(found, default=float))
-    usual = json.loads((path.parent / "usual.json").read_text())
-    before, after = case.judged(usual), case.judged(found)
+    before, after = case.judged(_usual(case, out)), case.judged(found)
     print(f"{name}: {case.source} {case.name}: {before!r} -> {after!r} ({found['verdict']})", flush=True)
 
 

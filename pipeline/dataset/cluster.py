@@ -18,17 +18,18 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from itertools import groupby
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pipeline.dataset import watchdog
-from pipeline.dataset.worker import EpochOrder, make_and_store_run
 from scene.common.errors import InputError, OutsideError
 from scene.common.extras import how_to_install
 
 if TYPE_CHECKING:
     from distributed import Client, Future, LocalCluster
 
-Run = list[EpochOrder]
+    from pipeline.dataset.worker import EpochOrder
+
+Run: TypeAlias = "list[EpochOrder]"
 """Epochs that a worker makes in one go."""
 _POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables that limit the threads of numerical libraries."""
@@ -159,6 +160,8 @@ def _require_distributed(where: str) -> None:
 
 def _make(orders: list[EpochOrder], count: int, scheduler: str) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield the index in `orders` of each epoch that is done, and what it took."""
+    from pipeline.dataset.worker import make_and_store_run  # with the ray tracer, which other users of this module do not need
+
     with ExitStack() as stack:
         if not scheduler:
             stack.enter_context(watchdog.watch_workers(watchdog.STALLED_S))

@@ -18,7 +18,10 @@ class VarianceThresholds(ThresholdGroup):
     """
 
     least_gain: PositiveFloat = threshold_field(
-        6.0, "log-likelihood", "The best noise term needs at least this log-likelihood ratio.", JUDGEMENT
+        6.0,
+        "log-likelihood",
+        "The best noise term needs at least this log-likelihood ratio, a second one beside it too.",
+        JUDGEMENT,
     )
     least_excess: PositiveFloat = threshold_field(
         0.04,
@@ -57,18 +60,6 @@ class VarianceThresholds(ThresholdGroup):
         "A variance free in bins that gains no more than this over the named term is only a note; beyond, the term is marked "
         "empirical. Known noise put into real scans came to 0.05 and 0.09, and noise outside the catalogue to 0.15.",
         DEVELOPMENT,
-    )
-    nonparametric_block_sigmas: PositiveFloat = threshold_field(
-        2.0,
-        "root sums of squares of the wall blocks' gains",
-        "The wall blocks must prefer a variance free in bins by this much.",
-        DEVELOPMENT,
-    )
-    second_gain: PositiveFloat = threshold_field(
-        3.0,
-        "log-likelihood",
-        "A second noise term must raise the score by this if the first alone does not explain the residuals.",
-        JUDGEMENT,
     )
     trial_cost: PositiveFloat = threshold_field(
         0.5, "log-likelihood", "Penalty of a parameter for which only a few values are tried.", JUDGEMENT
@@ -206,29 +197,19 @@ class EdgeThresholds(ThresholdGroup):
     block_sigmas: PositiveFloat = threshold_field(
         3.0,
         "root sums of squares of the wall blocks' gains",
-        "The wall blocks must agree by this much on an edge effect, on a second noise term, or on noise that is lower than "
-        "predicted.",
+        "The wall blocks must agree by this much on an edge effect, on a second noise term, on grid-correlated noise where "
+        "single points show no added variance, or on noise that is lower than predicted.",
         JUDGEMENT,
     )
     most_gain_of_a_point: PositiveFloat = threshold_field(
         3.0, "log-likelihood", "The gain of one point is clipped at this before the wall blocks are compared.", JUDGEMENT
     )
-    footprint_block_sigmas: PositiveFloat = threshold_field(
+    least_block_sigmas: PositiveFloat = threshold_field(
         2.0,
         "root sums of squares of the wall blocks' gains",
-        "The wall blocks must agree by this much on a beam divergence: for example four blocks of four. None of 60 development "
-        "cases without a footprint came to 1.9.",
+        "The wall blocks must agree by this much on a beam divergence, or that a variance free in bins fits better than a named "
+        "one: for example four blocks of four. None of 60 development cases without a footprint came to 1.9.",
         DEVELOPMENT,
-    )
-    footprint_fewest: PositiveInt = threshold_field(
-        20, "points", "At least this many points must lie at edges that a wide beam would move clearly.", JUDGEMENT
-    )
-    clear_step: PositiveFloat = threshold_field(
-        1.3,
-        "ratio of depth steps",
-        "A point is used to test edge fattening if the depth step is this many times the smallest that counts as a "
-        "step; matchers disagree on smaller ones.",
-        JUDGEMENT,
     )
     fewest_filled: PositiveInt = threshold_field(
         8,

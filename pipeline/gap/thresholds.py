@@ -298,7 +298,8 @@ class VerdictThresholds(ThresholdGroup):
     rejection_p: PositiveFloat = threshold_field(
         0.01,
         "probability",
-        "Significance level of the goodness of fit. The model is rejected if the p-value of the residual misfit is at most this.",
+        "Significance level of the goodness of fit. The model is rejected if the p-value of the residual misfit is at most this. "
+        "A score lies above the noise floor at half this level, one-sided.",
         "definition of the verdict no_gap",
         lt=1,
     )
@@ -321,12 +322,6 @@ class VerdictThresholds(ThresholdGroup):
         "standard errors",
         "The scores before and after differ if their difference exceeds this. Beside others, an effect whose only parameter is "
         "within this of zero is only mentioned.",
-        JUDGEMENT,
-    )
-    floor_sigmas: PositiveFloat = threshold_field(
-        2.6,
-        "standard errors",
-        "A score lies above the noise floor if the difference exceeds this: 0.5 % exceed it by chance.",
         JUDGEMENT,
     )
 

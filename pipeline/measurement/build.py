@@ -50,6 +50,7 @@ class ScanMaterial:
     model_words : Where the model comes from, for the user.
     stable_words : How much of each scan lies on stable rock, for the user; empty if all points are compared.
     whole : Whether the first scan has all of its points, so that missing returns can be told.
+    registered_alone : Whether each scan was registered by itself, so that it has a pose of its own even at one station.
     """
 
     scans: Sequence[RawScan]
@@ -59,6 +60,7 @@ class ScanMaterial:
     model_words: tuple[str, ...]
     stable_words: tuple[str, ...] = ()
     whole: bool = True
+    registered_alone: bool = False
 
 
 def build(request: Request, out: Path) -> Interpretation:
@@ -126,13 +128,13 @@ def write_scans(material: ScanMaterial, out: Path) -> Interpretation:
         "cannot show": reference.limits,
         "model": (*material.model_words, *noise_words),
     }
-    keys = _pose_keys(stations)
+    keys = _pose_keys(stations, material.registered_alone)
     if "scanner" in keys and station.pattern is not None and material.whole and not echo_words:
         keys["pattern"] = station.pattern
     if reference.of_points:
         keys |= {"incidence": "planes", "reference_error_m": float(f"{reference.error_m:.3g}")}
     if reference.noise_is_known:
-        keys["reference_error_kind"] = "noise"
+        keys["reference_error_kind"] = "scanner"
     clouds = [_for_file(scan, each) for scan, each in zip(scans, stations, strict=True)]
     content = MeasurementContent(
         "tls", clouds, reference.mesh, model, _eye(station), ", ".join(scan.name for scan in scans), keys=keys
@@ -263,10 +265,10 @@ def _distance_m(station: Station, other: Station) -> float:
     return float(np.linalg.norm(station.position - other.position))
 
 
-def _pose_keys(stations: list[Station]) -> dict[str, Any]:
-    """Return the key `scanner` for epochs from one station, or `scanners` for scans from several."""
+def _pose_keys(stations: list[Station], registered_alone: bool) -> dict[str, Any]:
+    """Return the key `scanner` for epochs from one station, or `scanners` for scans from several or with poses of their own."""
     poses = [{"position_m": each.position.tolist(), "rotation": each.rotation.tolist()} for each in stations]
-    one = all(_distance_m(each, stations[0]) <= _ONE_PLACE_M for each in stations[1:])
+    one = all(_distance_m(each, stations[0]) <= _ONE_PLACE_M and not registered_alone for each in stations[1:])
     return {"scanner": poses[0]} if one else {"scanners": poses}
 
 

@@ -48,7 +48,7 @@ class Reference:
     rows : (k,) indices of the measured points that are compared with it, if it was made of the other ones; None: all.
     of_points : Whether it was meshed from points. Noise and relief then tilt its triangles, so that incidence angles must not
         refer to them.
-    noise_is_known : Whether `error_m` is noise of the vertices alone, without relief between them.
+    noise_is_known : Whether `error_m` is noise of the same scanner alone, without relief between the vertices.
     epsg : EPSG code of the coordinate system that an elevation model states; None: it states none, or it is another kind of file.
     """
 
@@ -139,8 +139,8 @@ def reference_from_scans(
     position : (3,) place as seen from which they are meshed, m, in the same frame.
     rotation : (3, 3) rotation from a frame at that place to the frame of the scans.
     seen_from : That place in words, for the description of the reference.
-    noise : Known noise of a point along the lines of sight, without the relief between points; None: it is estimated from the
-        scatter of neighbouring points, which includes the relief.
+    noise : Known noise of a point along the lines of sight, by the scanner of the compared points and without relief; None: it
+        is estimated from the scatter of neighbouring points, which includes the relief.
 
     Raises
     ------

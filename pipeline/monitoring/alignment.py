@@ -97,7 +97,7 @@ class RasterPair:
         data.
         """
         found = _design(self.epoch, self.from_wall.apply(centre))
-        if self.from_wall is SAME:
+        if np.array_equal(self.from_wall.rotation, SAME.rotation):
             return found
         turned = self.from_wall.rotation.T.astype(np.float32)
         return np.concatenate([np.tensordot(turned, part, 1) for part in (found[:3], found[3:])])
@@ -138,12 +138,11 @@ class Alignment:
     rms_m: float
     notes: tuple[str, ...] = ()
 
-    def sigma(self, pair: RasterPair) -> NDArray[np.float32]:
+    def sigma(self, design: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the standard deviation of each registered height, (h, w), m, that comes from the registration's uncertainty.
 
-        pair: heights of the reference and of the epoch in one view of the wall. Pixels without data are NaN.
+        design: (6, h, w) design matrix of one view of the wall about `centre` (`RasterPair.design`). Pixels without data are NaN.
         """
-        design = pair.design(self.centre)
         covariance = self.covariance.astype(np.float32)
         sigma = np.empty(design.shape[1:], dtype=np.float32)
         for start in range(0, len(sigma), _BAND):
@@ -267,14 +266,21 @@ def refine(pairs: Sequence[RasterPair], areas: StableRock | None) -> Alignment:
     return Alignment(transform, covariance, centre, tuple(stable), rms, notes)
 
 
-def applied(alignment: Alignment, pair: RasterPair) -> NDArray[np.float32]:
+def applied(alignment: Alignment, pair: RasterPair, design: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the epoch's heights (h, w), m, after the small motion that `refine` estimated, to first order in it.
 
-    alignment: the motion. pair: heights of the reference and of the epoch in one view of the wall.
+    Parameters
+    ----------
+    alignment : Alignment
+        The motion.
+    pair : RasterPair
+        Heights of the reference and of the epoch in one view of the wall.
+    design : (6, h, w) array
+        Design matrix of this view about the centre of the motion (`RasterPair.design`).
     """
     shift = alignment.transform.apply(alignment.centre) - alignment.centre
     parameters = np.concatenate([shift, alignment.transform.rotation_vector])
-    return np.asarray(pair.epoch.height + np.tensordot(parameters.astype(np.float32), pair.design(alignment.centre), 1))
+    return np.asarray(pair.epoch.height + np.tensordot(parameters.astype(np.float32), design, 1))
 
 
 def _compared(pair: RasterPair, areas: StableRock | None) -> NDArray[np.bool_]:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from pipeline.monitoring.gridding import HeightRaster
+from pipeline.monitoring.raster_statistics import mean_over_squares
 from pipeline.monitoring.significance import Significance
 from scene.geometry.grid import Grid
 
@@ -217,8 +218,8 @@ def _begins(standard: NDArray[np.floating], significance: Significance) -> NDArr
     filled = np.where(known, standard, 0.0)
     found = np.zeros((2, *standard.shape), dtype=bool)
     for side in _SQUARES_PX:
-        share = ndimage.uniform_filter(known.astype(np.float32), side)
-        mean = ndimage.uniform_filter(filled.astype(np.float32), side) / np.maximum(share, 1e-6)
+        share = mean_over_squares(known.astype(np.float32), side)
+        mean = mean_over_squares(filled.astype(np.float32), side) / np.maximum(share, 1e-6)
         least, filled_square = _BEGINS * significance.sigma_of_mean(side**2), share > 0.5
         found[0] |= (mean > least) & filled_square
         found[1] |= (mean < -least) & filled_square

@@ -117,13 +117,20 @@ def raster_of(points: FloatArray, gsd_m: float | None, count: int | None = None)
     return Grid.over(bounds, gsd)
 
 
+def _count_cells(points: FloatArray, side: float) -> int:
+    """Return the number of squares of a grid in which points (n, 2) lie."""
+    column, row = np.floor(points / side).astype(np.int64).T
+    ordered = np.sort(column * (np.ptp(row) + 1) + row - row.min())
+    return 1 + int(np.count_nonzero(ordered[1:] != ordered[:-1]))
+
+
 def _usual_gsd(points: FloatArray, count: int) -> float:
     """Return a round pixel size, m, somewhat above the mean distance of neighbouring points."""
     few = points[:: len(points) // _MOST_COUNTED + 1, :2]
     apart, cell = _CELL_M, _CELL_M
     counted = 0
     for _ in range(_MOST_ROUNDS):
-        cells = len(np.unique(np.floor(few / cell).astype(np.int64), axis=0))
+        cells = _count_cells(few, cell)
         apart = float(np.sqrt(cells * cell**2 / count))
         cell = _POINTS_A_CELL * apart * float(np.sqrt(count / len(few)))
         counted += cells <= _ALONE * len(few)

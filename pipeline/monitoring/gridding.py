@@ -17,6 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.monitoring.raster_statistics import quantiles
+from pipeline.registration.rigid import RigidTransform
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray
 
@@ -26,11 +28,11 @@ _MOST_LEVERAGE = 1.0
 """Largest q: a pixel whose height is known worse than from a single point at its centre has no data."""
 _PRIOR_POINTS = 4.0
 """Weight of the raster's median variance in that of a pixel, in points: few points tell little of their own scatter."""
-_CHUNK = 4_000_000
-"""Points of which sums are taken at a time."""
+POINTS_AT_ONCE = 1 << 14
+"""Points that are transformed and summed at a time, so that their arrays stay in the processor's cache."""
 SAMPLE = 50_000
 """Points of an epoch that ICP works with: it only brings the epoch near, and is followed by a fit of the rasters."""
-_BAND = 64
+_BAND = 32
 """Rows to which planes are fitted at a time, so that the sums stay in the processor's cache."""
 
 
@@ -80,17 +82,17 @@ class WallPoints:
     ----------
     sample : (n, 3) array
         A subset of the points for ICP, spread over all of the epoch, m.
-    chunks : callable
-        Function that yields all points in chunks (k, 3), m, each time it is called.
+    moved : callable
+        Function of a rigid transform that yields all points, after this transform, in chunks (k, 3), m, each time it is called.
     """
 
     sample: FloatArray
-    chunks: Callable[[], Iterable[FloatArray]]
+    moved: Callable[[RigidTransform], Iterable[FloatArray]]
 
     @classmethod
     def of(cls, points: FloatArray) -> WallPoints:
         """Make the points of an epoch from an array (n, 3), wall frame, m, that is in memory."""
-        return cls(points, lambda: [points])
+        return cls(points, lambda motion: [motion.apply(points)])
 
 
 def gridded(points: FloatArray | Iterable[FloatArray], grid: Grid) -> HeightRaster:
@@ -112,9 +114,9 @@ class PointSums:
     ----------
     grid : Grid
         Raster of h x w pixels.
-    sums : (10, h w) array
+    sums : (h w, 10) array
         For each pixel the sums over its points of 1, u, v, z, uu, uv, vv, uz, vz and zz: u and v are x and y in pixels from the
-        pixel's centre, z is the height, m.
+        pixel's centre, z is the height, m. Those of one pixel lie side by side, because points come in any order.
     """
 
     grid: Grid
@@ -123,12 +125,12 @@ class PointSums:
     @classmethod
     def over(cls, grid: Grid) -> PointSums:
         """Return sums that are still zero for the pixels of a raster, so that points can be added to them. grid: the raster."""
-        return cls(grid, np.zeros((10, grid.height * grid.width)))
+        return cls(grid, np.zeros((grid.height * grid.width, 10)))
 
     def add(self, points: FloatArray) -> None:
         """Add points (n, 3), frame of the raster, m, to the sums of their pixels; those outside the raster are left out."""
-        for start in range(0, len(points), _CHUNK):
-            _add_moments(self.sums, points[start : start + _CHUNK], self.grid)
+        for start in range(0, len(points), POINTS_AT_ONCE):
+            _add_moments(self.sums.reshape(-1), points[start : start + POINTS_AT_ONCE], self.grid)
 
     def heights(self) -> HeightRaster:
         """Fit planes to all points added so far, and return the raster of heights.
@@ -136,46 +138,41 @@ class PointSums:
         The height of a pixel is that of a plane at its centre, frame of the raster, m. The plane is fitted to the points in
         the 3 x 3 pixels about it. Heights are NaN where these are fewer than four or do not determine a plane well.
         """
-        return _fitted(self.sums.reshape(10, self.grid.height, self.grid.width), self.grid)
+        return _fitted(self.sums.reshape(*self.grid.shape, 10), self.grid)
 
 
 def _add_moments(sums: FloatArray, points: FloatArray, grid: Grid) -> None:
-    """Add to (10, h w) the sums over points: 1, u, v, z, uu, uv, vv, uz, vz, zz; u and v in pixels from the pixel's centre."""
-    x, y, z = points.T
+    """Add to (10 h w,) the sums over points: 1, u, v, z, uu, uv, vv, uz, vz, zz; u and v in pixels from the pixel's centre."""
+    x, y, z = np.ascontiguousarray(points.T)
     column, row = (x - grid.x_min) / grid.gsd, (grid.y_max - y) / grid.gsd
     inside = (column >= 0) & (column < grid.width) & (row >= 0) & (row < grid.height)
     if not inside.all():
         column, row, z = column[inside], row[inside], z[inside]
-    if not len(z):
-        return
     whole_column, whole_row = np.floor(column), np.floor(row)
-    pixel = (whole_row * grid.width + whole_column).astype(np.int64)
-    first = int(pixel.min())
-    pixel -= first
+    place = (whole_row * grid.width + whole_column).astype(np.int64) * 10
     u, v = column - whole_column - 0.5, 0.5 - (row - whole_row)
-    product = whole_row  # its memory is used again
-    for place, factors in enumerate(((), (u,), (v,), (z,), (u, u), (u, v), (v, v), (u, z), (v, z), (z, z))):
-        weights = np.multiply(*factors, out=product) if len(factors) == 2 else factors[0] if factors else None
-        found = np.bincount(pixel, weights)
-        sums[place, first : first + len(found)] += found
+    np.add.at(sums, place, 1.0)
+    for weights in (u, v, z, u * u, u * v, v * v, u * z, v * z, z * z):
+        place += 1
+        np.add.at(sums, place, weights)
 
 
 def _fitted(sums: FloatArray, grid: Grid) -> HeightRaster:
-    """Fit planes band by band of rows; the variance that a pixel's is drawn to is the median of its raster."""
+    """Fit planes to sums (h, w, 10) band by band of rows; the variance that a pixel's is drawn to is the median of its raster."""
     height, scatter, slope_x, slope_y, leverage = np.full((5, *grid.shape), np.nan, dtype=np.float32)
     freedom = np.zeros(grid.shape, dtype=np.float32)
     for start in range(0, grid.height, _BAND):
         stop = min(start + _BAND, grid.height)
         low = max(start - 1, 0)
-        around = _about_each_pixel(sums[:, low : stop + 1])[:, start - low : stop - low]
+        around = _about_each_pixel(np.ascontiguousarray(sums[low : stop + 1].transpose(2, 0, 1)))[:, start - low : stop - low]
         band = slice(start, stop)
         freedom[band] = around[0] - 3
         height[band], scatter[band], slope_x[band], slope_y[band], leverage[band] = _planes(around)
     known = np.isfinite(height)
-    usual = float(np.median(scatter[known] / freedom[known])) if known.any() else 0.0
+    usual = float(quantiles(scatter[known] / freedom[known], [0.5])[0]) if known.any() else 0.0
     scatter = np.sqrt((scatter + np.float32(_PRIOR_POINTS * usual)) / (freedom + np.float32(_PRIOR_POINTS)))
     slopes = slope_x / np.float32(grid.gsd), slope_y / np.float32(grid.gsd)
-    return HeightRaster(grid, height, scatter * np.sqrt(leverage), scatter, *slopes, sums[0].astype(np.int32))
+    return HeightRaster(grid, height, scatter * np.sqrt(leverage), scatter, *slopes, sums[:, :, 0].astype(np.int32))
 
 
 def _planes(around: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -204,28 +201,20 @@ def _planes(around: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, Flo
 def _about_each_pixel(sums: FloatArray) -> FloatArray:
     """(10, h, w) the sums over 3 x 3 pixels, with u and v from the centre of the middle one: first along rows, then columns."""
     along = sums.copy()
-    along[:, :, :-1] += _shifted(sums[:, :, 1:], 1.0, 0.0)
-    along[:, :, 1:] += _shifted(sums[:, :, :-1], -1.0, 0.0)
+    _add_shifted(along[:, :, :-1], sums[:, :, 1:], 1.0, along_u=True)
+    _add_shifted(along[:, :, 1:], sums[:, :, :-1], -1.0, along_u=True)
     total = along.copy()
-    total[:, :-1] += _shifted(along[:, 1:], 0.0, -1.0)
-    total[:, 1:] += _shifted(along[:, :-1], 0.0, 1.0)
+    _add_shifted(total[:, :-1], along[:, 1:], -1.0, along_u=False)
+    _add_shifted(total[:, 1:], along[:, :-1], 1.0, along_u=False)
     return total
 
 
-def _shifted(sums: FloatArray, u: float, v: float) -> FloatArray:
-    """Return the sums with every point's offsets larger by u and v pixels."""
-    n, su, sv, sz, suu, suv, svv, suz, svz, szz = sums
-    return np.stack(
-        [
-            n,
-            su + u * n,
-            sv + v * n,
-            sz,
-            suu + 2 * u * su + u * u * n,
-            suv + u * sv + v * su + u * v * n,
-            svv + 2 * v * sv + v * v * n,
-            suz + u * sz,
-            svz + v * sz,
-            szz,
-        ]
-    )
+def _add_shifted(total: FloatArray, sums: FloatArray, by: float, *, along_u: bool) -> None:
+    """Add to `total` the sums (10, h, w) with the offset u, or v, of every point larger by `by` pixels, 1 or -1."""
+    own, square, with_z, other = (1, 4, 7, 2) if along_u else (2, 6, 8, 1)
+    for place in {*range(10)} - {own, square, 5, with_z}:
+        total[place] += sums[place]
+    total[own] += sums[own] + by * sums[0]
+    total[square] += sums[square] + 2 * by * sums[own] + sums[0]
+    total[5] += sums[5] + by * sums[other]
+    total[with_z] += sums[with_z] + by * sums[3]

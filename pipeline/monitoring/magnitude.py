@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 _FEWEST = 8
 
@@ -36,7 +36,7 @@ def fit_power_law(volumes_m3: Sequence[float]) -> PowerLaw | None:
     """Fit the magnitude-frequency law N(> V) = n (V / V0)^-b, the number of rockfalls larger than V, to their volumes, m3.
 
     The exponent is the maximum-likelihood estimate b = n / sum(log(V / V0)) over the n rockfalls of at least V0. Its interval
-    follows from 2 n (true b) / (estimated b), which has a chi-square distribution with 2 n degrees of freedom. V0 is the volume
+    follows from n (true b) / (estimated b), which has a gamma distribution of shape n and scale 1. V0 is the volume
     for which data and law have the least Kolmogorov-Smirnov distance (Clauset, Shalizi and Newman 2009, section 3.3).
 
     Returns None for fewer than eight rockfalls.
@@ -58,5 +58,5 @@ def fit_power_law(volumes_m3: Sequence[float]) -> PowerLaw | None:
         return None
     _, exponent, start = best
     count = len(ordered) - start
-    low, high = (float(chi2.ppf(share, 2 * count)) / (2 * count) * exponent for share in (0.025, 0.975))
+    low, high = (float(gammaincinv(count, share)) / count * exponent for share in (0.025, 0.975))
     return PowerLaw(exponent, low, high, float(ordered[start]), count)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from pipeline.config.presets import read_preset
-from pipeline.formats.measurements.model_file import read_model
 from pipeline.monitoring.gridding import HeightRaster
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.significance import NORMAL_95
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
-from sensors.models.sensor_model import TlsModel
+
+if TYPE_CHECKING:
+    from sensors.models.sensor_model import TlsModel
 
 DISAGREES = 1 / 3
 """Share by which the measured level may differ from the predicted one before it is worth a diagnosis."""
@@ -22,6 +24,12 @@ def scanner_model(options: MonitorOptions) -> TlsModel | None:
 
     Raises InputError if the file holds the model of a stereo pair.
     """
+    if options.model is None and options.scanner is None:
+        return None
+    from pipeline.config.presets import read_preset  # with all effects, which take long to import
+    from pipeline.formats.measurements.model_file import read_model
+    from sensors.models.sensor_model import TlsModel
+
     if options.model is not None:
         model = read_model(options.model)
         if not isinstance(model, TlsModel):

@@ -1,4 +1,4 @@
-"""Write the registered points of each epoch once, in whatever process still has them in memory.
+"""Write the registered points of each epoch once, in whatever process still has them in memory, and draw its pictures.
 
 Points carry the number of their event, and events are numbered over all epochs in order. So a process that compared an epoch
 writes its points as soon as the results of all earlier epochs are stored. What no process wrote is written at the end.
@@ -59,11 +59,18 @@ def _key(epoch: Followed, fingerprint: str) -> str:
     return hashlib.sha256(json.dumps([fingerprint, dict(epoch.record.inputs), events]).encode()).hexdigest()
 
 
+def _draw(epoch: Followed, site: ReferenceSite, out: Path) -> None:
+    """Draw the epoch's pictures for the report, which needs them at the end."""
+    from pipeline.monitoring.report import epoch_pictures  # Matplotlib takes long to import
+
+    epoch_pictures(epoch, site.views, out)
+
+
 @dataclass
 class PointsInOrder:
-    """Writes the points of the epochs that one process compares, each once the results of all earlier epochs are stored.
+    """Writes the points and pictures of the epochs that one process compares.
 
-    Points are written with the numbers of their events, which depend on all earlier epochs.
+    Both have the numbers of the events, which depend on all earlier epochs, whose results must be stored before.
 
     Attributes
     ----------
@@ -88,7 +95,7 @@ class PointsInOrder:
     _waiting: dict[int, tuple[EpochSource, EpochRecord, EpochData]] = field(default_factory=dict)
 
     def add(self, source: EpochSource, record: EpochRecord, data: EpochData) -> None:
-        """Write the points of a compared epoch now, or in a later call of `add` if results of earlier epochs are still missing.
+        """Write points and pictures of a compared epoch now, or in a later call if results of earlier epochs are still missing.
 
         At most two epochs wait, and none with files too large for memory; the caller must write the points of the others later.
 
@@ -101,6 +108,7 @@ class PointsInOrder:
                 source, record, data = self._waiting.pop(self._next)
                 epoch = Followed(source, record, regions)
                 write_points_once(epoch, data, self.site, self.out, self.fingerprint, self.options)
+                _draw(epoch, self.site, self.out)
             self._next += 1
         large = [number for number, (_, _, each) in self._waiting.items() if each.large is not None]
         for number in large or sorted(self._waiting)[_MOST_WAITING:]:

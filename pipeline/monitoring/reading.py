@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,10 @@ from pipeline.formats.points.points import SUFFIXES
 from pipeline.formats.records.result_records import RUN_FILE, read_run
 from pipeline.measurement.reference import DEMS, is_cloud, reference_from_dem
 from pipeline.measurement.scans import RawScan, read_scans
-from pipeline.monitoring.gridding import SAMPLE, WallPoints
+from pipeline.monitoring.gridding import POINTS_AT_ONCE, SAMPLE, WallPoints
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.times import SIDECAR, EpochTime, check_order, time_of
+from pipeline.registration.rigid import RigidTransform
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.bounds import bounding_box
@@ -173,7 +174,7 @@ class EpochData:
         """
         if self.mesh is None:
             sample = self.points[:: max(len(self.points) // SAMPLE, 1)]
-            return WallPoints(frame.to_wall(sample), lambda: map(frame.to_wall, self.chunks()))
+            return WallPoints(frame.to_wall(sample), lambda motion: self._in_wall_frame(frame, motion))
         if several:
             return WallPoints.of(frame.to_wall(_spread_over(self.mesh, gsd_m / 2)))
         from pipeline.change.difference import surface_raster
@@ -184,6 +185,17 @@ class EpochData:
         row, column = np.nonzero(np.isfinite(heights))
         x, y = grid.x_min + (column + 0.5) * grid.gsd, grid.y_max - (row + 0.5) * grid.gsd
         return WallPoints.of(np.stack([x, y, heights[row, column]], axis=1).astype(np.float64))
+
+    def _in_wall_frame(self, frame: WallFrame, motion: RigidTransform) -> Iterator[FloatArray]:
+        """Yield all points in pieces (n, 3), wall frame, m, after a motion, with which the frame's rotation is combined."""
+        turned = RigidTransform(motion.rotation @ frame.rotation, motion.translation)
+        for piece in in_pieces(self.chunks(), POINTS_AT_ONCE):
+            yield turned.apply(piece - frame.origin)
+
+
+def in_pieces(chunks: Iterable[FloatArray], most: int) -> Iterator[FloatArray]:
+    """Yield the points of chunks (n, 3) in pieces of at most `most` points."""
+    return (chunk[start : start + most] for chunk in chunks for start in range(0, len(chunk), most))
 
 
 def _spread_over(mesh: TriangleMesh, apart_m: float) -> FloatArray:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,8 +37,8 @@ def write_report(result: Result) -> None:
     pictures: dict[str, bytes] = {}
     for view in result.site.views:
         pictures[f"reference{view.suffix}.png"] = hillshade_figure(view.raster.height, view.grid)
-        for epoch in result.epochs:
-            pictures |= _pictures_of(epoch, view, result)
+    for epoch in result.epochs:
+        pictures |= epoch_pictures(epoch, result.site.views, result.folder)
     law = None
     if len(result.sources) >= _EPOCHS_FOR_LAW:
         pictures["volumes.png"] = _volumes_figure(result)
@@ -155,30 +157,55 @@ def _about(epoch: Followed, result: Result) -> dict[str, Any]:
     return {"number": epoch.number, "registered": registered, "predicted": predicted, "notes": record.notes}
 
 
-def _pictures_of(epoch: Followed, view: WallView, result: Result) -> dict[str, bytes]:
-    """Map and gallery of an epoch in one view, which are drawn and written unless the folder has them from an earlier call."""
-    place = f"{epoch.number:03d}{view.suffix}"
-    note, points = result.folder / KEPT / f"pictures_{place}.txt", points_note(result.folder, epoch.number)
-    key = points.read_text(encoding="utf-8")
-    if note.is_file():
-        before, *names = note.read_text(encoding="utf-8").splitlines()
-        if before == key and all((result.folder / name).is_file() for name in names):
-            return {name: (result.folder / name).read_bytes() for name in names}
-    pictures = _drawn(epoch, view, result)
-    for name, png in pictures.items():
-        write_bytes(result.folder / name, png)
-    write_text(note, "\n".join([key, *pictures]))
+def epoch_pictures(epoch: Followed, views: Sequence[WallView], folder: Path) -> dict[str, bytes]:
+    """Draw and write map, gallery of events and map styles of an epoch, unless the folder has them from an earlier call.
+
+    Parameters
+    ----------
+    epoch : Followed
+        Result of the epoch, whose points are written already.
+    views : sequence of WallView
+        The separately mapped parts of the wall.
+    folder : Path
+        Folder of the results, which has the epoch's difference maps and levels of detection.
+
+    Returns
+    -------
+    dict
+        PNG files by name.
+    """
+    key = points_note(folder, epoch.number).read_text(encoding="utf-8")
+    pictures: dict[str, bytes] = {}
+    for view in views:
+        note = folder / KEPT / f"pictures_{epoch.number:03d}{view.suffix}.txt"
+        found = _drawn_before(note, key, folder)
+        if found is None:
+            found = _drawn(epoch, view, folder)
+            for name, png in found.items():
+                write_bytes(folder / name, png)
+            write_text(note, "\n".join([key, *found]))
+        pictures |= found
     return pictures
 
 
-def _drawn(epoch: Followed, view: WallView, result: Result) -> dict[str, bytes]:
+def _drawn_before(note: Path, key: str, folder: Path) -> dict[str, bytes] | None:
+    """Read the pictures that a note lists; None if they are missing or were drawn for another state of the epoch."""
+    if not note.is_file():
+        return None
+    before, *names = note.read_text(encoding="utf-8").splitlines()
+    if before != key or not all((folder / name).is_file() for name in names):
+        return None
+    return {name: (folder / name).read_bytes() for name in names}
+
+
+def _drawn(epoch: Followed, view: WallView, folder: Path) -> dict[str, bytes]:
     """Draw map and gallery of an epoch in one view, and write styles of its maps."""
     grid, place = view.grid, f"{epoch.number:03d}{view.suffix}"
-    difference, _ = read_geotiff(result.folder / f"difference_{place}.tif")
-    level, _ = read_geotiff(result.folder / f"lod_{place}.tif")
+    difference, _ = read_geotiff(folder / f"difference_{place}.tif")
+    level, _ = read_geotiff(folder / f"lod_{place}.tif")
     sigma = max(epoch.record.level_m / NORMAL_95, 1e-6)
-    difference_style(result.folder / f"difference_{place}.tif", _SIGMAS_SHOWN * sigma)
-    quantity_style(result.folder / f"lod_{place}.tif", level, "mm", 1e3)
+    difference_style(folder / f"difference_{place}.tif", _SIGMAS_SHOWN * sigma)
+    quantity_style(folder / f"lod_{place}.tif", level, "mm", 1e3)
     labels = event_raster(epoch.regions, view)
     captions = {
         region.identity: f"{region.volume_m3:.3g} m³" if region.volume_m3 >= 0.1 else f"{1e3 * region.volume_m3:.3g} l"

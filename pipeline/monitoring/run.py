@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import pickle
+import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -173,8 +175,10 @@ def _compared_in_processes(
 ) -> dict[int, EpochRecord | None]:
     """The records of epochs, compared on local workers of Dask, by number."""
     found: dict[int, EpochRecord | None] = {}
-    tasks = [(number, source, site.source, out, options, fingerprint) for number, source in left]
-    with progress.stage("comparisons"):
+    with progress.stage("comparisons"), tempfile.TemporaryDirectory(prefix="scarpsim-") as folder:
+        shared = Path(folder) / "reference.pickle"
+        shared.write_bytes(pickle.dumps(site, pickle.HIGHEST_PROTOCOL))
+        tasks = [(number, source, shared, out, options, fingerprint) for number, source in left]
         for record in map_on_workers(_in_worker, tasks, workers):
             found[record.number] = record
             progress.advance(len(found) / len(left))
@@ -182,7 +186,7 @@ def _compared_in_processes(
 
 
 def _in_worker(
-    number: int, source: EpochSource, reference: EpochSource, out: Path, options: MonitorOptions, fingerprint: str
+    number: int, source: EpochSource, reference: Path, out: Path, options: MonitorOptions, fingerprint: str
 ) -> EpochRecord:
     points = _points_of_worker(reference, _Frozen(options), out, fingerprint)
     record, data = processed(number, source, points.site, out, options, fingerprint)
@@ -205,9 +209,9 @@ class _Frozen:
 
 
 @lru_cache(1)
-def _points_of_worker(reference: EpochSource, frozen: _Frozen, out: Path, fingerprint: str) -> PointsInOrder:
-    """Return what writes the points of this process's epochs; the reference site is prepared once in each process."""
-    return PointsInOrder(prepared(reference, frozen.options), out, fingerprint, frozen.options)
+def _points_of_worker(reference: Path, frozen: _Frozen, out: Path, fingerprint: str) -> PointsInOrder:
+    """Return what writes the points of this process's epochs. reference: file with the prepared ReferenceSite, read once."""
+    return PointsInOrder(pickle.loads(reference.read_bytes()), out, fingerprint, frozen.options)
 
 
 def processed(

@@ -12,13 +12,13 @@ of digital elevation models by spatial inference from stable terrain").
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from pipeline.monitoring.raster_statistics import quantiles
 from scene.geometry.mesh import FloatArray
 
 NORMAL_95 = 1.959964
@@ -91,10 +91,12 @@ def significance(difference: NDArray[np.float32], predicted: NDArray[np.float32]
     """
     level = predicted * _factor(difference, predicted, stable)
     standard = np.where(stable, difference / (level / NORMAL_95), np.nan)
+    known = np.isfinite(standard)
+    filled = np.where(known, standard, 0.0)
     sides: list[float] = []
     sigmas: list[float] = []
     for side in _SIDES:
-        means = _means_of_squares(standard, side)
+        means = _means_of_squares(filled, known, side)
         if len(means) < _FEWEST_SQUARES and sides:
             break
         sides.append(float(side))
@@ -104,34 +106,37 @@ def significance(difference: NDArray[np.float32], predicted: NDArray[np.float32]
 
 def _sigma_with_tails(means: NDArray[np.float64]) -> float:
     """Largest of the standard deviations that quantiles tell, from the median on outwards: noise has long tails at edges."""
-    apart = np.abs(means - np.median(means))
+    apart = np.abs(means - quantiles(means, [0.5]))
     known = [quantile for quantile in _QUANTILES if (1 - quantile) * len(apart) >= 1]
-    found = np.quantile(apart, known) / ndtri((1 + np.array(known)) / 2)
+    found = quantiles(apart, known) / ndtri((1 + np.array(known)) / 2)
     return float(max(min(found.max(), _LONGEST_TAIL * found[0]), 1e-3))
 
 
 def _factor(difference: NDArray[np.float32], predicted: NDArray[np.float32], stable: NDArray[np.bool_]) -> NDArray[np.float32]:
     """(h, w) by how much the level of detection exceeds the predicted standard deviation."""
-    ratio, of = np.abs(difference[stable]) / predicted[stable], predicted[stable]
+    of = predicted[stable]
+    order = np.argsort(of)
+    of, ratio = of[order], (np.abs(difference[stable]) / of)[order]
     classes = int(np.clip(len(ratio) // _FEWEST_IN_CLASS, 1, _CLASSES))
-    edges = np.quantile(of, np.linspace(0, 1, classes + 1))
+    edges = quantiles(of, np.linspace(0, 1, classes + 1), ordered=True)
+    begins, ends = np.searchsorted(of, edges[:-1], "left"), np.searchsorted(of, edges[1:], "right")
     middle, quantile = [], []
-    for low, high in itertools.pairwise(edges):
-        inside = (of >= low) & (of <= high)
-        if inside.any():
-            middle.append(float(np.median(of[inside])))
-            half, most = np.quantile(ratio[inside], [0.5, 0.95])
+    for begin, end in zip(begins, ends, strict=True):
+        if end > begin:
+            middle.append(float(quantiles(of[begin:end], [0.5], ordered=True)[0]))
+            half, most = quantiles(ratio[begin:end], [0.5, 0.95])
             quantile.append(float(max(min(most, _LONGEST_TAIL * NORMAL_95 * half / MEDIAN), _LEAST_FACTOR)))
     return np.interp(predicted, middle, quantile).astype(np.float32)
 
 
-def _means_of_squares(values: NDArray[np.floating], side: int) -> NDArray[np.float64]:
-    """Means over the squares of a grid that have data in most of their pixels."""
-    height, width = (size // side * side for size in values.shape)
+def _means_of_squares(filled: NDArray[np.floating], known: NDArray[np.bool_], side: int) -> NDArray[np.float64]:
+    """Means over the squares of a grid that have data in most of their pixels. filled: values, zero where they are not known."""
+    if side == 1:
+        return filled[known].astype(np.float64)
+    height, width = (size // side * side for size in filled.shape)
     if not height or not width:
         return np.empty(0)
-    cells = values[:height, :width].reshape(height // side, side, width // side, side)
-    known = np.isfinite(cells)
-    count = known.sum(axis=(1, 3))
-    total = np.where(known, cells, 0.0).sum(axis=(1, 3)) / np.maximum(count, 1)
+    cells = (height // side, side, width // side, side)
+    count = known[:height, :width].reshape(cells).sum(axis=(1, 3))
+    total = filled[:height, :width].reshape(cells).sum(axis=(1, 3)) / np.maximum(count, 1)
     return np.asarray(total[count >= _FILLED * side**2], dtype=np.float64)

@@ -88,6 +88,7 @@ def build_from_monitoring(
         model_words,
         stable_words=(*(each.words for each in scans), _LIMIT),
         whole=False,
+        registered_alone=True,
     )
     return write_scans(material, out)
 

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.special import ndtri
 
+from pipeline.monitoring.raster_statistics import dilated, mean_over_squares, quantiles
+
 _SQUARES_PX = (3, 5, 9)
 """Sides of the squares over which means are taken: more than the 3 pixels that share points."""
 _CHANGED = 4.0
@@ -53,7 +55,7 @@ def unchanged_pixels(standard: NDArray[np.floating], candidates: NDArray[np.bool
     means = {side: _mean_over_squares(standard, side) for side in _SQUARES_PX}
     for _ in range(_ROUNDS):
         before = unchanged
-        unchanged = candidates & ~_dilated(_changed(means, unchanged))
+        unchanged = candidates & ~dilated(_changed(means, unchanged), _MARGIN_PX)
         if np.count_nonzero(unchanged) < _FEWEST:
             return before
         if np.count_nonzero(before != unchanged) <= _SETTLED * before.size:
@@ -72,13 +74,15 @@ def quieter_scatter(values: NDArray[np.floating]) -> float:
     if not sides:
         return float(np.sqrt(np.mean(values**2))) if len(values) else np.inf
     normal = ndtri((1 + np.array(_QUANTILES)) / 2)
-    found = [np.quantile(side, _QUANTILES) / normal for side in sides]
+    found = [quantiles(side, _QUANTILES) / normal for side in sides]
     return float(min(min(each.max(), _LONGEST_TAIL * each[0]) for each in found))
 
 
 def _changed(means: dict[int, NDArray[np.float32]], unchanged: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(h, w) changed places by the noise of the pixels that are unchanged as far as is known."""
-    scatter = {side: _scatter_on(mean, unchanged) for side, mean in means.items()}
+    places = np.flatnonzero(unchanged)
+    places = places[:: max(len(places) // _SAMPLE, 1)]
+    scatter = {side: _scatter(mean.ravel()[places]) for side, mean in means.items()}
     changed = np.zeros(unchanged.shape, dtype=bool)
     for sign in (1.0, -1.0):
         begun = np.zeros(unchanged.shape, dtype=bool)
@@ -99,22 +103,14 @@ def _connected_with(begun: NDArray[np.bool_], reached: NDArray[np.bool_]) -> NDA
     return np.asarray(wanted[labels])
 
 
-def _dilated(changed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(h, w) changed places with a margin of `_MARGIN_PX`, as a binary dilation gives them more slowly."""
-    side = 2 * _MARGIN_PX + 1
-    return ndimage.maximum_filter(changed.view(np.uint8), side, mode="constant").view(bool)
-
-
-def _scatter_on(mean: NDArray[np.float32], unchanged: NDArray[np.bool_]) -> float:
-    """Scatter of means on the pixels that are unchanged, of a subset of evenly spaced ones where they are many."""
-    places = np.flatnonzero(unchanged)
-    values = mean.ravel()[places[:: max(len(places) // _SAMPLE, 1)]]
-    return quieter_scatter(values[np.isfinite(values)])
+def _scatter(means: NDArray[np.float32]) -> float:
+    """Scatter of means on pixels that are unchanged; NaN is left out."""
+    return quieter_scatter(means[np.isfinite(means)])
 
 
 def _mean_over_squares(standard: NDArray[np.floating], side: int) -> NDArray[np.float32]:
     """(h, w) means over squares about each pixel; NaN where less than half of the square has data."""
     known = np.isfinite(standard)
-    share = ndimage.uniform_filter(known.astype(np.float32), side)
-    total = ndimage.uniform_filter(np.where(known, standard, 0.0).astype(np.float32), side)
+    share = mean_over_squares(known.astype(np.float32), side)
+    total = mean_over_squares(np.where(known, standard, 0.0).astype(np.float32), side)
     return np.where(known & (share > _FILLED), total / np.maximum(share, 1e-9), np.nan)

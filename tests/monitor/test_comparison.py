@@ -69,9 +69,10 @@ def test_heights_are_moved_as_their_points_are() -> None:
     reference, points = gridded(wall(1), GRID), wall(2, 0.0)
     motion = RigidTransform.about(np.array([8.0, 5.0, 0.0]), np.array([1e-4, 2e-4, -1e-4]), np.array([1e-3, 2e-3, -4e-3]))
     epoch = gridded(points, GRID)
-    alignment = refine([RasterPair(reference, gridded(motion.apply(points), GRID))], None)
+    pair = RasterPair(reference, gridded(motion.apply(points), GRID))
+    alignment = refine([pair], None)
     np.testing.assert_allclose(
-        applied(alignment, RasterPair(reference, gridded(motion.apply(points), GRID)))[5:-5, 5:-5],
+        applied(alignment, pair, pair.design(alignment.centre))[5:-5, 5:-5],
         epoch.height[5:-5, 5:-5],
         atol=2e-3,
     )

@@ -79,7 +79,7 @@ def test_what_fell_is_left_out(model: Path, tmp_path: Path) -> None:
     told = yaml.safe_load((tmp_path / "measurement" / "measurement.yaml").read_text())
     assert told["points"] == ["scan_0.laz", "scan_1.laz"]
     assert told["reference_error_m"] == pytest.approx(NOISE_M, rel=0.2)
-    np.testing.assert_allclose(told["scanner"]["position_m"], POSITION, atol=0.02)
+    np.testing.assert_allclose([each["position_m"] for each in told["scanners"]], [POSITION, POSITION], atol=0.02)
     assert "are on stable rock" in told["notes"][0]
     events = read_laz(tmp_path / "found" / "epoch_001.laz")
     used = read_laz(tmp_path / "measurement" / "scan_0.laz").points

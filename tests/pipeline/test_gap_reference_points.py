@@ -21,6 +21,7 @@ from scene.common.config import parse
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.point_planes import estimate_point_noise
+from sensors.models.sensor_model import TlsModel, TlsNoise
 
 MODEL = {"sensor": "tls", "noise": {"range_sigma_m": 0.001, "angle_sigma_rad": 5e-5}}
 SCANNER = np.zeros(3)
@@ -108,7 +109,7 @@ def test_slopes_do_not_share_the_noise_of_the_ranges(tmp_path: Path) -> None:
     """Level ground 1.7 m below has no slope by azimuth.
 
     The slope of a triangle comes from the noise of its corners, as does the range to it: their correlation of 4.6 standard
-    deviations would pass for an error of the azimuth. Fitted planes avoid it.
+    deviations would pass for an error of the azimuth. Fitted planes avoid it, and so do normals between those of the corners.
     """
     rng = np.random.default_rng(8)
     azimuth, zenith = (
@@ -123,7 +124,29 @@ def test_slopes_do_not_share_the_noise_of_the_ranges(tmp_path: Path) -> None:
         return float(abs(np.corrcoef(part.value, part.geometry.by_azimuth)[0, 1]) * np.sqrt(len(part)))
 
     assert sigmas(tls_residuals(measurement)) < 3
-    assert sigmas(tls_residuals(measurement.changed(planes=None))) > 4
+    assert sigmas(tls_residuals(measurement.changed(planes=None))) < 3
+    assert sigmas(tls_residuals(measurement.changed(planes=None, reference_error_m=0.0))) > 4
+
+
+def test_noise_of_the_same_scanner_is_larger_on_steep_rock(tmp_path: Path) -> None:
+    """Half of the vertices lie on a slope where noise of the angles adds to the ranges: there the reference errs more too."""
+    x, y = (each.ravel() for each in np.meshgrid(np.arange(-4, 4, 0.04), np.arange(-4, 4, 0.04), indexing="ij"))
+    points = np.stack([x, 20 + np.maximum(x, 0), y], axis=1)
+    measurement = read_measurement(halves(tmp_path, points))
+    assert isinstance(measurement, TlsMeasurement)
+    noise = TlsNoise(range_sigma_m=0.002, angle_sigma_rad=2e-4)
+    measurement = measurement.changed(planes=None, reference_error_m=0.003, model=TlsModel(noise=noise))
+    alike, growing = (tls_residuals(measurement.changed(error_like_scanner=each)) for each in (False, True))
+    slope = np.abs(growing.geometry.by_azimuth)
+    right, left = slope > 15, slope < 8
+    ratio = growing.reference_variance / alike.reference_variance
+    variance = measurement.model.variance(growing.geometry)
+    assert right.sum() > 1000
+    assert left.sum() > 1000
+    np.testing.assert_allclose(
+        ratio[right].mean() / ratio[left].mean(), variance[right].mean() / variance[left].mean(), rtol=0.02
+    )
+    assert ratio[right].mean() > 2 * ratio[left].mean()
 
 
 def test_edges_between_points_have_no_say(residuals: TlsResiduals) -> None:

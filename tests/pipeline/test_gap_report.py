@@ -115,11 +115,11 @@ def test_every_verdict_has_a_report(
 def test_what_is_closed_is_said_by_the_thresholds_of_the_diagnosis(few: tuple[GapDiagnosis, Measurement]) -> None:
     """The thresholds of the diagnosis apply wherever it is written.
 
-    With a minimum of 1000 standard errors a gap of 500 is none.
+    At a significance level of 1e-300, which 37 standard errors reach, a gap of 20 is none.
     """
     found, measurement = few
-    gap = Gap(before=0.006, after=0.001, floor=0.001, error=1e-5, floor_error=1e-5, points=100)
-    strict = read_thresholds(["verdict.gap_sigmas=1000", "verdict.floor_sigmas=1000"])
+    gap = Gap(before=0.006, after=0.001, floor=0.001, error=2.5e-4, floor_error=2.5e-4, points=100)
+    strict = read_thresholds(["verdict.gap_sigmas=1000", "verdict.rejection_p=1e-300"])
     assert report.to_dict(replace(found, gap=gap), measurement)["gap"]["closed"] == 1.0
     assert report.to_dict(replace(found, gap=gap, thresholds=strict), measurement)["gap"]["closed"] is None
 

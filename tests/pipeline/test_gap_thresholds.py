@@ -61,8 +61,8 @@ def test_each_is_used_by_the_diagnosis(group: str, key: str) -> None:
 def test_thresholds_hold_within_the_block_that_sets_them() -> None:
     gap = Gap(before=0.0015, after=0.0015, floor=0.001, error=0.0, floor_error=0.0001, points=100)
     assert gap.above_floor
-    with use_thresholds(read_thresholds(["verdict.floor_sigmas=6"])):
-        assert thresholds().verdict.floor_sigmas == 6
+    with use_thresholds(read_thresholds(["verdict.rejection_p=1e-8"])):
+        assert thresholds().verdict.rejection_p == 1e-8
         assert not gap.above_floor
     assert gap.above_floor
 

@@ -287,3 +287,10 @@ def check_noise(of: str, sigma: FloatArray) -> None:
             allowed=f"{least:g} {unit} or more",
             remedy=f"set `{key}` in the model to the sensor's standard deviation",
         )
+
+
+def check_sensor(measured: Sensor, modelled: Sensor, where: str) -> None:
+    """Raise InputError, naming the file `where`, if the sensor model is not of the sensor that measured."""
+    if modelled != measured:
+        what = f"the model is of the sensor {modelled}, but the measurement is of the sensor {measured}"
+        raise InputError(what, where=where, remedy="name a model of the same sensor")

@@ -98,10 +98,11 @@ class MeasurementConfig(Config):
         description="standard deviation of the reference's vertices along the rays, with independent errors [m] (tls); "
         "none: 0, or as estimated from the vertices if `incidence` is not given either",
     )
-    reference_error_kind: Literal["noise", "relief"] | None = Field(
+    reference_error_kind: Literal["noise", "scanner", "relief"] | None = Field(
         None,
-        description="whether `reference_error_m` is noise of the vertices, which rays to the same triangles share, or relief "
-        "between them (tls); none: as the scatter of the vertices about planes tells",
+        description="whether `reference_error_m` is noise of the vertices, which rays to the same triangles share; such noise "
+        "of the scanner itself, larger where its model has more; or relief between the vertices (tls); none: as the scatter of "
+        "the vertices about planes tells",
     )
     notes: tuple[str, ...] = Field(
         (), description="notes on the measurement for the report, such as what a reference cannot show"

@@ -25,6 +25,7 @@ from pipeline.formats.measurements.checks import (
     check_power,
     check_pulses,
     check_seen,
+    check_sensor,
 )
 from pipeline.formats.measurements.config import MeasurementConfig, ScanPattern
 from pipeline.formats.measurements.model_file import read_model
@@ -141,6 +142,8 @@ class TlsMeasurement(MeasurementBase):
     planes : Planes through the reference's vertices, to which incidence angles refer; None: its triangles.
     reference_error_m : Standard deviation of each vertex of the reference along the rays, m.
     error_is_relief : Whether that error is mostly relief between the vertices, which is independent from ray to ray.
+    error_like_scanner : Whether that error is larger where the noise of the scanner is, as in a scan by the same scanner;
+        `reference_error_m` is then its median.
     """
 
     sensor = "tls"
@@ -154,6 +157,7 @@ class TlsMeasurement(MeasurementBase):
     planes: PointPlanes | None = None
     reference_error_m: float = 0.0
     error_is_relief: bool = False
+    error_like_scanner: bool = False
 
     @property
     def viewpoint(self) -> FloatArray:
@@ -324,7 +328,7 @@ def read_measurement(folder: Path) -> Measurement:
     values = load_yaml(path)
     config, base = parse(MeasurementConfig, values, str(path)), path.parent
     model = read_model(base / config.model)
-    _check_sensor(config, model, str(path))
+    check_sensor(config.sensor, model.sensor, str(path))
     cameras = _cameras(config, base)
     mesh, notes = read_reference(base / config.reference)
     points = {str(base / name): read_points(base / name) for name in _files(config)}
@@ -346,7 +350,7 @@ def assembled(config: MeasurementConfig, material: Material, reference: str, whe
     reference, where: names of mesh and config, for errors. Raises InputError if the parts do not fit together.
     """
     mesh, model, cameras = material.reference, material.model, material.cameras
-    _check_sensor(config, model, where)
+    check_sensor(config.sensor, model.sensor, where)
     viewpoints = _viewpoints(config, material, where)
     check_distances(mesh.vertices, viewpoints, reference)
     frame = WallFrame.fit(mesh.vertices, np.mean([*viewpoints.values()], axis=0))
@@ -391,7 +395,8 @@ def _of_sensor(config: MeasurementConfig, material: Material, where: str, **shar
     station, vertices = _to_wall(pose, frame), shared["reference"].vertices
     points = ReferencePoints.of(config, vertices, station[0], material.model.noise.range_sigma_m)
     known: dict[str, Any] = {"planes": points.planes, "reference_error_m": points.error_m}
-    known |= {"error_is_relief": points.error_is_relief, "notes": (*shared.pop("notes"), *points.words)}
+    known |= {"error_is_relief": points.error_is_relief, "error_like_scanner": config.reference_error_kind == "scanner"}
+    known |= {"notes": (*shared.pop("notes"), *points.words)}
     return TlsMeasurement(model=material.model, station=station, scans=scans, pattern=config.pattern, **known, **shared)
 
 
@@ -405,12 +410,6 @@ def _scanner_pose(config: MeasurementConfig, where: str) -> ScannerPose:
     if config.scanner is None:
         raise InputError("a TLS measurement needs `scanner`", where=where, remedy="add `scanner` with position_m and rotation")
     return config.scanner
-
-
-def _check_sensor(config: MeasurementConfig, model: TlsModel | StereoModel, where: str) -> None:
-    if model.sensor != config.sensor:
-        what = f"the model is of the sensor {model.sensor}, but the measurement is of the sensor {config.sensor}"
-        raise InputError(what, where=where, remedy="name a model of the same sensor")
 
 
 def _check(found: Measurement, cloud: PointCloud, config: MeasurementConfig, where: str) -> None:

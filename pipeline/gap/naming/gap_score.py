@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from pipeline.change.robust import nmad
 from pipeline.formats.measurements.measurement import Measurement, StereoMeasurement, SurfaceMeasurement, TlsMeasurement
@@ -93,18 +94,18 @@ class Gap:
         """Whether the model without named effects fits worse than noise explains.
 
         That is so if its score (`before`) exceeds the score that noise alone leaves (`floor`) by more than the uncertainty of
-        their difference: 2.6 standard errors `floor_error` by default.
+        their difference, at half the significance level `verdict.rejection_p`: 2.6 standard errors `floor_error` by default.
         """
-        return self.before - self.floor > thresholds().verdict.floor_sigmas * self.floor_error
+        return self.before - self.floor > _floor_sigmas() * self.floor_error
 
     @property
     def left_open(self) -> bool:
         """Whether the model fits worse than noise explains even with the named effects.
 
-        That is so if its score (`after`) exceeds the score that noise alone leaves (`floor`) by more than the uncertainty: 2.6
-        standard errors `floor_error` by default.
+        That is so if its score (`after`) exceeds the score that noise alone leaves (`floor`) by more than the uncertainty, as
+        for `above_floor`.
         """
-        return self.after - self.floor > thresholds().verdict.floor_sigmas * self.floor_error
+        return self.after - self.floor > _floor_sigmas() * self.floor_error
 
     @property
     def uncertain(self) -> bool:
@@ -130,6 +131,11 @@ class Gap:
             "standard_error": {"before_minus_after": self.error, "before_minus_floor": self.floor_error},
             "note": note,
         }
+
+
+def _floor_sigmas() -> float:
+    """Standard errors beyond which a score lies above the noise floor: the one-sided quantile of half the significance level."""
+    return float(-ndtri(thresholds().verdict.rejection_p / 2))
 
 
 @dataclass(frozen=True)

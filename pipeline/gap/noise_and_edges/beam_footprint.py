@@ -61,7 +61,7 @@ def find_footprint(
     rows = np.flatnonzero(~held_out)[every]
     widest_shift = footprint.shift(rows, ("mean",), _DIVERGENCES_RAD[-1])["mean"]
     rows = rows[np.abs(widest_shift) > sigma[rows]]
-    if len(rows) < thresholds().edges.footprint_fewest:
+    if not len(rows):
         return []
     blocks = WallBlocks(WallBlocks.over(residuals.wall_xy).number[rows])
     jittered = footprint.shift(rows, ("mean",), _equivalent_divergence(measurement.model))["mean"]
@@ -75,7 +75,7 @@ def find_footprint(
 
     best_divergence = {mode: maximise_gain(partial(gains, mode), _DIVERGENCES_RAD, ()) for mode in _MODES}
     mode = max(best_divergence, key=lambda each: float(gains(each, best_divergence[each]).sum()))
-    gain = blocks.total_if_agreed(gains(mode, best_divergence[mode]), thresholds().edges.footprint_block_sigmas)
+    gain = blocks.total_if_agreed(gains(mode, best_divergence[mode]), thresholds().edges.least_block_sigmas)
     if gain is None:
         return []
     divergence = maximise_gain(partial(gains, mode), [best_divergence[mode]], _REFINEMENT_FACTORS)

@@ -142,8 +142,8 @@ class _EdgeData:
         It is 0 at points that the effect does not move; for a rim, also where it moves them little, because matchers disagree on
         small steps.
         """
-        least = thresholds().edges.clear_step * self.raster.depth_step_px
-        clear = np.abs(self.shift([effect]) - self.shift_without) > (least if effect.window == "rim" else 0.0)
+        least = self.raster.depth_step_px if effect.window == "rim" else 0.0
+        clear = np.abs(self.shift([effect]) - self.shift_without) > least
         return (self.registered_density([effect]) - self.registered_density_without) * clear
 
     def edge_effect(self, effect: Effect, std: dict[str, float], gain: float) -> EdgeEffect:

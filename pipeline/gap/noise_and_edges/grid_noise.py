@@ -220,7 +220,7 @@ def find_grid_noise(
         return None, ""
     fit, step, near = best
     by = thresholds().grid_noise
-    if fit.chi2 >= variogram.chi2_without_grid - by.least_gain or fit.variance <= 0:
+    if fit.chi2 >= variogram.chi2_without_grid - by.least_gain or fit.variance <= thresholds().edges.block_sigmas * fit.error:
         return None, ""
     without = variogram.chi2_of_reference_error
     if fit.chi2 >= without - by.least_gain:

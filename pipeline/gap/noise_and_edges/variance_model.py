@@ -252,10 +252,9 @@ def fit_variance_model(
     ]
     pair = max(pairs, key=lambda fit: fit.score, default=best)
     free_name, free_score, free = _best_binned_variance(squares, {name: v[used] for name, v in residuals.covariates.items()})
-    # where one effect leaves a misfit, a second one of the catalogue is preferred to a binned variance
     ahead = max(thresholds().mean.nonparametric_margin, class_share * best.gain)
     # no form of a variance is exact, so a second effect must explain more than the inexact part of the first
-    needed = max(by.second_gain if free_score > best.score + ahead else by.least_gain, class_share * best.gain)
+    needed = max(by.least_gain, class_share * best.gain)
     agreed = pair.score > best.score + needed and _blocks_agree(squares, best.added(shapes), pair.added(shapes), block)
     chosen = pair if agreed and all(float(theta.max()) > 0 for theta in pair.theta) else best
     free_fits_better = free_score > chosen.score + ahead and _blocks_prefer_binned(squares, chosen.added(shapes), free, block)
@@ -447,7 +446,7 @@ def _blocks_agree(squares: FloatArray, first: FloatArray, second: FloatArray, bl
 def _blocks_prefer_binned(squares: FloatArray, first: FloatArray, free: FloatArray, block: NDArray[np.int64]) -> bool:
     """Whether wall blocks agree that a binned variance fits better, which only has to show that the named one does not fit."""
     gain, sigmas = _gain_over(squares, first, free, block)
-    return gain > 0 and sigmas > thresholds().variance.nonparametric_block_sigmas
+    return gain > 0 and sigmas > thresholds().edges.least_block_sigmas
 
 
 def _gain_over(squares: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> tuple[float, float]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.formats.measurements.measurement import TlsMeasurement
 from pipeline.gap.residuals.residuals import Rows, range_derivative, select_rows
-from scene.geometry.mesh import FloatArray, IntArray, barycentric
+from scene.geometry.mesh import FloatArray, IntArray, TriangleMesh, barycentric
 from scene.geometry.point_planes import PointPlanes
 from sensors.signal_chain.pulses import PulseGeometry
 
@@ -33,7 +33,8 @@ class RayGeometry(PulseGeometry):
         subtracted from the field `range_m`. None if the triangles are used as they are.
     corner : (n, 3) row numbers of the vertices of the triangle that each ray hits; None if the vertices have no errors of their
         own.
-    weight : (n, 3) barycentric weights of these vertices at the hit; None if `corner` is None.
+    weight : (n, 3) weights with which the vertices' errors enter the range: the barycentric weights at the hit, larger where the
+        reference is less precise than usual; None if `corner` is None.
     plane_normal : (n, 3) normal of the plane on which a ray is assumed to hit if it is turned a little, scanner frame. None: it
         is traced to the triangles.
     """
@@ -71,7 +72,7 @@ class RayHits:
     Attributes
     ----------
     distance : (n,) range to the surface, m; infinite or NaN without a hit.
-    normal : (n, 3) unit normals, wall frame, of the triangle or of the plane.
+    normal : (n, 3) unit normals, wall frame: of the triangle, interpolated between its corners, or of the plane.
     cos_incidence : (n,) cosine of the incidence angle.
     curvature : (n,) largest deviation of the surface from the triangle's plane within a beam's width, m, along the ray.
     bulge : (n,) how much nearer a curved surface through the vertices lies than the triangle, m; already subtracted from
@@ -122,9 +123,22 @@ def cast_rays(measurement: TlsMeasurement, axes: list[FloatArray]) -> RayHits:
     corner = scene.mesh.faces[face]
     weight = barycentric(position + distance[:, None] * ray, scene.mesh.vertices[corner])
     found = replace(found, corner=corner, weight=weight)
+    if measurement.reference_error_m and not measurement.error_is_relief:
+        found = replace(found, normal=_interpolated_normals(scene.mesh, corner, weight))
     if measurement.planes is None:
         return found
     return _smoothed_hits(found, measurement.planes, ray, (corner, weight, scene.mesh.vertices[corner]))
+
+
+def _interpolated_normals(mesh: TriangleMesh, corner: IntArray, weight: FloatArray) -> FloatArray:
+    """(n, 3) unit normals between those of the triangles' corners (n, 3), with barycentric weights (n, 3).
+
+    The noise of a vertex tilts the triangles beside it, and so the derivative of a range by an angle would be correlated with
+    the error of that range. The area-weighted normal of a vertex does not depend on its own position, because the area vectors
+    of the triangles about it sum to one that depends on their outer edges alone.
+    """
+    normal = np.einsum("nk,nki->ni", weight, np.nan_to_num(mesh.vertex_normals())[corner])
+    return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300))
 
 
 def redirect_hits(found: RayHits, nominal: FloatArray, real: FloatArray) -> RayHits:

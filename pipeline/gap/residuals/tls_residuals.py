@@ -19,6 +19,7 @@ from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Stage
 from sensors.effects.range_empirical import RangeEmpirical
 from sensors.effects.range_noise import RangeNoise
+from sensors.models.sensor_model import TlsModel
 from sensors.signal_chain.polar import polar, polar_axes
 from sensors.signal_chain.pulses import PulseGeometry
 
@@ -155,6 +156,8 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
         power=None if intensity is None else np.maximum(intensity, _LEAST_POWER),
     )
     predicted = predict_ranges(measurement, geometry) if model.effects else distance
+    if measurement.error_like_scanner and geometry.weight is not None:
+        geometry = replace(geometry, weight=geometry.weight * _relative_noise(model, geometry)[:, None])
     sigma = np.sqrt(model.variance(geometry) + _reference_variance(measurement.reference_error_m, geometry))
     slope = np.hypot(geometry.by_azimuth / np.sin(zenith), geometry.by_zenith) / distance
     hit = np.isfinite(predicted) & np.isfinite(distance)
@@ -177,6 +180,12 @@ def tls_residuals(measurement: TlsMeasurement) -> TlsResiduals:
         error_is_relief=measurement.error_is_relief,
     )
     return whole.part(hit)
+
+
+def _relative_noise(model: TlsModel, geometry: RayGeometry) -> FloatArray:
+    """(n,) standard deviation of a range by the model's noise, relative to its median: larger on steep and distant rock."""
+    sigma = np.sqrt(model.model_copy(update={"effects": ()}).variance(geometry))
+    return np.asarray(np.nan_to_num(sigma / np.nanmedian(sigma), nan=1.0))
 
 
 def _reference_variance(error_m: float, geometry: RayGeometry) -> FloatArray:

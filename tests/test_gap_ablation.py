@@ -1,0 +1,75 @@
+"""The ablation of the thresholds of `gap` (benchmarks/gap_ablation): its table of settings, its judgements and its page."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.gap_ablation import page, run
+from benchmarks.gap_ablation.settings import KEPT_OUT, MERGED, OFF, changed, others
+from benchmarks.gap_ablation.sources import StoredCase, stored_cases
+from pipeline.gap.thresholds import Thresholds
+
+KEYS = [f"{group}.{name}" for group, found in Thresholds().model_dump().items() for name in found]
+
+
+def test_each_threshold_is_switched_off_or_stays_out_for_a_reason() -> None:
+    assert sorted([*OFF, *KEPT_OUT]) == sorted(KEYS)
+    assert set(MERGED) <= set(KEYS)
+
+
+def test_settings_change_one_threshold_even_beyond_its_bounds() -> None:
+    found = changed([("mean.least_score", "off"), ("verdict.least_closed", "off")])
+    assert found.mean.least_score == OFF["mean.least_score"]
+    assert found.verdict.least_closed == OFF["verdict.least_closed"]
+    assert found.mean.class_margin == Thresholds().mean.class_margin
+    assert ("mean.least_score", "off") in others("mean.least_score")
+    assert not others("points.most")
+
+
+def _write(path: Path, found: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(found))
+
+
+@pytest.fixture
+def wall(tmp_path: Path) -> StoredCase:
+    """A stored case of the second generator without an effect."""
+    (tmp_path / "runs/second/cases/0001").mkdir(parents=True)
+    _write(tmp_path / "runs/second/truth/0001.json", {"kind": "none", "effects": {}})
+    (case,) = stored_cases(tmp_path / "runs", tmp_path / "measurements")
+    return case
+
+
+def test_a_name_where_there_is_nothing_is_a_false_alarm(wall: StoredCase) -> None:
+    assert wall.judged({"verdict": "no_gap", "effects": []}) == ""
+    named = {"name": "tls.wobble", "kind": "physical", "cannot_be_told_from": []}
+    assert wall.judged({"verdict": "named", "effects": [named]}) == "false alarm"
+    assert wall.judged({"verdict": "error", "error": "ValueError()", "effects": []}) == "no answer"
+
+
+def test_a_case_is_diagnosed_again_only_where_a_decision_would_differ(
+    wall: StoredCase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The page counts the case in which the rule acts, and that its answer becomes wrong."""
+    out = tmp_path / "out"
+
+    def answered(folder: Path, thresholds: Any) -> dict[str, Any]:
+        assert folder == wall.folder
+        alarm = thresholds.mean.least_score < 0
+        return {"verdict": "unknown" if alarm else "no_gap", "effects": [], "wall_s": 1.0}
+
+    _write(out / "second/0001/asked.json", {"asked": ["mean.least_score"], "matters": [["mean.least_score", "off"]]})
+    _write(out / "second/0001/usual.json", answered(wall.folder, Thresholds()))
+    monkeypatch.setattr(run, "diagnosed", answered)
+    (job,) = run.jobs([wall], out, [])
+    assert job == (wall, ("mean.least_score", "off"))
+    run.again(wall, [job[1]], "mean.least_score=off", out)
+    results = page.collect(out, [wall])
+    assert results["thresholds"]["mean.least_score"]["settings"]["off"]["became wrong"] == ["second 0001: false alarm"]
+    written = page.page(json.loads(json.dumps(results)), "make")
+    assert "| `mean.least_score` | 4 | none | 1 | 1 | 1 | 1 | 1 | 0 | kept |" in written
+    assert "| `mean.least_score` | off | second 0001 | right to false alarm |" in written
