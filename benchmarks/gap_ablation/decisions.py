@@ -21,6 +21,8 @@ DONE: dict[str, str] = {
     "variance.nonparametric_block_sigmas": "merged into `edges.least_block_sigmas`",
     "variance.second_gain": "merged with `variance.least_gain`, which changes no decision",
     "variance.nonparametric_share": "kept: without it a right name becomes unknown",
+    "variance.least_unshared_share": "kept: without it an answer becomes wrong",
+    "edges.least_filled_share": "kept: without it two answers become wrong",
     "variance.core_excess": _NONE_CAME,
     "grid_noise.margin": "merged with `mean.class_margin`, which changes no decision",
     "grid_noise.least_sigmas": "merged with `edges.block_sigmas`, which changes no decision",

@@ -40,7 +40,14 @@ def collect(out: Path, cases: list[StoredCase]) -> Json:
                 rows[key]["settings"][setting] = {"value": table[key], **_changes(acts, f"{key}={setting}", usual, out)}
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
     wrong = Counter(f"{case.source}: {answer['judged']}" for case, answer in usual.items() if answer and answer["judged"])
-    return {"cases": Counter(case.source for case in cases), "wrong": wrong, "commit": commit, "thresholds": rows}
+    together = _changes(cases, "final", usual, out)
+    return {
+        "cases": Counter(case.source for case in cases),
+        "wrong": wrong,
+        "commit": commit,
+        "together": together,
+        "thresholds": rows,
+    }
 
 
 def _answer(case: StoredCase, name: str, out: Path) -> Json | None:
@@ -91,7 +98,7 @@ def page(results: Json, command: str) -> str:
     before, after = len(results["thresholds"]), sum(len(group) for group in Thresholds().model_dump().values())
     return _PAGE.format(
         total=total, sources=sources, wrong=wrong, before=before, after=after, commit=results["commit"], command=command,
-        table="\n".join(lines), merged="\n".join(merged), flips=_flips(results),
+        table="\n".join(lines), merged="\n".join(merged), flips=_flips(results), together=_together(results["together"]),
     )  # fmt: skip
 
 
@@ -102,6 +109,15 @@ def _cells(found: Json) -> str:
     return (
         f"{found['acts']} | {found['diagnosed']} | {found['other answers']} | {len(found['became wrong'])} | "
         f"{len(found['became right'])}"
+    )
+
+
+def _together(found: Json) -> str:
+    """Return a paragraph on the cases that were diagnosed with the thresholds that are left."""
+    return (
+        f"With the thresholds that are left, {found['diagnosed']} of the cases were diagnosed again: {found['other answers']} "
+        f"have another verdict or other names, {len(found['became wrong'])} became wrong, and "
+        f"{len(found['became right'])} became right."
     )
 
 
@@ -149,6 +165,8 @@ so often as time allowed, the column "diagnosed" can be smaller than "acts".
 A rule that acts in no case changed nothing that could be measured here. It was deleted if cases used it and no test of the
 program requires it. It stays if no case came to it, if it limits the damage of measurements that are not among the cases,
 or if it belongs to what `gap` promises, such as classes of effects that cannot be told apart.
+
+{together}
 
 {table}
 

@@ -4,7 +4,8 @@
 
 The first diagnosis of a case also carries the value of each threshold with which its rule never acts (benchmarks/varied.py), and
 records which of them would change a decision. Only with those is the case diagnosed again, settings that take the least time
-first. An interrupted run continues. `--together KEY=NAME ...` diagnoses all cases with several settings at once instead.
+first. An interrupted run continues. `--together KEY=NAME ...` diagnoses all cases with several settings at once instead, and
+`--final` with the thresholds as they are now, once some were deleted.
 """
 
 from __future__ import annotations
@@ -102,11 +103,12 @@ def main() -> None:
     parser.add_argument("--watch", action="store_true", help="only the first diagnosis of each case")
     parser.add_argument("--only", nargs="*", default=[], help="settings for the second diagnoses: names, or KEY=NAME")
     parser.add_argument("--together", nargs="*", default=[], help="diagnose all watched cases with these settings at once")
+    parser.add_argument("--final", action="store_true", help="diagnose all watched cases with the thresholds as they are now")
     parser.add_argument("--name", default="together", help="name of the answers of --together")
     given = parser.parse_args()
     end = time.monotonic() + 60 * given.minutes
     cases = _ordered(stored_cases(given.runs, given.measurements), given.order)
-    if not given.together:
+    if not (given.together or given.final):
         for case in cases:
             if time.monotonic() < end:
                 watch(case, given.out)
@@ -114,7 +116,8 @@ def main() -> None:
         return
     watched = [case for case in cases if (given.out / case.source / case.name / "usual.json").exists()]
     settings = [tuple(each.split("=")) for each in given.together]
-    work = [(case, settings, given.name) for case in watched] if settings else [
+    name = "final" if given.final else given.name
+    work = [(case, settings, name) for case in watched] if settings or given.final else [
         (case, [setting], "=".join(setting)) for case, setting in jobs(watched, given.out, given.only)
     ]  # fmt: skip
     for case, some, name in work:
