@@ -1,10 +1,10 @@
 """How often `scarpsim gap` is right on walls that were monitored: each epoch is a scan, and so is the reference.
 
-    python benchmarks/gap_monitored.py --walls 5 --seed 40 --out /tmp/monitored [--write]     (--write: into docs/validation/gap.md)
+    python benchmarks/gap_monitored.py --walls 5 --seed 40 --out /tmp/monitored [--write]
 
 Each wall is simulated in four epochs, from which rock falls; the epochs are given to `scarpsim monitor`, and its folder to
 `scarpsim gap`. Each wall is diagnosed twice: without an effect, and with a bias by the incidence angle in the later epochs. An
-interrupted run continues.
+interrupted run continues. With --write, the table goes into docs/validation/gap.md.
 """
 
 from __future__ import annotations
@@ -14,13 +14,20 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 from documents import printed, write_between
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from pipeline.formats.points.laz import read_laz, write_laz  # noqa: E402
+from scene.geometry.frame import WallFrame  # noqa: E402
+
 DOCUMENT = ROOT / "docs" / "validation" / "gap.md"
 MARKS = ("<!-- monitored -->", "<!-- end of monitored -->")
 STYLES = ("glendale", "bulga", "pilkington", "bismantova")
@@ -50,22 +57,37 @@ def scarpsim(*words: object) -> None:
     subprocess.run([Path(sys.executable).parent / "scarpsim", *map(str, words), "--quiet"], check=True, capture_output=True)
 
 
+def surveyed(epoch: Path, out: Path) -> Path:
+    """Write the points of a run's epoch in the coordinates of the survey, with all that the file says of them."""
+    record = json.loads((epoch.parent / "run.json").read_text())["wall_frame"]
+    cloud = read_laz(epoch / "points.laz")
+    points = WallFrame(np.array(record["rotation"]), np.array(record["origin_m"])).to_world(cloud.points)
+    write_laz(out, replace(cloud, points=points))
+    return out
+
+
+def simulated(seed: int, effects: list[dict[str, Any]], out: Path) -> list[Path]:
+    """Simulate the epochs of a wall, and return their folders."""
+    path = out.with_suffix(".yaml")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(yaml.safe_dump(config(seed, effects)))
+    scarpsim("simulate", "--sensor", "tls", "--config", path, "--out", out, *(["--resume"] if out.exists() else []))
+    return sorted(out.glob("epoch_*"))
+
+
 def diagnosed(seed: int, biased: bool, folder: Path) -> dict[str, Any]:
     """Simulate, monitor and diagnose a wall in a folder, and return gap.json."""
-    answer = folder / "gap" / "gap.json"
-    if not answer.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        runs = {"clean": [], "biased": [BIAS]} if biased else {"clean": []}
-        for name, effects in runs.items():
-            path = folder / f"{name}.yaml"
-            path.write_text(yaml.safe_dump(config(seed, effects)))
-            scarpsim("simulate", "--sensor", "tls", "--config", path, "--out", folder / name)
-        (folder / "model.yaml").write_text(yaml.safe_dump({"sensor": "tls", "noise": NOISE}))
-        clouds = [folder / "clean" / "epoch_000" / "points.laz"]
-        clouds += [folder / [*runs][-1] / f"epoch_{number:03d}" / "points.laz" for number in range(1, EPOCHS + 1)]
-        scarpsim("monitor", *clouds, "--position", POSITION, "--model", folder / "model.yaml", "--out", folder / "found")
-        scarpsim("gap", folder / "found", "--out", folder / "gap")
-    return dict(json.loads(answer.read_text()))
+    kind = "biased" if biased else "clean"
+    found, answer = folder / f"monitor_{kind}", folder / f"gap_{kind}"
+    if not (answer / "gap.json").exists():
+        clean = simulated(seed, [], folder / "clean")
+        epochs = [clean[0], *(simulated(seed, [BIAS], folder / "biased") if biased else clean)[1:]]
+        clouds = [surveyed(each, folder / f"{kind}_{each.name}.laz") for each in epochs]
+        model = folder / "model.yaml"
+        model.write_text(yaml.safe_dump({"sensor": "tls", "noise": NOISE}))
+        scarpsim("monitor", *clouds, "--position", POSITION, "--model", model, "--out", found)
+        scarpsim("gap", found, "--out", answer)
+    return dict(json.loads((answer / "gap.json").read_text()))
 
 
 def rows(walls: int, seed: int, out: Path) -> Iterator[str]:
@@ -73,8 +95,7 @@ def rows(walls: int, seed: int, out: Path) -> Iterator[str]:
     yield "| later epochs | walls | answers | estimates of the 8 mm bias |"
     yield "|---|---|---|---|"
     for biased in (False, True):
-        kind = "biased" if biased else "clean"
-        found = [diagnosed(number, biased, out / f"{number}_{kind}") for number in range(seed, seed + walls)]
+        found = [diagnosed(number, biased, out / str(number)) for number in range(seed, seed + walls)]
         said = [_answer(each) for each in found]
         counted = ", ".join(f"{said.count(each)} {each}" for each in sorted(set(said), key=lambda each: -said.count(each)))
         sizes = [each["parameters"]["coefficient_m"] for one in found for each in one["effects"] if _is_bias(each)]
