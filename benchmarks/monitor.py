@@ -35,13 +35,16 @@ from pipeline.change.difference import SurfaceRaster, cast_raster  # noqa: E402
 from pipeline.change.m3c2 import M3c2Config, M3c2Map, m3c2  # noqa: E402
 from pipeline.formats.point_cloud import PointCloud  # noqa: E402
 from pipeline.formats.points.laz import read_laz, write_laz  # noqa: E402
+from pipeline.monitoring.alignment import SAME, RasterPair, coarse, refine  # noqa: E402
 from pipeline.monitoring.comparison import EpochChange, compare_epoch  # noqa: E402
-from pipeline.monitoring.events import LEAST_PIXELS, SIGNIFICANT, Change, ChangedRegion, region_of_mask  # noqa: E402
+from pipeline.monitoring.events import LEAST_PIXELS, SIGNIFICANT, Catalogue, Change, ChangedRegion, region_of_mask  # noqa: E402
 from pipeline.monitoring.options import MonitorOptions  # noqa: E402
-from pipeline.monitoring.products import Result  # noqa: E402
-from pipeline.monitoring.reading import find_epochs, read_epoch  # noqa: E402
-from pipeline.monitoring.run import monitor_paths  # noqa: E402
-from pipeline.monitoring.site import WallView, prepared  # noqa: E402
+from pipeline.monitoring.point_writing import write_points_once  # noqa: E402
+from pipeline.monitoring.products import Followed, Result  # noqa: E402
+from pipeline.monitoring.reading import EpochSource, find_epochs, read_epoch  # noqa: E402
+from pipeline.monitoring.report import epoch_pictures  # noqa: E402
+from pipeline.monitoring.run import monitor_paths, processed  # noqa: E402
+from pipeline.monitoring.site import ReferenceSite, WallView, prepared  # noqa: E402
 from pipeline.registration.rigid import RigidTransform  # noqa: E402
 from scene.geometry.frame import WallFrame  # noqa: E402
 from scene.geometry.mesh import FloatArray, TriangleMesh  # noqa: E402
@@ -50,7 +53,7 @@ from scene.ray_casting.raycast import RayCaster  # noqa: E402
 DOCUMENT = ROOT / "docs" / "validation" / "monitor.md"
 MARKS = {
     name: (f"<!-- {name} -->", f"<!-- end of {name} -->")
-    for name in ("simulated", "nothing", "cliff", "m3c2", "regions", "speed", "many")
+    for name in ("simulated", "nothing", "cliff", "m3c2", "regions", "speed", "many", "steps")
 }
 CLIFF = ROOT.parent / "shared" / "data" / "trier_cliff"
 PAIR, PAIR_FROM = CLIFF.parent / "tls_rock_blocks_pair", np.array([547_466.3, 149_575.8, 706.1])
@@ -251,7 +254,7 @@ class BothWays:
         change = compare_epoch(site.reference, points[1], None, options.seed)
         surface = SurfaceRaster(grid, raster.height, np.zeros(grid.shape, dtype=np.int32))
         config = M3c2Config(core_step_px=1, cylinder_radius_m=3 * grid.gsd, normal_radius_m=6 * grid.gsd, direction="wall")
-        clouds = [np.concatenate(list(each.chunks())) for each in points]
+        clouds = [np.concatenate(list(each.moved(SAME))) for each in points]
         other = m3c2(clouds[0], change.transform.apply(clouds[1]), surface, surface.block, config)
         return cls(change, other)
 
@@ -350,23 +353,79 @@ def speed() -> Iterator[str]:
         yield f"| {POINTS:,} | {took:.0f} s | {processor:.0f} s | {memory:.1f} GB | {others:.1f} |"
 
 
-def many() -> Iterator[str]:
-    """Rows of the table of many epochs: the time of the command, and of a process that only reads the same files."""
-    yield "| epochs, points in each | what | time | processor time | processor time over reading |"
-    yield "|---|---|---|---|---|"
+def many(epochs: int) -> Iterator[str]:
+    """Rows of the table of many epochs: the time of the command, and of programs that only read, or read and write, the same."""
+    heads = "time over reading | processor time over reading | load average of other programs"
+    yield f"| epochs, points in each | what | time | processor time | {heads} |"
+    yield "|---|---|---|---|---|---|---|"
     with tempfile.TemporaryDirectory() as folder:
-        files = [f"{folder}/2026-03-01T{number // 2:02d}{30 * (number % 2):02d}.laz" for number in range(EPOCHS)]
+        files = [f"{folder}/2026-03-01T{number // 2:02d}{30 * (number % 2):02d}.laz" for number in range(epochs)]
         for number, file in enumerate(files):
             write_laz(Path(file), PointCloud(_large_wall(number, EPOCH_POINTS)))
-        reading = _timed(READ, *files)
-        rows = {"reading the files": reading}
+        calls = {"reading the files": [READ, *files]}
+        for processes in ("1 process", "2 processes"):
+            calls[f"only reading and writing them, in {processes}"] = [REWRITE, processes[0], folder, *files]
         for workers in ("1", "2"):
-            rows[f"reading and writing them alone, {workers} processes"] = _timed(REWRITE, workers, folder, *files)
-        for workers in ("1", "2"):
-            words = [*files, *FROM, "--workers", workers, "--out", f"{folder}/out{workers}"]
-            rows[f"`monitor --workers {workers}`"] = _timed(MONITOR, *words)
-        for what, (took, processor) in rows.items():
-            yield f"| {EPOCHS}, {EPOCH_POINTS:,} | {what} | {took:.0f} s | {processor:.0f} s | {processor / reading[1]:.1f} |"
+            words = [MONITOR, *files, *FROM, "--workers", workers, "--out", f"{folder}/out{workers}"]
+            calls[f"`monitor --workers {workers}`"] = words
+        reading: tuple[float, float] | None = None
+        for what, (program, *words) in calls.items():
+            took, processor = _timed(program, *words)
+            reading = reading or (took, processor)
+            others = max(os.getloadavg()[0] - processor / took, 0.0)
+            ratios = f"{took / reading[0]:.1f} | {processor / reading[1]:.1f}"
+            yield f"| {epochs}, {EPOCH_POINTS:,} | {what} | {took:.0f} s | {processor:.0f} s | {ratios} | {others:.1f} |"
+
+
+def steps() -> Iterator[str]:
+    """Rows of the table of the steps of one epoch: the least processor time of three epochs in one process."""
+    yield "| step | processor time of an epoch | over reading |"
+    yield "|---|---|---|"
+    options = MonitorOptions(position=np.array([50.0, -80.0, 10.0]))
+    least: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        files = [Path(folder) / f"{number}.laz" for number in range(4)]
+        for number, file in enumerate(files):
+            write_laz(file, PointCloud(_large_wall(number, EPOCH_POINTS)))
+        reference, *sources = find_epochs(files)
+        site, out = prepared(reference, options), Path(folder) / "out"
+        for number, source in enumerate(sources, start=1):
+            for step, used in _steps_of(number, source, site, out, options).items():
+                least[step] = min(used, least.get(step, np.inf))
+    for step, used in least.items():
+        yield f"| {step} | {used:.2f} s | {used / least['reading']:.2f} |"
+
+
+def _steps_of(number: int, source: EpochSource, site: ReferenceSite, out: Path, options: MonitorOptions) -> dict[str, float]:
+    """Processor time, s, of each step of an epoch."""
+    ends = [time.process_time()]
+
+    def passed() -> float:
+        ends.append(time.process_time())
+        return ends[-1] - ends[-2]
+
+    points = read_epoch(source, options).wall_points(site.frame, site.grid.gsd)
+    read = passed()
+    first = coarse(site.reference.surface, points.sample, site.grid.gsd, options.seed)
+    near = passed()
+    rasters = site.reference.gridded(points.moved(first))
+    fitted = passed()
+    refine([RasterPair(*each) for each in zip(site.reference.rasters, rasters, strict=True)], None)
+    registered = passed()
+    record, data = processed(number, source, site, out, options, "benchmark")
+    rest = passed() - read - near - fitted - registered
+    epoch = Followed(source, record, Catalogue().identified(record.regions))
+    write_points_once(epoch, data, site, out, "benchmark", options)
+    written = passed()
+    epoch_pictures(epoch, site.views, out)
+    return {
+        "reading": read,
+        "fitting planes to the points": fitted,
+        "registration": near + registered,
+        "differences, levels of detection, events, their files": rest,
+        "writing the registered points": written,
+        "map of the report": passed(),
+    }
 
 
 MONITOR = "import sys; from pipeline.cli.main import main; sys.exit(main(['monitor', '--quiet', *sys.argv[1:]]))"
@@ -414,6 +473,7 @@ def _large_wall(seed: int, count: int) -> FloatArray:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--epochs", type=int, default=4, help="simulated epochs of each site")
+    parser.add_argument("--many", type=int, default=EPOCHS, help="epochs of the part `many`")
     parser.add_argument("--parts", nargs="+", default=list(MARKS), choices=list(MARKS))
     parser.add_argument("--write", action="store_true", help="put the tables into docs/validation/monitor.md")
     arguments = parser.parse_args()
@@ -424,7 +484,8 @@ def main() -> None:
         "m3c2": against_m3c2,
         "regions": regions,
         "speed": speed,
-        "many": many,
+        "many": lambda: many(arguments.many),
+        "steps": steps,
     }
     for part in arguments.parts:
         table = printed(rows[part]())

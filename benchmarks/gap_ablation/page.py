@@ -154,7 +154,7 @@ or if it belongs to what `gap` promises, such as classes of effects that cannot 
 
 ## Values that were tried in place of others
 
-Thresholds of the same kind can share one value. These values were tried. Where no answer became wrong, the threshold was
+Thresholds of the same kind can share one value. These values were tried. Where no answer became wrong, the threshold could be
 merged with the one whose value it shares.
 
 {merged}

@@ -35,7 +35,6 @@ OFF: dict[str, float] = {
     "variance.least_excess": 0.0,
     "variance.least_unshared_share": -LARGE,
     "variance.excess_noise_ratio": 1.0,
-    "variance.class_margin": 0.0,
     "variance.nonparametric_share": 0.0,
     "variance.trial_cost": 0.0,
     "variance.most_tail_share": LARGE,
@@ -98,7 +97,6 @@ KEPT_OUT: dict[str, str] = {
 
 MERGED: dict[str, float] = {
     "mean.class_margin": 5.0,
-    "variance.class_margin": 3.0,
     "mean.nonparametric_margin": 6.0,
     "variance.least_gain": 4.0,
     "mean.least_relative_gain": 0.01,

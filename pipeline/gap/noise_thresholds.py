@@ -46,14 +46,6 @@ class VarianceThresholds(ThresholdGroup):
     clip_sigmas: PositiveFloat = threshold_field(
         4.5, "standard deviations", "A deviation beyond this is not used to fit the variance model.", JUDGEMENT
     )
-    class_margin: PositiveFloat = threshold_field(
-        5.0,
-        "log-likelihood",
-        "Noise terms whose score is within this of the best one belong to its equivalence class. It is larger than for "
-        "systematic effects, because a few steep wall blocks decide. White and grid-correlated noise belong to one class if the "
-        "chi^2 of their semivariograms differ by less.",
-        "in three development scans the true term scored 9 to 15 more than the next",
-    )
     nonparametric_share: PositiveFloat = threshold_field(
         0.1,
         "share of the named term's log-likelihood ratio",
@@ -93,7 +85,7 @@ class GridNoiseThresholds(ThresholdGroup):
 
     White noise is independent from point to point. Grid-correlated noise is interpolated by a stereo matcher between widely
     spaced pixels (nodes of a grid). The semivariogram of the residuals is fitted with each kind. The kind that fits better by
-    `variance.class_margin` is named; otherwise both are reported as indistinguishable. An error of the reference also
+    `mean.class_margin` is named; otherwise both are reported as indistinguishable. An error of the reference also
     correlates residuals. A component of the semivariogram is attributed to it if it is not larger than the `reference_error`
     limits allow. The last text of each field states where its value comes from: tuning on development cases, or judgement.
     """

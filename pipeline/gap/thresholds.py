@@ -92,8 +92,8 @@ class MeanThresholds(ThresholdGroup):
     class_margin: PositiveFloat = threshold_field(
         3.0,
         "log-likelihood",
-        "Effects whose score is within this of the best one belong to its equivalence class. The likelihood factor exp(-3) "
-        "bounds by 5 % how often the true effect is left out.",
+        "Effects whose score is within this of the best one belong to its equivalence class, noise terms likewise. The "
+        "likelihood factor exp(-3) bounds by 5 % how often the true effect is left out.",
         "target of 93 to 97 % of classes that contain the true effect",
     )
     class_share: PositiveFloat = threshold_field(

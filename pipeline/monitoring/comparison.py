@@ -63,7 +63,7 @@ class ReferenceHeights:
         partition : Partition or None
             Says which points belong to which view, wall frame; None for a single view.
         """
-        rasters = _gridded(points.chunks(), grids, from_wall, partition)
+        rasters = _gridded(points.moved(SAME), grids, from_wall, partition)
         return cls(tuple(rasters), tuple(from_wall), partition, reference_surface(rasters, from_wall))
 
     def gridded(self, chunks: Iterable[FloatArray]) -> list[HeightRaster]:
@@ -129,7 +129,7 @@ def compare_epoch(
     """
     gsd = reference.rasters[0].grid.gsd
     first = coarse(reference.surface, points.sample, gsd, seed) if start is None else start
-    epochs = reference.gridded(map(first.apply, points.chunks()))
+    epochs = reference.gridded(points.moved(first))
     pairs = [RasterPair(*each) for each in zip(reference.rasters, epochs, reference.from_wall, strict=True)]
     alignment = refine(pairs, stable)
     changes = [_change(pair, alignment, view) for view, pair in enumerate(pairs)]

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.monitoring.raster_statistics import quantiles
+from pipeline.registration.rigid import RigidTransform
 from scene.geometry.grid import Grid
 from scene.geometry.mesh import FloatArray
 
@@ -81,17 +82,17 @@ class WallPoints:
     ----------
     sample : (n, 3) array
         A subset of the points for ICP, spread over all of the epoch, m.
-    chunks : callable
-        Function that yields all points in chunks (k, 3), m, each time it is called.
+    moved : callable
+        Function of a rigid transform that yields all points, after this transform, in chunks (k, 3), m, each time it is called.
     """
 
     sample: FloatArray
-    chunks: Callable[[], Iterable[FloatArray]]
+    moved: Callable[[RigidTransform], Iterable[FloatArray]]
 
     @classmethod
     def of(cls, points: FloatArray) -> WallPoints:
         """Make the points of an epoch from an array (n, 3), wall frame, m, that is in memory."""
-        return cls(points, lambda: [points])
+        return cls(points, lambda motion: [motion.apply(points)])
 
 
 def gridded(points: FloatArray | Iterable[FloatArray], grid: Grid) -> HeightRaster:

@@ -20,6 +20,7 @@ from pipeline.measurement.scans import RawScan, read_scans
 from pipeline.monitoring.gridding import POINTS_AT_ONCE, SAMPLE, WallPoints
 from pipeline.monitoring.options import MonitorOptions
 from pipeline.monitoring.times import SIDECAR, EpochTime, check_order, time_of
+from pipeline.registration.rigid import RigidTransform
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.bounds import bounding_box
@@ -173,7 +174,7 @@ class EpochData:
         """
         if self.mesh is None:
             sample = self.points[:: max(len(self.points) // SAMPLE, 1)]
-            return WallPoints(frame.to_wall(sample), lambda: map(frame.to_wall, in_pieces(self.chunks(), POINTS_AT_ONCE)))
+            return WallPoints(frame.to_wall(sample), lambda motion: self._in_wall_frame(frame, motion))
         if several:
             return WallPoints.of(frame.to_wall(_spread_over(self.mesh, gsd_m / 2)))
         from pipeline.change.difference import surface_raster
@@ -184,6 +185,12 @@ class EpochData:
         row, column = np.nonzero(np.isfinite(heights))
         x, y = grid.x_min + (column + 0.5) * grid.gsd, grid.y_max - (row + 0.5) * grid.gsd
         return WallPoints.of(np.stack([x, y, heights[row, column]], axis=1).astype(np.float64))
+
+    def _in_wall_frame(self, frame: WallFrame, motion: RigidTransform) -> Iterator[FloatArray]:
+        """Yield all points in pieces (n, 3), wall frame, m, after a motion, with which the frame's rotation is combined."""
+        turned = RigidTransform(motion.rotation @ frame.rotation, motion.translation)
+        for piece in in_pieces(self.chunks(), POINTS_AT_ONCE):
+            yield turned.apply(piece - frame.origin)
 
 
 def in_pieces(chunks: Iterable[FloatArray], most: int) -> Iterator[FloatArray]:

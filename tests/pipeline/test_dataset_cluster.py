@@ -20,7 +20,7 @@ import psutil
 import pytest
 from tiny_dataset import ROOT, TINY
 
-from pipeline.dataset import watchdog
+from pipeline.dataset import watchdog, worker
 from pipeline.dataset.worker import EpochOrder
 from scene.common.errors import OutsideError
 
@@ -116,7 +116,7 @@ def test_nobody_else_can_hand_the_workers_work() -> None:
 
 
 def test_workers_killed_at_their_start_are_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "make_and_store_run", quickly)
+    monkeypatch.setattr(worker, "make_and_store_run", quickly)
     with killer(2) as killed:
         found = list(cluster.make_on_cluster(ORDERS, 1, ""))
     assert len(killed) == 2
@@ -124,7 +124,7 @@ def test_workers_killed_at_their_start_are_started_again(monkeypatch: pytest.Mon
 
 
 def test_workers_that_never_start_end_the_job(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "make_and_store_run", quickly)
+    monkeypatch.setattr(worker, "make_and_store_run", quickly)
     monkeypatch.setattr(cluster, "_STARTS", 2)
     with killer(1000) as killed, pytest.raises(OutsideError, match="run the same command to continue"):
         list(cluster.make_on_cluster(ORDERS, 1, ""))
@@ -132,7 +132,7 @@ def test_workers_that_never_start_end_the_job(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_an_epoch_that_kills_its_workers_ends_the_job(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "make_and_store_run", deadly)
+    monkeypatch.setattr(worker, "make_and_store_run", deadly)
     monkeypatch.setattr(cluster, "_LOOK_S", 0.5)
     with pytest.raises(OutsideError, match="run the same command to continue"):
         list(cluster.make_on_cluster(ORDERS, 1, ""))
@@ -145,7 +145,7 @@ def test_a_stopped_worker_is_replaced(
 ) -> None:
     """The worker gets SIGSTOP, which freezes it with its interpreter; the next one does the work."""
     monkeypatch.setenv("AT_WORK", str(tmp_path / "at_work"))
-    monkeypatch.setattr(cluster, "make_and_store_run", slowly)
+    monkeypatch.setattr(worker, "make_and_store_run", slowly)
     monkeypatch.setattr(cluster, "_LOOK_S", 0.5)
     monkeypatch.setattr(watchdog, "STALLED_S", 4.0)
 
@@ -163,7 +163,7 @@ def test_a_stopped_worker_is_replaced(
 
 
 def test_a_deadlocked_worker_ends_the_job(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(cluster, "make_and_store_run", deadlocked)
+    monkeypatch.setattr(worker, "make_and_store_run", deadlocked)
     monkeypatch.setattr(cluster, "_LOOK_S", 0.5)
     monkeypatch.setattr(watchdog, "STALLED_S", 1.0)
     once = dask.config.set({"distributed.scheduler.allowed-failures": 0})

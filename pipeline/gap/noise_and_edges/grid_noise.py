@@ -254,9 +254,9 @@ def _name_noise(white: VarianceTerm, part: StereoResiduals, value: FloatArray, m
     )  # otherwise a grid may be too fine for this raster
     white = replace(both, indistinguishable=white.indistinguishable) if resolved else both
     best = variogram.best_grid()
-    if best is None or white_fit.chi2 < best[0].chi2 - thresholds().variance.class_margin:
+    if best is None or white_fit.chi2 < best[0].chi2 - thresholds().mean.class_margin:
         return white
-    if best[0].variance <= 0 or white_fit.chi2 < best[0].chi2 + thresholds().variance.class_margin:
+    if best[0].variance <= 0 or white_fit.chi2 < best[0].chi2 + thresholds().mean.class_margin:
         return both
     grid = replace(white, name=RegularizationNoise.tag(), effect=RegularizationNoise.tag(), indistinguishable=())
     return _as_grid_noise(grid, *best)

@@ -263,7 +263,7 @@ def fit_variance_model(
     if empirical:
         chosen, note = best, ""
     tried = sorted([*tried, VarianceScore(free_name, free_score + _BINS, free_score, True)], key=lambda item: -item.score)
-    margin = max(by.class_margin, class_share * chosen.gain)
+    margin = max(thresholds().mean.class_margin, class_share * chosen.gain)
     found = []
     for place, number in enumerate(chosen.members):
         candidate, theta = candidates[number], chosen.theta[place]
