@@ -33,7 +33,7 @@ MARKS = ("<!-- monitored -->", "<!-- end of monitored -->")
 STYLES = ("glendale", "bulga", "pilkington", "bismantova")
 NOISE = {"range_sigma_m": 0.003, "angle_sigma_rad": 5e-5}
 BIAS_M = 0.008
-BIAS = {"effect": "range_incidence_bias", "coefficient_m": BIAS_M}
+BIAS = {"name": "range_incidence_bias", "coefficient_m": BIAS_M}
 EPOCHS = 3
 POSITION = "8,-50,1.6"
 """Where the scanner of the simulation stands about, m: before the middle of the wall, at the height of the instrument."""
