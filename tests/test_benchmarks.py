@@ -35,6 +35,7 @@ ELSEWHERE = {
     "gap_ablation/run": "tests/test_gap_ablation.py",
     "gap_ablation/page": "tests/test_gap_ablation.py",
     "gap_closed_form/run": "tests/test_gap_closed_form.py",
+    "gap_monitored": "tests/monitor/test_stable_measurement.py runs the same commands on smaller walls",
     "gap_injections/run": "tests/test_gap_injections.py",
     "gap_second_generator/run": "tests/test_gap_second_generator.py",
     "gap_thresholds": "tests/test_varied.py",

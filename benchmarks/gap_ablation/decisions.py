@@ -34,7 +34,7 @@ DONE: dict[str, str] = {
     "edges.footprint_fewest": "deleted",
     "edges.clear_sigmas": "deleted",
     "edges.clear_step": "deleted: a rim must move a point by a depth step",
-    "edges.most_relative_noise": "deleted; the simplest explanation is taken",
+    "edges.most_relative_noise": _TESTED,
     "edges.least_filled_gain": "merged with `edges.least_gain`, which changes no decision",
     "missing_returns.least_isolated_share": "kept: it tells rain from objects, and no case has many early returns",
     "missing_returns.nonparametric_margin": "merged with `mean.nonparametric_margin`, which changes no decision",

@@ -51,6 +51,7 @@ OFF: dict[str, float] = {
     "edges.least_gain": -LARGE,
     "edges.block_sigmas": -LARGE,
     "edges.least_block_sigmas": -LARGE,
+    "edges.most_relative_noise": LARGE,
     "edges.fewest_filled": 1,
     "edges.least_filled_share": 0.0,
     "missing_returns.least_gain": -LARGE,

@@ -196,6 +196,12 @@ class EdgeThresholds(ThresholdGroup):
     most_gain_of_a_point: PositiveFloat = threshold_field(
         3.0, "log-likelihood", "The gain of one point is clipped at this before the wall blocks are compared.", JUDGEMENT
     )
+    most_relative_noise: PositiveFloat = threshold_field(
+        1.5,
+        "ratio of standard deviations",
+        "A selection pass is rejected if its residuals have more than this times the noise of the best pass.",
+        JUDGEMENT,
+    )
     least_block_sigmas: PositiveFloat = threshold_field(
         2.0,
         "root sums of squares of the wall blocks' gains",
