@@ -354,7 +354,7 @@ def speed() -> Iterator[str]:
 
 
 def many(epochs: int) -> Iterator[str]:
-    """Rows of the table of many epochs: the time of the command, and of programs that only read, or read and write, the same."""
+    """Rows of the table of many epochs: the time of `monitor`, of reading its files, and of reading and writing them."""
     heads = "time over reading | processor time over reading | load average of other programs"
     yield f"| epochs, points in each | what | time | processor time | {heads} |"
     yield "|---|---|---|---|---|---|---|"

@@ -50,7 +50,7 @@ import cv2, drjit, manifold3d, mitsuba, numpy, pydantic, tifffile, yaml
 mitsuba.set_variant("llvm_ad_mono")
 pydantic.BaseModel
 """
-"""The packages that `simulate` imports, and the variant that it sets, without anything of scarpsim."""
+"""What `simulate` imports from other projects, and the variant of Mitsuba that it sets."""
 _SURFACE_PACKAGES = "import laspy, lazrs, numpy, pydantic, scipy.spatial, yaml; pydantic.BaseModel"
 """The packages that `surface` imports for a LAZ file."""
 _MITSUBA = 'import mitsuba; mitsuba.set_variant("llvm_ad_mono")'

@@ -111,7 +111,7 @@ MERGED: dict[str, float] = {
     "validation.shortfall_sigmas": 2.0,
     "validation.least_gain_beside_others": 4.0,
 }
-"""The value of another threshold of the same kind, which could replace this one."""
+"""For some thresholds, the value of a similar one. If no answer changes with it, one threshold can serve for both."""
 
 
 def others(key: str) -> dict[Setting, Any]:

@@ -32,7 +32,10 @@ class StoredCase:
     runs: Path
 
     def judged(self, answer: Json) -> str:
-        """Return what is wrong with an answer, "" if it is right; "false alarm" where there is nothing to name."""
+        """Return in words what is wrong with an answer, such as "wrong name"; an empty text if it is right.
+
+        "false alarm" stands for an answer other than `no_gap` about a measurement without an effect.
+        """
         if "error" in answer:
             return "no answer"
         if self.source == "closed":

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import pickle
-import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -18,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.dataset.cluster import map_on_workers
-from pipeline.formats.files.atomic import empty_folder
+from pipeline.formats.files.atomic import empty_folder, write_bytes
 from pipeline.formats.files.checksum import sha256
 from pipeline.formats.rasters.geotiff import write_geotiff
 from pipeline.monitoring.comparison import EpochChange, compare_epoch
@@ -30,7 +29,7 @@ from pipeline.monitoring.plausibility import check_motion, compared_area, remark
 from pipeline.monitoring.point_writing import PointsInOrder, write_points_once
 from pipeline.monitoring.products import Followed, Result, write_results
 from pipeline.monitoring.reading import EpochData, EpochSource, find_epochs, read_epoch
-from pipeline.monitoring.records import EpochRecord, discard, kept
+from pipeline.monitoring.records import KEPT, EpochRecord, discard, kept
 from pipeline.monitoring.site import ReferenceSite, prepared
 from pipeline.monitoring.stable_areas import StableRock
 from pipeline.monitoring.targets import TargetFit, fit_targets, read_targets
@@ -175,13 +174,16 @@ def _compared_in_processes(
 ) -> dict[int, EpochRecord | None]:
     """The records of epochs, compared on local workers of Dask, by number."""
     found: dict[int, EpochRecord | None] = {}
-    with progress.stage("comparisons"), tempfile.TemporaryDirectory(prefix="scarpsim-") as folder:
-        shared = Path(folder) / "reference.pickle"
-        shared.write_bytes(pickle.dumps(site, pickle.HIGHEST_PROTOCOL))
-        tasks = [(number, source, shared, out, options, fingerprint) for number, source in left]
-        for record in map_on_workers(_in_worker, tasks, workers):
-            found[record.number] = record
-            progress.advance(len(found) / len(left))
+    shared = out / KEPT / "reference.pickle"
+    tasks = [(number, source, shared, out, options, fingerprint) for number, source in left]
+    with progress.stage("comparisons"):
+        write_bytes(shared, pickle.dumps(site, pickle.HIGHEST_PROTOCOL))
+        try:
+            for record in map_on_workers(_in_worker, tasks, workers):
+                found[record.number] = record
+                progress.advance(len(found) / len(left))
+        finally:
+            shared.unlink()
     return found
 
 

@@ -134,12 +134,12 @@ def parts_of(indices: NDArray[np.intp] | int) -> list[Part]:
 
 
 def _point_columns(arm: FloatArray, offset: FloatArray) -> FloatArray:
-    """Return the columns (7, k) from p - g and p - q, (3, k) each."""
+    """Return the vectors u (7, k) of k pairs (`NearestPairs.moments`). arm: p - g; offset: p - q; (3, k) each, m."""
     return np.concatenate([arm, -offset, np.ones((1, arm.shape[1]))])
 
 
 def _plane_columns(arm: FloatArray, offset: FloatArray, normal: FloatArray) -> FloatArray:
-    """Return the columns (8, k) from p - g, p - q and n, (3, k) each."""
+    """Return the vectors u (8, k) of k pairs (`NearestPairs.moments`). arm: p - g; offset: p - q, m; normal: n; (3, k) each."""
     columns = np.ones((8, arm.shape[1]))
     for axis, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
         columns[axis] = arm[i] * normal[j] - arm[j] * normal[i]

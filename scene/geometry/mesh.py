@@ -176,10 +176,14 @@ class TriangleMesh:
         return self.face_normals()
 
     def vertex_normals(self) -> FloatArray:
-        """Compute outward unit normals (n, 3) at the n vertices: the area-weighted mean of the adjacent faces' normals.
+        """Return outward unit normals (n, 3) at the n vertices: the area-weighted mean of the adjacent faces' normals.
 
-        A vertex that no face uses has NaN.
+        A vertex that no face uses has NaN. They are computed once and then kept.
         """
+        return self._vertex_normals
+
+    @cached_property
+    def _vertex_normals(self) -> FloatArray:
         total = np.zeros((3, len(self.vertices)))
         for start in range(0, len(self.faces), _CHUNK):
             faces = self.faces[start : start + _CHUNK]

@@ -38,7 +38,8 @@ that shows in the noise."""
 _NOISE_UNCERTAINTY, _LEAST_NOISE_SHARE = 0.1, 0.01
 """Relative uncertainty of the noise; least share of the measured variance that is noise."""
 _MULTIPLES = np.arange(1, 5)
-_MOST_NOISE_PX = 0.35  # of a grid of trial values; more noise hides any crowding
+_MOST_NOISE_PX = 0.35
+"""Largest standard deviation of matching noise that is tried, px: with more noise, locked disparities look evenly spread."""
 _FOLDING, _LARGE_AMPLITUDE, _HARMONIC_MISFIT = 1 / (2 * np.pi), 0.3, 0.02
 """Amplitude from which disparities fold over; amplitude that is large; chi^2 share by which a small amplitude may fit worse,
 because a matcher's error is not exactly a sine."""
