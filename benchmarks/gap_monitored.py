@@ -36,7 +36,7 @@ BIAS_M = 0.008
 BIAS = {"name": "range_incidence_bias", "coefficient_m": BIAS_M}
 EPOCHS = 3
 POSITION = "8,-50,1.6"
-"""Where the scanner of the simulation stands about, m: before the middle of the wall, at the height of the instrument."""
+"""Approximate place of the simulated scanner, m: in front of the middle of the wall, at the height of the instrument."""
 
 
 def config(seed: int, effects: list[dict[str, Any]]) -> dict[str, Any]:

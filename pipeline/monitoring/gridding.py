@@ -210,7 +210,10 @@ def _about_each_pixel(sums: FloatArray) -> FloatArray:
 
 
 def _add_shifted(total: FloatArray, sums: FloatArray, by: float, *, along_u: bool) -> None:
-    """Add to `total` the sums (10, h, w) with the offset u, or v, of every point larger by `by` pixels, 1 or -1."""
+    """Add the sums of neighbouring pixels (10, h, w) to `total`, with offsets from the centre of the pixel that they are added to.
+
+    This makes the offset u (`along_u`) or v of each of their points larger by `by` pixels, 1 or -1.
+    """
     own, square, with_z, other = (1, 4, 7, 2) if along_u else (2, 6, 8, 1)
     for place in {*range(10)} - {own, square, 5, with_z}:
         total[place] += sums[place]

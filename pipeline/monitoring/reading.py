@@ -187,7 +187,7 @@ class EpochData:
         return WallPoints.of(np.stack([x, y, heights[row, column]], axis=1).astype(np.float64))
 
     def _in_wall_frame(self, frame: WallFrame, motion: RigidTransform) -> Iterator[FloatArray]:
-        """Yield all points in pieces (n, 3), wall frame, m, after a motion, with which the frame's rotation is combined."""
+        """Yield all points in pieces (n, 3), wall frame, m, moved by `motion`; both rotations are applied at once."""
         turned = RigidTransform(motion.rotation @ frame.rotation, motion.translation)
         for piece in in_pieces(self.chunks(), POINTS_AT_ONCE):
             yield turned.apply(piece - frame.origin)
