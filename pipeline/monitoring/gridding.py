@@ -210,7 +210,7 @@ def _about_each_pixel(sums: FloatArray) -> FloatArray:
 
 
 def _add_shifted(total: FloatArray, sums: FloatArray, by: float, *, along_u: bool) -> None:
-    """Add the sums of neighbouring pixels (10, h, w) to `total`, with offsets from the centre of the pixel that they are added to.
+    """Add the sums of neighbouring pixels (10, h, w) to `total`, with offsets from the centre of the latter.
 
     This makes the offset u (`along_u`) or v of each of their points larger by `by` pixels, 1 or -1.
     """
