@@ -6,6 +6,12 @@ _NONE_CAME = "kept: no case came to it, so nothing was measured"
 _TESTED = "kept: a test of the program requires it"
 
 DONE: dict[str, str] = {
+    "mean.largest_size": "now `points.outlier_sigmas` times `mean.prior_size`, which is the same value",
+    "grid_noise.least_gain": "now twice `variance.least_gain`, which is the same value as chi^2",
+    "grid_noise.finest_grid": "now a constant: the sampling theorem's two cells",
+    "grid_noise.reference_error": "now `points.reference_error`",
+    "changes.smallest_departure": "merged with `points.reference_error`, which has the same value",
+    "changes.false_changes": "merged with `verdict.rejection_p`, which has the same value",
     "points.fewest": "kept: below it the verdict is `insufficient_data`",
     "points.fewest_epochs": "kept: no case has several epochs",
     "points.least_share_on_reference": "kept: without points on the reference nothing can be fitted",
@@ -28,13 +34,13 @@ DONE: dict[str, str] = {
     "grid_noise.least_sigmas": "merged with `edges.block_sigmas`, which changes no decision",
     "grid_noise.short_reference_error": _NONE_CAME,
     "locking.most_noise": "now a constant: it ends a grid of trial values",
-    "locking.equal_fit": "kept: without it a case has no answer",
+    "locking.equal_fit": "now twice `mean.class_margin`, which is the same value as chi^2",
     "locking.good_fit": _TESTED,
     "edges.footprint_block_sigmas": "now `edges.least_block_sigmas`",
     "edges.footprint_fewest": "deleted",
     "edges.clear_sigmas": "deleted",
     "edges.clear_step": "deleted: a rim must move a point by a depth step",
-    "edges.most_relative_noise": _TESTED,
+    "edges.most_relative_noise": "merged with `verdict.overdispersion`, which has the same value",
     "edges.least_filled_gain": "merged with `edges.least_gain`, which changes no decision",
     "missing_returns.least_isolated_share": "kept: it tells rain from objects, and no case has many early returns",
     "missing_returns.nonparametric_margin": "merged with `mean.nonparametric_margin`, which changes no decision",

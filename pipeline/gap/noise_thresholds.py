@@ -20,7 +20,8 @@ class VarianceThresholds(ThresholdGroup):
     least_gain: PositiveFloat = threshold_field(
         6.0,
         "log-likelihood",
-        "The best noise term needs at least this log-likelihood ratio, a second one beside it too.",
+        "The best noise term needs at least this log-likelihood ratio, a second one beside it too. Grid-correlated noise must "
+        "improve the fit of the semivariogram by twice this in chi^2.",
         JUDGEMENT,
     )
     least_excess: PositiveFloat = threshold_field(
@@ -90,24 +91,6 @@ class GridNoiseThresholds(ThresholdGroup):
     limits allow. The last text of each field states where its value comes from: tuning on development cases, or judgement.
     """
 
-    least_gain: PositiveFloat = threshold_field(
-        12.0,
-        "chi^2",
-        "Grid-correlated noise must improve the fit of the semivariogram by this where single points show no added variance.",
-        DEVELOPMENT,
-    )
-    finest_grid: PositiveFloat = threshold_field(
-        2.0,
-        "cells of the disparity raster",
-        "A grid with narrower nodes than this cannot be told from white noise and is not tried.",
-        JUDGEMENT,
-    )
-    reference_error: PositiveFloat = threshold_field(
-        0.02,
-        "m",
-        "Largest standard deviation that is attributed to an error of the reference correlated over metres.",
-        JUDGEMENT,
-    )
     reference_length: PositiveFloat = threshold_field(
         0.45,
         "m, standard deviation of a Gaussian correlation",
@@ -143,12 +126,6 @@ class LockingThresholds(ThresholdGroup):
     )
     significance: PositiveFloat = threshold_field(
         1e-4, "probability", "Significance level: crowding that chance makes more often is not reported.", JUDGEMENT, lt=1
-    )
-    equal_fit: PositiveFloat = threshold_field(
-        6.0,
-        "chi^2 of four values",
-        "Amplitudes whose fits differ by less than this count as equally good, and the smallest is taken.",
-        JUDGEMENT,
     )
     good_fit: PositiveFloat = threshold_field(
         20.0,
@@ -195,12 +172,6 @@ class EdgeThresholds(ThresholdGroup):
     )
     most_gain_of_a_point: PositiveFloat = threshold_field(
         3.0, "log-likelihood", "The gain of one point is clipped at this before the wall blocks are compared.", JUDGEMENT
-    )
-    most_relative_noise: PositiveFloat = threshold_field(
-        1.5,
-        "ratio of standard deviations",
-        "A selection pass is rejected if its residuals have more than this times the noise of the best pass.",
-        JUDGEMENT,
     )
     least_block_sigmas: PositiveFloat = threshold_field(
         2.0,

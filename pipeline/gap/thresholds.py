@@ -47,7 +47,9 @@ class PointThresholds(ThresholdGroup):
     outlier_sigmas: PositiveFloat = threshold_field(
         5.0,
         "predicted standard deviations, times the ratio of observed to predicted noise",
-        "A residual beyond this is an outlier and is not used for fitting; in validation blocks it is clipped at this.",
+        "A residual beyond this is an outlier and is not used for fitting; in validation blocks it is clipped at this. An effect "
+        "that lies this many standard deviations of its prior (`mean.prior_size`) from zero is rejected, as no instrument is "
+        "that far off.",
         JUDGEMENT,
     )
     most_reference_scatter: PositiveFloat = threshold_field(
@@ -58,6 +60,13 @@ class PointThresholds(ThresholdGroup):
     )
     registration_outlier_sigmas: PositiveFloat = threshold_field(
         3.5, "standard deviations", "A residual beyond this is an outlier in the robust pose estimate.", JUDGEMENT
+    )
+    reference_error: PositiveFloat = threshold_field(
+        0.02,
+        "m",
+        "Largest standard deviation that is attributed to an error of the reference correlated over metres. A median of "
+        "neighbours that departs by less than this is no change of the rock.",
+        JUDGEMENT,
     )
     least_share_on_reference: PositiveFloat = threshold_field(
         0.9,
@@ -92,7 +101,8 @@ class MeanThresholds(ThresholdGroup):
     class_margin: PositiveFloat = threshold_field(
         3.0,
         "log-likelihood",
-        "Effects whose score is within this of the best one belong to its equivalence class, noise terms likewise. The "
+        "Effects whose score is within this of the best one belong to its equivalence class, noise terms likewise. Amplitudes "
+        "of pixel locking whose chi^2 differ by less than twice this fit equally well, and the smallest is taken. The "
         "likelihood factor exp(-3) bounds by 5 % how often the true effect is left out.",
         "target of 93 to 97 % of classes that contain the true effect",
     )
@@ -192,12 +202,6 @@ class MeanThresholds(ThresholdGroup):
         "Largest standard deviation that the reference's correlated error may have; `--reference-error` sets it.",
         "no limit, unless the user knows the reference",
     )
-    largest_size: PositiveFloat = threshold_field(
-        100.0,
-        "typical sizes of the effect",
-        "An effect that would have to be larger than this is rejected, as no instrument is that far off.",
-        JUDGEMENT,
-    )
 
 
 class ChangesThresholds(ThresholdGroup):
@@ -206,12 +210,6 @@ class ChangesThresholds(ThresholdGroup):
     Points in such regions are not used to find sensor effects.
     """
 
-    false_changes: PositiveFloat = threshold_field(
-        0.01,
-        "expected number in one measurement",
-        "A region is a change if noise would produce fewer than this in the whole measurement.",
-        "target of 1 % false alarms",
-    )
     fewest: PositiveInt = threshold_field(
         5, "points", "A change needs at least this many points.", "reported rockfalls that were missed: five points of 5 sigma"
     )
@@ -224,12 +222,6 @@ class ChangesThresholds(ThresholdGroup):
         "Neighbouring medians beyond this are joined to one region, which finds faint but wide changes. A point counts as moved "
         "if the median of it and its neighbours lies this many predicted standard deviations off the reference.",
         JUDGEMENT,
-    )
-    smallest_departure: PositiveFloat = threshold_field(
-        0.02,
-        "m",
-        "A median of neighbours that departs by less than this is no change: errors of the reference and of rays are as large.",
-        DEVELOPMENT,
     )
     margin: PositiveFloat = threshold_field(
         3.0, "point spacings", "Points within this distance of a change are set aside with it.", JUDGEMENT
@@ -299,7 +291,8 @@ class VerdictThresholds(ThresholdGroup):
         0.01,
         "probability",
         "Significance level of the goodness of fit. The model is rejected if the p-value of the residual misfit is at most this. "
-        "A score lies above the noise floor at half this level, one-sided.",
+        "A score lies above the noise floor at half this level, one-sided. A region is a change of the rock if noise would "
+        "produce fewer than this number of such regions in the whole measurement.",
         "definition of the verdict no_gap",
         lt=1,
     )
@@ -313,7 +306,8 @@ class VerdictThresholds(ThresholdGroup):
     overdispersion: PositiveFloat = threshold_field(
         1.5,
         "ratio of observed to predicted standard deviation",
-        "The model is rejected if the residuals have at least this ratio and no noise term explains it.",
+        "The model is rejected if the residuals have at least this ratio and no noise term explains it. A search for all "
+        "effects, with or without edge effects, is rejected if it leaves more than this times the noise of the best one.",
         JUDGEMENT,
         gt=1,
     )

@@ -287,7 +287,7 @@ class MeanSearch:
         """Tell whether a wave in the residuals is so small that it may be part of the reference surface's error.
 
         The wave's standard deviation is compared with that of the reference's error. The latter is estimated in the same fit; at
-        most the threshold `grid_noise.reference_error` is taken for it.
+        most the threshold `points.reference_error` is taken for it.
 
         Parameters
         ----------
@@ -297,7 +297,7 @@ class MeanSearch:
         if form.candidate.form != "wave":
             return False
         size, fit = self._fitted_std_and_fit(form, members)
-        most = thresholds().grid_noise.reference_error / float(np.median(self.design.residuals.unit_m))
+        most = thresholds().points.reference_error / float(np.median(self.design.residuals.unit_m))
         error = min(float(np.sqrt(fit.cell_covariance.variance_ratio)) * self.design.model.typical_sigma, most)
         return size < thresholds().mean.least_wave_sigmas * error
 

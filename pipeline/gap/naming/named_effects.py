@@ -166,7 +166,7 @@ def only_within_bounds(model: TlsModel | StereoModel, named: list[NamedEffect]) 
 def is_plausible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
     """Tell whether a fitted sensor error (effect) is plausible, so that absurd explanations are not reported.
 
-    It is if a config accepts its values and its size is at most `mean.largest_size` (a threshold, by default 100) times its
+    It is if a config accepts its values and its size is at most `largest_relative_size` (by default 100) times its
     typical size in the catalogue.
 
     model: the sensor model that would contain the effect.
@@ -174,7 +174,15 @@ def is_plausible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
     """
     if not within_bounds(model, entry):
         return False
-    return relative_size(entry) <= thresholds().mean.largest_size
+    return relative_size(entry) <= largest_relative_size()
+
+
+def largest_relative_size() -> float:
+    """Return the largest plausible size of an effect, in units of its typical size in the catalogue.
+
+    It lies `points.outlier_sigmas` standard deviations of the prior (`mean.prior_size`) from zero.
+    """
+    return thresholds().points.outlier_sigmas * thresholds().mean.prior_size
 
 
 def relative_size(entry: dict[str, Any]) -> float:

@@ -255,7 +255,7 @@ def _plausible_minimum(shares: FloatArray, chi2: FloatArray, whole: float) -> in
     without locking.
     """
     lowest = (chi2 <= np.append(chi2[1:], np.inf)) & (chi2 <= np.append(np.inf, chi2[:-1]))
-    rows = np.flatnonzero(lowest & (chi2 < chi2.min() + thresholds().locking.equal_fit))
+    rows = np.flatnonzero(lowest & (chi2 < chi2.min() + 2 * thresholds().mean.class_margin))
     unfolded = np.flatnonzero(lowest & (shares < _FOLDING))
     if len(unfolded):
         small = int(unfolded[np.argmin(chi2[unfolded])])
