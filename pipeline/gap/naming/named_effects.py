@@ -490,7 +490,7 @@ def absorbed_by_registration(
 
     A shift and rotation of the sensor imitates such an effect almost completely, so the pose fit absorbs it. Two thresholds
     tell it: a share of less than `mean.absorbed_share` of its signature (the pattern of residuals that it makes) is left beside
-    the pose, and its size is more than `mean.absorbed_size` times the typical one.
+    the pose, and its size is more than one standard deviation of its prior, `mean.prior_size`.
 
     Parameters
     ----------
@@ -504,5 +504,5 @@ def absorbed_by_registration(
     """
     by = thresholds().mean
     doubtful = [each for each in estimates if not each.candidate.empirical and survival[each.candidate.name] < by.absorbed_share]
-    large = [each for each in doubtful if relative_size(effect_from_estimate(each, part).entry) > by.absorbed_size]
+    large = [each for each in doubtful if relative_size(effect_from_estimate(each, part).entry) > by.prior_size]
     return frozenset((each.candidate.name, False) for each in large)

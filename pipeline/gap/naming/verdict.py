@@ -69,7 +69,7 @@ class Evidence:
     def much_moved(self) -> bool:
         """Whether so much of the wall moved that nothing can be said about the sensor.
 
-        By default, 30 % of the points must lie off the reference together with their neighbours.
+        By default, 20 % of the points must lie off the reference together with their neighbours.
         """
         return self.moved_share >= thresholds().changes.moved_share
 

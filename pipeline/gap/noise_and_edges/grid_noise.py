@@ -41,8 +41,8 @@ because a covariance of few blocks is inexact."""
 _DRAWS = 1999
 _FINEST_GRID = 2.0
 """Narrowest grid that is tried, in cells of the disparity raster (sampling theorem)."""
-_RELATIVE_LENGTHS = tuple(2 ** (half / 2) for half in range(-4, 9))
-"""Correlation lengths of the reference error that are tried, in units of `grid_noise.reference_length`."""
+_REFERENCE_LENGTHS_M = tuple(0.45 * 2 ** (half / 2) for half in range(-4, 9))
+"""Correlation lengths of the reference error that are tried (standard deviations of a Gaussian), m."""
 
 
 @dataclass(frozen=True)
@@ -126,14 +126,11 @@ class _Variogram:
     def chi2_of_reference_error(self) -> float:
         """Return chi^2 of the best fit without grid noise.
 
-        Errors of the reference of all correlation lengths are tried; short ones have a lower bound.
+        Errors of the reference of all correlation lengths are tried.
         """
-        by = thresholds().grid_noise
-        chi2 = self.chi2_without_grid
-        for length in _RELATIVE_LENGTHS:
-            shape = 1 - np.exp(-0.5 * (self.distance_m / (length * by.reference_length)) ** 2)
-            largest = thresholds().points.reference_error if length >= 1 else by.short_reference_error
-            chi2 = min(chi2, self._chi2_of(shape, largest))
+        most_m, chi2 = thresholds().points.reference_error, self.chi2_without_grid
+        for length_m in _REFERENCE_LENGTHS_M:
+            chi2 = min(chi2, self._chi2_of(1 - np.exp(-0.5 * (self.distance_m / length_m) ** 2), most_m))
         return chi2
 
     def _chi2_of(self, shape: FloatArray, most_m: float) -> float:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.special import j1, jv
+from scipy.special import chdtri, j1, jv
 
 from pipeline.gap.thresholds import thresholds
 from scene.geometry.mesh import FloatArray
@@ -259,7 +259,7 @@ def _plausible_minimum(shares: FloatArray, chi2: FloatArray, whole: float) -> in
     unfolded = np.flatnonzero(lowest & (shares < _FOLDING))
     if len(unfolded):
         small = int(unfolded[np.argmin(chi2[unfolded])])
-        if chi2.min() > thresholds().locking.good_fit or (
+        if chi2.min() > chdtri(len(_MULTIPLES), thresholds().mean.significance) or (
             shares[rows[0]] > _LARGE_AMPLITUDE and chi2[small] < _HARMONIC_MISFIT * whole
         ):
             return small

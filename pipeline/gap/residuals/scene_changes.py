@@ -191,12 +191,12 @@ def _components(z: FloatArray, faint: FloatArray, view: SensorView, eligible: Bo
     first, second = view.neighbour_pairs(np.flatnonzero(side))
     together = side[first] * side[second] > 0
     pairs, size = (first[together], second[together]), np.abs(z)
-    least = max(thresholds().changes.median_sigmas, _correlated_sigmas(z, view, eligible))
+    least = max(thresholds().changes.faint_sigmas, _correlated_sigmas(z, view, eligible))
     core = _faint_cores(faint, exceeds, pairs, eligible)
     for sign, level, ratio in product((1.0, -1.0), _LEVELS, _RATIOS):
         core |= _significant(sign * z, level, ratio, pairs, eligible, least)
     whole = _extended(core, size, pairs, eligible)
-    label = _compact(_connected(whole, pairs), view, int(eligible.sum()))
+    label = _compact(_connected(whole, pairs), int(eligible.sum()))
     inside = _select_pairs(pairs, whole[pairs[0]] & whole[pairs[1]])
     most = np.zeros(len(z))
     for one, other in (inside, inside[::-1]):
@@ -320,19 +320,10 @@ def _select_pairs(pairs: Pairs, which: BoolArray) -> Pairs:
     return pairs[0][which], pairs[1][which]
 
 
-def _compact(label: NDArray[np.int64], view: SensorView, points: int) -> NDArray[np.int64]:
-    """Labels (n,) without regions that are no compact change: a large part of the wall, or a stripe."""
-    rows = np.flatnonzero(label >= 0)
-    if not len(rows):
-        return label
-    order = rows[np.argsort(label[rows], kind="stable")]
-    starts = np.flatnonzero(np.diff(label[order], prepend=-1))
-    place = view.scaled_coordinates[order]
-    length = (np.maximum.reduceat(place, starts) - np.minimum.reduceat(place, starts)).max(axis=1)
-    size = np.diff(np.append(starts, len(order))) / len(np.unique(view.epoch))
-    stripe = (length >= thresholds().changes.stripe_length) & (size <= 0.1 * length**2)
-    compact = (size * len(np.unique(view.epoch)) < thresholds().changes.largest_share * points) & ~stripe
-    return np.where(np.isin(label, label[order][starts][compact]), label, -1)
+def _compact(label: NDArray[np.int64], points: int) -> NDArray[np.int64]:
+    """Labels (n,) without regions that are a large part of the wall, and no compact change."""
+    size = np.bincount(label[label >= 0])
+    return np.where(np.isin(label, np.flatnonzero(size < thresholds().changes.moved_share * points)), label, -1)
 
 
 def _measure_changes(label: NDArray[np.int64], departure: FloatArray, error: FloatArray, view: SensorView) -> list[SceneChange]:
