@@ -63,8 +63,9 @@ class PointThresholds(ThresholdGroup):
     reference_error: PositiveFloat = threshold_field(
         0.02,
         "m",
-        "Largest standard deviation that is attributed to an error of the reference correlated over metres. A median of "
-        "neighbours that departs by less than this is no change of the rock.",
+        "Largest standard deviation that is attributed to an error of the reference correlated over a metre or more; below, "
+        "the limit falls in proportion to the correlation length. A median of neighbours that departs by less than this is no "
+        "change of the rock.",
         JUDGEMENT,
     )
     least_share_on_reference: PositiveFloat = threshold_field(
@@ -101,8 +102,9 @@ class MeanThresholds(ThresholdGroup):
         "log-likelihood",
         "Effects whose score is within this of the best one belong to its equivalence class, noise terms likewise. The "
         "linearised model is used if it misjudges the strongest effect by less. Amplitudes of pixel locking whose chi^2 differ "
-        "by less than twice this fit equally well, and the smallest is taken. The likelihood factor exp(-3) bounds by 5 % how "
-        "often the true effect is left out.",
+        "by less than twice this fit equally well, and the smallest is taken. The gain of one point at a depth step is clipped "
+        "at this before the wall blocks are compared. The likelihood factor exp(-3) bounds by 5 % how often the true effect is "
+        "left out.",
         "target of 93 to 97 % of classes that contain the true effect",
     )
     class_share: PositiveFloat = threshold_field(

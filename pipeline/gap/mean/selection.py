@@ -335,4 +335,4 @@ class ForwardSelection:
 
     def _significant(self, score: float) -> bool:
         """Tell whether a score is significant."""
-        return score > 0 and self.search.p_value(score) <= thresholds().mean.significance
+        return self.search.p_value(score) <= thresholds().mean.significance

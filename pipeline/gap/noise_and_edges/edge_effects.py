@@ -92,8 +92,8 @@ class WallBlocks:
         by_signs : whether agreement of the signs alone is enough, for effects of which a few wall blocks hold most of the
             points.
         """
-        by = thresholds().edges
-        total, sums = float(gains.sum()), self.sums(gains)
+        by, most = thresholds().edges, thresholds().mean.class_margin
+        total, sums = float(gains.sum()), self.sums(np.clip(gains, -most, most))
         sigmas = float(sums.sum()) / max(float(np.linalg.norm(sums)), 1e-12)
         if by_signs:
             signs = np.sign(sums[sums != 0])

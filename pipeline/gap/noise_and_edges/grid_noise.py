@@ -126,11 +126,11 @@ class _Variogram:
     def chi2_of_reference_error(self) -> float:
         """Return chi^2 of the best fit without grid noise.
 
-        Errors of the reference of all correlation lengths are tried.
+        Errors of the reference of all correlation lengths are tried; below 1 m, the bound falls in proportion to the length.
         """
         most_m, chi2 = thresholds().points.reference_error, self.chi2_without_grid
         for length_m in _REFERENCE_LENGTHS_M:
-            chi2 = min(chi2, self._chi2_of(1 - np.exp(-0.5 * (self.distance_m / length_m) ** 2), most_m))
+            chi2 = min(chi2, self._chi2_of(1 - np.exp(-0.5 * (self.distance_m / length_m) ** 2), most_m * min(length_m, 1.0)))
         return chi2
 
     def _chi2_of(self, shape: FloatArray, most_m: float) -> float:
