@@ -76,9 +76,7 @@ class VarianceThresholds(ThresholdGroup):
 class LockingThresholds(ThresholdGroup):
     """Thresholds of the test for pixel locking: measured disparities that crowd around whole pixels.
 
-    The resultant length measures how strongly fractions of a pixel crowd: 0 not at all, 1 all alike. It is computed for
-    fractions of 1, 1/2, 1/3 and 1/4 pixel; the chi^2 of a trial amplitude compares these four values with those that it
-    predicts.
+    The resultant length measures how strongly fractions of a pixel crowd: 0 not at all, 1 all alike.
     """
 
     fewest_cycles: PositiveFloat = threshold_field(
@@ -116,8 +114,7 @@ class EdgeThresholds(ThresholdGroup):
 
     A gain is a log-likelihood ratio of the models with and without an effect. Wall blocks are squares of the wall, which count
     as independent. Their agreement is measured like a number of standard deviations: the sum of their gains over the root of
-    the sum of squared gains. A cell is a pixel of the disparity raster. A selection pass is one search for all effects, with or
-    without edge effects in the model.
+    the sum of squared gains. A cell is a pixel of the disparity raster.
     """
 
     least_gain: PositiveFloat = threshold_field(
