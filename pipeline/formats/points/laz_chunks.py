@@ -102,7 +102,8 @@ class ChunkWriter:
 
     def __init__(self, las: laspy.LasWriter) -> None:
         self.scales, self.offsets = np.asarray(las.header.scales), np.asarray(las.header.offsets)
-        self._las, self._records = las, np.zeros(0, las.header.point_format.dtype())
+        self._las = las
+        self._records: NDArray[Any] = np.zeros(0, las.header.point_format.dtype())
 
     def write(self, count: int, fill: Callable[[NDArray[np.void], slice], None]) -> None:
         """Write the next points, each of which is the only return of its pulse.
