@@ -1,8 +1,9 @@
 """Where the processor time of `scarpsim gap` goes: diagnose measurements and print the slowest with the share of each part.
 
-    python benchmarks/gap_cost.py FOLDER [FOLDER ...]
+    python benchmarks/gap_cost.py FOLDER [FOLDER ...] [--write]
 
 A FOLDER is a measurement or holds measurements. Times are processor seconds of all threads, each without the parts inside it.
+With --write, the table goes into docs/validation/gap.md.
 """
 
 from __future__ import annotations
@@ -15,15 +16,20 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
+from statistics import median
 from typing import Any
 from unittest.mock import patch
+
+from documents import write_between
 
 from pipeline.formats.measurements.measurement import FILE, read_measurement
 from pipeline.gap.mean.search import MeanSearch
 from pipeline.gap.naming import effect_selection, nonlinear_refit, selection_passes, workflow
 from pipeline.gap.naming.validation import Validation
 
-MOST_ROWS = 10
+MOST_ROWS, MOST_PARTS = 10, 3
+DOCUMENT = Path(__file__).parents[1] / "docs" / "validation" / "gap.md"
+MARKS = ("<!-- cost -->", "<!-- end of cost -->")
 PARTS: dict[str, list[tuple[Any, str]]] = {
     "first residuals and pose": [(workflow, "compute_residuals"), (workflow, "align")],
     "residuals beside effects": [(nonlinear_refit, "_aligned_with_estimates"), (selection_passes, "aligned_with")],
@@ -46,6 +52,7 @@ class DiagnosisCost:
     """Processor seconds of one diagnosis. parts: by part of the workflow."""
 
     name: str
+    sensor: str
     verdict: str
     points: int
     seconds: float
@@ -86,16 +93,20 @@ def cost_of(folder: Path) -> DiagnosisCost:
         found = workflow.diagnose(measurement)
     whole = time.process_time() - start
     spent["rest"] = whole - sum(spent.values())
-    return DiagnosisCost(folder.name, found.verdict, len(found.residuals), whole, spent)
+    return DiagnosisCost(folder.name, measurement.sensor, found.verdict, len(found.residuals), whole, spent)
 
 
 def table(costs: list[DiagnosisCost]) -> str:
-    """Return the slowest diagnoses as text, each with the parts that take more than a twentieth of its time."""
-    lines = []
+    """Return the slowest diagnoses as a table in Markdown, with the parts that take most of each one's time."""
+    seconds = [each.seconds for each in costs]
+    lines = [
+        f"{len(costs)} measurements: {median(seconds):.0f} s in the median, {max(seconds):.0f} s at most.\n",
+        "| measurement | sensor | points | verdict | processor time | most of it |",
+        "|---|---|---|---|---|---|",
+    ]
     for each in sorted(costs, key=lambda cost: -cost.seconds)[:MOST_ROWS]:
-        lines.append(f"{each.seconds:7.1f} s  {each.name} ({each.points:,} points, {each.verdict})")
-        large = [(part, seconds) for part, seconds in each.parts.most_common() if seconds > 0.05 * each.seconds]
-        lines += [f"    {seconds:7.1f} s  {part}" for part, seconds in large]
+        parts = ", ".join(f"{part} {seconds:.0f} s" for part, seconds in each.parts.most_common(MOST_PARTS))
+        lines.append(f"| {each.name} | {each.sensor} | {each.points:,} | `{each.verdict}` | {each.seconds:.0f} s | {parts} |")
     return "\n".join(lines)
 
 
@@ -103,15 +114,20 @@ def main(words: list[str] | None = None) -> None:
     """Diagnose the measurements that the command line names and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER")
-    given: list[Path] = parser.parse_args(words).folders
-    folders = [
-        path.parent for each in given for path in ([each / FILE] if (each / FILE).is_file() else sorted(each.glob(f"*/{FILE}")))
-    ]
+    parser.add_argument("--write", action="store_true")
+    given = parser.parse_args(words)
+    folders = []
+    for each in given.folders:
+        files = [each / FILE] if (each / FILE).is_file() else sorted(each.glob(f"*/{FILE}"))
+        folders += [path.parent for path in files]
     costs = []
     for folder in folders:
         costs.append(cost_of(folder))
         print(f"{costs[-1].seconds:.0f} s  {folder.name}", flush=True)
-    print(table(costs))
+    found = table(costs)
+    print(found)
+    if given.write:
+        write_between(DOCUMENT, MARKS, found)
 
 
 if __name__ == "__main__":

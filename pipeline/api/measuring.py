@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from pipeline.api.configs import Show, plain
+from pipeline.api.monitoring import Monitoring
 from pipeline.api.pictures import Picture, html_table, pick
 from pipeline.api.points import Points, scatter
 from pipeline.api.runs import Run
@@ -31,6 +33,8 @@ from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points.points import read_points
 from pipeline.gap.naming import workflow
 from pipeline.gap.report import figures, report
+from pipeline.monitoring.recorded import is_monitoring
+from pipeline.monitoring.stable_measurement import build_from_monitoring
 from pipeline.report.notebook_progress import python_progress
 from pipeline.run.site import prepare_site
 from scene.common.config import parse
@@ -40,6 +44,7 @@ from scene.geometry.mesh import TriangleMesh
 from scene.walls.imported import read_reference
 from sensors.cameras.camera import CameraPair
 from sensors.laser.tls import LaserScanner
+from sensors.models.sensor_model import TlsModel
 from sensors.stereo.exchanged import pair_of
 
 if TYPE_CHECKING:
@@ -51,7 +56,7 @@ _SCALE_SIGMAS = 6.0
 
 
 def measure(
-    given: Run | Path | str | None = None,
+    given: Run | Monitoring | Path | str | None = None,
     *,
     sensor: Literal["tls", "stereo"] = "tls",
     reference: Any = None,
@@ -60,13 +65,16 @@ def measure(
     cameras: Any = None,
     **keys: Any,
 ) -> Measurement:
-    """Load a measurement, to compare it with its sensor model by `diagnose`: from a folder, from its parts, or from a run.
+    """Load a measurement, to compare it with its sensor model by `diagnose`.
+
+    It is read from a folder, from its parts, from a run, or from a monitoring.
 
     Parameters
     ----------
-    given : path or Run, optional
-        A folder with measurement.yaml, or a simulated run, whose reference epoch is compared with its true wall. Not
-        needed if `reference` and `points` are given.
+    given : path, Run or Monitoring, optional
+        A folder with measurement.yaml; or a simulated run, whose reference epoch is compared with its true wall; or a
+        monitoring by laser scanner or its folder, whose later epochs are compared with the first where the rock is stable.
+        Not needed if `reference` and `points` are given.
     sensor : "tls" or "stereo"
         What measured the points: laser scanner or stereo pair.
     reference : mesh or path, optional
@@ -74,8 +82,8 @@ def measure(
     points : (n, 3) array, Points, path, or a list of them, optional
         The measured points, m; one entry of a list per epoch.
     model : model, mapping, path or name, optional
-        The sensor model to test. With a run it may differ from the model that made the run. Default: the run's model, or
-        else the default model of the sensor.
+        The sensor model to test. With a run it may differ from the model that made the run. Default: the model of the run
+        or the monitoring, or else the default model of the sensor.
     cameras : CameraPair or path, optional
         The nominal camera pair (stereo only).
     **keys
@@ -95,8 +103,11 @@ def measure(
     """
     if isinstance(given, Run):
         return _of_run(given, model)
+    if isinstance(given, Monitoring):
+        return _of_monitoring(given.folder, model)
     if given is not None:
-        return Measurement(read_measurement(Path(given)))
+        folder = Path(given)
+        return _of_monitoring(folder, model) if is_monitoring(folder) else Measurement(read_measurement(folder))
     if reference is None or points is None:
         raise InputError(
             "neither a folder nor both reference and points are given",
@@ -164,14 +175,18 @@ class Measurement:
 
 
 def diagnose(
-    measurement: Measurement | Path | str, *, seed: int = 1, out: Path | str | None = None, progress: Show = "auto"
+    measurement: Measurement | Monitoring | Path | str,
+    *,
+    seed: int = 1,
+    out: Path | str | None = None,
+    progress: Show = "auto",
 ) -> Diagnosis:
     """Find where a measurement and its sensor model disagree and name the effects that explain it, as `scarpsim gap` does.
 
     Parameters
     ----------
-    measurement : Measurement or path
-        Result of `measure`, or the folder of a measurement.
+    measurement : Measurement, Monitoring or path
+        Result of `measure` or `monitor`, or the folder of a measurement or a monitoring.
     seed : int
         Seed of the simulated null distributions.
     out : path, optional
@@ -350,6 +365,21 @@ def _of_run(run: Run, model: Any) -> Measurement:
     position, rotation = site.frame.to_world(site.sensor.position), site.frame.rotation.T @ site.sensor.rotation
     scanner, believed = {"position_m": position, "rotation": rotation}, model or run.config.tls_model()
     return measure(sensor="tls", reference=world, points=points, model=believed, scanner=scanner)
+
+
+def _of_monitoring(folder: Path, model: Any) -> Measurement:
+    """Return the points of a monitoring's later epochs on stable rock as a measurement of its first epoch's surface."""
+    believed = None if model is None else _model(model, "tls")
+    if not isinstance(believed, TlsModel | None):
+        raise InputError(
+            "the model is of a stereo pair, but the points come from a laser scanner",
+            where="model",
+            allowed="the model of a laser scanner",
+            remedy='give one as model=, such as {"sensor": "tls", ...}, or None for that of the monitoring',
+        )
+    with tempfile.TemporaryDirectory(prefix="scarpsim_stable_") as written:
+        build_from_monitoring(folder, Path(written), model=believed)
+        return Measurement(read_measurement(Path(written)))
 
 
 def _clouds(points: Any) -> dict[str, PointCloud]:

@@ -29,7 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=Path,
         metavar="EPOCH",
-        help="a scan, cloud, mesh or DEM, a folder of scans of one epoch, or a run of simulate; the first is the reference",
+        help="a scan, cloud, mesh or DEM, a folder of scans of one epoch, a run of simulate or one of its epoch folders; the "
+        "first is the reference",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for maps, events and report")
     parser.add_argument("--reference", type=Path, metavar="FILE", help="compare with this instead of the first epoch")

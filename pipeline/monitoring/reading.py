@@ -359,7 +359,9 @@ def _sources(path: Path) -> list[EpochSource]:
     if path.is_file():
         return [EpochSource(path, (path,), unknown)]
     if (path / RUN_FILE).is_file():
-        return _epochs_of_run(path)
+        return _epochs_of_run(path, "epoch_*")
+    if (path.absolute().parent / RUN_FILE).is_file():
+        return _epochs_of_run(path.absolute().parent, path.absolute().name)
     files = tuple(epoch_files(path))
     if not files:
         raise InputError(
@@ -371,7 +373,8 @@ def _sources(path: Path) -> list[EpochSource]:
     return [EpochSource(path, files, unknown)]
 
 
-def _epochs_of_run(folder: Path) -> list[EpochSource]:
+def _epochs_of_run(folder: Path, pattern: str) -> list[EpochSource]:
+    """Return the epochs of a run of `simulate` whose folders match a pattern of `glob`."""
     record = read_run(folder / RUN_FILE, "make the run again with scarpsim simulate")
     if not record.get("wall_frame"):
         raise InputError(
@@ -379,10 +382,12 @@ def _epochs_of_run(folder: Path) -> list[EpochSource]:
             where=str(folder / RUN_FILE),
             remedy="make the run again with scarpsim simulate",
         )
-    epochs = sorted(each for each in folder.glob("epoch_*") if (each / "points.laz").is_file())
+    epochs = sorted(each for each in folder.glob(pattern) if (each / "points.laz").is_file())
     if not epochs:
         raise InputError(
-            "this is a run without a finished epoch", where=str(folder), remedy="finish the run with scarpsim simulate --resume"
+            "this is a run without a finished epoch",
+            where=str(folder / pattern),
+            remedy="finish the run with scarpsim simulate --resume",
         )
     return [EpochSource(each, (each / "points.laz",), EpochTime(None, ""), record) for each in epochs]
 

@@ -24,6 +24,7 @@ from pipeline.monitoring.repeated_directions import repeated_noise
 from scene.common.errors import InputError
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
+from sensors.models.sensor_model import TlsModel
 
 _MOST_POINTS = 4_000_000
 """Points of all epochs together that are written, twice as many as `gap` works with."""
@@ -48,7 +49,7 @@ def build_from_monitoring(
     out: Path,
     *,
     scanner: str | None = None,
-    model: Path | None = None,
+    model: Path | TlsModel | None = None,
     position: tuple[float, float, float] | None = None,
 ) -> Interpretation:
     """Convert a folder of results of `scarpsim monitor` to a measurement folder, the input of `scarpsim gap`.
@@ -61,7 +62,7 @@ def build_from_monitoring(
     folder : The folder that `monitor` wrote.
     out : Folder to write.
     scanner : Name or file of a scanner preset, which gives the noise model; None: as given to `monitor`.
-    model : File of the scanner's noise model, instead of a preset.
+    model : The scanner's noise model or its file, instead of a preset.
     position : (3,) position of the scanner, survey coordinates, m; None: as given to `monitor`, or as the files state.
 
     Returns
@@ -76,7 +77,7 @@ def build_from_monitoring(
     """
     monitoring = read_monitoring(folder)
     _check_laser(monitoring)
-    scanner_model, model_words = read_scanner_model(_request(monitoring, scanner, model))
+    scanner_model, model_words = _model(monitoring, scanner, model)
     given = monitoring.options.position if position is None else np.array(position, dtype=np.float64)
     scans = [each for epoch in monitoring.epochs for each in _stable_scans(monitoring, epoch, given)]
     reference = _reference(monitoring, given, scans)
@@ -93,8 +94,12 @@ def build_from_monitoring(
     return write_scans(material, out)
 
 
-def _request(monitoring: RecordedMonitoring, scanner: str | None, model: Path | None) -> Request:
-    """Return the request for the scanner's model: as given, or else as it was given to `monitor`."""
+def _model(
+    monitoring: RecordedMonitoring, scanner: str | None, model: Path | TlsModel | None
+) -> tuple[TlsModel, tuple[str, ...]]:
+    """Return the scanner's model, as given or else as it was given to `monitor`, with a description for the user."""
+    if isinstance(model, TlsModel):
+        return model, ("as given",)
     if scanner is None and model is None:
         scanner, model = monitoring.options.scanner, monitoring.options.model
     if scanner is None and model is None:
@@ -103,7 +108,7 @@ def _request(monitoring: RecordedMonitoring, scanner: str | None, model: Path | 
             where=str(monitoring.folder),
             remedy="add --scanner with a preset such as riegl_vz400i, or --model FILE",
         )
-    return Request([], "", scanner if model is None else None, model)
+    return read_scanner_model(Request([], "", scanner if model is None else None, model))
 
 
 def _check_laser(monitoring: RecordedMonitoring) -> None:

@@ -15,6 +15,7 @@ import pytest
 import yaml
 from monitor_cases import ANGLE_NOISE_RAD, NOISE_M, STATION, las, points, scan
 
+from pipeline import diagnose, measure
 from pipeline.calibration.reference_error import ReferenceError
 from pipeline.calibration.single_ranges import SingleRanges
 from pipeline.cli import main as cli
@@ -22,6 +23,7 @@ from pipeline.formats.measurements.measurement import read_measurement
 from pipeline.formats.points.laz import read_laz
 from pipeline.monitoring.repeated_directions import repeated_noise
 from pipeline.monitoring.stable_measurement import build_from_monitoring
+from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
 from sensors.models.sensor_model import TlsModel, TlsNoise
 
@@ -196,3 +198,18 @@ def test_mistakes(
     assert remedy in told
     assert told.count("\n") == 1
     assert not (tmp_path / "gap").exists()
+
+
+def test_python_diagnoses_a_monitoring_as_the_command_does(model: Path, tmp_path: Path) -> None:
+    commanded = diagnosed(tmp_path, model, 10, block=FALL)
+    found = diagnose(tmp_path / "found", progress=False)
+    assert found.to_dict()["gap"] == commanded["gap"]
+    assert found.verdict == commanded["verdict"] == "no_gap"
+
+
+def test_python_tests_the_model_that_it_is_given(model: Path, tmp_path: Path) -> None:
+    assert run("monitor", *scans(tmp_path / "scans", 10, 1), "--model", model, "--out", tmp_path / "found") == 0
+    given = TlsModel(sensor="tls", noise=TlsNoise(range_sigma_m=3 * NOISE_M, angle_sigma_rad=ANGLE_NOISE_RAD))
+    assert measure(tmp_path / "found", model=given).model.noise.range_sigma_m == pytest.approx(3 * NOISE_M)
+    with pytest.raises(InputError, match="stereo pair"):
+        measure(tmp_path / "found", model={"sensor": "stereo"})

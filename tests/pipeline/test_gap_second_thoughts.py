@@ -7,6 +7,7 @@ reconsidered.
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,12 +24,13 @@ from pipeline.gap.naming.effect_selection import NONPARAMETRIC_TERMS, _note_most
 from pipeline.gap.naming.gap_score import simulate_errors
 from pipeline.gap.naming.named_effects import NamedEffect, with_effects
 from pipeline.gap.naming.selection_passes import PassInput, PassInputs, SelectionPass, best_pass
+from pipeline.gap.naming.validation import Validation, ValidationResult
 from pipeline.gap.naming.validation_scores import ValidatedEffects
 from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
 from pipeline.gap.residuals.alignment import align, at_points_of, compute_residuals
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
-from pipeline.gap.residuals.nominal_pair import NominalPair
+from pipeline.gap.residuals.nominal_pair import NominalPair, real_pair
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
 from scene.common.keyed_random import KeyedRandom
 from sensors.effects.edge_fattening import EdgeFattening
@@ -96,6 +98,30 @@ def test_where_a_free_form_fails_all_is_named_again_without_any(
     assert found.selection.asked is bool(kept)  # type: ignore[attr-defined]
 
 
+def test_where_the_score_drops_an_empirical_term_all_is_named_again_without_any(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ranges 8 mm too long by incidence, described first by an empirical term that predicts validation points worse."""
+    write_scan(tmp_path, 10, step_rad=0.007, ranges=lambda scan: scan.R + 0.008 * (1 / scan.cos_i - 1))
+    honest, score = workflow._select_and_validate, Validation.validate
+
+    def described(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[Any] = frozenset()) -> Any:
+        found = honest(inputs, random, excluded)
+        return found if NONPARAMETRIC_TERMS in excluded else replace(found, named=[_named("range_empirical", "empirical")])
+
+    def scored(self: Validation, named: list[NamedEffect]) -> tuple[ValidationResult, list[str]]:
+        harmful = [f"{item.name} dropped: the model predicts worse with it" for item in named if item.kind == "empirical"]
+        return score(self, [item for item in named if item.kind != "empirical"])[0], harmful
+
+    monkeypatch.setattr(workflow, "_select_and_validate", described)
+    monkeypatch.setattr(Validation, "validate", scored)
+    found = workflow.diagnose(read_measurement(tmp_path))
+    (effect,) = found.effects
+    assert (found.verdict, effect.name) == ("named", "tls.range_incidence_bias")
+    assert effect.entry["coefficient_m"] == pytest.approx(0.008, abs=4 * effect.std["coefficient_m"])
+    assert "range_empirical dropped" in found.remaining["note"]
+
+
 def test_a_simulation_without_noise_departs_nowhere_from_the_surface(tmp_path: Path) -> None:
     """Depth maps have cells of two pixels or more, whose centres differ by half a pixel from the measurement's pixels.
 
@@ -112,6 +138,26 @@ def test_a_simulation_without_noise_departs_nowhere_from_the_surface(tmp_path: P
     known = residuals.usable & np.isfinite(seen)
     assert known.sum() > 5000
     np.testing.assert_allclose(seen[known], 0, atol=2e-4)
+
+
+def test_a_simulated_pair_with_a_shifted_image_sees_the_rock_that_its_pixels_see(tmp_path: Path) -> None:
+    """With a wrong principal point other rock lies between a pixel and the centre of its cell.
+
+    A simulation without noise must give the disparities of the rays through the measured pixels of the real cameras.
+    """
+    make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json", baselines=False)
+    there, residuals, _ = align(read_measurement(tmp_path / "case"))
+    assert isinstance(there, StereoMeasurement)
+    model = with_effects(there.model, [{"name": "principal_point_y", "camera": "left", "delta_px": -8.0}])
+    quiet = StereoNoise(parallax_sigma_px=1e-6, regularization_sigma_px=0.0)
+    (seen,) = simulate_errors(there, model.model_copy(update={"noise": quiet}), residuals, [KeyedRandom(1)])
+    nominal, real = NominalPair.of(there), real_pair(model.effects, there)
+    u, v = residuals.geometry.u, residuals.geometry.v
+    expected = nominal.surface_disparity(there.scene, u, v, real) - nominal.surface_disparity(there.scene, u, v)
+    known = residuals.usable & np.isfinite(seen) & np.isfinite(expected)
+    assert known.sum() > 5000
+    assert np.std(expected[known]) > 0.05, "px of disparity, by which the rock that is seen differs"
+    np.testing.assert_allclose(seen[known], expected[known], atol=2e-4)
 
 
 def test_outlines_grow_among_the_measurement_s_own_pixels_when_it_is_simulated(tmp_path: Path) -> None:

@@ -183,22 +183,19 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
     clock.lap("residuals")
     if plain.usable.sum() < thresholds().points.fewest:
         return _insufficient_data(measurement, plain, clock)
-    validated = _select_and_validate(PassInputs(aligned, plain, held_out_points), random)
-    given, selection = validated.given, validated.selection
+    inputs = PassInputs(aligned, plain, held_out_points)
+    validated = _select_and_validate(inputs, random)
     clock.lap("naming")
-    validation = Validation(
-        measurement=aligned,
-        residuals=plain,
-        registration_rows=given.training_rows,
-        tested=given.measurable & given.held_out,
-        training=given.measurable & ~given.held_out,
-        losses=validated.losses,
-        reference_sigma=selection.reference_sigma,
-        most_sigmas=thresholds().points.outlier_sigmas * given.noise_ratio,
-        random=random,
-        reduced_noise=reduced_noise(aligned.model, _share_of_model_noise(selection.unexplained_noise.at_most_one, plain)),
-    )
+    validation = _validation(aligned, plain, validated, random)
     result, harmful = validation.validate(validated.named)
+    if _empirical(validated.named, but_not=result.named) and _nameable(inputs):
+        again = _select_and_validate(inputs, random, frozenset({NONPARAMETRIC_TERMS}))
+        validation_again = _validation(aligned, plain, again, random)
+        result_again, harmful_again = validation_again.validate(again.named)
+        if result_again.named:
+            validated, validation, result = again, validation_again, result_again
+            harmful = [*harmful, *harmful_again]
+    given, selection = validated.given, validated.selection
     notes = [
         *selection.notes,
         *note_excess_noise(selection.unexplained_noise.at_most_one, validation.reduced_noise),
@@ -242,6 +239,33 @@ def _diagnose(measurement: Measurement, clock: _Clock, random: KeyedRandom) -> G
         reference_sigma=selection.reference_sigma,
         thresholds=thresholds(),
     )
+
+
+def _validation(aligned: Measurement, plain: Residuals, validated: _ValidatedSelection, random: KeyedRandom) -> Validation:
+    """Prepare the scores on the validation points of a selection; plain: residuals without edge effects."""
+    given, selection = validated.given, validated.selection
+    return Validation(
+        measurement=aligned,
+        residuals=plain,
+        registration_rows=given.training_rows,
+        tested=given.measurable & given.held_out,
+        training=given.measurable & ~given.held_out,
+        losses=validated.losses,
+        reference_sigma=selection.reference_sigma,
+        most_sigmas=thresholds().points.outlier_sigmas * given.noise_ratio,
+        random=random,
+        reduced_noise=reduced_noise(aligned.model, _share_of_model_noise(selection.unexplained_noise.at_most_one, plain)),
+    )
+
+
+def _empirical(named: Sequence[NamedEffect], but_not: Sequence[NamedEffect] = ()) -> bool:
+    """Whether an empirical term that is no noise is among some effects, but not among others."""
+    return any(item.kind == "empirical" and not item.adds_variance and item not in but_not for item in named)
+
+
+def _nameable(inputs: PassInputs) -> bool:
+    """Whether the catalogue has effects for these residuals."""
+    return any(not each.empirical for each in inputs.plain.candidates)
 
 
 def _share_of_model_noise(share: float, residuals: Residuals) -> float:
@@ -305,7 +329,7 @@ def _select_and_validate(
     inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple[str, bool]] = frozenset()
 ) -> _ValidatedSelection:
     """Select effects and validate them. If an empirical term fails, the selection is repeated without empirical terms."""
-    best, aligned, plain = best_pass(inputs, random, excluded), inputs.measurement, inputs.plain
+    best, aligned = best_pass(inputs, random, excluded), inputs.measurement
     given, selection = best.pass_input, best.selection
     losses = _explain_losses(aligned, given)
     lost = [effect_from_losses(losses[0], aligned.cloud.intensity)] if losses else []
@@ -313,12 +337,7 @@ def _select_and_validate(
     named, words = only_within_bounds(aligned.model, named)
     scored = _validate(aligned, given, named, selection.reference_sigma)
     words += [f"{item.name} dropped: it does not improve the validation blocks" for item in scored.failed]
-    nameable = any(not each.empirical for each in plain.candidates)
-    if (
-        nameable
-        and NONPARAMETRIC_TERMS not in excluded
-        and any(item.kind == "empirical" and not item.adds_variance for item in scored.failed)
-    ):
+    if NONPARAMETRIC_TERMS not in excluded and _empirical(scored.failed) and _nameable(inputs):
         again = _select_and_validate(inputs, random, excluded | {NONPARAMETRIC_TERMS})
         if again.named:
             return replace(again, words=[*words, *(each for each in again.words if each not in words)])
