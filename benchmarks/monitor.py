@@ -343,10 +343,7 @@ def speed() -> Iterator[str]:
     yield "|---|---|---|---|---|"
     with tempfile.TemporaryDirectory() as folder:
         for number in (1, 2):
-            write_laz(
-                Path(folder) / f"{number}.laz",
-                PointCloud(_large_wall(number, POINTS)),
-            )
+            write_laz(Path(folder) / f"{number}.laz", PointCloud(_large_wall(number, POINTS)))
         took, processor = _timed(MONITOR, f"{folder}/1.laz", f"{folder}/2.laz", *FROM, "--out", f"{folder}/out")
         others = max(os.getloadavg()[0] - processor / took, 0.0)
         memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6
@@ -443,14 +440,12 @@ def rewrite(folder, name):
     bounds = np.stack([points.min(axis=0), points.max(axis=0)])
     types = {key: values.dtype for key, values in extra.items()}
     with chunk_writer(pathlib.Path(folder, f"copy_{path.name}"), bounds, types, LazHeader(scale_m=1e-4)) as file:
-        for start in range(0, len(points), 400_000):
-            def fill(records, part):
-                rows = slice(start + part.start, start + part.stop)
-                for axis, values, scale, offset in zip("XYZ", points[rows].T, file.scales, file.offsets):
-                    records[axis] = np.rint((values - offset) / scale)
-                for key, values in extra.items():
-                    records[key] = values[rows]
-            file.write(min(400_000, len(points) - start), fill)
+        def fill(records, part):
+            for axis, values, scale, offset in zip("XYZ", points[part].T, file.scales, file.offsets):
+                records[axis] = np.rint((values - offset) / scale)
+            for key, values in extra.items():
+                records[key] = values[part]
+        file.write(len(points), fill)
 
 with concurrent.futures.ProcessPoolExecutor(int(sys.argv[1])) as pool:
     list(pool.map(functools.partial(rewrite, sys.argv[2]), sys.argv[3:]))
