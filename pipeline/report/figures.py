@@ -16,13 +16,14 @@ from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
-from matplotlib.colors import BoundaryNorm, ListedColormap, LogNorm, Normalize, to_rgb
+from matplotlib.colors import BoundaryNorm, ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
+from pipeline.report.pixel_map import PixelMap, coloured
 from pipeline.report.plain_text import plain_text
 from pipeline.report.png import encode_png
 from scene.geometry.grid import Grid
@@ -120,7 +121,7 @@ def difference_figure(difference: NDArray[np.floating], grid: Grid, block: IntAr
     values = mean_pooled(difference, pooling(grid)) * 1e3
     limit, extent = SCALE_SIGMAS * sigma_m * 1e3, raster_extent(grid, values.shape)
     figure, axes = _map_figure(grid, title)
-    axes.imshow(_coloured(values, limit), extent=extent, interpolation="nearest")
+    figure.add_artist(PixelMap(coloured(values, limit, COLOURS, NO_DATA), axes, extent))
     image = ScalarMappable(Normalize(-limit, limit), COLOURS)
     inside = _max_pooled(block != WALL, pooling(grid))
     if inside.any() and min(inside.shape) > 1:
@@ -133,17 +134,6 @@ def difference_figure(difference: NDArray[np.floating], grid: Grid, block: IntAr
     _sigma_bar(figure, axes, image, sigma_m * 1e3)
     _no_data_legend(axes, values, NO_DATA, "outline: block, numbered as in the table" if inside.any() else "")
     return png_bytes(figure)
-
-
-def _coloured(values: NDArray[np.floating], limit: float) -> NDArray[np.uint8]:
-    """Return the colours (h, w, 3) of differences (h, w) by COLOURS, whose scale ends at -limit and limit; NaN is NO_DATA.
-
-    Matplotlib would first enlarge the values to the pixels of the picture, which takes five times as long.
-    """
-    table = np.concatenate([COLOURS(np.arange(COLOURS.N), bytes=True)[:, :3], [np.rint(255 * np.array(to_rgb(NO_DATA)))]])
-    step = (values + np.float32(limit)) * np.float32(COLOURS.N / (2 * limit))
-    step = np.where(np.isnan(step), COLOURS.N, np.clip(step, 0, COLOURS.N - 1))
-    return table.astype(np.uint8)[step.astype(np.uint8)]
 
 
 def block_boxes(block: IntArray) -> dict[int, tuple[int, int, int, int]]:
