@@ -305,6 +305,14 @@ def equivalence_margin(log_likelihood_ratio: float) -> float:
     return max(by.class_margin, by.class_share * log_likelihood_ratio)
 
 
+def largest_relative_size() -> float:
+    """Return the largest plausible size of an effect, in units of its typical size in the catalogue.
+
+    It lies `points.outlier_sigmas` standard deviations of the prior (`mean.prior_size`) from zero.
+    """
+    return thresholds().points.outlier_sigmas * thresholds().mean.prior_size
+
+
 @contextmanager
 def use_thresholds(chosen: Thresholds) -> Iterator[None]:
     """Make `thresholds()` return the chosen thresholds inside a `with` block, for one diagnosis by `gap`."""

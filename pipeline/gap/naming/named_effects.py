@@ -22,7 +22,7 @@ from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
 from pipeline.gap.residuals.alignment import AlignedMeasurement, align
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from pipeline.gap.thresholds import thresholds
+from pipeline.gap.thresholds import largest_relative_size, thresholds
 from scene.common.config import parse
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
@@ -175,14 +175,6 @@ def is_plausible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
     if not within_bounds(model, entry):
         return False
     return relative_size(entry) <= largest_relative_size()
-
-
-def largest_relative_size() -> float:
-    """Return the largest plausible size of an effect, in units of its typical size in the catalogue.
-
-    It lies `points.outlier_sigmas` standard deviations of the prior (`mean.prior_size`) from zero.
-    """
-    return thresholds().points.outlier_sigmas * thresholds().mean.prior_size
 
 
 def relative_size(entry: dict[str, Any]) -> float:

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.gap.mean.detection_power import DetectableSize
-from pipeline.gap.naming.named_effects import largest_relative_size
 from pipeline.gap.residuals.residuals import Residuals
+from pipeline.gap.thresholds import largest_relative_size
 from sensors.effects.base import Effect, ShowsIn
 
 _NOT_COMPUTED = {
