@@ -30,7 +30,7 @@ from pipeline.gap.noise_and_edges.edge_effects import EdgeEffect
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
 from pipeline.gap.residuals.alignment import align, at_points_of, compute_residuals
 from pipeline.gap.residuals.disparity_raster import DisparityRaster
-from pipeline.gap.residuals.nominal_pair import NominalPair
+from pipeline.gap.residuals.nominal_pair import NominalPair, real_pair
 from pipeline.gap.residuals.stereo_residuals import stereo_residuals
 from scene.common.keyed_random import KeyedRandom
 from sensors.effects.edge_fattening import EdgeFattening
@@ -138,6 +138,26 @@ def test_a_simulation_without_noise_departs_nowhere_from_the_surface(tmp_path: P
     known = residuals.usable & np.isfinite(seen)
     assert known.sum() > 5000
     np.testing.assert_allclose(seen[known], 0, atol=2e-4)
+
+
+def test_a_simulated_pair_with_a_shifted_image_sees_the_rock_that_its_pixels_see(tmp_path: Path) -> None:
+    """With a wrong principal point other rock lies between a pixel and the centre of its cell.
+
+    A simulation without noise must give the disparities of the rays through the measured pixels of the real cameras.
+    """
+    make(Case(0, (3, 1), "none", "stereo", (), 15_000, 15_000), tmp_path / "case", tmp_path / "truth.json", baselines=False)
+    there, residuals, _ = align(read_measurement(tmp_path / "case"))
+    assert isinstance(there, StereoMeasurement)
+    model = with_effects(there.model, [{"name": "principal_point_y", "camera": "left", "delta_px": -8.0}])
+    quiet = StereoNoise(parallax_sigma_px=1e-6, regularization_sigma_px=0.0)
+    (seen,) = simulate_errors(there, model.model_copy(update={"noise": quiet}), residuals, [KeyedRandom(1)])
+    nominal, real = NominalPair.of(there), real_pair(model.effects, there)
+    u, v = residuals.geometry.u, residuals.geometry.v
+    expected = nominal.surface_disparity(there.scene, u, v, real) - nominal.surface_disparity(there.scene, u, v)
+    known = residuals.usable & np.isfinite(seen) & np.isfinite(expected)
+    assert known.sum() > 5000
+    assert np.std(expected[known]) > 0.05, "px of disparity, by which the rock that is seen differs"
+    np.testing.assert_allclose(seen[known], expected[known], atol=2e-4)
 
 
 def test_outlines_grow_among_the_measurement_s_own_pixels_when_it_is_simulated(tmp_path: Path) -> None:

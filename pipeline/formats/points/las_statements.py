@@ -180,7 +180,7 @@ def flagged(las: Any) -> tuple[np.ndarray[Any, np.dtype[np.bool_]], tuple[str, .
     for what, rows in (
         ("flagged as withheld", np.asarray(las.withheld, dtype=bool)),
         ("flagged as synthetic", np.asarray(las.synthetic, dtype=bool)),
-        ("classified as noise", np.isin(classes, _NOISE)),
+        ("classified as noise", (classes == _NOISE[0]) | (classes == _NOISE[1])),
     ):
         if rows.all():
             notes.append(f"all points are {what} and are kept")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.formats.measurements.measurement import StereoMeasurement
 from pipeline.gap.residuals.disparity_raster import DisparityRaster, raster_cell_px
-from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, project
+from pipeline.gap.residuals.nominal_pair import NominalPair, PixelGeometry, project, real_pair
 from pipeline.gap.residuals.stereo_residuals import StereoResiduals
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
@@ -30,7 +30,8 @@ def simulate_disparities(
     """Simulate the disparities that a sensor model gives at the measured pixels of a stereo pair, with its random errors.
 
     The simulated depth maps have cells of 2, 4 or 8 px. The size is chosen whose cell centres lie nearest to the pixels. The
-    disparity of the reference is corrected for the distance of each pixel from the centre of its cell. If the measurement's own
+    simulated disparities are corrected for the distance of each pixel from the centre of its cell, by the disparities that the
+    simulated cameras see on the reference at both places. If the measurement's own
     raster has another spacing, effects that depend on neighbouring cells are applied on that raster.
 
     Parameters
@@ -50,8 +51,9 @@ def simulate_disparities(
     height, width = pair.shape
     rows = np.clip((g.v / step).astype(int), 0, height - 1)
     columns = np.clip((g.u / step).astype(int), 0, width - 1)
-    middle = nominal.surface_disparity(measurement.scene, (columns + 0.5) * step, (rows + 0.5) * step)
-    beside = g.disparity + (middle - nominal.surface_disparity(measurement.scene, g.u, g.v))
+    real = real_pair(model.effects, measurement)  # a shifted image sees other rock, so that the relief beside it differs too
+    middle = nominal.surface_disparity(measurement.scene, (columns + 0.5) * step, (rows + 0.5) * step, real)
+    beside = g.disparity + (middle - nominal.surface_disparity(measurement.scene, g.u, g.v, real))
     pair, shaped = _on_own_raster(pair, measurement, g, step)
     drawn = []
     for seen in _points(pair, measurement, rows * width + columns, randoms):

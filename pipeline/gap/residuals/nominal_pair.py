@@ -123,22 +123,24 @@ class NominalPair:
         first, second = ([on_device(mi.Float64, each) for each in pixel] for pixel in (left, right))
         return _on_host(self.left_column(*first) - self.right_column(*second))[0]
 
-    def surface_disparity(self, scene: RayCaster, u: FloatArray, v: FloatArray) -> FloatArray:
+    def surface_disparity(self, scene: RayCaster, u: FloatArray, v: FloatArray, real: CameraPair | None = None) -> FloatArray:
         """Predict the disparity of the surface point that each pixel of the left image sees.
 
         Parameters
         ----------
         scene : The surface, in the wall frame, prepared for ray tracing.
         u, v : (n,) columns and rows of the pixels in the original (not rectified) left image, px.
+        real : The cameras that take the images, wall frame, if they differ from the calibrated ones; None: they do not. The
+            images are rectified with the calibrated ones in any case.
 
         Returns
         -------
         (n,) disparities, px; NaN for pixels that see nothing.
         """
-        left = self.pair.left
+        left, right = (self.pair.left, self.pair.right) if real is None else (real.left, real.right)
         ray = pixel_rays(left, u, v)
         point = left.position + scene.cast(left.position, ray)[0][:, None] * ray
-        return self.disparity((u, v), project(self.pair.right, point))
+        return self.disparity((u, v), project(right, point))
 
     def left_column(self, u: mi.Float64, v: mi.Float64) -> mi.Float64:
         """Transform pixels of the left image to the rectified image, and return their columns, px: one half of a disparity.
