@@ -343,10 +343,7 @@ def speed() -> Iterator[str]:
     yield "|---|---|---|---|---|"
     with tempfile.TemporaryDirectory() as folder:
         for number in (1, 2):
-            write_laz(
-                Path(folder) / f"{number}.laz",
-                PointCloud(_large_wall(number, POINTS)),
-            )
+            write_laz(Path(folder) / f"{number}.laz", PointCloud(_large_wall(number, POINTS)))
         took, processor = _timed(MONITOR, f"{folder}/1.laz", f"{folder}/2.laz", *FROM, "--out", f"{folder}/out")
         others = max(os.getloadavg()[0] - processor / took, 0.0)
         memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6
@@ -433,17 +430,22 @@ REWRITE = """
 import concurrent.futures, functools, pathlib, sys
 import numpy as np
 from pipeline.formats.points.laz import LazHeader, read_laz
-from pipeline.formats.points.laz_chunks import write_chunks
+from pipeline.formats.points.laz_chunks import chunk_writer
 
 def rewrite(folder, name):
     path = pathlib.Path(name)
-    points = read_laz(path).points
+    points = read_laz(path, only_points=True).points
     noise = (np.rint(np.random.default_rng(0).normal(0, 200, len(points))) / 2**16).astype(np.float32)
     extra = {"distance_m": noise, "lod_m": np.abs(noise), "event": np.zeros(len(points), dtype=np.uint16)}
-    parts = [slice(start, start + 400_000) for start in range(0, len(points), 400_000)]
-    pieces = ((points[part], {key: values[part] for key, values in extra.items()}) for part in parts)
     bounds = np.stack([points.min(axis=0), points.max(axis=0)])
-    write_chunks(pathlib.Path(folder, f"copy_{path.name}"), bounds, pieces, LazHeader(scale_m=1e-4))
+    types = {key: values.dtype for key, values in extra.items()}
+    with chunk_writer(pathlib.Path(folder, f"copy_{path.name}"), bounds, types, LazHeader(scale_m=1e-4)) as file:
+        def fill(records, part):
+            for axis, values, scale, offset in zip("XYZ", points[part].T, file.scales, file.offsets):
+                records[axis] = np.rint((values - offset) / scale)
+            for key, values in extra.items():
+                records[key] = values[part]
+        file.write(len(points), fill)
 
 with concurrent.futures.ProcessPoolExecutor(int(sys.argv[1])) as pool:
     list(pool.map(functools.partial(rewrite, sys.argv[2]), sys.argv[3:]))

@@ -22,11 +22,11 @@ def test_each_threshold_is_switched_off_or_stays_out_for_a_reason() -> None:
 
 
 def test_settings_change_one_threshold_even_beyond_its_bounds() -> None:
-    found = changed([("mean.least_score", "off"), ("verdict.least_closed", "off")])
-    assert found.mean.least_score == OFF["mean.least_score"]
+    found = changed([("variance.least_gain", "off"), ("verdict.least_closed", "off")])
+    assert found.variance.least_gain == OFF["variance.least_gain"]
     assert found.verdict.least_closed == OFF["verdict.least_closed"]
     assert found.mean.class_margin == Thresholds().mean.class_margin
-    assert ("mean.least_score", "off") in others("mean.least_score")
+    assert ("variance.least_gain", "off") in others("variance.least_gain")
     assert not others("points.most")
 
 
@@ -59,17 +59,17 @@ def test_a_case_is_diagnosed_again_only_where_a_decision_would_differ(
 
     def answered(folder: Path, thresholds: Any) -> dict[str, Any]:
         assert folder == wall.folder
-        alarm = thresholds.mean.least_score < 0
+        alarm = thresholds.variance.least_gain < 0
         return {"verdict": "unknown" if alarm else "no_gap", "effects": [], "wall_s": 1.0}
 
-    _write(out / "second/0001/asked.json", {"asked": ["mean.least_score"], "matters": [["mean.least_score", "off"]]})
+    _write(out / "second/0001/asked.json", {"asked": ["variance.least_gain"], "matters": [["variance.least_gain", "off"]]})
     _write(out / "second/0001/usual.json", answered(wall.folder, Thresholds()))
     monkeypatch.setattr(run, "diagnosed", answered)
     (job,) = run.jobs([wall], out, [])
-    assert job == (wall, ("mean.least_score", "off"))
-    run.again(wall, [job[1]], "mean.least_score=off", out)
+    assert job == (wall, ("variance.least_gain", "off"))
+    run.again(wall, [job[1]], "variance.least_gain=off", out)
     results = page.collect(out, [wall])
-    assert results["thresholds"]["mean.least_score"]["settings"]["off"]["became wrong"] == ["second 0001: false alarm"]
+    assert results["thresholds"]["variance.least_gain"]["settings"]["off"]["became wrong"] == ["second 0001: false alarm"]
     written = page.page(json.loads(json.dumps(results)), "make")
-    assert "| `mean.least_score` | 4 | none | 1 | 1 | 1 | 1 | 1 | 0 | kept |" in written
-    assert "| `mean.least_score` | off | second 0001 | right to false alarm |" in written
+    assert "| `variance.least_gain` | 6 | none | 1 | 1 | 1 | 1 | 1 | 0 | kept |" in written
+    assert "| `variance.least_gain` | off | second 0001 | right to false alarm |" in written

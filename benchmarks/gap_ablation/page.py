@@ -99,6 +99,7 @@ def page(results: Json, command: str) -> str:
     return _PAGE.format(
         total=total, sources=sources, wrong=wrong, before=before, after=after, commit=results["commit"], command=command,
         table="\n".join(lines), merged="\n".join(merged), flips=_flips(results), together=_together(results["together"]),
+        groups=_groups(results.get("groups", [])),
     )  # fmt: skip
 
 
@@ -114,11 +115,18 @@ def _cells(found: Json) -> str:
 
 def _together(found: Json) -> str:
     """Return a paragraph on the cases that were diagnosed with the thresholds that are left."""
+    changes = ", ".join([*found["became wrong"], *found["became right"], *found["other errors"]])
     return (
         f"With the thresholds that are left, {found['diagnosed']} of the cases were diagnosed again: {found['other answers']} "
         f"have another verdict or other names, {len(found['became wrong'])} became wrong, and "
-        f"{len(found['became right'])} became right."
+        f"{len(found['became right'])} became right{changes and f' ({changes})'}."
     )
+
+
+def _groups(found: list[Json]) -> str:
+    """Return a table of settings in a group that changed an answer, and what was done therefore."""
+    rows = [f"| `{each['threshold']}` | {each['tried']} | {each['case']} | {each['change']} | {each['done']} |" for each in found]
+    return "\n".join(["| threshold | tried | case | change | done |", "|---|---|---|---|---|", *rows])
 
 
 def _number(value: float) -> str:
@@ -176,6 +184,14 @@ Thresholds of the same kind can share one value. These values were tried. Where 
 merged with the one whose value it shares.
 
 {merged}
+
+## Thresholds that were changed in groups
+
+A diagnosis takes up to a minute, so most rules that act could not be switched off one by one. They were changed in two groups:
+deleted, or set to the value of a threshold of the same kind. Where an answer of a case differed, halves of the group were tried
+until the cause was found. These settings were a cause:
+
+{groups}
 
 ## Answers that change
 

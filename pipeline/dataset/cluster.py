@@ -13,7 +13,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -25,10 +25,14 @@ from scene.common.errors import InputError, OutsideError
 from scene.common.extras import how_to_install
 
 if TYPE_CHECKING:
+    from concurrent.futures import Future as StartedFuture
+
     from distributed import Client, Future, LocalCluster
 
     from pipeline.dataset.worker import EpochOrder
 
+BackgroundStart: TypeAlias = "StartedFuture[tuple[LocalCluster, Client]]"
+"""Workers that are being started in a thread (`workers_in_background`)."""
 Run: TypeAlias = "list[EpochOrder]"
 """Epochs that a worker makes in one go."""
 _POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -66,7 +70,35 @@ def runs(orders: Sequence[EpochOrder], workers: int) -> list[Run]:
     return found
 
 
-def map_on_workers(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], count: int) -> Iterator[Any]:
+@contextmanager
+def workers_in_background(count: int, modules: Sequence[str]) -> Iterator[BackgroundStart]:
+    """Start local worker processes in a thread, while this process prepares the work that `map_on_workers` gives them later.
+
+    They end with the block.
+
+    Parameters
+    ----------
+    count : Number of workers.
+    modules : Names of modules that the workers import at once.
+
+    Raises
+    ------
+    InputError
+        If Dask is not installed.
+    """
+    _require_distributed("--workers")
+
+    def start() -> tuple[LocalCluster, Client]:
+        cluster = _local(stack, count, modules)
+        return cluster, _client(stack, cluster)
+
+    with ExitStack() as stack, ThreadPoolExecutor(1) as pool:
+        yield pool.submit(start)
+
+
+def map_on_workers(
+    function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], count: int, started: BackgroundStart | None = None
+) -> Iterator[Any]:
     """Call a function with each task's arguments on local worker processes, and yield the results as they finish.
 
     Parameters
@@ -74,6 +106,7 @@ def map_on_workers(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]
     function : Function of a module, which workers import; what it raises is raised here.
     tasks : Arguments of each call.
     count : Number of workers.
+    started : Workers that were started before; None: they are started now.
 
     Raises
     ------
@@ -87,8 +120,11 @@ def map_on_workers(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]
     for start in range(1, _STARTS + 1):
         try:
             with ExitStack() as stack:
-                cluster = _local(stack, min(count, len(left)))
-                client = _client(stack, cluster)
+                if started is not None and start == 1:
+                    cluster, client = started.result()
+                else:
+                    cluster = _local(stack, min(count, len(left)))
+                    client = _client(stack, cluster)
                 futures = client.map(_called, [function] * len(left), list(left.values()), key=list(left))
                 for future, result in _results(client, futures, cluster):
                     del left[future.key]
@@ -229,10 +265,11 @@ def _threads_each(count: int) -> int:
     return max(1, len(os.sched_getaffinity(0)) // count)
 
 
-def _local(stack: ExitStack, count: int) -> LocalCluster:
+def _local(stack: ExitStack, count: int, modules: Sequence[str] = ()) -> LocalCluster:
     """Start workers on this machine, with one Dask thread each.
 
-    Dask's memory limit is off, because it takes the ray tracer's memory for a leak.
+    Dask's memory limit is off, because it takes the ray tracer's memory for a leak. modules: names of modules that the workers
+    import as they start.
     """
     import dask
     from distributed import LocalCluster, Security
@@ -253,6 +290,7 @@ def _local(stack: ExitStack, count: int) -> LocalCluster:
             n_workers=count,
             threads_per_worker=1,
             memory_limit=0,
+            preload=list(modules),
             loop=stack.enter_context(_loop_without_interrupts()),
             security=Security.temporary(),
             scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},

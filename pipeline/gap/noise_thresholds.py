@@ -1,8 +1,8 @@
-"""Thresholds of what is no systematic effect: variance model, grid noise, pixel locking, rounding, edges, missing returns."""
+"""Thresholds of what is no systematic effect: variance model, pixel locking, rounding, edges, missing returns."""
 
 from __future__ import annotations
 
-from pydantic import PositiveFloat, PositiveInt
+from pydantic import PositiveFloat
 
 from pipeline.gap.threshold_field import DEVELOPMENT, JUDGEMENT, ThresholdGroup, threshold_field
 
@@ -20,13 +20,18 @@ class VarianceThresholds(ThresholdGroup):
     least_gain: PositiveFloat = threshold_field(
         6.0,
         "log-likelihood",
-        "The best noise term needs at least this log-likelihood ratio, a second one beside it too.",
+        "The best noise term needs at least this log-likelihood ratio, a second one beside it and an effect on the returns "
+        "too. A non-parametric term, a variance free in bins or losses free by direction must score this much more than the "
+        "best effect of the catalogue to be chosen instead, a term of two covariates this much more than one of one, and any "
+        "of them this much more than an error of the reference can. Grid-correlated noise must improve the fit of the "
+        "semivariogram by twice this in chi^2.",
         JUDGEMENT,
     )
     least_excess: PositiveFloat = threshold_field(
         0.04,
         "share of the predicted variance",
-        "Less additional variance than this is attributed to small errors of the reference, and no noise term is named.",
+        "Less additional variance than this is attributed to small errors of the reference, and no noise term is named. Beside "
+        "heavy tails, the core of the residuals must have as much more variance for a noise term to be kept.",
         DEVELOPMENT,
     )
     least_unshared_share: PositiveFloat = threshold_field(
@@ -43,18 +48,12 @@ class VarianceThresholds(ThresholdGroup):
         "Below this ratio the model's noise is reported as too large, and a lower one is proposed.",
         JUDGEMENT,
     )
-    clip_sigmas: PositiveFloat = threshold_field(
-        4.5, "standard deviations", "A deviation beyond this is not used to fit the variance model.", JUDGEMENT
-    )
     nonparametric_share: PositiveFloat = threshold_field(
         0.1,
         "share of the named term's log-likelihood ratio",
         "A variance free in bins that gains no more than this over the named term is only a note; beyond, the term is marked "
         "empirical. Known noise put into real scans came to 0.05 and 0.09, and noise outside the catalogue to 0.15.",
         DEVELOPMENT,
-    )
-    trial_cost: PositiveFloat = threshold_field(
-        0.5, "log-likelihood", "Penalty of a parameter for which only a few values are tried.", JUDGEMENT
     )
     tail_sigmas: PositiveFloat = threshold_field(
         4.0, "standard deviations", "A residual beyond this counts as an outlier of the tails.", JUDGEMENT
@@ -72,63 +71,12 @@ class VarianceThresholds(ThresholdGroup):
         "If the share of outliers differs more than this between blocks, parts of the wall are the cause, not the instrument.",
         JUDGEMENT,
     )
-    core_excess: PositiveFloat = threshold_field(
-        0.15,
-        "share of the predicted variance",
-        "Beside heavy tails a noise term is kept only if the core of the residuals has this much more variance than predicted.",
-        JUDGEMENT,
-    )
-
-
-class GridNoiseThresholds(ThresholdGroup):
-    """Thresholds that separate white from grid-correlated noise of disparities, and noise from errors of the reference.
-
-    White noise is independent from point to point. Grid-correlated noise is interpolated by a stereo matcher between widely
-    spaced pixels (nodes of a grid). The semivariogram of the residuals is fitted with each kind. The kind that fits better by
-    `mean.class_margin` is named; otherwise both are reported as indistinguishable. An error of the reference also
-    correlates residuals. A component of the semivariogram is attributed to it if it is not larger than the `reference_error`
-    limits allow. The last text of each field states where its value comes from: tuning on development cases, or judgement.
-    """
-
-    least_gain: PositiveFloat = threshold_field(
-        12.0,
-        "chi^2",
-        "Grid-correlated noise must improve the fit of the semivariogram by this where single points show no added variance.",
-        DEVELOPMENT,
-    )
-    finest_grid: PositiveFloat = threshold_field(
-        2.0,
-        "cells of the disparity raster",
-        "A grid with narrower nodes than this cannot be told from white noise and is not tried.",
-        JUDGEMENT,
-    )
-    reference_error: PositiveFloat = threshold_field(
-        0.02,
-        "m",
-        "Largest standard deviation that is attributed to an error of the reference correlated over metres.",
-        JUDGEMENT,
-    )
-    reference_length: PositiveFloat = threshold_field(
-        0.45,
-        "m, standard deviation of a Gaussian correlation",
-        "From this correlation length on the error of the reference may be as large as `reference_error`. Errors in waves of "
-        "1.5 m have this length (0.3 of a wave).",
-        JUDGEMENT,
-    )
-    short_reference_error: PositiveFloat = threshold_field(
-        0.005,
-        "m",
-        "Largest standard deviation that is attributed to an error of the reference of a shorter correlation length.",
-        JUDGEMENT,
-    )
 
 
 class LockingThresholds(ThresholdGroup):
     """Thresholds of the test for pixel locking: measured disparities that crowd around whole pixels.
 
-    The resultant length measures how strongly fractions of a pixel crowd: 0 not at all, 1 all alike. It is computed for
-    fractions of 1, 1/2, 1/3 and 1/4 pixel; the chi^2 of a trial amplitude compares these four values with those that it
-    predicts.
+    The resultant length measures how strongly fractions of a pixel crowd: 0 not at all, 1 all alike.
     """
 
     fewest_cycles: PositiveFloat = threshold_field(
@@ -143,19 +91,6 @@ class LockingThresholds(ThresholdGroup):
     )
     significance: PositiveFloat = threshold_field(
         1e-4, "probability", "Significance level: crowding that chance makes more often is not reported.", JUDGEMENT, lt=1
-    )
-    equal_fit: PositiveFloat = threshold_field(
-        6.0,
-        "chi^2 of four values",
-        "Amplitudes whose fits differ by less than this count as equally good, and the smallest is taken.",
-        JUDGEMENT,
-    )
-    good_fit: PositiveFloat = threshold_field(
-        20.0,
-        "chi^2 of four values",
-        "If even the best amplitude of pixel locking has a larger chi^2 than this, the best small amplitude is taken: one that "
-        "keeps the order of the disparities.",
-        DEVELOPMENT,
     )
 
 
@@ -179,40 +114,18 @@ class EdgeThresholds(ThresholdGroup):
 
     A gain is a log-likelihood ratio of the models with and without an effect. Wall blocks are squares of the wall, which count
     as independent. Their agreement is measured like a number of standard deviations: the sum of their gains over the root of
-    the sum of squared gains. A cell is a pixel of the disparity raster. A selection pass is one search for all effects, with or
-    without edge effects in the model.
+    the sum of squared gains. A cell is a pixel of the disparity raster.
     """
 
     least_gain: PositiveFloat = threshold_field(
         30.0, "log-likelihood", "An edge effect needs at least this log-likelihood ratio, filled occlusions too.", DEVELOPMENT
     )
     block_sigmas: PositiveFloat = threshold_field(
-        3.0,
+        2.5,
         "root sums of squares of the wall blocks' gains",
-        "The wall blocks must agree by this much on an edge effect, on a second noise term, on grid-correlated noise where "
-        "single points show no added variance, or on noise that is lower than predicted.",
-        JUDGEMENT,
-    )
-    most_gain_of_a_point: PositiveFloat = threshold_field(
-        3.0, "log-likelihood", "The gain of one point is clipped at this before the wall blocks are compared.", JUDGEMENT
-    )
-    most_relative_noise: PositiveFloat = threshold_field(
-        1.5,
-        "ratio of standard deviations",
-        "A selection pass is rejected if its residuals have more than this times the noise of the best pass.",
-        JUDGEMENT,
-    )
-    least_block_sigmas: PositiveFloat = threshold_field(
-        2.0,
-        "root sums of squares of the wall blocks' gains",
-        "The wall blocks must agree by this much on a beam divergence, or that a variance free in bins fits better than a named "
-        "one: for example four blocks of four. None of 60 development cases without a footprint came to 1.9.",
-        DEVELOPMENT,
-    )
-    fewest_filled: PositiveInt = threshold_field(
-        8,
-        "cells",
-        "Filled occlusions need at least this many cells that hold a point though only one camera sees them.",
+        "The wall blocks must agree by this much on an edge effect, on a beam divergence, on a second noise term, on a "
+        "variance free in bins, on grid-correlated noise where single points show no added variance, or on noise that is lower "
+        "than predicted.",
         JUDGEMENT,
     )
     least_filled_share: PositiveFloat = threshold_field(
@@ -233,9 +146,6 @@ class MissingReturnsThresholds(ThresholdGroup):
     of the wall.
     """
 
-    least_gain: PositiveFloat = threshold_field(
-        9.0, "log-likelihood", "An effect on the returns needs at least this penalised log-likelihood ratio.", JUDGEMENT
-    )
     cutoff_ratio: PositiveFloat = threshold_field(
         0.7,
         "ratio of log-power intervals: lowest 0.5 % over lowest 1 %",
@@ -243,19 +153,14 @@ class MissingReturnsThresholds(ThresholdGroup):
         DEVELOPMENT,
         le=1,
     )
-    least_isolated_share: PositiveFloat = threshold_field(
+    least_agreement: PositiveFloat = threshold_field(
         0.8,
-        "share of the wall blocks that scattered returns would reach",
-        "Early returns count as drops if they lie in at least this share of those blocks; objects return many side by side.",
+        "share of full agreement between parts of the wall or of the scan",
+        "Early returns count as drops if they lie in at least this share of the wall blocks that scattered returns would "
+        "reach; objects return many side by side. A sector without returns is divided into strips across it, whose gains must "
+        "agree this well: the highest of 35 cases without losses by direction is 0.73, the lowest of 3 sectors 0.96.",
         DEVELOPMENT,
         le=1,
-    )
-    strip_agreement: PositiveFloat = threshold_field(
-        0.85,
-        "ratio; 1: every strip gains equally",
-        "A sector without returns is divided into strips across it; their gains must agree this well. The highest of 35 "
-        "cases without losses by direction is 0.73, the lowest of 3 sectors 0.96.",
-        DEVELOPMENT,
     )
     early_m: PositiveFloat = threshold_field(
         0.5, "m", "A return counts as early, possibly from a drop, if it lies this far before the surface.", JUDGEMENT

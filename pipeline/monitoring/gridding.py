@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse._sparsetools import csc_matvecs  # np.add.at takes twice the time
 
 from pipeline.monitoring.raster_statistics import quantiles
 from pipeline.registration.rigid import RigidTransform
@@ -28,11 +29,11 @@ _MOST_LEVERAGE = 1.0
 """Largest q: a pixel whose height is known worse than from a single point at its centre has no data."""
 _PRIOR_POINTS = 4.0
 """Weight of the raster's median variance in that of a pixel, in points: few points tell little of their own scatter."""
-POINTS_AT_ONCE = 1 << 14
+POINTS_AT_ONCE = 1 << 13
 """Points that are transformed and summed at a time, so that their arrays stay in the processor's cache."""
 SAMPLE = 50_000
 """Points of an epoch that ICP works with: it only brings the epoch near, and is followed by a fit of the rasters."""
-_BAND = 32
+_BAND = 8
 """Rows to which planes are fitted at a time, so that the sums stay in the processor's cache."""
 
 
@@ -149,12 +150,15 @@ def _add_moments(sums: FloatArray, points: FloatArray, grid: Grid) -> None:
     if not inside.all():
         column, row, z = column[inside], row[inside], z[inside]
     whole_column, whole_row = np.floor(column), np.floor(row)
-    place = (whole_row * grid.width + whole_column).astype(np.int64) * 10
+    pixel = (whole_row * grid.width + whole_column).astype(np.int64)
     u, v = column - whole_column - 0.5, 0.5 - (row - whole_row)
-    np.add.at(sums, place, 1.0)
-    for weights in (u, v, z, u * u, u * v, v * v, u * z, v * z, z * z):
-        place += 1
-        np.add.at(sums, place, weights)
+    count = len(pixel)
+    moments = np.empty((count, 10))
+    moments[:, 0], moments[:, 1], moments[:, 2], moments[:, 3] = 1.0, u, v, z
+    for place, (one, other) in enumerate(((u, u), (u, v), (v, v), (u, z), (v, z), (z, z)), start=4):
+        np.multiply(one, other, out=moments[:, place])
+    # Adds each point's row of moments to that of its pixel: the product of a sparse matrix with `moments`, added to `sums`.
+    csc_matvecs(grid.height * grid.width, count, 10, np.arange(count + 1), pixel, np.ones(count), moments.reshape(-1), sums)
 
 
 def _fitted(sums: FloatArray, grid: Grid) -> HeightRaster:
@@ -164,7 +168,10 @@ def _fitted(sums: FloatArray, grid: Grid) -> HeightRaster:
     for start in range(0, grid.height, _BAND):
         stop = min(start + _BAND, grid.height)
         low = max(start - 1, 0)
-        around = _about_each_pixel(np.ascontiguousarray(sums[low : stop + 1].transpose(2, 0, 1)))[:, start - low : stop - low]
+        rows = sums[low : stop + 1]
+        margined = np.zeros((10, stop - start + 2, grid.width + 2))
+        margined[:, low - start + 1 : low - start + 1 + len(rows), 1:-1] = rows.transpose(2, 0, 1)
+        around = _about_each_pixel(margined)
         band = slice(start, stop)
         freedom[band] = around[0] - 3
         height[band], scatter[band], slope_x[band], slope_y[band], leverage[band] = _planes(around)
@@ -199,25 +206,26 @@ def _planes(around: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, Flo
 
 
 def _about_each_pixel(sums: FloatArray) -> FloatArray:
-    """(10, h, w) the sums over 3 x 3 pixels, with u and v from the centre of the middle one: first along rows, then columns."""
-    along = sums.copy()
-    _add_shifted(along[:, :, :-1], sums[:, :, 1:], 1.0, along_u=True)
-    _add_shifted(along[:, :, 1:], sums[:, :, :-1], -1.0, along_u=True)
-    total = along.copy()
-    _add_shifted(total[:, :-1], along[:, 1:], -1.0, along_u=False)
-    _add_shifted(total[:, 1:], along[:, :-1], 1.0, along_u=False)
-    return total
+    """(10, h, w) the sums over 3 x 3 pixels, with u and v from the centre of the middle one; first along rows, then columns.
+
+    sums: (10, h + 2, w + 2) those of each pixel, with a margin of one pixel.
+    """
+    along = _of_three(sums[:, :, :-2], sums[:, :, 1:-1], sums[:, :, 2:], along_u=True)
+    return _of_three(along[:, 2:], along[:, 1:-1], along[:, :-2], along_u=False)
 
 
-def _add_shifted(total: FloatArray, sums: FloatArray, by: float, *, along_u: bool) -> None:
-    """Add the sums of neighbouring pixels (10, h, w) to `total`, with offsets from the centre of the latter.
+def _of_three(before: FloatArray, middle: FloatArray, after: FloatArray, *, along_u: bool) -> FloatArray:
+    """(10, h, w) the sums over three pixels side by side, with offsets from the centre of the middle one.
 
-    This makes the offset u (`along_u`) or v of each of their points larger by `by` pixels, 1 or -1.
+    The offset u (`along_u`) or v of points in the pixel `before` is one pixel smaller than from that pixel's own centre, and in
+    `after` it is one pixel larger.
     """
     own, square, with_z, other = (1, 4, 7, 2) if along_u else (2, 6, 8, 1)
-    for place in {*range(10)} - {own, square, 5, with_z}:
-        total[place] += sums[place]
-    total[own] += sums[own] + by * sums[0]
-    total[square] += sums[square] + 2 * by * sums[own] + sums[0]
-    total[5] += sums[5] + by * sums[other]
-    total[with_z] += sums[with_z] + by * sums[3]
+    total = before + after
+    total[square] += total[0]
+    total += middle
+    total[own] += after[0] - before[0]
+    total[square] += 2 * (after[own] - before[own])
+    total[5] += after[other] - before[other]
+    total[with_z] += after[3] - before[3]
+    return total

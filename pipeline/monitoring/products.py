@@ -16,7 +16,7 @@ from pipeline.change.annotate import BLOCK_CATEGORY, run_length_encoding
 from pipeline.formats.files.atomic import write_json, write_text
 from pipeline.formats.files.plain_json import without_nan
 from pipeline.formats.points.laz import LazHeader
-from pipeline.formats.points.laz_chunks import write_chunks
+from pipeline.formats.points.laz_chunks import chunk_writer
 from pipeline.formats.rasters.geotiff import read_geotiff, write_geotiff
 from pipeline.formats.records.geopackage import write_geopackage
 from pipeline.monitoring.events import ChangedRegion
@@ -44,8 +44,6 @@ _VALUE_STEP_M = np.float32(2.0**-16)
 """Of distances and levels of detection in the registered clouds: with a power of two, half of their bytes are zero, and LAZ
 compresses them well.
 """
-_AT_ONCE = 1 << 14
-"""Points that are registered at a time; their arrays then stay in the processor's cache."""
 _WRITTEN = 400_000
 """Points that are written at a time: a multiple of the 50,000 of a LAZ chunk."""
 
@@ -153,30 +151,34 @@ def write_points(epoch: Followed, data: EpochData, site: ReferenceSite, out: Pat
         Folder of the results, which has the epoch's maps already.
     """
     maps = [_PointMaps.of(epoch, view, out) for view in site.views]
-    frame, partition = site.frame, site.reference.partition
-    motion = epoch.record.transform
+    frame, motion = site.frame, epoch.record.transform
     to_registered = RigidTransform(motion.rotation @ frame.rotation, motion.translation)
-    to_world = RigidTransform(frame.rotation.T, frame.origin)
-
-    def registered(points: FloatArray) -> tuple[FloatArray, dict[str, NDArray[Any]]]:
-        world, values = np.empty_like(points), np.empty((len(points), 2), dtype=np.float32)
-        event = np.empty(len(points), dtype=maps[0].event.dtype)
-        for start in range(0, len(points), _AT_ONCE):
-            part = slice(start, start + _AT_ONCE)
-            wall = to_registered.apply(points[part] - frame.origin)
-            world[part] = to_world.apply(wall)
-            if partition is None:
-                values[part], event[part] = maps[0].at(wall)
-                continue
-            belongs = partition.of(wall)
-            for view, each in zip(site.views, maps, strict=True):
-                inside = start + np.flatnonzero(belongs == view.number - 1)
-                values[inside], event[inside] = each.at(view.frame.to_wall(world[inside]))
-        return world, {"distance_m": values[:, 0], "lod_m": values[:, 1], "event": event}
-
+    to_survey = RigidTransform(frame.rotation.T, frame.origin)
+    types = {"distance_m": np.float32, "lod_m": np.float32, "event": maps[0].event.dtype}
     header = LazHeader(scale_m=_SCALE_M, wkt=data.crs)
-    pieces = map(registered, in_pieces(data.chunks(), _WRITTEN))
-    write_chunks(out / f"epoch_{epoch.number:03d}.laz", data.bounds, pieces, header)
+    with chunk_writer(out / f"epoch_{epoch.number:03d}.laz", data.bounds, types, header) as file:
+        to_steps = to_survey.rotation / file.scales[:, None], (to_survey.translation - file.offsets) / file.scales
+        for piece in in_pieces(data.chunks(), _WRITTEN):
+
+            def fill(records: NDArray[np.void], part: slice, piece: FloatArray = piece) -> None:
+                wall = to_registered.apply_to_columns((piece[part] - frame.origin).T)
+                for axis, rotation, shift in zip("XYZ", *to_steps, strict=True):
+                    steps = rotation[0] * wall[0]
+                    steps += rotation[1] * wall[1]
+                    steps += rotation[2] * wall[2]
+                    steps += shift
+                    records[axis] = np.rint(steps, out=steps)
+                if site.reference.partition is None:
+                    maps[0].fill(records, wall)
+                    return
+                belongs, survey = site.reference.partition.of(wall.T), to_survey.apply(wall.T)
+                for view, each in zip(site.views, maps, strict=True):
+                    inside = np.flatnonzero(belongs == view.number - 1)
+                    some = records[inside]
+                    each.fill(some, view.frame.to_wall(survey[inside]).T)
+                    records[inside] = some
+
+            file.write(len(piece), fill)
 
 
 _LEAST_LARGEST = 2**8
@@ -187,33 +189,43 @@ _LEAST_LARGEST = 2**8
 class _PointMaps:
     """Maps of an epoch in one view, from which the points of the epoch get their values.
 
-    grid: of h x w pixels. values (h w + 1, 2): difference and level of detection of each pixel, m; NaN in the last row, which is
-    for points beside the maps. event (h w + 1,): number of the event, 0 for none, in two bytes where these suffice, so that LAZ
-    takes less time.
+    They have a margin of one pixel, for points beside the maps.
+
+    grid: of h x w pixels. values (h + 2, w + 2, 2): difference and level of detection of each pixel, m; NaN in the margin. event
+    (h + 2, w + 2): number of the event, 0 for none, in two bytes where these suffice, so that LAZ takes less time. any_event:
+    whether there is one.
     """
 
     grid: Grid
     values: NDArray[np.float32]
     event: NDArray[np.uint16] | NDArray[np.uint32]
+    any_event: bool
 
     @classmethod
     def of(cls, epoch: Followed, view: WallView, out: Path) -> _PointMaps:
         """Read the maps of an epoch that are in the folder of results."""
         names = [out / f"{kind}_{epoch.number:03d}{view.suffix}.tif" for kind in ("difference", "lod")]
-        values = np.stack([np.append(read_geotiff(name)[0], np.float32(np.nan)) for name in names], axis=1)
+        values = np.stack([np.pad(read_geotiff(name)[0], 1, constant_values=np.nan) for name in names], axis=2)
         largest = max((region.identity for region in epoch.regions), default=0)
-        event = np.append(event_raster(epoch.regions, view), 0).astype(np.min_scalar_type(max(largest, _LEAST_LARGEST)))
-        return cls(view.grid, np.rint(values / _VALUE_STEP_M) * _VALUE_STEP_M, event)
+        event = np.pad(event_raster(epoch.regions, view), 1).astype(np.min_scalar_type(max(largest, _LEAST_LARGEST)))
+        return cls(view.grid, np.rint(values / _VALUE_STEP_M) * _VALUE_STEP_M, event, bool(event.any()))
 
-    def at(self, points: FloatArray) -> tuple[NDArray[np.float32], NDArray[np.integer]]:
-        """Return difference and level of detection (n, 2), m, and event (n,) at points (n, 3), frame of the view."""
-        grid = self.grid
-        column = np.floor((points[:, 0] - grid.x_min) / grid.gsd)
-        row = np.floor((grid.y_max - points[:, 1]) / grid.gsd)
-        inside = (column >= 0) & (column < grid.width) & (row >= 0) & (row < grid.height)
-        pixel = np.where(inside, row * grid.width + column, grid.height * grid.width).astype(np.int64)
-        pairs = self.values.view(np.int64).ravel()[pixel]  # of two float32 each: faster than by rows
-        return pairs.view(np.float32).reshape(-1, 2), self.event[pixel]
+    def fill(self, records: NDArray[np.void], points: FloatArray) -> None:
+        """Fill difference, level of detection and event of records (n,) from the maps at points (3, n), frame of the view."""
+        column = (points[0] - (self.grid.x_min - self.grid.gsd)) / self.grid.gsd
+        row = ((self.grid.y_max + self.grid.gsd) - points[1]) / self.grid.gsd
+        pixel = np.clip(row, 0, self.grid.height + 1, out=row).astype(np.int64)
+        pixel *= self.grid.width + 2
+        pixel += np.clip(column, 0, self.grid.width + 1, out=column).astype(np.int64)
+        _pairs_of(records)[:] = self.values.view(np.int64).ravel().take(pixel)
+        records["event"] = self.event.ravel().take(pixel) if self.any_event else 0
+
+
+def _pairs_of(records: NDArray[np.void]) -> NDArray[np.int64]:
+    """Return a view (n,) of the pairs of difference and level of detection in records, eight bytes each, as one number."""
+    place = records.dtype.fields["distance_m"][1] if records.dtype.fields else 0
+    pair = np.dtype({"names": ["pair"], "formats": [np.int64], "offsets": [place], "itemsize": records.dtype.itemsize})
+    return np.asarray(records.view(pair)["pair"])
 
 
 def write_results(result: Result) -> None:

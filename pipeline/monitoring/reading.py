@@ -190,7 +190,7 @@ class EpochData:
         """Yield all points in pieces (n, 3), wall frame, m, moved by `motion`; both rotations are applied at once."""
         turned = RigidTransform(motion.rotation @ frame.rotation, motion.translation)
         for piece in in_pieces(self.chunks(), POINTS_AT_ONCE):
-            yield turned.apply(piece - frame.origin)
+            yield turned.apply_to_columns((piece - frame.origin).T).T
 
 
 def in_pieces(chunks: Iterable[FloatArray], most: int) -> Iterator[FloatArray]:
@@ -395,7 +395,7 @@ def _epochs_of_run(folder: Path, pattern: str) -> list[EpochSource]:
 def _of_run(source: EpochSource, run: dict[str, Any]) -> EpochData:
     """An epoch of a run, whose points are in the wall frame of its config."""
     frame = _frame_of_run(run)
-    (scan,) = read_scans(source.files[0])
+    (scan,) = read_scans(source.files[0], only_points=True)
     middle = scan.cloud.points.mean(axis=0) + np.array([0.0, 0.0, _BEFORE_M])
     notes = ("an epoch of a run of simulate: its points were put into survey coordinates",)
     return EpochData(frame.to_world(scan.cloud.points), None, frame.to_world(middle), "", notes)
@@ -416,7 +416,7 @@ def _read_file(path: Path, options: MonitorOptions) -> EpochData:
     if not is_cloud(path):
         mesh, notes = read_mesh(path, options.unit or "m")
         return EpochData(mesh.vertices, mesh, _before(mesh), "", notes)
-    scans = read_scans(path, options.unit, options.columns)
+    scans = read_scans(path, options.unit, options.columns, only_points=True)
     positions = [scan.position for scan in scans if scan.position is not None]
     notes = tuple(dict.fromkeys(note for scan in scans for note in scan.cloud.notes))
     position = np.mean(positions, axis=0) if positions else None

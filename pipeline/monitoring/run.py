@@ -10,13 +10,14 @@ import hashlib
 import json
 import pickle
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
-from pipeline.dataset.cluster import map_on_workers
+from pipeline.dataset.cluster import BackgroundStart, map_on_workers, workers_in_background
 from pipeline.formats.files.atomic import empty_folder, write_bytes
 from pipeline.formats.files.checksum import sha256
 from pipeline.formats.rasters.geotiff import write_geotiff
@@ -36,6 +37,8 @@ from pipeline.monitoring.targets import TargetFit, fit_targets, read_targets
 from pipeline.report.progress import Progress
 from scene.common.errors import InputError
 
+_MODULES = ("pipeline.monitoring.run", "pipeline.monitoring.report")
+"""Modules that workers need, and import while the reference is prepared."""
 _TENTH = 0.1
 _UNLIKE_UNITS = 3.0
 """Ratio of the extents of two epochs from which their units are taken to differ."""
@@ -122,6 +125,24 @@ def monitor(
     progress = progress or Progress()
     if not resume:
         empty_folder(out)
+    count = min(workers, len(sources) - 1)
+    with ExitStack() as stack:
+        # An earlier call may have left nothing to do, so workers of a resumed one are started where they are needed.
+        early = count > 1 and not resume
+        started = stack.enter_context(workers_in_background(count, _MODULES)) if early else None
+        return _monitored(sources, out, options, count, resume, progress, started)
+
+
+def _monitored(
+    sources: Sequence[EpochSource],
+    out: Path,
+    options: MonitorOptions,
+    workers: int,
+    resume: bool,
+    progress: Progress,
+    started: BackgroundStart | None,
+) -> Result:
+    """Do the work of `monitor`, on workers that were started before if there are any."""
     with progress.stage(f"reference {sources[0].name}"):
         site = prepared(sources[0], options)
     fingerprint = _fingerprint(site, options)
@@ -132,7 +153,7 @@ def monitor(
     for number, _ in left:
         discard(out, number)
     if workers > 1 and len(left) > 1:
-        records |= _compared_in_processes(left, site, out, options, fingerprint, workers, progress)
+        records |= _compared_in_processes(left, site, out, options, fingerprint, workers, progress, started)
     followed = []
     catalogue = Catalogue()
     for number, source in further:
@@ -171,6 +192,7 @@ def _compared_in_processes(
     fingerprint: str,
     workers: int,
     progress: Progress,
+    started: BackgroundStart | None,
 ) -> dict[int, EpochRecord | None]:
     """The records of epochs, compared on local workers of Dask, by number."""
     found: dict[int, EpochRecord | None] = {}
@@ -179,7 +201,9 @@ def _compared_in_processes(
     with progress.stage("comparisons"):
         write_bytes(shared, pickle.dumps(site, pickle.HIGHEST_PROTOCOL))
         try:
-            for record in map_on_workers(_in_worker, tasks, workers):
+            for record in map_on_workers(_in_worker, tasks, workers, started):
+                if not found:
+                    import pipeline.monitoring.report  # noqa: F401  loads Matplotlib while the workers are busy
                 found[record.number] = record
                 progress.advance(len(found) / len(left))
         finally:

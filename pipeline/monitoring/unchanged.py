@@ -7,9 +7,9 @@ far beyond it has changed. Most walls lose rock in many places and gain hardly a
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 from scipy.special import ndtri
 
 from pipeline.monitoring.raster_statistics import dilated, mean_over_squares, quantiles
@@ -87,18 +87,23 @@ def _changed(means: dict[int, NDArray[np.float32]], unchanged: NDArray[np.bool_]
     for sign in (1.0, -1.0):
         begun = np.zeros(unchanged.shape, dtype=bool)
         for side in _SQUARES_PX:
-            begun |= sign * means[side] > _CHANGED * scatter[side]
+            begun |= _beyond(means[side], _CHANGED * scatter[side], sign)
         if not begun.any():
             continue
-        reached = (sign * means[3] > _GROWS * scatter[3]) | begun
+        reached = _beyond(means[3], _GROWS * scatter[3], sign) | begun
         changed |= _connected_with(begun, reached)
     return changed
 
 
+def _beyond(means: NDArray[np.float32], limit: float, sign: float) -> NDArray[np.bool_]:
+    """(h, w) where means of one sign, 1 or -1, are farther from zero than a limit; NaN is not."""
+    return np.asarray(means > np.float32(limit) if sign > 0 else means < np.float32(-limit))
+
+
 def _connected_with(begun: NDArray[np.bool_], reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(h, w) connected parts of `reached` that contain a pixel of `begun`, all of which are in `reached`."""
-    labels, count = ndimage.label(reached)
-    wanted = np.zeros(count + 1, dtype=bool)
+    count, labels = cv2.connectedComponents(reached.view(np.uint8), connectivity=4)
+    wanted = np.zeros(count, dtype=bool)
     wanted[labels[begun]] = True
     return np.asarray(wanted[labels])
 

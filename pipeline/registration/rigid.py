@@ -59,6 +59,20 @@ class RigidTransform:
                 moved[start : start + _AT_ONCE, axis] = row[0] * x + row[1] * y + row[2] * z + shift
         return moved.reshape(points.shape)
 
+    def apply_to_columns(self, columns: FloatArray) -> FloatArray:
+        """Apply the rigid transform to the columns x, y, z (3, n) of points, m, and return those of the moved points.
+
+        This is faster than `apply` for so few points that they stay in the processor's cache.
+        """
+        x, y, z = columns
+        moved = np.empty(columns.shape)
+        for column, row, shift in zip(moved, self.rotation, self.translation, strict=True):
+            np.multiply(x, row[0], out=column)
+            column += row[1] * y
+            column += row[2] * z
+            column += shift
+        return moved
+
     def after(self, first: RigidTransform) -> RigidTransform:
         """Compose two rigid transforms: return the one that applies `first` and then this one."""
         return RigidTransform(self.rotation @ first.rotation, self.rotation @ first.translation + self.translation)

@@ -15,6 +15,8 @@ def bounding_box(points: FloatArray) -> FloatArray:
 
     The result is that of `points.min(axis=0)` and `points.max(axis=0)`, which take ten times as long.
     """
+    if points.T.flags.c_contiguous:  # coordinates that are stored column by column
+        return np.array([[column.min() for column in points.T], [column.max() for column in points.T]])
     whole = len(points) // _ROWS * _ROWS
     rows, rest = points[:whole].reshape(-1, _ROWS * points.shape[1]), points[whole:]
     return np.array([_extreme(np.minimum, rows, rest), _extreme(np.maximum, rows, rest)])

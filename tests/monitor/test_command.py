@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -160,8 +161,8 @@ def test_an_error_of_map_on_workers_is_one_line(
 ) -> None:
     """A worker sends its error to the main process as pickled bytes. Here this process plays the worker."""
 
-    def here(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], count: int) -> Iterator[Any]:
-        assert count == 2
+    def here(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], count: int, started: None) -> Iterator[Any]:
+        assert (count, started) == (2, None)
         for task in tasks:
             try:
                 yield function(*pickle.loads(pickle.dumps(task)))
@@ -169,6 +170,7 @@ def test_an_error_of_map_on_workers_is_one_line(
                 raise pickle.loads(pickle.dumps(error)) from None
 
     monkeypatch.setattr(run, "map_on_workers", here)
+    monkeypatch.setattr(run, "workers_in_background", lambda count, modules: nullcontext())
     first, second, _ = map(str, sorted(scans.glob("*.las")))
     las(tmp_path / "site_2026-03-15.las", points(2000, 4) + np.array([5000.0, 0, 0]))
     words = ["monitor", first, str(tmp_path / "site_2026-03-15.las"), second, "--position", ",".join(STATION.split())]

@@ -174,9 +174,6 @@ class _Scripted:
     def with_harmonics(self, members: Any, form: Any) -> Any:
         return form
 
-    def may_be_reference_error(self, members: EffectSet, form: FamilyScore) -> bool:
-        return False
-
 
 class _Cameras(_Scripted):
     """A search whose best explanation depends on which effects are fitted together.

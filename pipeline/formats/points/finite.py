@@ -63,4 +63,4 @@ def _on_a_line(points: FloatArray) -> bool:
     away = away - away[len(away) // 2]
     axis = away[np.argmax(np.einsum("ni,ni->n", away, away))]
     beside = away - np.outer(away @ axis / (axis @ axis), axis)
-    return bool(np.linalg.norm(beside, axis=1).max() < max(_ONE_PLACE_M, 1e-9 * np.abs(points).max()))
+    return bool(np.linalg.norm(beside, axis=1).max() < max(_ONE_PLACE_M, 1e-9 * np.abs(bounding_box(points)).max()))

@@ -2,36 +2,44 @@
 
 from __future__ import annotations
 
-import itertools
 import struct
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import laspy
 import numpy as np
 from lazrs import LazrsError  # type: ignore[import-untyped]
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from pipeline.formats.files.atomic import writing
 from pipeline.formats.point_cloud import PointCloud
 from pipeline.formats.points.las_statements import flagged, stated_units
-from pipeline.formats.points.laz import LazHeader, PulseChannels, StoredCloud, check_extent, check_quantisation, damaged, writer
+from pipeline.formats.points.laz import (
+    POINT_FIELDS,
+    LazHeader,
+    PulseChannels,
+    StoredCloud,
+    check_extent,
+    check_quantisation,
+    damaged,
+    writer,
+)
 from pipeline.formats.points.points import check_reach
 from pipeline.formats.units import agreed_units
 from scene.common.errors import InputError
 from scene.common.regular_file import check_file
+from scene.common.threads import map_in_threads
+from scene.geometry.bounds import bounding_box
 from scene.geometry.mesh import FloatArray
 
 CHUNK = 2_000_000
 """Points in memory at a time."""
-_FIELDS = (
-    laspy.DecompressionSelection.XY_RETURNS_CHANNEL
-    | laspy.DecompressionSelection.Z
-    | laspy.DecompressionSelection.CLASSIFICATION
-    | laspy.DecompressionSelection.FLAGS
-)
-"""Fields that are decompressed: coordinates, and what takes points out of use."""
+_FILLED_AT_ONCE = 1 << 14
+"""Points whose records are filled at a time; their arrays then stay in the processor's cache."""
+_SINGLE_RETURN = 0x11
+"""Return number and number of returns of a pulse with one return, as point format 6 stores them."""
 
 
 def count_points(path: Path) -> int:
@@ -65,7 +73,7 @@ def read_chunks(path: Path, unit: str | None = None) -> Iterator[FloatArray]:
     read = 0
     try:
         check_extent(path)
-        with laspy.open(path, decompression_selection=_FIELDS) as reader:
+        with laspy.open(path, decompression_selection=POINT_FIELDS) as reader:
             check_quantisation(reader.header, path)
             factors = agreed_units(stated_units(reader.header, where)[0], unit, where).factors()
             for record in reader.chunk_iterator(CHUNK):
@@ -84,16 +92,63 @@ def read_chunks(path: Path, unit: str | None = None) -> Iterator[FloatArray]:
         )
 
 
-def write_chunks(
-    path: Path, bounds: FloatArray, chunks: Iterable[tuple[FloatArray, Mapping[str, NDArray[Any]]]], header: LazHeader
-) -> None:
-    """Write points that may not fit into the memory to a LAZ file, chunk by chunk.
+class ChunkWriter:
+    """Writes the points of a LAZ file part by part (`chunk_writer` opens one).
+
+    Attributes
+    ----------
+    scales, offsets : (3,) arrays
+        Step of the stored coordinates, m, and the place from which they are counted, m.
+    """
+
+    def __init__(self, las: laspy.LasWriter) -> None:
+        self.scales, self.offsets = np.asarray(las.header.scales), np.asarray(las.header.offsets)
+        self._las = las
+        self._records: NDArray[Any] = np.zeros(0, las.header.point_format.dtype())
+
+    def write(self, count: int, fill: Callable[[NDArray[np.void], slice], None]) -> None:
+        """Write the next points, each of which is the only return of its pulse.
+
+        Parameters
+        ----------
+        count : int
+            Number of points.
+        fill : callable
+            Fills an array of records (k,) with the k points that a slice of `range(count)` names: the coordinates "X", "Y" and
+            "Z" in steps, and the extra dimensions by their names. Threads call it.
+        """
+        if len(self._records) < count:
+            self._records = np.zeros(count, self._records.dtype)
+            self._records["bit_fields"] = _SINGLE_RETURN
+        records = self._records[:count]
+
+        def filled(start: int) -> NDArray[Any]:
+            part = slice(start, min(start + _FILLED_AT_ONCE, count))
+            fill(records[part], part)
+            return bounding_box(np.stack([records[axis][part] for axis in "XYZ"]).T)
+
+        boxes = np.array(map_in_threads(filled, range(0, count, _FILLED_AT_ONCE)))
+        self._las.point_writer.write_points(laspy.PackedPointRecord(records, self._las.header.point_format))
+        self._extend_header(count, boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0))
+
+    def _extend_header(self, count: int, low: NDArray[Any], high: NDArray[Any]) -> None:
+        """Extend numbers and bounding box in the header, as laspy does, but without another look at all points."""
+        header = self._las.header
+        header.mins = np.minimum(header.mins, low * self.scales + self.offsets)
+        header.maxs = np.maximum(header.maxs, high * self.scales + self.offsets)
+        header.number_of_points_by_return[0] += count
+        header.point_count += count
+
+
+@contextmanager
+def chunk_writer(path: Path, bounds: FloatArray, types: Mapping[str, DTypeLike], header: LazHeader) -> Iterator[ChunkWriter]:
+    """Open a LAZ file for points that may not fit into the memory; it exists once the block has ended without an error.
 
     Parameters
     ----------
     path : File to write.
     bounds : (2, 3) corners of a box about all points, m, from which the stored offset follows.
-    chunks : Points (n, 3), m, with their extra dimensions by name: the same names and types in each chunk, one chunk at least.
+    types : Types of the extra dimensions by name.
     header : Header values.
 
     Raises
@@ -101,13 +156,10 @@ def write_chunks(
     InputError
         If the file cannot be written.
     """
-    waiting = iter(chunks)
-    first = next(waiting)
-    corners = PointCloud(bounds, extra={name: np.zeros(2, values.dtype) for name, values in first[1].items()})
+    corners = PointCloud(bounds, extra={name: np.zeros(2, kind) for name, kind in types.items()})
     stored = StoredCloud.of(corners, PulseChannels(), header)
     with writing(path) as temporary, temporary.open("wb") as file, writer(file, stored.header, compress=True) as las:
-        for points, extra in itertools.chain([first], waiting):
-            las.write_points(stored.with_points(PointCloud(points, extra=dict(extra))).records(slice(None)))
+        yield ChunkWriter(las)
 
 
 def _in_use(record: Any, factors: FloatArray, where: str) -> FloatArray:

@@ -69,7 +69,7 @@ def read_points(path: Path) -> PointCloud:
 
 
 def read_placed_scans(
-    path: Path, unit: str | None = None, columns: Sequence[str] = (), option: str = "--unit"
+    path: Path, unit: str | None = None, columns: Sequence[str] = (), option: str = "--unit", *, only_points: bool = False
 ) -> list[PlacedScan]:
     """Read all laser scans of a point cloud file, in metres and without points that stand for a missing return.
 
@@ -79,6 +79,7 @@ def read_placed_scans(
     unit : Name of the coordinates' unit, such as "mm"; None: as the file states, or metres.
     columns : Names of a text file's columns, instead of the file's own.
     option : Command-line option that gives the unit, for errors.
+    only_points : Whether intensity, times and other channels may be left out, which saves time for LAS and LAZ files.
 
     Raises
     ------
@@ -86,7 +87,7 @@ def read_placed_scans(
         If the format is unknown, the file is wrong or contradicts the unit, or coordinates are impossible.
     """
     where = str(check_file(path))
-    scans = _read(path, columns)
+    scans = _read(path, columns, only_points)
     if not any(len(scan.cloud.points) for scan in scans):
         raise InputError("the file has no points", where=where, remedy="export the file again, with its points")
     found = []
@@ -111,7 +112,7 @@ def check_reach(points: FloatArray, where: str) -> None:
         )  # fmt: skip
 
 
-def _read(path: Path, columns: Sequence[str]) -> list[PlacedScan]:
+def _read(path: Path, columns: Sequence[str], only_points: bool) -> list[PlacedScan]:
     """Return the scans in the file's unit, without fillers."""
     suffix, where = path.suffix.lower(), str(path)
     if suffix == ".e57":
@@ -123,7 +124,7 @@ def _read(path: Path, columns: Sequence[str]) -> list[PlacedScan]:
     elif suffix in (".laz", ".las"):
         from pipeline.formats.points.laz import read_laz  # laspy takes a fifth of a second to load
 
-        cloud = read_laz(path)
+        cloud = read_laz(path, only_points=only_points)
     elif suffix == ".ply":
         cloud = read_ply_points(path)
     else:

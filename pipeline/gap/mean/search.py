@@ -10,7 +10,6 @@ import numpy as np
 from pipeline.gap.mean.candidates import Candidate, ExplanationKey, SineGrid
 from pipeline.gap.mean.design import Design
 from pipeline.gap.mean.detection_power import DetectableSize, detectable_sizes
-from pipeline.gap.mean.mean_model import MeanFit
 from pipeline.gap.mean.nonparametric_terms import HARMONIC_ORDERS, HARMONIC_SERIES, LINE_PATTERN, SPATIAL_NULL, harmonics
 from pipeline.gap.mean.null_distribution import NullDistribution
 from pipeline.gap.mean.selection import EffectSet, FamilyScore, ForwardSelection, SelectedEffect
@@ -107,7 +106,7 @@ class MeanSearch:
             best = int(np.argmax(ratios))
             candidate = families.plain[rows[best]] if best < len(rows) else families.sine(sines[best - len(rows)])
             ratio = float(ratios[best])
-            negligible = ratio < thresholds().mean.least_relative_gain * alone.get((candidate.name, candidate.empirical), 0.0)
+            negligible = ratio < thresholds().mean.class_share * alone.get((candidate.name, candidate.empirical), 0.0)
             found.append(
                 FamilyScore(candidate.name, candidate.empirical, ratio - self._null.penalty(name), ratio, candidate, negligible)
             )
@@ -251,7 +250,7 @@ class MeanSearch:
             for each in self.score_families(members)
             if each.candidate.form.startswith(LINE_PATTERN) and each.name == form.name
         ]
-        good = [each for each in patterns if each.score > form.score - thresholds().mean.nonparametric_margin]
+        good = [each for each in patterns if each.score > form.score - thresholds().mean.class_margin]
         return min(good, key=lambda each: each.candidate.period)
 
     def _wave_instead(self, members: EffectSet, form: FamilyScore) -> FamilyScore:
@@ -281,25 +280,7 @@ class MeanSearch:
             return replace(form, candidate=both, log_likelihood_ratio=form.log_likelihood_ratio + ratio, score=form.score + score)
 
         best = max(map(with_overtones, HARMONIC_ORDERS), key=lambda each: each.score)
-        return best if best.score >= form.score + thresholds().mean.nonparametric_margin else form
-
-    def may_be_reference_error(self, members: EffectSet, form: FamilyScore) -> bool:
-        """Tell whether a wave in the residuals is so small that it may be part of the reference surface's error.
-
-        The wave's standard deviation is compared with that of the reference's error. The latter is estimated in the same fit; at
-        most the threshold `grid_noise.reference_error` is taken for it.
-
-        Parameters
-        ----------
-        members : Other errors in the model, fitted jointly.
-        form : The wave: a non-parametric term with its score. For a term that is no wave the answer is false.
-        """
-        if form.candidate.form != "wave":
-            return False
-        size, fit = self._fitted_std_and_fit(form, members)
-        most = thresholds().grid_noise.reference_error / float(np.median(self.design.residuals.unit_m))
-        error = min(float(np.sqrt(fit.cell_covariance.variance_ratio)) * self.design.model.typical_sigma, most)
-        return size < thresholds().mean.least_wave_sigmas * error
+        return best if best.score >= form.score + thresholds().variance.least_gain else form
 
     def fitted_std(self, item: FamilyScore) -> float:
         """Return how large a candidate error is: the standard deviation of its fitted values over the points.
@@ -309,14 +290,9 @@ class MeanSearch:
 
         item: the candidate with its score.
         """
-        return self._fitted_std_and_fit(item, ())[0]
-
-    def _fitted_std_and_fit(self, form: FamilyScore, members: EffectSet) -> tuple[float, MeanFit]:
-        """Return the standard deviation of the fitted values of `form`, fitted jointly with `members`, and the joint fit."""
-        candidates, fit = self.design.fit_refined([form.candidate, *(member.candidate for member in members)])
+        candidates, fit = self.design.fit_refined([item.candidate])
         columns = candidates[0].columns
-        values = self.design.split_coefficients(fit.coefficients, candidates)[0][: columns.shape[1]]
-        return float(np.std(columns @ values)), fit
+        return float(np.std(columns @ self.design.split_coefficients(fit.coefficients, candidates)[0][: columns.shape[1]]))
 
     def leading_effects(self) -> list[Candidate]:
         """List the sensor errors that explain the most on their own, which are worth refitting without linearisation.

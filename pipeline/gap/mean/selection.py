@@ -1,4 +1,4 @@
-"""Select the systematic effects: forward selection of sets of up to three, tested against a simulated null distribution.
+"""Select the systematic effects: forward selection of sets, tested against a simulated null distribution.
 
 The score of a candidate is its penalised log-likelihood ratio: the log-likelihood ratio minus twice its mean under the
     null. It estimates the ratio on new data; for k linear columns the penalty is k, as in AIC, and it is larger if a period
@@ -14,11 +14,11 @@ from typing import Protocol
 
 from pipeline.gap.mean.candidates import Candidate
 from pipeline.gap.mean.nonparametric_terms import POLYNOMIAL, SPATIAL_NULL
-from pipeline.gap.thresholds import thresholds
+from pipeline.gap.thresholds import equivalence_margin, thresholds
 from sensors.effects.range_offset import RangeOffset
 
-_BEAM_WIDTH = 5
-"""Number of the best sets of one size that are grown further (beam width)."""
+_BEAM_WIDTH, _MOST_EFFECTS = 5, 9
+"""Number of the best sets of one size that are grown further (beam width), and largest size of a set."""
 _NOT_SPATIAL = ("intensity", "disparity_fraction")
 """Covariates that do not vary along the wall, so that the reference's error cannot imitate their effects."""
 
@@ -121,23 +121,9 @@ class _Set:
         ]
         found = [item for item in terms if _beats_spatial_null(item, null_score)]
         one_covariate = next((item for item in found if item.candidate.form != POLYNOMIAL), None)
-        by = thresholds().mean
-        if one_covariate is None or found[0].score > max(
-            one_covariate.score + by.nonparametric_margin, by.surface_ratio * one_covariate.score
-        ):
+        if one_covariate is None or found[0].score > one_covariate.score + thresholds().variance.least_gain:
             return found[0] if found else None
         return one_covariate
-
-
-def equivalence_margin(log_likelihood_ratio: float) -> float:
-    """Return the difference of scores within which two effects count as indistinguishable, so that both are reported.
-
-    It is the threshold `mean.class_margin`, or the share `mean.class_share` of the log-likelihood ratio if that is larger. The
-    pattern of residuals of an effect is linearised, and is inexact by such a share.
-
-    log_likelihood_ratio: log-likelihood with the chosen effect minus that without it.
-    """
-    return max(thresholds().mean.class_margin, thresholds().mean.class_share * log_likelihood_ratio)
 
 
 def _replacements(names: frozenset[str], name: str, margin: float, scores: SetScores) -> list[str]:
@@ -154,11 +140,10 @@ def _unreported_score(form: FamilyScore | None) -> float:
 
 def _beats_spatial_null(item: FamilyScore, null_score: float) -> bool:
     """Tell whether a non-parametric term clearly beats the best spatial null candidate, whose score is `null_score`."""
-    by = thresholds().mean
+    beats = item.score > null_score + thresholds().variance.least_gain
     if item.candidate.form == POLYNOMIAL:
-        return item.score > max(null_score + by.nonparametric_margin, by.least_surface_score)
-    least = (by.null_wave_ratio if item.candidate.form == "wave" else 1.0) * null_score + by.nonparametric_margin
-    return item.name in _NOT_SPATIAL or item.score > least
+        return beats and item.score > thresholds().mean.least_nonparametric_score
+    return beats or item.name in _NOT_SPATIAL
 
 
 class CandidateScorer(Protocol):
@@ -202,17 +187,6 @@ class CandidateScorer(Protocol):
         form : The term with its score; one that is not periodic is returned unchanged.
         """
 
-    def may_be_reference_error(self, members: EffectSet, form: FamilyScore) -> bool:
-        """Tell whether a wave in the residuals is so small that the reference surface's own error may cause it.
-
-        It is if the standard deviation of the fitted wave is below a threshold's multiple of that of the reference's error.
-
-        Parameters
-        ----------
-        members : The systematic errors already in the model, which are fitted together with the wave.
-        form : The wave: a non-parametric term with its score. For a term that is no wave the answer is false.
-        """
-
 
 @dataclass(frozen=True)
 class ForwardSelection:
@@ -238,7 +212,7 @@ class ForwardSelection:
         """
         empty = _Set((), 0.0, self.search.score_families(()))
         levels, scores = [[empty]], SetScores()
-        while len(levels) <= thresholds().mean.most_effects:
+        while len(levels) <= _MOST_EFFECTS:
             grown, of_sets = self._grow(levels[-1])
             if not grown or not self._significant(grown[0].score - levels[-1][0].score):
                 break
@@ -246,8 +220,8 @@ class ForwardSelection:
             scores |= of_sets
         best = levels[-1][0]
         members, form = self._nonparametric_term(levels) or ((), None)
-        form = None if form is None else self.search.with_harmonics(members, form)
-        if form is not None and not self.search.may_be_reference_error(members, form):
+        if form is not None:
+            form = self.search.with_harmonics(members, form)
             chosen = [self.with_equivalents(members, item, scores) for item in members]
             chosen.append(
                 SelectedEffect(
@@ -261,7 +235,7 @@ class ForwardSelection:
             )
             return chosen, self.search.score_families((*members, form))
         best, chosen = self._drop_below_spatial_null(best, scores)
-        nearly = (1 - thresholds().mean.least_relative_gain) * empty.spatial_null_score
+        nearly = (1 - thresholds().mean.class_share) * empty.spatial_null_score
         if best.score <= max(nearly, _unreported_score(empty.nonparametric)):  # no effect of the catalogue explains it as well
             return [], empty.family_scores
         return chosen, best.family_scores
@@ -315,14 +289,8 @@ class ForwardSelection:
         if not best.members or alone is None:
             return None
         score = max(best.score, self.search.joint_score(best.members))
-        margin = (
-            max(thresholds().mean.nonparametric_margin, thresholds().mean.least_relative_gain * score)
-            if len(best.members) < 2
-            else 0.0
-        )
-        if alone.score > score + margin:
-            return (), alone
-        return None
+        margin = max(thresholds().variance.least_gain, thresholds().mean.class_share * score) if len(best.members) < 2 else 0.0
+        return ((), alone) if alone.score > score + margin else None
 
     def _effects_required(self, state: _Set, score: float, form: FamilyScore) -> bool:
         """Tell whether the data require the effects of a set beside a non-parametric term.
@@ -366,5 +334,5 @@ class ForwardSelection:
         )
 
     def _significant(self, score: float) -> bool:
-        """Tell whether a score is large enough and significant."""
-        return score >= thresholds().mean.least_score and self.search.p_value(score) <= thresholds().mean.significance
+        """Tell whether a score is significant."""
+        return self.search.p_value(score) <= thresholds().mean.significance

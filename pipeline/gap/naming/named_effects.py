@@ -22,7 +22,7 @@ from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
 from pipeline.gap.residuals.alignment import AlignedMeasurement, align
 from pipeline.gap.residuals.residuals import Residuals
 from pipeline.gap.residuals.tls_residuals import TlsResiduals
-from pipeline.gap.thresholds import thresholds
+from pipeline.gap.thresholds import largest_relative_size, thresholds
 from scene.common.config import parse
 from scene.common.errors import InputError
 from scene.geometry.mesh import FloatArray
@@ -166,7 +166,7 @@ def only_within_bounds(model: TlsModel | StereoModel, named: list[NamedEffect]) 
 def is_plausible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
     """Tell whether a fitted sensor error (effect) is plausible, so that absurd explanations are not reported.
 
-    It is if a config accepts its values and its size is at most `mean.largest_size` (a threshold, by default 100) times its
+    It is if a config accepts its values and its size is at most `largest_relative_size` (by default 100) times its
     typical size in the catalogue.
 
     model: the sensor model that would contain the effect.
@@ -174,7 +174,7 @@ def is_plausible(model: TlsModel | StereoModel, entry: dict[str, Any]) -> bool:
     """
     if not within_bounds(model, entry):
         return False
-    return relative_size(entry) <= thresholds().mean.largest_size
+    return relative_size(entry) <= largest_relative_size()
 
 
 def relative_size(entry: dict[str, Any]) -> float:
@@ -482,7 +482,7 @@ def absorbed_by_registration(
 
     A shift and rotation of the sensor imitates such an effect almost completely, so the pose fit absorbs it. Two thresholds
     tell it: a share of less than `mean.absorbed_share` of its signature (the pattern of residuals that it makes) is left beside
-    the pose, and its size is more than `mean.absorbed_size` times the typical one.
+    the pose, and its size is more than one standard deviation of its prior, `mean.prior_size`.
 
     Parameters
     ----------
@@ -496,5 +496,5 @@ def absorbed_by_registration(
     """
     by = thresholds().mean
     doubtful = [each for each in estimates if not each.candidate.empirical and survival[each.candidate.name] < by.absorbed_share]
-    large = [each for each in doubtful if relative_size(effect_from_estimate(each, part).entry) > by.absorbed_size]
+    large = [each for each in doubtful if relative_size(effect_from_estimate(each, part).entry) > by.prior_size]
     return frozenset((each.candidate.name, False) for each in large)

@@ -11,14 +11,14 @@ from pipeline.formats.measurements.measurement import Measurement
 from pipeline.gap.mean.candidates import Candidate, ExplanationKey, SineGrid, prior_precision
 from pipeline.gap.mean.nonparametric_terms import HARMONIC_ORDERS, HARMONICS, harmonics
 from pipeline.gap.mean.search import MeanSearch
-from pipeline.gap.mean.selection import FamilyScore, SelectedEffect, equivalence_margin
+from pipeline.gap.mean.selection import FamilyScore, SelectedEffect
 from pipeline.gap.naming.candidate_families import PERIODIC, candidate_families, catalogue_families
 from pipeline.gap.naming.named_effects import Estimate, aligned_with, effect_from_estimate, out_of_bounds
 from pipeline.gap.naming.search_residuals import with_added_variance, with_fitted_variance
 from pipeline.gap.noise_and_edges.variance_model import VarianceTerm
 from pipeline.gap.residuals.alignment import AlignedMeasurement, at_points_of, fit_pose_robustly
 from pipeline.gap.residuals.residuals import BoolArray, Residuals
-from pipeline.gap.thresholds import thresholds
+from pipeline.gap.thresholds import equivalence_margin, thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 
@@ -300,7 +300,7 @@ def _strongest_single_fits(given: SearchInput, first: MeanSearch, together: list
     Empty where the linearised model is good enough: its error is smaller than the gain of any selected effect.
     """
     found: list[_SingleFit] = []
-    tolerance = min([thresholds().mean.linearisation_error, *(_ABSORBED_SHARE * each.log_likelihood_ratio for each in together)])
+    tolerance = min([thresholds().mean.class_margin, *(_ABSORBED_SHARE * each.log_likelihood_ratio for each in together)])
     for candidate in first.leading_effects():
         alone = _single_fit(given, first, candidate)
         if alone is None:

@@ -303,7 +303,7 @@ def best_pass(inputs: PassInputs, random: KeyedRandom, excluded: frozenset[tuple
     simple = found[-1].complexity <= _LEAST_COMPLEXITY and found[-1].selection.noise_ratio <= found[0].selection.noise_ratio
     if Smoothing.tag() in first.edge_effect_names and found[0].complexity >= (1, 0) and not simple:
         found.insert(1, search_edges_again(SelectionPass.of(inputs.at_initial_pose, random, excluded)))
-    most_noise = thresholds().edges.most_relative_noise * min(each.selection.noise_ratio for each in found)
+    most_noise = thresholds().verdict.overdispersion * min(each.selection.noise_ratio for each in found)
     return min((each for each in found if each.selection.noise_ratio <= most_noise), key=lambda each: each.complexity)
 
 

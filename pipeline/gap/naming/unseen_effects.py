@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.gap.mean.detection_power import DetectableSize
 from pipeline.gap.residuals.residuals import Residuals
-from pipeline.gap.thresholds import thresholds
+from pipeline.gap.thresholds import largest_relative_size
 from sensors.effects.base import Effect, ShowsIn
 
 _NOT_COMPUTED = {
@@ -51,7 +51,7 @@ def unseen_effects(residuals: Residuals, computed: Iterable[DetectableSize], nam
 def _plausible(item: DetectableSize, effect: type[Effect] | None) -> DetectableSize:
     """Return the detectable size of an effect, but without a value if it is larger than any plausible one."""
     typical = effect.typical_sizes().get(item.parameter, np.inf) if effect is not None else np.inf
-    if item.size <= thresholds().mean.largest_size * typical and np.isfinite(item.size):
+    if item.size <= largest_relative_size() * typical and np.isfinite(item.size):
         return item
     return replace(item, size=np.inf, note=_NO_SIZE)
 

@@ -102,11 +102,7 @@ def _is_weak(item: NamedEffect) -> bool:
     This is so if its log-likelihood ratio g is at most its standard error sqrt(2 g), or if the effect is consistent with zero.
     """
     by = thresholds().validation
-    return (
-        item.kind == "physical"
-        and item.effect.scored()
-        and (item.gain <= by.least_gain_beside_others or _is_consistent_with_zero(item))
-    )
+    return item.kind == "physical" and item.effect.scored() and (item.gain <= by.least_gain or _is_consistent_with_zero(item))
 
 
 def describe_weakness(item: NamedEffect) -> str:
@@ -201,8 +197,8 @@ def _gain_needed(expected: float) -> float:
     """
     likely = max(expected, 0.0)
     return max(
-        min(0.0, likely - thresholds().validation.shortfall_sigmas * float(np.sqrt(2 * likely))),
-        -thresholds().validation.most_loss,
+        min(0.0, likely - thresholds().verdict.gap_sigmas * float(np.sqrt(2 * likely))),
+        -thresholds().validation.least_gain,
     )
 
 

@@ -69,7 +69,7 @@ class Evidence:
     def much_moved(self) -> bool:
         """Whether so much of the wall moved that nothing can be said about the sensor.
 
-        By default, 30 % of the points must lie off the reference together with their neighbours.
+        By default, 20 % of the points must lie off the reference together with their neighbours.
         """
         return self.moved_share >= thresholds().changes.moved_share
 
@@ -266,11 +266,10 @@ def note_moved_wall(evidence: Evidence, stable_areas: bool) -> list[str]:
     """
     if not evidence.much_moved:
         return []
-    by = thresholds().changes
+    sigmas, least_mm = thresholds().changes.faint_sigmas, 1e3 * thresholds().points.reference_error
     said = (
         f"{100 * evidence.moved_share:.0f} % of the points lie off the reference together with their neighbours, by more than "
-        f"{by.faint_sigmas:g} predicted standard deviations and {1e3 * by.smallest_departure:g} mm: rock moved, or the reference "
-        "shows another place or time"
+        f"{sigmas:g} predicted standard deviations and {least_mm:g} mm: rock moved, or the reference shows another place or time"
     )
     remedy = "the given stable_areas are not stable" if stable_areas else "add stable_areas where nothing moved"
     return [f"{said}; {remedy}, or use a reference of the same time"]

@@ -293,7 +293,7 @@ def _with_moved_share(evidence: Evidence, aligned: Measurement, given: PassInput
         found = compute_residuals(aligned.changed(model=result.model))
         sigma = found.values_at(found.sigma, after.index)
         beside = moved_share(replace(after, sigma=np.where(np.isfinite(sigma), sigma, after.sigma)), sight, given.stable)
-        moved = moved if beside >= thresholds().changes.moved_share_beside_noise else 0.0
+        moved = moved if beside >= thresholds().changes.moved_share else 0.0
     return replace(evidence, moved_share=moved)
 
 
@@ -375,7 +375,7 @@ def _with_heavy_tails(
     rows_of_tails = [item for item in named if not item.adds_variance]
     if len(rows_of_tails) < len(named):
         _, _, middle = _smooth_residuals_with(measurement, rows_of_tails)
-        if middle**2 - 1 > thresholds().variance.core_excess:
+        if middle**2 - 1 > thresholds().variance.least_excess:
             return named, tails
     heavy = effect_from_tails(part, tails.sigma * float(np.median(part.sigma)), tails.gain)
     return [*rows_of_tails, *only_within_bounds(measurement.model, [heavy])[0]], tails

@@ -205,7 +205,7 @@ def find_disparity_edge_effects(
         current = replace(data, beside=[*known_effects, *(each.effect for each in found)])
         results = zip(searches, map_in_threads(partial(_run_search, current), searches.values()), strict=True)
         # no prediction is exact, so a further effect must explain more than the inexact part of those before
-        needed = thresholds().mean.least_relative_gain * max([0.0, *(each.gain for each in found)])
+        needed = thresholds().mean.class_share * max([0.0, *(each.gain for each in found)])
         tried = {name: each for name, each in results if each is not None and each.gain > needed}
         if not tried:
             break
@@ -401,7 +401,7 @@ def _find_filling(data: _EdgeData) -> EdgeEffect | None:
     raster = data.raster
     points = raster.in_filled_occlusions(data.beside)
     gain = float(data.gains(OcclusionFill(reach_px=1e5))[points].sum())
-    if points.sum() < thresholds().edges.fewest_filled or gain < thresholds().edges.least_gain:
+    if points.sum() < thresholds().changes.fewest or gain < thresholds().edges.least_gain:
         return None
     widths, held = _occluded_strips(raster.apply(data.beside), raster)
     reach, std = _estimate_reach(widths, held, raster.step)

@@ -39,8 +39,10 @@ _RIDGE, _SHRINKAGE_PER_LAG = 0.02, 0.2
 """Shares of the covariance of lags that are added to its diagonal: one always, one times the number of lags per wall block,
 because a covariance of few blocks is inexact."""
 _DRAWS = 1999
-_RELATIVE_LENGTHS = tuple(2 ** (half / 2) for half in range(-4, 9))
-"""Correlation lengths of the reference error that are tried, in units of `grid_noise.reference_length`."""
+_FINEST_GRID = 2.0
+"""Narrowest grid that is tried, in cells of the disparity raster (sampling theorem)."""
+_REFERENCE_LENGTHS_M = tuple(0.45 * 2 ** (half / 2) for half in range(-4, 9))
+"""Correlation lengths of the reference error that are tried (standard deviations of a Gaussian), m."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ class _Variogram:
         columns, value = self.root @ np.stack([shape, self._smooth], axis=1), self.root @ self.value
         weights = np.linalg.pinv(columns)
         smooth = float(weights[1] @ value)
-        largest = self._variance(thresholds().grid_noise.reference_error)
+        largest = self._variance(thresholds().points.reference_error)
         if not 0 <= smooth <= largest:
             value = value - np.clip(smooth, 0, largest) * columns[:, 1]
             columns = columns[:, :1]
@@ -105,7 +107,7 @@ class _Variogram:
     @property
     def _trials(self) -> list[tuple[_VariogramFit, float]]:
         """Fits of grids and their steps, px, for which the raster is fine enough."""
-        finest = thresholds().grid_noise.finest_grid * self.step
+        finest = _FINEST_GRID * self.step
         return [(self.fitted(_grid_semivariogram(self.lag, step)), step) for step in _GRID_STEPS_PX if step >= finest]
 
     @property
@@ -118,20 +120,17 @@ class _Variogram:
     def chi2_without_grid(self) -> float:
         """chi^2 of white noise, or of a smooth error of the reference."""
         white = self.fitted(np.ones(len(self.lag))).chi2
-        return min(white, self._chi2_of(self._smooth, thresholds().grid_noise.reference_error))
+        return min(white, self._chi2_of(self._smooth, thresholds().points.reference_error))
 
     @property
     def chi2_of_reference_error(self) -> float:
         """Return chi^2 of the best fit without grid noise.
 
-        Errors of the reference of all correlation lengths are tried; short ones have a lower bound.
+        Errors of the reference of all correlation lengths are tried; below 1 m, the bound falls in proportion to the length.
         """
-        by = thresholds().grid_noise
-        chi2 = self.chi2_without_grid
-        for length in _RELATIVE_LENGTHS:
-            shape = 1 - np.exp(-0.5 * (self.distance_m / (length * by.reference_length)) ** 2)
-            largest = by.reference_error if length >= 1 else by.short_reference_error
-            chi2 = min(chi2, self._chi2_of(shape, largest))
+        most_m, chi2 = thresholds().points.reference_error, self.chi2_without_grid
+        for length_m in _REFERENCE_LENGTHS_M:
+            chi2 = min(chi2, self._chi2_of(1 - np.exp(-0.5 * (self.distance_m / length_m) ** 2), most_m * min(length_m, 1.0)))
         return chi2
 
     def _chi2_of(self, shape: FloatArray, most_m: float) -> float:
@@ -219,11 +218,11 @@ def find_grid_noise(
     if variogram is None or best is None:
         return None, ""
     fit, step, near = best
-    by = thresholds().grid_noise
-    if fit.chi2 >= variogram.chi2_without_grid - by.least_gain or fit.variance <= thresholds().edges.block_sigmas * fit.error:
+    needed = 2 * thresholds().variance.least_gain  # chi^2 is twice a log-likelihood
+    if fit.chi2 >= variogram.chi2_without_grid - needed or fit.variance <= thresholds().edges.block_sigmas * fit.error:
         return None, ""
     without = variogram.chi2_of_reference_error
-    if fit.chi2 >= without - by.least_gain:
+    if fit.chi2 >= without - needed:
         return None, _describe_reference_error(fit, step, variogram.unit_m)
     name, p_value = RegularizationNoise.tag(), variogram.p_value(random)
     found = VarianceTerm(name, name, (), p_value, (without - fit.chi2) / 2, {}, {}, False, np.zeros(len(part)))
@@ -249,9 +248,7 @@ def _name_noise(white: VarianceTerm, part: StereoResiduals, value: FloatArray, m
     white_fit = variogram.fitted(np.ones(len(variogram.lag)))
     if white_fit.variance > 0:
         both = _with_variance(both, white_fit, 1.0)
-    resolved = (
-        thresholds().grid_noise.finest_grid * variogram.step <= _GRID_STEPS_PX[0]
-    )  # otherwise a grid may be too fine for this raster
+    resolved = _FINEST_GRID * variogram.step <= _GRID_STEPS_PX[0]  # otherwise a grid may be too fine for this raster
     white = replace(both, indistinguishable=white.indistinguishable) if resolved else both
     best = variogram.best_grid()
     if best is None or white_fit.chi2 < best[0].chi2 - thresholds().mean.class_margin:

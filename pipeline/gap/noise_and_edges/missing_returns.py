@@ -154,11 +154,11 @@ def explain_missing_returns(
     best, second = (limit, precipitation) if limit.score >= precipitation.score else (precipitation, limit)
     free = _fit_directional_losses(losses, missing.covariates)
     ahead = free.score - max(best.score, 0.0)
-    if ahead > thresholds().mean.nonparametric_margin and _strips_agree(missing, best, free, fit):
+    if ahead > thresholds().variance.least_gain and _strips_agree(missing, best, free, fit):
         best = free
     confidence = 1 / _overdispersion(lost[fit], best.probability[fit], missing.wall_xy[fit])
     best = replace(best, gain=best.gain * confidence, score=best.score * confidence)
-    if best.score < thresholds().missing_returns.least_gain:
+    if best.score < thresholds().variance.least_gain:
         return None
     return replace(
         best,
@@ -180,7 +180,7 @@ def count_isolated_returns(at: FloatArray, early: BoolArray) -> int:
     patch, count = wall_blocks_by_points(at, _PULSES_PER_PATCH), int(early.sum())
     number = int(patch.max()) + 1
     anywhere = number * (1 - (1 - 1 / number) ** count)
-    return count if len(np.unique(patch[early])) >= thresholds().missing_returns.least_isolated_share * anywhere else 0
+    return count if len(np.unique(patch[early])) >= thresholds().missing_returns.least_agreement * anywhere else 0
 
 
 def _overdispersion(lost: BoolArray, probability: FloatArray, at: FloatArray) -> float:
@@ -202,7 +202,7 @@ def _strips_agree(missing: ExpectedPulses, known: LossExplanation, free: LossExp
     others = (gone.sum(axis=0) - gone + 0.5) / (sent.sum(axis=0) - sent + 1.0)
     p, q = np.clip(known.probability[fit], 1e-9, 1 - 1e-9), others[strip, group]
     sums = np.bincount(strip, np.where(lost, np.log(q / p), np.log1p(-q) - np.log1p(-p)), _STRIPS)
-    return float(sums.sum()) > thresholds().missing_returns.strip_agreement * np.sqrt(_STRIPS) * float(np.linalg.norm(sums))
+    return float(sums.sum()) > thresholds().missing_returns.least_agreement * np.sqrt(_STRIPS) * float(np.linalg.norm(sums))
 
 
 def _quantile_group(values: FloatArray, count: int) -> NDArray[np.int64]:

@@ -49,7 +49,7 @@ def detectable_noise(
     z = standardised_deviations(residuals, cells, value)
     if not np.isfinite(z).any():
         return []
-    used = np.isfinite(z) & (np.abs(z) < thresholds().variance.clip_sigmas * max(1.0, nmad(z, 0.0)))
+    used = np.isfinite(z) & (np.abs(z) < thresholds().points.outlier_sigmas * max(1.0, nmad(z, 0.0)))
     squares = z[used] ** 2 / float(np.mean(z[used] ** 2))
     block = np.unique(wall_block_numbers(residuals.wall_xy[used], cells.side_m), return_inverse=True)[1]
     shapes = [(each.variance[used] / residuals.sigma[used, None] ** 2).sum(axis=1) for each in candidates]

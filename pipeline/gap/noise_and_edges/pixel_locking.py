@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.special import j1, jv
+from scipy.special import chdtri, j1, jv
 
 from pipeline.gap.thresholds import thresholds
 from scene.geometry.mesh import FloatArray
@@ -255,11 +255,11 @@ def _plausible_minimum(shares: FloatArray, chi2: FloatArray, whole: float) -> in
     without locking.
     """
     lowest = (chi2 <= np.append(chi2[1:], np.inf)) & (chi2 <= np.append(np.inf, chi2[:-1]))
-    rows = np.flatnonzero(lowest & (chi2 < chi2.min() + thresholds().locking.equal_fit))
+    rows = np.flatnonzero(lowest & (chi2 < chi2.min() + 2 * thresholds().mean.class_margin))
     unfolded = np.flatnonzero(lowest & (shares < _FOLDING))
     if len(unfolded):
         small = int(unfolded[np.argmin(chi2[unfolded])])
-        if chi2.min() > thresholds().locking.good_fit or (
+        if chi2.min() > chdtri(len(_MULTIPLES), thresholds().mean.significance) or (
             shares[rows[0]] > _LARGE_AMPLITUDE and chi2[small] < _HARMONIC_MISFIT * whole
         ):
             return small

@@ -17,7 +17,7 @@ from pipeline.change.robust import nmad
 from pipeline.gap.noise_and_edges.sign_flips import null_p_value
 from pipeline.gap.residuals.residuals import BoolArray, Geometry, Residuals
 from pipeline.gap.residuals.wall_blocks import WallCells, wall_block_numbers
-from pipeline.gap.thresholds import thresholds
+from pipeline.gap.thresholds import equivalence_margin, thresholds
 from scene.common.keyed_random import KeyedRandom
 from scene.geometry.mesh import FloatArray
 from sensors.effects.base import Effect, ShowsIn
@@ -46,7 +46,7 @@ class VarianceCandidate:
     variance : (n, k) variance that each parameter adds at its typical size, squared unit of the observable (m² or px²).
     scale : (k,) typical sizes; the value of a parameter is scale * sqrt(theta).
     names : (k,) names of the parameters.
-    cost : penalty subtracted from the log-likelihood ratio: 1 for each fitted parameter, less for those in `fixed`.
+    cost : penalty subtracted from the log-likelihood ratio: the number of parameters, with those in `fixed`.
     fixed : values, by name, of parameters that are not fitted; each of a few trial values makes a candidate of its own.
     """
 
@@ -194,8 +194,7 @@ def _candidate(effect: type[Effect], geometry: Geometry, fixed: dict[str, float]
     sizes = effect.typical_sizes()
     columns = np.stack([effect(**fixed, **{key: size}).variance(geometry) for key, size in sizes.items()], axis=1)
     columns = np.minimum(columns, np.quantile(columns, _HIGHEST_QUANTILE, axis=0))
-    cost = len(sizes) + thresholds().variance.trial_cost * len(fixed)
-    return VarianceCandidate(effect.tag(), columns, tuple(sizes.values()), tuple(sizes), cost, fixed)
+    return VarianceCandidate(effect.tag(), columns, tuple(sizes.values()), tuple(sizes), len(sizes) + len(fixed), fixed)
 
 
 def fit_variance_model(
@@ -224,7 +223,7 @@ def fit_variance_model(
         z = standardised_deviations(weighted, cells, value)
         if not np.isfinite(z).any():  # no cell has enough points for a plane and a deviation from it
             return [], [], ""
-        used = np.isfinite(z) & (np.abs(z) < thresholds().variance.clip_sigmas * max(1.0, nmad(z, 0.0)))
+        used = np.isfinite(z) & (np.abs(z) < thresholds().points.outlier_sigmas * max(1.0, nmad(z, 0.0)))
         squares = (z * weighted.sigma)[used] ** 2 / predicted[used]
         shapes = [candidate.variance[used] / predicted[used, None] for candidate in candidates]
         singles = [_JointFit.fitted(squares, shapes, [number], candidates) for number in range(len(shapes))]
@@ -238,7 +237,6 @@ def fit_variance_model(
     tried = [VarianceScore(c.name, fit.gain, fit.score) for c, fit in zip(candidates, singles, strict=True)]
     tried = sorted(_best_variants(tried), key=lambda item: -item.score)
     by = thresholds().variance
-    class_share = thresholds().mean.class_share
     if best.gain < by.least_gain or p_value > thresholds().mean.significance or excess < by.least_excess:
         return [], tried, ""
     # for disparities `grid_noise` compares neighbours, because grid-correlated noise moves them alike too
@@ -252,18 +250,18 @@ def fit_variance_model(
     ]
     pair = max(pairs, key=lambda fit: fit.score, default=best)
     free_name, free_score, free = _best_binned_variance(squares, {name: v[used] for name, v in residuals.covariates.items()})
-    ahead = max(thresholds().mean.nonparametric_margin, class_share * best.gain)
-    # no form of a variance is exact, so a second effect must explain more than the inexact part of the first
-    needed = max(by.least_gain, class_share * best.gain)
+    # no form of a variance is exact, so a second effect or a free form must explain more than the inexact part of the first
+    needed = max(by.least_gain, thresholds().mean.class_share * best.gain)
     agreed = pair.score > best.score + needed and _blocks_agree(squares, best.added(shapes), pair.added(shapes), block)
     chosen = pair if agreed and all(float(theta.max()) > 0 for theta in pair.theta) else best
-    free_fits_better = free_score > chosen.score + ahead and _blocks_prefer_binned(squares, chosen.added(shapes), free, block)
-    empirical = free_fits_better and free_score > chosen.score + by.nonparametric_share * chosen.gain
+    ahead = free_score - chosen.score
+    free_fits_better = ahead > needed and _blocks_agree(squares, chosen.added(shapes), free, block)
+    empirical = free_fits_better and ahead > by.nonparametric_share * chosen.gain
     note = f"the noise also varies with {free_name}, which no effect of the catalogue explains" if free_fits_better else ""
     if empirical:
         chosen, note = best, ""
     tried = sorted([*tried, VarianceScore(free_name, free_score + _BINS, free_score, True)], key=lambda item: -item.score)
-    margin = max(thresholds().mean.class_margin, class_share * chosen.gain)
+    margin = equivalence_margin(chosen.gain)
     found = []
     for place, number in enumerate(chosen.members):
         candidate, theta = candidates[number], chosen.theta[place]
@@ -439,24 +437,9 @@ def _replaces_only(fit: _JointFit, chosen: _JointFit, number: int) -> bool:
 
 def _blocks_agree(squares: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> bool:
     """Whether wall blocks agree that one variance fits better than another, so that the gain is not due to a few blocks."""
-    gain, sigmas = _gain_over(squares, first, second, block)
-    return gain > 0 and sigmas > thresholds().edges.block_sigmas
-
-
-def _blocks_prefer_binned(squares: FloatArray, first: FloatArray, free: FloatArray, block: NDArray[np.int64]) -> bool:
-    """Whether wall blocks agree that a binned variance fits better, which only has to show that the named one does not fit."""
-    gain, sigmas = _gain_over(squares, first, free, block)
-    return gain > 0 and sigmas > thresholds().edges.least_block_sigmas
-
-
-def _gain_over(squares: FloatArray, first: FloatArray, second: FloatArray, block: NDArray[np.int64]) -> tuple[float, float]:
-    """Return the log-likelihood ratio of one variance over another, and its significance.
-
-    The significance is the ratio over the root sum of squares of the wall blocks' contributions.
-    """
     terms = 0.5 * (squares * (second - first) / ((1 + first) * (1 + second)) + np.log1p(first) - np.log1p(second))
     sums = np.bincount(np.unique(block, return_inverse=True)[1], terms)
-    return float(sums.sum()), float(sums.sum() / max(float(np.linalg.norm(sums)), 1e-300))
+    return float(sums.sum()) > thresholds().edges.block_sigmas * float(np.linalg.norm(sums))
 
 
 def _log_likelihood_gain(squares: FloatArray, added: FloatArray) -> float:

@@ -133,7 +133,7 @@ def find_scene_changes(residuals: Residuals, view: SensorView, eligible: BoolArr
         shared = np.sqrt(np.maximum(scatter**2 - _WHITE_MEDIAN_STD**2, 0.0))
         error = np.stack([np.abs(departure / np.where(z == 0, np.inf, z)), shared * residuals.sigma]) * residuals.unit_m
         faint = medians / np.maximum(scatter, _LEAST_MEDIAN_STD)
-        faint[np.abs(medians) * residuals.sigma * residuals.unit_m < thresholds().changes.smallest_departure] = 0.0
+        faint[np.abs(medians) * residuals.sigma * residuals.unit_m < thresholds().points.reference_error] = 0.0
         label, limit = _components(z, faint, view, eligible)
         members = np.flatnonzero(label >= 0)
         beside = view.near(members, thresholds().changes.margin) if len(members) else np.zeros(len(residuals), dtype=bool)
@@ -177,7 +177,7 @@ def moved_share(residuals: Residuals, view: SensorView, eligible: BoolArray) -> 
         return 0.0
     part = residuals.part(known)
     medians = view.part(known).neighbour_median(part.value / part.sigma)
-    far = np.abs(medians) * part.sigma * part.unit_m > thresholds().changes.smallest_departure
+    far = np.abs(medians) * part.sigma * part.unit_m > thresholds().points.reference_error
     return float(np.mean(far & (np.abs(medians) > thresholds().changes.faint_sigmas)))
 
 
@@ -191,12 +191,12 @@ def _components(z: FloatArray, faint: FloatArray, view: SensorView, eligible: Bo
     first, second = view.neighbour_pairs(np.flatnonzero(side))
     together = side[first] * side[second] > 0
     pairs, size = (first[together], second[together]), np.abs(z)
-    least = max(thresholds().changes.median_sigmas, _correlated_sigmas(z, view, eligible))
+    least = max(thresholds().changes.faint_sigmas, _correlated_sigmas(z, view, eligible))
     core = _faint_cores(faint, exceeds, pairs, eligible)
     for sign, level, ratio in product((1.0, -1.0), _LEVELS, _RATIOS):
         core |= _significant(sign * z, level, ratio, pairs, eligible, least)
     whole = _extended(core, size, pairs, eligible)
-    label = _compact(_connected(whole, pairs), view, int(eligible.sum()))
+    label = _compact(_connected(whole, pairs), int(eligible.sum()))
     inside = _select_pairs(pairs, whole[pairs[0]] & whole[pairs[1]])
     most = np.zeros(len(z))
     for one, other in (inside, inside[::-1]):
@@ -210,7 +210,7 @@ def _faint_cores(faint: FloatArray, exceeds: BoolArray, pairs: Pairs, eligible: 
     inside = label >= 0
     highest = np.zeros(int(label.max(initial=-1)) + 1)
     np.maximum.at(highest, label[inside], np.where(eligible, np.abs(faint), 0.0)[inside])
-    return np.isin(label, np.flatnonzero(highest > -ndtri(thresholds().changes.false_changes / (2 * eligible.sum())))) & inside
+    return np.isin(label, np.flatnonzero(highest > -ndtri(thresholds().verdict.rejection_p / (2 * eligible.sum())))) & inside
 
 
 def _agreeing(pairs: Pairs, size: FloatArray, ratio: float) -> Pairs:
@@ -238,7 +238,7 @@ def _significant(z: FloatArray, level: float, ratio: float, pairs: Pairs, eligib
     for _ in range(len(count)):
         stray = np.sort(z[inside][~accepted[label[inside]]])
         by_chance = _log_expected(count, int(eligible.sum()), len(stray), _agreeing_share(stray, ratio))
-        rare = by_chance < np.log(thresholds().changes.false_changes / _SEARCHES)
+        rare = by_chance < np.log(thresholds().verdict.rejection_p / _SEARCHES)
         again = (count >= thresholds().changes.fewest) & (middle > least) & rare
         if np.array_equal(again, accepted):
             break
@@ -287,7 +287,7 @@ def _correlated_sigmas(z: FloatArray, view: SensorView, eligible: BoolArray) -> 
     chosen = counts >= NEIGHBOURS // 2
     if not chosen.any():
         return 0.0
-    return nmad(total[chosen] / (counts[chosen] + 1)) * float(-ndtri(thresholds().changes.false_changes / (2 * len(known))))
+    return nmad(total[chosen] / (counts[chosen] + 1)) * float(-ndtri(thresholds().verdict.rejection_p / (2 * len(known))))
 
 
 def _extended(core: BoolArray, size: FloatArray, pairs: Pairs, eligible: BoolArray) -> BoolArray:
@@ -320,19 +320,10 @@ def _select_pairs(pairs: Pairs, which: BoolArray) -> Pairs:
     return pairs[0][which], pairs[1][which]
 
 
-def _compact(label: NDArray[np.int64], view: SensorView, points: int) -> NDArray[np.int64]:
-    """Labels (n,) without regions that are no compact change: a large part of the wall, or a stripe."""
-    rows = np.flatnonzero(label >= 0)
-    if not len(rows):
-        return label
-    order = rows[np.argsort(label[rows], kind="stable")]
-    starts = np.flatnonzero(np.diff(label[order], prepend=-1))
-    place = view.scaled_coordinates[order]
-    length = (np.maximum.reduceat(place, starts) - np.minimum.reduceat(place, starts)).max(axis=1)
-    size = np.diff(np.append(starts, len(order))) / len(np.unique(view.epoch))
-    stripe = (length >= thresholds().changes.stripe_length) & (size <= 0.1 * length**2)
-    compact = (size * len(np.unique(view.epoch)) < thresholds().changes.largest_share * points) & ~stripe
-    return np.where(np.isin(label, label[order][starts][compact]), label, -1)
+def _compact(label: NDArray[np.int64], points: int) -> NDArray[np.int64]:
+    """Labels (n,) without regions that are a large part of the wall, and no compact change."""
+    size = np.bincount(label[label >= 0])
+    return np.where(np.isin(label, np.flatnonzero(size < thresholds().changes.moved_share * points)), label, -1)
 
 
 def _measure_changes(label: NDArray[np.int64], departure: FloatArray, error: FloatArray, view: SensorView) -> list[SceneChange]:

@@ -138,7 +138,7 @@ def _fit_noise(points: FloatArray, value: FloatArray) -> SurfaceNoise:
             best = step, found
     step, (values, square) = best if best is not None else (1.0, without_nodes)
     shared = 4 / 9 * values[1]
-    improves = without_nodes[1] - square > thresholds().grid_noise.least_gain
+    improves = without_nodes[1] - square > 2 * thresholds().variance.least_gain
     if not improves or shared < thresholds().variance.least_excess * values[0]:
         return SurfaceNoise(float(np.sqrt(without_nodes[0][0])), 0.0, 0.1, spacing, 0.0)
     own = max(values[0], 1e-4 * shared)
